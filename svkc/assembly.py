@@ -1,0 +1,151 @@
+"""F4: a consistent state from what the user knows of it: names to numbers, loops closed, velocities made to agree."""
+
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from svkc.chain import Q_SIZE, V_SIZE, Chain, State, Structure
+from svkc.closure import agree, close, decide_rank, loop_gaps
+from svkc.kinematics import kinematics, normalize
+from svkc.loops import active_dofs, joint_coordinates
+
+_NEWTON = 30
+
+
+def gap_tolerance(dtype) -> float:
+    """Largest loop gap, over `chain.length` where it is in metres, that counts as closed: eps^(4/7), 1.1e-9 in float64, 1.1e-4 in float32."""
+    return float(np.finfo(dtype).eps ** (4 / 7))
+
+
+def connection_mask(chain: Chain, connected) -> np.ndarray | jax.Array:
+    """[links] Boolean from names, a mask, or None (as the model says)."""
+    if connected is None:
+        return chain.structure.connected
+    names = (connected,) if isinstance(connected, str) else connected
+    if isinstance(names, (tuple, list, set, frozenset)) and all(isinstance(n, str) for n in names):
+        return np.isin(chain.link_names, [chain.link_names[link_index(chain, n)] for n in names])
+    mask = connected if isinstance(connected, jax.Array) else np.asarray(connected)
+    if mask.shape != (len(chain.link_names),) or mask.dtype != bool:
+        raise ValueError(f"connected: expected names of virtual links or {len(chain.link_names)} Booleans, got {mask.dtype} of shape {mask.shape}")
+    return mask
+
+
+def link_index(chain: Chain, name: str) -> int:
+    """The slot of a virtual link; ValueError naming those there are."""
+    if name not in chain.link_names:
+        raise ValueError(f"no virtual link {name!r}; virtual links: {', '.join(chain.link_names) or 'none'}")
+    return chain.link_names.index(name)
+
+
+def joint_slice(chain: Chain, name: str, sizes, start) -> slice:
+    """Where a joint of the tree stands in q or v; ValueError naming those there are."""
+    top = chain.topology
+    if name not in top.joint_names:
+        raise ValueError(f"no joint {name!r}; joints: {', '.join(top.joint_names)}")
+    row = top.joint_row[top.joint_names.index(name)]
+    return slice(start[row], start[row] + sizes[top.kind[row]])
+
+
+def _filled(chain: Chain, what: str, value, default, tree: int, sizes, start):
+    """The full vector of a user's array or dict, and which coordinates the dict named."""
+    named = np.zeros(len(default), bool)
+    if value is None:
+        return default, named
+    if isinstance(value, dict):
+        out = default
+        for name, number in value.items():
+            at = joint_slice(chain, name, sizes, start)
+            number = _numbers(f"{what}[{name!r}]", number, default.dtype)
+            if number.size != at.stop - at.start:
+                raise ValueError(f"{what}[{name!r}]: got {number.size} numbers, the joint has {at.stop - at.start}")
+            out = out.at[at].set(number.reshape(-1))
+            if what == "v" or at.stop - at.start == 1:
+                named[at] = True
+        return out, named
+    value = _numbers(what, value, default.dtype)
+    if value.shape == (tree,):
+        return default.at[:tree].set(value), named
+    if value.shape != default.shape:
+        raise ValueError(f"{what}: got shape {value.shape}, expected ({tree},) for the tree or {default.shape} for every coordinate")
+    return value, named
+
+
+def _numbers(what: str, value, dtype):
+    """As floats of the chain's type, finite where that can be seen."""
+    value = value if isinstance(value, jax.Array) else np.asarray(value)
+    if not np.issubdtype(value.dtype, np.number) or np.issubdtype(value.dtype, np.complexfloating):
+        raise ValueError(f"{what}: expected real numbers, got {value.dtype}")
+    if not isinstance(value, jax.core.Tracer) and not np.isfinite(np.asarray(value)).all():
+        raise ValueError(f"{what}: expected finite numbers, got {np.asarray(value)}")
+    return jnp.asarray(value, dtype)
+
+
+def _check_quaternions(chain: Chain, q):
+    """Unit quaternions where that can be seen: to a thousandth, beyond which a normalised one would be a guess."""
+    first, _ = chain.topology.quaternions
+    if isinstance(q, jax.core.Tracer) or not len(first):
+        return
+    norms = np.linalg.norm(np.asarray(q)[first[:, None] + np.arange(4)], axis=1)
+    if np.any(np.abs(norms - 1) > 1e-3):
+        i = int(np.argmax(np.abs(norms - 1)))
+        raise ValueError(f"q: the quaternion at q[{first[i]}:{first[i] + 4}] has norm {norms[i]:.6g}, expected 1")
+
+
+@eqx.filter_jit
+def _close_and_agree(chain: Chain, structure: Structure, q, v, held_q, held_v):
+    """Loops closed with the named coordinates held, then, for what is still open, with all of them free; the same for velocities."""
+    q = joint_coordinates(chain, structure, kinematics(chain, q), q)
+    full = eqx.tree_at(lambda s: s.rank, structure, jnp.asarray(min(6 * len(chain.link_names), chain.dofs), jnp.int32))
+    q = close(chain, full, q, _NEWTON, hold=held_q)
+    q = close(chain, full, q, _NEWTON)
+    structure = decide_rank(chain, structure, q)
+    q = close(chain, structure, q)
+    v = jnp.where(active_dofs(chain, structure), v, 0)
+    v = agree(chain, full, q, v, hold=held_v)
+    return State(q, agree(chain, structure, q, v), structure)
+
+
+def assemble(chain: Chain, q, v, connected) -> State:
+    """See `Chain.state`."""
+    top = chain.topology
+    structure = eqx.tree_at(lambda s: s.connected, chain.structure, jnp.asarray(connection_mask(chain, connected)))
+    q, held_q = _filled(chain, "q", q, chain.q_load, top.nq, Q_SIZE, top.q_start)
+    v, held_v = _filled(chain, "v", v, jnp.zeros(top.dofs, chain.q_load.dtype), top.nv, V_SIZE, top.v_start)
+    _check_quaternions(chain, q)
+    if not len(top.link_names):
+        return State(normalize(chain, q), v, structure)
+    state = _close_and_agree(chain, structure, q, v, _as_dofs(chain, held_q), held_v)
+    return check_closed(chain, state)
+
+
+def _as_dofs(chain: Chain, held_q: np.ndarray) -> np.ndarray:
+    """Held entries of q (one number a joint) as entries of v."""
+    held = np.zeros(chain.dofs, bool)
+    scalar_q, scalar_v = chain.topology.scalars
+    held[scalar_v] = held_q[scalar_q]
+    return held
+
+
+@eqx.filter_jit
+def _worst_gap(chain: Chain, state: State):
+    gaps = jnp.abs(loop_gaps(chain, state))
+    return jnp.maximum(jnp.max(gaps[:, :3], 1), jnp.max(gaps[:, 3:], 1) / chain.length)
+
+
+def check_closed(chain: Chain, state: State) -> State:
+    """The state; ValueError (or an error raised at run time, under jit) where a loop is open, saying which and by how much."""
+    worst = _worst_gap(chain, state)
+    limit = gap_tolerance(state.q.dtype)
+    if isinstance(worst, jax.core.Tracer):
+        return eqx.error_if(state, ~(jnp.max(worst) < limit), "the loops of the initial state cannot be closed")
+    worst = np.asarray(worst)
+    if not np.all(worst < limit):
+        gaps = np.asarray(loop_gaps(chain, state))
+        open_ = [
+            f"{chain.link_names[i]} by {np.linalg.norm(gaps[i, 3:]):.3g} m and {np.linalg.norm(gaps[i, :3]):.3g} rad"
+            for i in np.flatnonzero(~(worst < limit))
+        ]
+        raise ValueError(f"the loops cannot be closed from this configuration: {'; '.join(open_)}. Give a q nearer to a closed one.")
+    return state

@@ -1,0 +1,370 @@
+"""F1: the nouns. Chain (what the bodies are), Structure (how they are joined now), State (how they move now), VirtualLink."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+FIXED, HINGE, SLIDE, BALL, FREE = range(5)
+Q_SIZE = (0, 1, 1, 4, 7)
+V_SIZE = (0, 1, 1, 3, 6)
+
+# the freedoms of the named joints: rotations about x, y, z, then translations along x, y, z; the axis of the joint is z
+JOINTS = {
+    "weld": (False, False, False, False, False, False),
+    "hinge": (False, False, True, False, False, False),
+    "slide": (False, False, False, False, False, True),
+    "cylinder": (False, False, True, False, False, True),
+    "universal": (True, True, False, False, False, False),
+    "planar": (False, False, True, True, True, False),
+    "ball": (True, True, True, False, False, False),
+    "free": (True, True, True, True, True, True),
+}
+
+
+def joint_freedoms(joint) -> tuple[bool, ...]:
+    """The six Booleans of a joint given by name or as six Booleans; ValueError otherwise."""
+    if isinstance(joint, str):
+        if joint in JOINTS:
+            return JOINTS[joint]
+    elif len(tuple(joint)) == 6:
+        return tuple(bool(x) for x in joint)
+    raise ValueError(
+        f"joint: got {joint!r}, expected one of {', '.join(JOINTS)} or six Booleans (three rotations, three translations)"
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class VirtualLink:
+    """A massless extra link, child of `parent`, that coincides with its `real` link while connected (paper, section IV).
+
+    `parent`, `real`: body names ("world" is the ground). `pos` (m), `quat`: the joint's frame in the parent; `real_pos`, `real_quat`: the
+    same frame in the real link, None: from the load pose. `axis`: of the joint, in the frame `pos`, `quat` makes in the parent.
+    `joint`: weld, hinge, slide, cylinder, universal, planar, ball, free, or six Booleans (three rotations, three translations).
+    """
+
+    name: str
+    parent: str
+    real: str
+    joint: Any = "weld"
+    pos: Any = (0.0, 0.0, 0.0)
+    quat: Any = (1.0, 0.0, 0.0, 0.0)
+    real_pos: Any = None
+    real_quat: Any = None
+    axis: Any = (0.0, 0.0, 1.0)
+    connected: bool = False
+
+    def __post_init__(self):
+        joint_freedoms(self.joint)
+        for name, size in (("pos", 3), ("quat", 4), ("real_pos", 3), ("real_quat", 4), ("axis", 3)):
+            value = getattr(self, name)
+            if value is None and name.startswith("real"):
+                continue
+            value = np.asarray(value, float)
+            if value.shape != (size,) or not np.isfinite(value).all():
+                raise ValueError(f"virtual link {self.name!r}: {name} must be {size} finite numbers, got {value}")
+            if size == 4 and abs(np.linalg.norm(value) - 1) > 1e-6:
+                raise ValueError(f"virtual link {self.name!r}: {name} must be a unit quaternion, got one of norm {np.linalg.norm(value):.6g}")
+        if np.linalg.norm(np.asarray(self.axis, float)) == 0:
+            raise ValueError(f"virtual link {self.name!r}: axis must not be zero")
+
+
+@dataclasses.dataclass(frozen=True)
+class Topology:
+    """Everything about a chain that never changes and that the compiler may specialise on. Rows are links, sorted by level, row 0 the world.
+
+    A body with several joints takes one row a joint, the last of them the body itself; the others have no mass.
+    """
+
+    body_names: tuple[str, ...]
+    joint_names: tuple[str, ...]
+    link_names: tuple[str, ...]
+    parent: tuple[int, ...]
+    kind: tuple[int, ...]
+    q_start: tuple[int, ...]
+    v_start: tuple[int, ...]
+    nq: int
+    nv: int
+    body_row: tuple[int, ...]
+    joint_row: tuple[int, ...]
+    link_freedoms: tuple[tuple[bool, ...], ...]
+    link_spare: tuple[bool, ...]
+
+    @functools.cached_property
+    def _hash(self):
+        return hash(tuple(getattr(self, f.name) for f in dataclasses.fields(self)))
+
+    def __hash__(self):
+        return self._hash
+
+    @functools.cached_property
+    def levels(self) -> tuple[tuple[int, int], ...]:
+        """(first row, last row + 1) of each level of the tree, the world's first."""
+        depth = np.zeros(len(self.parent), int)
+        for i in range(1, len(depth)):
+            depth[i] = depth[self.parent[i]] + 1
+        edges = np.searchsorted(depth, np.arange(depth.max() + 2))
+        return tuple((int(a), int(b)) for a, b in zip(edges[:-1], edges[1:], strict=True))
+
+    @functools.cached_property
+    def root(self) -> np.ndarray:
+        """The child of the world that each row hangs on; 0 for the world."""
+        root = np.arange(len(self.parent))
+        for i in range(1, len(root)):
+            root[i] = i if self.parent[i] == 0 else root[self.parent[i]]
+        return root
+
+    @functools.cached_property
+    def dof_row(self) -> np.ndarray:
+        """The row whose joint each coordinate of the tree belongs to."""
+        row = np.zeros(self.nv, int)
+        for i, (kind, start) in enumerate(zip(self.kind, self.v_start, strict=True)):
+            row[start : start + V_SIZE[kind]] = i
+        return row
+
+    @functools.cached_property
+    def ancestor(self) -> np.ndarray:
+        """[rows, rows] Boolean: the column is the row itself or one of its ancestors."""
+        table = np.eye(len(self.parent), dtype=bool)
+        for i in range(1, len(table)):
+            table[i] |= table[self.parent[i]]
+        return table
+
+    def rows_of(self, *kinds: int) -> np.ndarray:
+        """The rows whose joint is one of these kinds."""
+        return np.flatnonzero(np.isin(self.kind, kinds))
+
+    @functools.cached_property
+    def links(self) -> "LinkTables":
+        """Where the virtual links' coordinates stand in q and v."""
+        return LinkTables.of(self)
+
+    @property
+    def nq_all(self) -> int:
+        """Length of State.q: the tree's coordinates, then the virtual links'."""
+        return self.links.nq_all
+
+    @property
+    def dofs(self) -> int:
+        """Length of State.v: N_J with every virtual link connected."""
+        return self.links.dofs
+
+    @functools.cached_property
+    def quaternions(self) -> tuple[np.ndarray, np.ndarray]:
+        """(first index in q, first index in v) of every rotation kept as a quaternion, virtual links' included."""
+        offset_q, offset_v = (0, 0, 0, 0, 3), (0, 0, 0, 0, 3)
+        rows = self.rows_of(BALL, FREE)
+        q = [self.q_start[i] + offset_q[self.kind[i]] for i in rows] + [int(i[0]) for i in self.links.quat if i[0] < self.nq_all]
+        v = [self.v_start[i] + offset_v[self.kind[i]] for i in rows]
+        v += [int(d[0]) for i, d in zip(self.links.quat, self.links.dof, strict=True) if i[0] < self.nq_all]
+        return np.array(q, int), np.array(v, int)
+
+    @functools.cached_property
+    def scalars(self) -> tuple[np.ndarray, np.ndarray]:
+        """(index in q, index in v) of every coordinate whose rate is its velocity."""
+        quat_q, quat_v = self.quaternions
+        q = np.setdiff1d(np.arange(self.nq_all), (quat_q[:, None] + np.arange(4)).ravel())
+        v = np.setdiff1d(np.arange(self.dofs), (quat_v[:, None] + np.arange(3)).ravel())
+        return q, v
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class LinkTables:
+    """Index tables of the virtual joints: x, y, z turns, then x, y, z slides; an index past the end reads a constant.
+
+    Three rotations are one quaternion. A spare slot has room for all six freedoms; its mask in the Structure says which it uses.
+    """
+
+    nq_all: int
+    dofs: int
+    angle: np.ndarray  # [L 3] into (q, 0, 1)
+    slide: np.ndarray  # [L 3] into (q, 0, 1)
+    quat: np.ndarray  # [L 4] into (q, 0, 1)
+    dof: np.ndarray  # [L 6] into (v, 0)
+
+    @classmethod
+    def of(cls, topology: Topology) -> "LinkTables":
+        count = len(topology.link_names)
+        q, v = topology.nq, topology.nv
+        angle, slide, quat, dof = (np.full((count, k), -1) for k in (3, 3, 4, 6))
+        for i, freedoms in enumerate(topology.link_freedoms):
+            if sum(freedoms[:3]) == 3:
+                quat[i] = np.arange(q, q + 4)
+                q += 4
+            else:
+                for k in np.flatnonzero(freedoms[:3]):
+                    angle[i, k], q = q, q + 1
+            for k in np.flatnonzero(freedoms[3:]):
+                slide[i, k], q = q, q + 1
+            for k in np.flatnonzero(freedoms):
+                dof[i, k], v = v, v + 1
+        angle[angle < 0] = q
+        slide[slide < 0] = q
+        quat[quat[:, 0] < 0] = [q + 1, q, q, q]
+        dof[dof < 0] = v
+        return cls(q, v, angle, slide, quat, dof)
+
+
+class Structure(eqx.Module):
+    """How the bodies are joined for the length of a phase. Placements are the joint's frame in its two bodies (m, wxyz), its axis along z.
+
+    `connected` [links]; `parent`, `real`: rows of the two bodies; `freedoms`: of each virtual joint; `locked`: joint coordinates held still, None
+    where nothing can be locked; `independent`: coordinates asked to be independent where they can be; `rank`: m, decided once for the phase.
+    """
+
+    connected: Bool[Array, " links"]
+    parent: Int[Array, " links"]
+    real: Int[Array, " links"]
+    pos: Float[Array, "links 3"]
+    quat: Float[Array, "links 4"]
+    real_pos: Float[Array, "links 3"]
+    real_quat: Float[Array, "links 4"]
+    freedoms: Bool[Array, "links 6"]
+    rank: Int[Array, ""]
+    locked: Bool[Array, " dofs"] | None = None
+    independent: Bool[Array, " dofs"] | None = None
+
+
+class State(eqx.Module):
+    """How the bodies move: `q` (m, rad, wxyz; MuJoCo's qpos, then the virtual joints'), `v` (m/s, rad/s), and the structure they move under."""
+
+    q: Float[Array, " q"]
+    v: Float[Array, " dofs"]
+    structure: Structure
+
+
+class Chain(eqx.Module):
+    """The bodies of a scene and the joints between them; its floats are leaves to differentiate. Made by `svkc.load`.
+
+    Rows are those of `Topology`. `pos`, `quat`: joint frame in the parent's; `anchor`, `axis`: of the joint in the row's own frame; `inertia`: about the
+    centre of mass, row axes. What a scene does not have (anchors, armature, damping, springs, limits) is None and is not compiled.
+    """
+
+    topology: Topology = eqx.field(static=True)
+    pos: Float[Array, "rows 3"]
+    quat: Float[Array, "rows 4"]
+    axis: Float[Array, "rows 3"]
+    mass: Float[Array, " rows"]
+    com: Float[Array, "rows 3"]
+    inertia: Float[Array, "rows 3 3"]
+    gravity: Float[Array, "3"]
+    q_load: Float[Array, " q"]
+    length: Float[Array, ""]
+    gear: Float[Array, "motors nv"]
+    control_range: Float[Array, "motors 2"]
+    force_range: Float[Array, "motors 2"]
+    structure: Structure
+    anchor: Float[Array, "rows 3"] | None = None
+    armature: Float[Array, " nv"] | None = None
+    damping: Float[Array, " nv"] | None = None
+    stiffness: Float[Array, " nv"] | None = None
+    q_spring: Float[Array, " nq"] | None = None
+    limit: Float[Array, "2 nv"] | None = None
+    limit_spring: Float[Array, "2 nv"] | None = None
+    model: Any = eqx.field(static=True, default=None)
+    left_out: tuple[str, ...] = eqx.field(static=True, default=())
+
+    @property
+    def body_names(self) -> tuple[str, ...]:
+        return self.topology.body_names
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        return self.topology.joint_names
+
+    @property
+    def link_names(self) -> tuple[str, ...]:
+        """The virtual links."""
+        return self.topology.link_names
+
+    @property
+    def nq(self) -> int:
+        return self.topology.nq
+
+    @property
+    def nv(self) -> int:
+        return self.topology.nv
+
+    @property
+    def dofs(self) -> int:
+        """All joint coordinates: the tree's, then the virtual links'."""
+        return self.topology.dofs
+
+    @property
+    def parent(self) -> np.ndarray:
+        """Pointer of the paper's section IV, for each body, then each virtual link, as an index into both; -1: none."""
+        return _pointers(self)[0]
+
+    @property
+    def child(self) -> np.ndarray:
+        """The first child of each body and virtual link; -1: none."""
+        return _pointers(self)[1]
+
+    @property
+    def brother(self) -> np.ndarray:
+        """The next child of the same parent; -1: none."""
+        return _pointers(self)[2]
+
+    @property
+    def real(self) -> np.ndarray:
+        """The real link of each virtual link; -1 for bodies, and for spare slots not bound yet."""
+        return _pointers(self)[3]
+
+    @property
+    def actuated(self) -> Bool[Array, " dofs"]:
+        """What the model's actuators drive; without actuators every joint of the tree that is not free."""
+        top = self.topology
+        if self.gear.shape[0]:
+            tree = jnp.any(self.gear != 0, 0)
+        else:
+            tree = jnp.asarray(np.array(top.kind)[top.dof_row] != FREE)
+        return jnp.concatenate([tree, jnp.zeros(top.dofs - top.nv, bool)])
+
+    def motors(self, u: Float[Array, " motors"]) -> Float[Array, " dofs"]:
+        """Joint torques (N m, N) of the model's actuators for the controls u: gear times u, each clipped to its range."""
+        if u.shape != self.gear.shape[:1]:
+            raise ValueError(f"u: got shape {u.shape}, the model has {self.gear.shape[0]} actuators")
+        force = jnp.clip(u, self.control_range[:, 0], self.control_range[:, 1])
+        force = jnp.clip(force, self.force_range[:, 0], self.force_range[:, 1])
+        return jnp.concatenate([force @ self.gear, jnp.zeros(self.dofs - self.nv, u.dtype)])
+
+    def state(self, q=None, v=None, connected=None) -> State:
+        """A consistent state: loops closed by Newton's method, velocities made to agree with them.
+
+        q, v: arrays over the tree (or over every coordinate), or dicts by joint name, whose entries are kept where the loops allow it.
+        connected: names of the virtual links, or a mask; None: as the model says. ValueError: unknown names, wrong sizes, quaternions that are
+        not unit, loops that cannot be closed (says which, and by how much).
+        """
+        # the one import that goes up the house: a state needs the loops closed, and the contract puts the verb on the noun
+        from svkc.assembly import assemble
+
+        return assemble(self, q, v, connected)
+
+
+def _pointers(chain: Chain) -> np.ndarray:
+    """[4, bodies + links] parent, child, brother, real."""
+    top = chain.topology
+    bodies, count = len(top.body_names), len(top.body_names) + len(top.link_names)
+    body_of_row = np.full(len(top.parent), -1)
+    for body, row in enumerate(top.body_row):
+        body_of_row[row] = body
+    table = np.full((4, count), -1)
+    for body in range(1, bodies):
+        row = top.parent[top.body_row[body]]
+        while body_of_row[row] < 0:
+            row = top.parent[row]
+        table[0, body] = body_of_row[row]
+    for link, spare in enumerate(top.link_spare):
+        if not spare:
+            table[0, bodies + link] = body_of_row[int(chain.structure.parent[link])]
+            table[3, bodies + link] = body_of_row[int(chain.structure.real[link])]
+    for parent in range(bodies):
+        children = np.flatnonzero(table[0] == parent)
+        if len(children):
+            table[1, parent] = children[0]
+            table[2, children[:-1]] = children[1:]
+    return table

@@ -1,0 +1,50 @@
+"""F3: energy and momentum of the tree; virtual links have no mass."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from svkc.chain import Chain, State
+from svkc.inverse_dynamics import spring_stretch
+from svkc.kinematics import Kinematics, kinematics, twists
+from svkc.spatial import cross, rotate
+
+
+def _bodies(chain: Chain, kin: Kinematics, v):
+    """Of each row: centre of mass from the root's origin, its velocity, angular velocity, angular momentum about it."""
+    V = twists(chain, kin, v)
+    c = kin.r + rotate(kin.R, chain.com)
+    w = V[:, :3]
+    spin = rotate(kin.R, rotate(chain.inertia, rotate(jnp.swapaxes(kin.R, -1, -2), w)))
+    return c, V[:, 3:] + cross(w, c), w, spin
+
+
+def kinetic_energy(chain: Chain, state: State) -> Float[Array, ""]:
+    """Kinetic energy (J), armature included: v^T M v / 2."""
+    _, u, w, spin = _bodies(chain, kinematics(chain, state.q), state.v)
+    energy = jnp.sum(chain.mass * jnp.sum(u * u, -1)) / 2 + jnp.sum(w * spin) / 2
+    if chain.armature is not None:
+        energy = energy + jnp.sum(chain.armature * state.v[: chain.nv] ** 2) / 2
+    return energy
+
+
+def potential_energy(chain: Chain, state: State) -> Float[Array, ""]:
+    """Gravity's potential (J), zero at the world's origin, and that of the joints' springs."""
+    kin = kinematics(chain, state.q)
+    c = kin.root + kin.r + rotate(kin.R, chain.com)
+    energy = -jnp.sum(chain.mass * jnp.sum(c * chain.gravity[None], -1))
+    if chain.stiffness is not None:
+        energy = energy + jnp.sum(chain.stiffness * spring_stretch(chain, state.q) ** 2) / 2
+    return energy
+
+
+def energy(chain: Chain, state: State) -> Float[Array, ""]:
+    """Mechanical energy (J): kinetic, gravity's and the joint springs'."""
+    return kinetic_energy(chain, state) + potential_energy(chain, state)
+
+
+def momentum(chain: Chain, state: State) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    """Linear momentum (N s) and angular momentum about the world's origin (N m s), in world axes."""
+    kin = kinematics(chain, state.q)
+    c, u, _, spin = _bodies(chain, kin, state.v)
+    p = chain.mass[:, None] * u
+    return jnp.sum(p, 0), jnp.sum(spin + cross(kin.root + c, p), 0)

@@ -1,0 +1,172 @@
+"""F5: changes of structure to come, at a time or when a guard crosses zero, and where in a step it does."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from svkc.assembly import joint_slice, link_index
+from svkc.chain import V_SIZE, Chain, Structure
+
+
+class Action(eqx.Module):
+    """What an event does: names of virtual links to connect (those in `here`: where they are) and cut, of joints to lock and unlock."""
+
+    connect: tuple[str, ...] = eqx.field(static=True, default=())
+    cut: tuple[str, ...] = eqx.field(static=True, default=())
+    lock: tuple[str, ...] = eqx.field(static=True, default=())
+    unlock: tuple[str, ...] = eqx.field(static=True, default=())
+    here: tuple[str, ...] = eqx.field(static=True, default=())
+    stop: bool = eqx.field(static=True, default=False)
+
+
+class At(eqx.Module):
+    """An event at a time (s); the time is differentiable."""
+
+    time: Any
+    action: Action
+
+
+class When(eqx.Module):
+    """An event when guard(t, state, args) crosses zero: upwards (True), downwards (False), either way (None)."""
+
+    guard: Callable
+    action: Action
+    direction: bool | None = eqx.field(static=True, default=None)
+
+
+def _names(value) -> tuple[str, ...]:
+    names = (value,) if isinstance(value, str) else tuple(value)
+    if not all(isinstance(n, str) for n in names):
+        raise ValueError(f"expected names, got {value!r}")
+    return names
+
+
+def _action(connect, cut, lock, unlock, here, stop) -> Action:
+    connect = _names(connect)
+    here = connect if here is True else () if here is False else _names(here)
+    if not set(here) <= set(connect):
+        raise ValueError(f"here: {here} must be among the links to connect, {connect}")
+    return Action(connect, _names(cut), _names(lock), _names(unlock), here, stop)
+
+
+def at(time, connect=(), cut=(), *, lock=(), unlock=(), here=False, stop=False) -> At:
+    """At this time (s): connect and cut virtual links, lock and unlock joints, by name. Where a link is both connected and cut, it is cut.
+
+    here: True, or names: grip where the bodies are. stop: end the run then.
+    """
+    return At(time, _action(connect, cut, lock, unlock, here, stop))
+
+
+def when(guard, connect=(), cut=(), direction=None, *, lock=(), unlock=(), here=False, stop=False) -> When:
+    """When guard(t, state, args) -> real crosses zero, located to round-off and differentiable in time; the actions are those of `at`.
+
+    direction: True for upwards only, False for downwards only. A guard is watched while its action would change something, or always if it has none;
+    one that is exactly zero at the start has not crossed. Crossings are seen between the ends of steps: two within one step go unseen, bound the step
+    (`stepsize_controller`, `dt`) where that can happen.
+    """
+    if not callable(guard):
+        raise ValueError(f"when: guard must be a function of (t, state, args), got {guard!r}")
+    if direction not in (None, True, False):
+        raise ValueError(f"when: direction must be True, False or None, got {direction!r}")
+    return When(guard, _action(connect, cut, lock, unlock, here, stop), direction)
+
+
+class Plan(eqx.Module):
+    """A list of events as tables: which are timed, and what each does."""
+
+    times: Float[Array, " timed"]
+    guards: tuple[Callable, ...]
+    timed: tuple[int, ...] = eqx.field(static=True)
+    guarded: tuple[int, ...] = eqx.field(static=True)
+    directions: tuple[bool | None, ...] = eqx.field(static=True)
+    actions: tuple[Action, ...] = eqx.field(static=True)
+
+    @property
+    def locks(self) -> bool:
+        return any(a.lock or a.unlock for a in self.actions)
+
+    def table(self, chain: Chain, what: str) -> np.ndarray:
+        """[events, links or dofs] Boolean of one part of the actions."""
+        if what in ("lock", "unlock"):
+            table = np.zeros((len(self.actions), chain.dofs), bool)
+            for row, action in zip(table, self.actions, strict=True):
+                for name in getattr(action, what):
+                    row[joint_slice(chain, name, V_SIZE, chain.topology.v_start)] = True
+            return table
+        table = np.zeros((len(self.actions), len(chain.link_names)), bool)
+        for row, action in zip(table, self.actions, strict=True):
+            row[[link_index(chain, name) for name in getattr(action, what)]] = True
+        return table
+
+    def watched(self, chain: Chain, structure: Structure) -> Bool[Array, " guards"]:
+        """Guards whose action would change something now, or that have none."""
+        rows = list(self.guarded)
+        on, off = (self.table(chain, what)[rows] for what in ("connect", "cut"))
+        c = structure.connected[None]
+        change = jnp.any(on & ~c, 1) | jnp.any(off & c, 1)
+        if self.locks:
+            on, off = (self.table(chain, what)[rows] for what in ("lock", "unlock"))
+            change = change | jnp.any(on & ~structure.locked[None], 1) | jnp.any(off & structure.locked[None], 1)
+        idle = [self.actions[i].stop or not any((a := self.actions[i]).connect + a.cut + a.lock + a.unlock) for i in rows]
+        return change | np.array(idle, bool)
+
+    def crossed(self, before: Float[Array, " guards"], after: Float[Array, " guards"]) -> Bool[Array, " guards"]:
+        """Guards that went through zero; one that starts at zero has not."""
+        up, down = (before < 0) & (after >= 0), (before > 0) & (after <= 0)
+        either = np.array([d is None for d in self.directions], bool)
+        upward = np.array([d is True for d in self.directions], bool)
+        return jnp.where(either, up | down, jnp.where(upward, up, down))
+
+
+def plan(chain: Chain, events, dtype) -> Plan:
+    """Tables of the events; ValueError for anything that is not one, and for names the chain does not have."""
+    for event in events:
+        if not isinstance(event, At | When):
+            raise ValueError(f"events: expected svkc.at(...) and svkc.when(...), got {event!r}")
+    timed = tuple(i for i, e in enumerate(events) if isinstance(e, At))
+    guarded = tuple(i for i, e in enumerate(events) if isinstance(e, When))
+    times = [jnp.asarray(events[i].time, dtype) for i in timed]
+    if any(t.shape != () for t in times):
+        raise ValueError("at: time must be one number; for a time in each lane use vmap")
+    made = Plan(
+        times=jnp.stack(times) if times else jnp.zeros(0, dtype),
+        guards=tuple(events[i].guard for i in guarded),
+        timed=timed,
+        guarded=guarded,
+        directions=tuple(events[i].direction for i in guarded),
+        actions=tuple(e.action for e in events),
+    )
+    for what in ("connect", "cut", "lock", "unlock"):
+        made.table(chain, what)
+    return made
+
+
+def first_root(f, a: Float[Array, ""], b: Float[Array, ""]) -> Float[Array, ""]:
+    """A zero of f in [a, b], f(b) >= 0, to round-off: false position with the Illinois weight, every third step a bisection.
+
+    Returns the side where f >= 0; a itself if f is not negative there. Not differentiable.
+    """
+    eps = jnp.finfo(b.dtype).eps
+    fine = 2 * eps * jnp.maximum(jnp.abs(a), jnp.abs(b)) + eps * (b - a)
+
+    def narrow(carry):
+        i, a, fa, b, fb, last = carry
+        weight = fb - fa
+        secant = b - fb * (b - a) / jnp.where(weight == 0, 1, weight)
+        c = jnp.where((i % 3 == 2) | (weight == 0), a + (b - a) / 2, secant)
+        c = jnp.clip(c, a + fine / 4, b - fine / 4)
+        fc = f(c)
+        right = fc >= 0
+        fa, fb = jnp.where(right & (last == 1), fa / 2, fa), jnp.where(~right & (last == -1), fb / 2, fb)
+        a, fa = jnp.where(right, a, c), jnp.where(right, fa, fc)
+        b, fb = jnp.where(right, c, b), jnp.where(right, fc, fb)
+        return i + 1, a, fa, b, fb, jnp.where(right, 1, -1)
+
+    fa = f(a)
+    start = (jnp.asarray(0), a, fa, jnp.where(fa >= 0, a, b), f(b), jnp.asarray(0))
+    return jax.lax.while_loop(lambda c: (c[3] - c[1] > fine) & (c[0] < 200), narrow, start)[3]

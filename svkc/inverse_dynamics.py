@@ -1,0 +1,144 @@
+"""F3: recursive Newton-Euler on the tree, the joint-space inertia by unit vectors and by composite bodies, and the forces joints make by themselves."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from svkc.chain import BALL, FREE, HINGE, SLIDE, Chain, State
+from svkc.kinematics import Kinematics, down, kinematics, to_rows, twists, up, velocity_products
+from svkc.spatial import cross, quat_conjugate, quat_log, quat_multiply, quat_normalize, rotate
+
+
+def newton_euler(
+    chain: Chain, kin: Kinematics, V: Float[Array, "rows 6"] | None, A: Float[Array, "rows 6"]
+) -> Float[Array, " nv"]:
+    """Joint forces S^T F that give every row the spatial acceleration A at the twist V (None: at rest); Featherstone section 5.3.
+
+    Each body's force is taken at its centre of mass, where gyroscopic terms need no parallel axes, and moved to the root's origin.
+    """
+    c = kin.r + rotate(kin.R, chain.com)
+    alpha = A[:, :3]
+    acceleration = A[:, 3:] + cross(alpha, c)
+    R = kin.R
+
+    def spin(w):
+        return rotate(R, rotate(chain.inertia, rotate(jnp.swapaxes(R, -1, -2), w)))
+
+    moment = spin(alpha)
+    if V is not None:
+        w = V[:, :3]
+        acceleration = acceleration + cross(w, V[:, 3:] + cross(w, c))
+        moment = moment + cross(w, spin(w))
+    force = chain.mass[:, None] * acceleration
+    F = up(chain.topology, jnp.concatenate([moment + cross(c, force), force], -1))
+    return jnp.sum(kin.S * F[chain.topology.dof_row], -1)
+
+
+def generalized_forces(chain: Chain, kin: Kinematics, V, v, vdot: Float[Array, " nv"]) -> Float[Array, " nv"]:
+    """ID(q, v, vdot) of the tree with gravity and armature (paper, section III-A, step 2)."""
+    A = down(chain.topology, to_rows(chain.topology, kin.S * vdot[:, None]) + velocity_products(chain, kin, V, v))
+    A = A.at[:, 3:].add(-chain.gravity[None])
+    tau = newton_euler(chain, kin, V, A)
+    return tau if chain.armature is None else tau + chain.armature * vdot
+
+
+def inertia_by_unit_vectors(chain: Chain, kin: Kinematics) -> Float[Array, "nv nv"]:
+    """Column i is ID(q, 0, e_i) without gravity: the paper's way (section III-B, step 3)."""
+
+    def column(unit):
+        A = down(chain.topology, to_rows(chain.topology, kin.S * unit[:, None]))
+        return newton_euler(chain, kin, None, A)
+
+    M = jax.vmap(column, out_axes=1)(jnp.eye(chain.nv, dtype=kin.r.dtype))
+    return M if chain.armature is None else M + jnp.diag(chain.armature)
+
+
+def inertia_by_composites(chain: Chain, kin: Kinematics) -> Float[Array, "nv nv"]:
+    """Composite rigid bodies (Featherstone section 6.2): mass, first moment and rotational inertia simply add up towards the root."""
+    top = chain.topology
+    c = kin.r + rotate(kin.R, chain.com)
+    RI = jnp.sum(kin.R[:, :, :, None] * chain.inertia[:, None, :, :], 2)
+    central = jnp.sum(RI[:, :, None, :] * kin.R[:, None, :, :], -1)
+    m = chain.mass[:, None]
+    square = jnp.sum(c * c, -1)[:, None, None] * jnp.eye(3, dtype=c.dtype)[None] - c[:, :, None] * c[:, None, :]
+    I = central + m[:, :, None] * square
+    total = up(top, jnp.concatenate([m, m * c, I.reshape(-1, 9)], -1))[top.dof_row]
+    m, h, I = total[:, :1], total[:, 1:4], total[:, 4:].reshape(-1, 3, 3)
+    w, u = kin.S[:, :3], kin.S[:, 3:]
+    # momentum of everything a joint carries, for a unit of its velocity
+    F = jnp.concatenate([rotate(I, w) + cross(h, u), m * u + cross(w, h)], -1)
+    related = top.ancestor[top.dof_row][:, top.dof_row]
+    M = jnp.where(related, F @ kin.S.T, 0)
+    M = jnp.where(related.T & ~related, M.T, M)
+    return M if chain.armature is None else M + jnp.diag(chain.armature)
+
+
+def passive_forces(chain: Chain, q: Float[Array, " q"], v: Float[Array, " dofs"]) -> Float[Array, " nv"]:
+    """Springs and dampers of the model's joints (N m, N), MuJoCo's meaning: -stiffness (q - q_spring) - damping v."""
+    tau = jnp.zeros_like(v[: chain.nv])
+    if chain.damping is not None:
+        tau = tau - chain.damping * v[: chain.nv]
+    if chain.stiffness is not None:
+        tau = tau - chain.stiffness * spring_stretch(chain, q)
+    return tau
+
+
+def spring_stretch(chain: Chain, q: Float[Array, " q"]) -> Float[Array, " nv"]:
+    """How far each coordinate of the tree is from its spring's rest (rad, m); rotation vector in body axes for balls."""
+    top, rest = chain.topology, chain.q_spring
+    stretch = jnp.zeros(chain.nv, q.dtype)
+    for kinds, offset_q, offset_v, size in (((HINGE, SLIDE), 0, 0, 1), ((FREE,), 0, 0, 3)):
+        rows = top.rows_of(*kinds)
+        at_q = np.array(top.q_start, int)[rows][:, None] + offset_q + np.arange(size)
+        at_v = np.array(top.v_start, int)[rows][:, None] + offset_v + np.arange(size)
+        stretch = stretch.at[at_v].set(q[at_q] - rest[at_q])
+    for kind, offset in ((BALL, 0), (FREE, 3)):
+        rows = top.rows_of(kind)
+        at_q = np.array(top.q_start, int)[rows][:, None] + offset + np.arange(4)
+        at_v = np.array(top.v_start, int)[rows][:, None] + offset + np.arange(3)
+        turn = quat_log(quat_multiply(quat_conjugate(rest[at_q]), quat_normalize(q[at_q])))
+        stretch = stretch.at[at_v].set(turn)
+    return stretch
+
+
+def limit_forces(chain: Chain, q: Float[Array, " q"], v: Float[Array, " dofs"]) -> Float[Array, " nv"]:
+    """The torque that keeps joints inside their range (paper, section VII-B): a stiff spring and damper that act outside of it only.
+
+    With x the distance outside and a = 0.01 rad or m: -(k x + c v) x / (x + a). Smooth once where it sets in; zero inside.
+    """
+    top, tau = chain.topology, jnp.zeros_like(v[: chain.nv])
+    if chain.limit is None:
+        return tau
+    k, c = chain.limit_spring
+    rows = top.rows_of(HINGE, SLIDE)
+    at_q, at_v = np.array(top.q_start, int)[rows], np.array(top.v_start, int)[rows]
+    lower, upper = chain.limit[:, at_v]
+    x = q[at_q]
+    out = jnp.maximum(x - upper, 0) - jnp.maximum(lower - x, 0)
+    return tau.at[at_v].set(-(k[at_v] * out + c[at_v] * v[at_v]) * jnp.abs(out) / (jnp.abs(out) + 0.01))
+
+
+def mass_matrix(chain: Chain, state: State) -> Float[Array, "nv nv"]:
+    """Joint-space inertia of the tree (kg, kg m, kg m^2), armature included, by composite bodies."""
+    return inertia_by_composites(chain, kinematics(chain, state.q))
+
+
+def bias_force(chain: Chain, state: State) -> Float[Array, " nv"]:
+    """Velocity-product and gravity forces of the tree: ID(q, v, 0) (MuJoCo's qfrc_bias)."""
+    kin = kinematics(chain, state.q)
+    V = twists(chain, kin, state.v)
+    return generalized_forces(chain, kin, V, state.v, jnp.zeros(chain.nv, state.v.dtype))
+
+
+def inverse_dynamics(chain: Chain, state: State, vdot: Float[Array, " accelerations"]) -> Float[Array, " nv"]:
+    """Torques (N m, N) the tree's joints must be given for vdot (over the tree, or over every coordinate): recursive Newton-Euler.
+
+    What springs and dampers of the joints give by themselves is taken off, so that this is the inverse of `forward_dynamics` on a tree.
+    """
+    if vdot.shape[0] not in (chain.nv, chain.dofs):
+        raise ValueError(f"vdot: got {vdot.shape[0]} numbers, expected {chain.nv} (the tree's) or {chain.dofs} (all)")
+    kin = kinematics(chain, state.q)
+    V = twists(chain, kin, state.v)
+    tau = generalized_forces(chain, kin, V, state.v, vdot[: chain.nv])
+    return tau - passive_forces(chain, state.q, state.v)

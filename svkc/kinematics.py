@@ -1,0 +1,233 @@
+"""F2: poses, twists and accelerations of the tree, and steps on its configuration.
+
+All vectors are in world axes about the origin of the tree's root body, so that twists and forces add up along the tree without transforms
+(Featherstone section 2.8 with X = 1) and keep their digits far from the world's origin.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from svkc.chain import BALL, FREE, HINGE, SLIDE, Chain, State, Topology
+from svkc.spatial import cross, motion_cross, quat_about, quat_exp, quat_log, quat_matrix, quat_multiply, quat_normalize, quat_rate, rotate
+from svkc.spatial import quat_conjugate
+
+# deeper trees sum by one product with the table of ancestors: compile time would grow with every level
+LEVELS_UNROLLED = 24
+
+
+def down(top: Topology, x: Float[Array, "rows *n"]) -> Float[Array, "rows *n"]:
+    """Sum of x over each row and its ancestors, level by level."""
+    if len(top.levels) > LEVELS_UNROLLED:
+        return jnp.tensordot(jnp.asarray(top.ancestor, x.dtype), x, 1)
+    parent, levels = np.array(top.parent), [x[:1]]
+    for (start, _), (first, last) in zip(top.levels[:-1], top.levels[1:], strict=True):
+        levels.append(x[first:last] + levels[-1][parent[first:last] - start])
+    return jnp.concatenate(levels)
+
+
+def up(top: Topology, x: Float[Array, "rows *n"]) -> Float[Array, "rows *n"]:
+    """Sum of x over each row and its descendants, level by level."""
+    if len(top.levels) > LEVELS_UNROLLED:
+        return jnp.tensordot(jnp.asarray(top.ancestor.T, x.dtype), x, 1)
+    parent, levels = np.array(top.parent), []
+    below = None
+    for level, (first, last) in reversed(list(enumerate(top.levels))):
+        here = x[first:last]
+        if below is not None:
+            lo, hi = top.levels[level + 1]
+            children = [np.flatnonzero(parent[lo:hi] == i) for i in range(first, last)]
+            # children padded with a row of zeros: a gather and a sum, no scatter
+            table = np.full((last - first, max(map(len, children))), hi - lo)
+            for i, c in enumerate(children):
+                table[i, : len(c)] = c
+            padded = jnp.concatenate([below, jnp.zeros_like(below[:1])])
+            here = here + jnp.sum(padded[table], 1)
+        levels.append(here)
+        below = here
+    return jnp.concatenate(levels[::-1])
+
+
+def to_rows(top: Topology, x: Float[Array, "nv *n"]) -> Float[Array, "rows *n"]:
+    """Sum of x over the coordinates of each row's joint."""
+    parts, order = [], []
+    for kinds, size in (((HINGE, SLIDE), 1), ((BALL,), 3), ((FREE,), 6)):
+        rows = top.rows_of(*kinds)
+        if len(rows):
+            start = np.array(top.v_start)[rows]
+            parts.append(sum(x[start + k] for k in range(size)))
+            order.append(rows)
+    fixed = np.setdiff1d(np.arange(len(top.parent)), np.concatenate(order) if order else np.zeros(0, int))
+    parts.append(jnp.zeros((len(fixed), *x.shape[1:]), x.dtype))
+    return jnp.concatenate(parts)[np.argsort(np.concatenate([*order, fixed]))]
+
+
+class Kinematics(eqx.Module):
+    """Poses and joint axes at one configuration: rotation, quaternion, place relative to the root's origin, the root's place, motion subspace S."""
+
+    R: Float[Array, "rows 3 3"]
+    quat: Float[Array, "rows 4"]
+    r: Float[Array, "rows 3"]
+    root: Float[Array, "rows 3"]
+    S: Float[Array, "nv 6"]
+
+
+def _joint_poses(chain: Chain, q: Float[Array, " q"]):
+    """Of each row in its parent: rotation [rows 4], the same without the joint's own turn, and offset along the slide [rows]."""
+    top, start = chain.topology, np.array(chain.topology.q_start)
+    quat, fixed, slide = chain.quat, chain.quat, None
+    hinges, balls, slides = top.rows_of(HINGE), top.rows_of(BALL), top.rows_of(SLIDE)
+    turn = []
+    if len(hinges):
+        turn.append((hinges, quat_about(chain.axis[hinges], q[start[hinges]] - chain.q_load[start[hinges]])))
+    if len(balls):
+        turn.append((balls, quat_normalize(q[start[balls][:, None] + np.arange(4)])))
+    for rows, joint in turn:
+        quat = quat.at[rows].set(quat_multiply(fixed[rows], joint))
+    free = top.rows_of(FREE)
+    if len(free):
+        quat = quat.at[free].set(quat_normalize(q[start[free][:, None] + np.arange(3, 7)]))
+    if len(slides):
+        along = q[start[slides]] - chain.q_load[start[slides]]
+        slide = jnp.zeros_like(chain.axis).at[slides].set(along[:, None] * chain.axis[slides])
+    return quat, fixed, slide
+
+
+def _compose(top: Topology, quat: Float[Array, "rows 4"]) -> Float[Array, "rows 4"]:
+    """Rotations in the parent -> rotations in the world: level by level, or by doubling along the ancestors in deep trees."""
+    parent = np.array(top.parent)
+    if len(top.levels) > LEVELS_UNROLLED:
+        above = np.maximum(parent, 0)
+        for _ in range(int(np.ceil(np.log2(len(top.levels))))):
+            quat, above = quat_multiply(quat[above], quat).at[0].set(quat[0]), above[above]
+        return quat
+    levels = [quat[:1]]
+    for (start, _), (first, last) in zip(top.levels[:-1], top.levels[1:], strict=True):
+        levels.append(quat_multiply(levels[-1][parent[first:last] - start], quat[first:last]))
+    return jnp.concatenate(levels)
+
+
+def kinematics(chain: Chain, q: Float[Array, " q"]) -> Kinematics:
+    """Poses of every row and the joint axes at q (Featherstone section 4.4, world axes)."""
+    top = chain.topology
+    local, fixed, slide = _joint_poses(chain, q)
+    quat = quat_normalize(_compose(top, local))
+    R = quat_matrix(quat)
+    parent = np.maximum(np.array(top.parent), 0)
+    above = R[parent]
+    step = rotate(above, chain.pos)
+    if slide is not None:
+        step = step + rotate(above, rotate(quat_matrix(fixed), slide))
+    if chain.anchor is not None:
+        # the anchor stays where it is while the row turns about it
+        step = step + rotate(above, rotate(quat_matrix(fixed), chain.anchor)) - rotate(R, chain.anchor)
+    free = top.rows_of(FREE)
+    if len(free):
+        step = step.at[free].set(q[np.array(top.q_start)[free][:, None] + np.arange(3)])
+    roots = np.array(top.parent) == 0
+    r = down(top, jnp.where(roots[:, None], 0, step).at[0].set(0))
+    return Kinematics(R, quat, r, step[top.root], _axes(chain, R, r))
+
+
+def _axes(chain: Chain, R, r) -> Float[Array, "nv 6"]:
+    """Motion subspace of every joint coordinate, in world axes about the root's origin."""
+    top = chain.topology
+    eye = jnp.eye(3, dtype=R.dtype)
+    point = r if chain.anchor is None else r + rotate(R, chain.anchor)
+    parts, order = [], []
+
+    def turning(rows, axes):
+        return jnp.concatenate([axes, cross(point[rows], axes)], -1)
+
+    hinges, slides = top.rows_of(HINGE), top.rows_of(SLIDE)
+    if len(hinges):
+        parts.append(turning(hinges, rotate(R[hinges], chain.axis[hinges])))
+        order.append(np.array(top.v_start)[hinges])
+    if len(slides):
+        along = rotate(R[slides], chain.axis[slides])
+        parts.append(jnp.concatenate([jnp.zeros_like(along), along], -1))
+        order.append(np.array(top.v_start)[slides])
+    for kind, offset in ((BALL, 0), (FREE, 3)):
+        rows = top.rows_of(kind)
+        for k in range(3) if len(rows) else ():
+            parts.append(turning(rows, R[rows][..., k]))
+            order.append(np.array(top.v_start)[rows] + offset + k)
+            if kind == FREE:
+                parts.append(jnp.broadcast_to(jnp.concatenate([jnp.zeros_like(eye[k]), eye[k]]), (len(rows), 6)))
+                order.append(np.array(top.v_start)[rows] + k)
+    if not parts:
+        return jnp.zeros((0, 6), R.dtype)
+    return jnp.concatenate(parts)[np.argsort(np.concatenate(order))]
+
+
+def twists(chain: Chain, kin: Kinematics, v: Float[Array, " dofs"]) -> Float[Array, "rows 6"]:
+    """V = sum of S v along the tree (rad/s, m/s), in world axes about the root's origin."""
+    return down(chain.topology, to_rows(chain.topology, kin.S * v[: chain.nv, None]))
+
+
+def velocity_products(chain: Chain, kin: Kinematics, V: Float[Array, "rows 6"], v: Float[Array, " dofs"]) -> Float[Array, "rows 6"]:
+    """Sdot v of each row's joint: V x (S v) for axes fixed in the row; a free joint's translations have axes fixed in the world."""
+    top = chain.topology
+    moving = np.ones(chain.nv, bool)
+    free = top.rows_of(FREE)
+    moving[(np.array(top.v_start)[free][:, None] + np.arange(3)).ravel()] = False
+    return motion_cross(V, to_rows(top, kin.S * jnp.where(moving, v[: chain.nv], 0)[:, None]))
+
+
+def bias_accelerations(chain: Chain, kin: Kinematics, V: Float[Array, "rows 6"], v: Float[Array, " dofs"]) -> Float[Array, "rows 6"]:
+    """Spatial accelerations with vdot = 0 and no gravity."""
+    return down(chain.topology, velocity_products(chain, kin, V, v))
+
+
+def rates(chain: Chain, q: Float[Array, " q"], v: Float[Array, " dofs"]) -> Float[Array, " q"]:
+    """qdot for the velocities v: quaternions turn by qdot = q w / 2, everything else is its own rate."""
+    quat_q, quat_v = chain.topology.quaternions
+    scalar_q, scalar_v = chain.topology.scalars
+    turn = quat_rate(q[quat_q[:, None] + np.arange(4)], v[quat_v[:, None] + np.arange(3)])
+    order = np.argsort(np.concatenate([scalar_q, (quat_q[:, None] + np.arange(4)).ravel()]))
+    return jnp.concatenate([v[scalar_v], turn.ravel()])[order]
+
+
+def integrate(chain: Chain, q: Float[Array, " q"], dv: Float[Array, " dofs"]) -> Float[Array, " q"]:
+    """q moved by the tangent vector dv (m, rad; body axes for rotations): the exponential map, Rodrigues' formula (39)."""
+    quat_q, quat_v = chain.topology.quaternions
+    scalar_q, scalar_v = chain.topology.scalars
+    at = quat_q[:, None] + np.arange(4)
+    turned = quat_multiply(quat_normalize(q[at]), quat_exp(dv[quat_v[:, None] + np.arange(3)]))
+    order = np.argsort(np.concatenate([scalar_q, at.ravel()]))
+    return jnp.concatenate([q[scalar_q] + dv[scalar_v], turned.ravel()])[order]
+
+
+def difference(chain: Chain, q1: Float[Array, " q"], q2: Float[Array, " q"]) -> Float[Array, " dofs"]:
+    """The tangent vector that takes q1 to q2: integrate(q1, difference(q1, q2)) = q2."""
+    quat_q, quat_v = chain.topology.quaternions
+    scalar_q, scalar_v = chain.topology.scalars
+    at = quat_q[:, None] + np.arange(4)
+    turn = quat_log(quat_multiply(quat_conjugate(quat_normalize(q1[at])), quat_normalize(q2[at])))
+    order = np.argsort(np.concatenate([scalar_v, (quat_v[:, None] + np.arange(3)).ravel()]))
+    return jnp.concatenate([q2[scalar_q] - q1[scalar_q], turn.ravel()])[order]
+
+
+def normalize(chain: Chain, q: Float[Array, " q"]) -> Float[Array, " q"]:
+    """q with every quaternion of unit length."""
+    quat_q, _ = chain.topology.quaternions
+    if not len(quat_q):
+        return q
+    at = quat_q[:, None] + np.arange(4)
+    return q.at[at].set(quat_normalize(q[at]))
+
+
+def poses(chain: Chain, state: State) -> tuple[Float[Array, "bodies 3"], Float[Array, "bodies 4"]]:
+    """Positions (m) and quaternions (wxyz, body to world) of the body frames in the world; row 0 is the world."""
+    rows = np.array(chain.topology.body_row)
+    kin = kinematics(chain, state.q)
+    return (kin.root + kin.r)[rows], kin.quat[rows]
+
+
+def velocities(chain: Chain, state: State) -> tuple[Float[Array, "bodies 3"], Float[Array, "bodies 3"]]:
+    """Linear velocity of each body's origin (m/s) and angular velocity (rad/s), both in world axes; row 0 is the world."""
+    rows = np.array(chain.topology.body_row)
+    kin = kinematics(chain, state.q)
+    V = twists(chain, kin, state.v)
+    return (V[:, 3:] + cross(V[:, :3], kin.r))[rows], V[rows, :3]

@@ -1,0 +1,313 @@
+"""F2: a MuJoCo model -> Chain, on the host in numpy. mujoco is imported here and nowhere below."""
+
+import dataclasses
+import os
+import pathlib
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from svkc.chain import BALL, FREE, HINGE, SLIDE, Chain, Structure, Topology, VirtualLink, joint_freedoms
+from svkc.chain import FIXED, V_SIZE
+from svkc.unsupported import plain_motors, what_is_left_out
+
+_LIMIT_RATE = 50.0  # rad/s: a joint outside its range is an oscillator of this frequency, critically damped, at its load-pose inertia
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Source:
+    """The MuJoCo model a chain was made of, for pictures; chains are told apart by their numbers and topology, not by it."""
+
+    model: Any
+
+    def __eq__(self, other):
+        return isinstance(other, Source)
+
+    def __hash__(self):
+        return 0
+
+
+def load(source, *, virtual_links=(), cuttable=(), spare=0, ignore=()) -> Chain:
+    """A Chain from MJCF or URDF (path or text), a mujoco.MjSpec or a mujoco.MjModel.
+
+    `virtual_links`: more of them, beside the <equality> connect (ball) and weld of the model; `spare`: slots for links bound at run time;
+    `ignore`: kinds of elements to leave out, by the names the error message uses, or "all". "limit" leaves out joint ranges.
+    Collisions between geoms are never modelled. ValueError: the source does not parse, elements not supported, unknown names.
+    """
+    if cuttable:
+        raise ValueError(f"cuttable: got {cuttable!r}; joints of the tree cannot be cut yet, cut virtual links instead")
+    model = compile_model(source)
+    if isinstance(ignore, str):
+        ignore = (ignore,)
+    left_out = what_is_left_out(model, ignore)
+    rows, topology = _rows(model)
+    links = [*_equalities(model, ignore), *virtual_links]
+    for link in links:
+        if not isinstance(link, VirtualLink):
+            raise ValueError(f"virtual_links: expected svkc.VirtualLink objects, got {link!r}")
+    links += [VirtualLink(f"spare_{i}", "world", "world", "free") for i in range(int(spare))]
+    names = [link.name for link in links]
+    if len(set(names)) < len(names):
+        raise ValueError(f"virtual_links: names must differ, got {names}")
+    topology = dataclasses.replace(
+        topology,
+        link_names=tuple(names),
+        link_freedoms=tuple(joint_freedoms(link.joint) for link in links),
+        link_spare=tuple(i >= len(links) - int(spare) for i in range(len(links))),
+    )
+    structure = _structure(model, topology, links, int(spare))
+    return _chain(model, topology, rows, structure, ignore, left_out)
+
+
+def compile_model(source):
+    """The mujoco.MjModel of any source; ValueError with MuJoCo's own words where it does not parse."""
+    import mujoco
+
+    if isinstance(source, mujoco.MjModel):
+        return source
+    try:
+        if isinstance(source, mujoco.MjSpec):
+            return source.compile()
+        return _read(os.fspath(source))
+    except TypeError as error:
+        raise ValueError(f"source: expected MJCF or URDF text, a path, MjSpec or MjModel, got {type(source).__name__}") from error
+    except (ValueError, OSError) as error:
+        raise ValueError(f"source: the model cannot be read: {error}") from error
+
+
+def _read(text: str):
+    """MJCF or URDF, by text or path. URDF keeps the links that fixed joints hold: their names are wanted for grips."""
+    import mujoco
+
+    inline = "<" in text
+    if not inline and not pathlib.Path(text).is_file():
+        raise ValueError(f"no such file: {text}")
+    if "<robot" not in (text if inline else pathlib.Path(text).read_text(errors="replace")):
+        return mujoco.MjModel.from_xml_string(text) if inline else mujoco.MjModel.from_xml_path(text)
+    spec = mujoco.MjSpec.from_string(text) if inline else mujoco.MjSpec.from_file(text)
+    spec.compiler.fusestatic = False
+    return spec.compile()
+
+
+def _name(model, kind: str, index: int) -> str:
+    import mujoco
+
+    name = mujoco.mj_id2name(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), index)
+    return name or (f"{kind}_{index}" if index or kind != "body" else "world")
+
+
+def _rows(model) -> tuple[list[tuple[int, int]], Topology]:
+    """One row a joint, sorted by level: [(body, joint or -1)] and the topology without virtual links."""
+    order, depth, last = [(0, -1, -1)], [0], {0: 0}
+    for body in range(1, model.nbody):
+        parent = last[int(model.body_parentid[body])]
+        first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
+        for joint in range(first, first + count) if count else (-1,):
+            order.append((body, joint, parent))
+            depth.append(depth[parent] + 1)
+            parent = len(order) - 1
+        last[body] = parent
+    rank = np.argsort(depth, kind="stable")
+    new = np.argsort(rank)
+    kinds = {0: FREE, 1: BALL, 2: SLIDE, 3: HINGE}
+    kind = [FIXED if j < 0 else kinds[int(model.jnt_type[j])] for _, j, _ in order]
+    topology = Topology(
+        body_names=tuple(_name(model, "body", i) for i in range(model.nbody)),
+        joint_names=tuple(_name(model, "joint", i) for i in range(model.njnt)),
+        link_names=(),
+        parent=tuple(int(new[order[i][2]]) if order[i][2] >= 0 else -1 for i in rank),
+        kind=tuple(kind[i] for i in rank),
+        q_start=tuple(int(model.jnt_qposadr[order[i][1]]) if order[i][1] >= 0 else 0 for i in rank),
+        v_start=tuple(int(model.jnt_dofadr[order[i][1]]) if order[i][1] >= 0 else 0 for i in rank),
+        nq=int(model.nq),
+        nv=int(model.nv),
+        body_row=tuple(int(new[last[i]]) for i in range(model.nbody)),
+        joint_row=tuple(int(new[[o[1] for o in order].index(j)]) for j in range(model.njnt)),
+        link_freedoms=(),
+        link_spare=(),
+    )
+    return [order[i][:2] for i in rank], topology
+
+
+def _equalities(model, ignore) -> list[VirtualLink]:
+    """<equality> connect and weld as virtual links: ball and weld, child of the first body, under their own names."""
+    import mujoco
+
+    links = []
+    if "equality" in ignore:
+        return links
+    for i in range(model.neq):
+        kind, data = int(model.eq_type[i]), model.eq_data[i]
+        if kind not in (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD):
+            continue
+        weld = kind == mujoco.mjtEq.mjEQ_WELD
+        ends = [int(model.eq_obj1id[i]), int(model.eq_obj2id[i])]
+        if model.eq_objtype[i] == mujoco.mjtObj.mjOBJ_SITE:
+            places = [(model.site_pos[s], model.site_quat[s]) for s in ends]
+            ends = [int(model.site_bodyid[s]) for s in ends]
+        elif weld:
+            places = [(data[3:6], data[6:10]), (data[:3], (1, 0, 0, 0))]
+        else:
+            # a ball's coordinates start at the identity in the load pose
+            places = [(data[:3], (1, 0, 0, 0)), (data[3:6], None)]
+        links.append(
+            VirtualLink(
+                name=_name(model, "equality", i),
+                parent=_name(model, "body", ends[0]),
+                real=_name(model, "body", ends[1]),
+                joint="weld" if weld else "ball",
+                pos=tuple(places[0][0]),
+                quat=_unit(places[0][1]),
+                real_pos=tuple(places[1][0]),
+                real_quat=None if places[1][1] is None or not weld else _unit(places[1][1]),
+                connected=bool(model.eq_active0[i]),
+            )
+        )
+    return links
+
+
+def _unit(quat):
+    return tuple(np.asarray(quat, float) / np.linalg.norm(quat))
+
+
+def _structure(model, topology: Topology, links: list[VirtualLink], spare: int) -> Structure:
+    """The links' declared placements, their axis turned to z of the joint's frame; what is not given is taken from the load pose."""
+    import mujoco
+
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    ids = {name: i for i, name in enumerate(topology.body_names)}
+
+    def multiply(a, b):
+        out = np.zeros(4)
+        mujoco.mju_mulQuat(out, np.asarray(a, float), np.asarray(b, float))
+        return out
+
+    def turn(quat, x):
+        out = np.zeros(3)
+        mujoco.mju_rotVecQuat(out, np.asarray(x, float), np.asarray(quat, float))
+        return out
+
+    frames = {"pos": [], "quat": [], "real_pos": [], "real_quat": []}
+    ends = []
+    for link in links:
+        for side in ("parent", "real"):
+            if getattr(link, side) not in ids:
+                raise ValueError(f"virtual link {link.name!r}: {side} is {getattr(link, side)!r}, not a body; bodies: {', '.join(ids)}")
+        p, r = ids[link.parent], ids[link.real]
+        to_z = np.zeros(4)
+        mujoco.mju_quatZ2Vec(to_z, np.asarray(link.axis, float) / np.linalg.norm(link.axis))
+        quat = _unit(multiply(_unit(link.quat), to_z))
+        world = data.xpos[p] + turn(data.xquat[p], link.pos)
+        back = data.xquat[r] * np.array([1, -1, -1, -1])
+        real_pos = turn(back, world - data.xpos[r]) if link.real_pos is None else link.real_pos
+        real_quat = multiply(back, multiply(data.xquat[p], quat)) if link.real_quat is None else multiply(_unit(link.real_quat), to_z)
+        ends.append((topology.body_row[p], topology.body_row[r]))
+        for name, value in (("pos", link.pos), ("quat", quat), ("real_pos", real_pos), ("real_quat", _unit(real_quat))):
+            frames[name].append(np.asarray(value, float))
+    count = len(links)
+    return Structure(
+        connected=jnp.asarray(np.array([link.connected for link in links], bool)),
+        parent=jnp.asarray(np.array([e[0] for e in ends], np.int32)),
+        real=jnp.asarray(np.array([e[1] for e in ends], np.int32)),
+        **{name: _floats(np.array(value).reshape(count, 4 if "quat" in name else 3)) for name, value in frames.items()},
+        freedoms=jnp.asarray(np.array([joint_freedoms(link.joint) for link in links], bool).reshape(count, 6)),
+        rank=jnp.asarray(np.int32(0)),
+    )
+
+
+def _floats(x):
+    """The default float type's array: float64 where jax has it enabled, else float32."""
+    return jnp.asarray(np.asarray(x, np.float64), dtype=jnp.result_type(float))
+
+
+def _inertia(model, body):
+    """About the centre of mass, in body axes."""
+    import mujoco
+
+    R = np.zeros(9)
+    mujoco.mju_quat2Mat(R, model.body_iquat[body])
+    R = R.reshape(3, 3)
+    return R @ np.diag(model.body_inertia[body]) @ R.T
+
+
+def _chain(model, topology, rows, structure, ignore, left_out) -> Chain:
+    import mujoco
+
+    n = len(rows)
+    pos, quat, axis = np.zeros((n, 3)), np.tile([1.0, 0, 0, 0], (n, 1)), np.tile([0.0, 0, 1], (n, 1))
+    anchor, mass, com, inertia = np.zeros((n, 3)), np.zeros(n), np.zeros((n, 3)), np.zeros((n, 3, 3))
+    for i, (body, joint) in enumerate(rows):
+        if topology.kind[i] != FREE and joint in (-1, int(model.body_jntadr[body])):
+            pos[i], quat[i] = model.body_pos[body], model.body_quat[body]
+        if joint >= 0:
+            axis[i] = model.jnt_axis[joint]
+            if topology.kind[i] in (HINGE, BALL):
+                anchor[i] = model.jnt_pos[joint]
+        if topology.body_row[body] == i:
+            mass[i], com[i], inertia[i] = model.body_mass[body], model.body_ipos[body], _inertia(model, body)
+    ignored = set(ignore)
+    stiffness, limit, spring = np.zeros(model.nv), np.tile([[-np.inf], [np.inf]], (1, model.nv)), np.zeros((2, model.nv))
+    for j in range(model.njnt):
+        dofs = slice(int(model.jnt_dofadr[j]), int(model.jnt_dofadr[j]) + V_SIZE[(FREE, BALL, SLIDE, HINGE)[model.jnt_type[j]]])
+        if "spring" not in ignored:
+            stiffness[dofs] = np.ravel(model.jnt_stiffness[j])[0]
+        if model.jnt_limited[j] and model.jnt_type[j] in (2, 3) and "limit" not in ignored:
+            limit[:, dofs] = model.jnt_range[j][:, None]
+            m = 1 / model.dof_invweight0[dofs] if np.all(model.dof_invweight0[dofs] > 0) else model.dof_M0[dofs]
+            spring[:, dofs] = m * _LIMIT_RATE**2, 2 * m * _LIMIT_RATE
+    damping = np.zeros(model.nv) if "damping" in ignored else np.ravel(model.dof_damping)
+    armature = np.zeros(model.nv) if "armature" in ignored else model.dof_armature
+    gravity = np.zeros(3) if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY else model.opt.gravity
+    gear, control, force = _motors(model, ignored)
+    offsets = np.linalg.norm(np.concatenate([pos[np.array(topology.parent) > 0], com]), axis=1)
+    offsets = offsets[offsets > 1e-12]
+    filled = topology.links
+    q_load = np.concatenate([model.qpos0, np.zeros(filled.nq_all - topology.nq)])
+    q_load[filled.quat[filled.quat[:, 0] < filled.nq_all, 0]] = 1
+
+    def unless(empty, value):
+        return None if empty else _floats(value)
+
+    return Chain(
+        topology=topology,
+        pos=_floats(pos),
+        quat=_floats(quat),
+        axis=_floats(axis),
+        mass=_floats(mass),
+        com=_floats(com),
+        inertia=_floats(inertia),
+        gravity=_floats(gravity),
+        q_load=_floats(q_load),
+        length=_floats(np.sqrt(np.mean(offsets**2)) if len(offsets) else 1.0),
+        gear=_floats(gear),
+        control_range=_floats(control),
+        force_range=_floats(force),
+        structure=structure,
+        anchor=unless(not anchor.any(), anchor),
+        armature=unless(not np.any(armature), armature),
+        damping=unless(not np.any(damping), damping),
+        stiffness=unless(not stiffness.any(), stiffness),
+        q_spring=unless(not stiffness.any(), model.qpos_spring),
+        limit=unless(not np.isfinite(limit).any(), limit),
+        limit_spring=unless(not np.isfinite(limit).any(), spring),
+        model=Source(model),
+        left_out=left_out,
+    )
+
+
+def _motors(model, ignored):
+    """Gear matrix and ranges of the actuators that are plain torques on joints."""
+    count = 0 if {"actuator", "all"} & ignored and not plain_motors(model).all() else model.nu
+    gear, control, force = np.zeros((count, model.nv)), np.tile([-np.inf, np.inf], (count, 1)), np.tile([-np.inf, np.inf], (count, 1))
+    for i in range(count):
+        joint = int(model.actuator_trnid[i, 0])
+        size = V_SIZE[(FREE, BALL, SLIDE, HINGE)[model.jnt_type[joint]]]
+        start = int(model.jnt_dofadr[joint])
+        gear[i, start : start + size] = model.actuator_gear[i, :size] * model.actuator_gainprm[i, 0]
+        if model.actuator_ctrllimited[i]:
+            control[i] = model.actuator_ctrlrange[i]
+        if model.actuator_forcelimited[i]:
+            force[i] = np.sort(model.actuator_forcerange[i] / model.actuator_gainprm[i, 0])
+    return gear, control, force

@@ -1,0 +1,136 @@
+"""F5: what a call of `simulate` asks for, checked at once, with defaults filled in."""
+
+from collections.abc import Callable
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from svkc.assembly import gap_tolerance
+from svkc.chain import Chain, State
+from svkc.events import At, Plan, plan
+from svkc.stepping import Baumgarte, Drift, FixedSteps, Projection, motion_norm
+
+
+class Options(eqx.Module):
+    """How to integrate."""
+
+    control: Callable | None
+    solver: diffrax.AbstractSolver
+    stabilization: Projection | Baumgarte | Drift
+    controller: Any
+    adjoint: diffrax.AbstractAdjoint
+    progress_meter: diffrax.AbstractProgressMeter
+    dt: Float[Array, ""] | None
+    first_step: Float[Array, ""]
+    max_events: int = eqx.field(static=True)
+    max_steps: int = eqx.field(static=True)
+    has_work: bool = eqx.field(static=True)
+    gap: float = eqx.field(static=True)
+
+    def steps(self, t0, t1, ts):
+        """The step-size controller of one phase, that stops at every save time, and the first step."""
+        if self.dt is not None:
+            return FixedSteps(self.dt, ts), None
+        if isinstance(self.controller, diffrax.AbstractAdaptiveStepSizeController):
+            return diffrax.ClipStepSizeController(self.controller, step_ts=ts), self.first_step
+        return self.controller, None if isinstance(self.controller, diffrax.StepTo) else self.first_step
+
+
+def _concrete(*values) -> bool:
+    return not any(isinstance(x, jax.core.Tracer) for v in values for x in jax.tree.leaves(v))
+
+
+def checked(
+    chain: Chain, state: State, t0, t1, ts, events, control, dt, rtol, atol, solver, stepsize_controller, stabilization, adjoint, max_events,
+    max_steps, progress_meter,
+) -> tuple[Options, Float[Array, " times"], Plan]:  # fmt: skip
+    """The call's options, save times and plan of events; ValueError for what cannot be right."""
+    dtype = state.q.dtype
+    _check_state(chain, state)
+    _check_times(t0, t1, ts, events)
+    for name, value in (("dt", dt), ("rtol", rtol), ("atol", atol)):
+        if value is not None and _concrete(value) and not np.all(np.asarray(value) > 0):
+            raise ValueError(f"{name}: got {value}, expected a positive number")
+    if dt is not None and (rtol is not None or atol is not None or stepsize_controller is not None):
+        raise ValueError("dt asks for fixed steps, rtol, atol and stepsize_controller for others; give one of them")
+    if stepsize_controller is not None and (rtol is not None or atol is not None):
+        raise ValueError("rtol and atol belong inside the stepsize_controller that is given")
+    if control is not None and not callable(control):
+        raise ValueError(f"control: expected a function of (t, state, args), got {control!r}")
+    if stabilization is not None and not isinstance(stabilization, Projection | Baumgarte | Drift):
+        raise ValueError(f"stabilization: expected svkc.Projection, svkc.Baumgarte or svkc.Drift, got {stabilization!r}")
+    made = plan(chain, tuple(events), dtype)
+    span = jnp.asarray(t1, dtype) - jnp.asarray(t0, dtype)
+    double = np.finfo(dtype).eps < 1e-10
+    controller = stepsize_controller
+    if controller is None:
+        rtol, atol = (1e-7 if double else 1e-4) if rtol is None else rtol, (1e-9 if double else 1e-6) if atol is None else atol
+        smallest = jnp.finfo(dtype).eps * jnp.maximum(jnp.abs(span), jnp.abs(jnp.asarray(t1, dtype)))
+        controller = diffrax.PIDController(rtol, atol, norm=motion_norm, dtmin=smallest, force_dtmin=False)
+    options = Options(
+        control=control,
+        solver=diffrax.Tsit5() if solver is None else solver,
+        stabilization=Projection() if stabilization is None else stabilization,
+        controller=controller,
+        adjoint=diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
+        progress_meter=diffrax.NoProgressMeter() if progress_meter is None else progress_meter,
+        dt=None if dt is None else jnp.asarray(dt, dtype),
+        first_step=jnp.maximum(span, jnp.finfo(dtype).tiny) * 1e-3,
+        max_events=_capacity(max_events, made),
+        max_steps=_step_bound(max_steps, span, dt),
+        has_work=control is not None or chain.limit is not None or chain.damping is not None,
+        gap=1e3 * gap_tolerance(dtype),
+    )
+    save_at = jnp.stack([jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)]) if ts is None else jnp.asarray(ts, dtype)
+    return options, save_at, made
+
+
+def _capacity(max_events, made: Plan) -> int:
+    if max_events is None:
+        return len(made.timed) + 4 * len(made.guarded)
+    if int(max_events) != max_events or max_events < 0:
+        raise ValueError(f"max_events: got {max_events}, expected a whole number, 0 or more")
+    return int(max_events) if made.actions else 0
+
+
+def _step_bound(max_steps, span, dt) -> int:
+    if max_steps is not None:
+        if int(max_steps) != max_steps or max_steps < 1:
+            raise ValueError(f"max_steps: got {max_steps}, expected a whole number, 1 or more")
+        return int(max_steps)
+    return 65536
+
+
+def _check_state(chain: Chain, state: State):
+    if not isinstance(state, State):
+        raise ValueError(f"state: expected what chain.state(...) gives, got {type(state).__name__}")
+    for name, size in (("q", chain.topology.nq_all), ("v", chain.dofs)):
+        shape = getattr(state, name).shape
+        if shape != (size,):
+            raise ValueError(f"state.{name}: got shape {shape}, expected ({size},); for many states use vmap or svkc.rollout")
+    if state.q.dtype != chain.q_load.dtype:
+        raise ValueError(f"state.q is {state.q.dtype}, the chain is {chain.q_load.dtype}; load and state must be made with the same precision")
+    if _concrete(state) and not (np.isfinite(np.asarray(state.q)).all() and np.isfinite(np.asarray(state.v)).all()):
+        raise ValueError("state: q and v must be finite")
+
+
+def _check_times(t0, t1, ts, events):
+    for name, value in (("t0", t0), ("t1", t1)):
+        if np.shape(value) != ():
+            raise ValueError(f"{name}: got shape {np.shape(value)}, expected one number; for a time in each lane use vmap")
+    if not _concrete(t0, t1):
+        return
+    if not t1 >= t0 or not np.isfinite(t1):
+        raise ValueError(f"t1: got {t1}, expected a time at or after t0 = {t0}")
+    if ts is not None and _concrete(ts):
+        times = np.asarray(ts)
+        if times.ndim != 1 or np.any(np.diff(times) < 0) or np.any((times < t0) | (times > t1)):
+            raise ValueError(f"ts: expected times in order from t0 = {t0} to t1 = {t1}, got {times}")
+    for event in events:
+        if isinstance(event, At) and _concrete(event.time) and not np.all((np.asarray(event.time) >= t0) & np.isfinite(np.asarray(event.time))):
+            raise ValueError(f"at: got time {event.time}, before the start of the run at {t0}")

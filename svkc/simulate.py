@@ -1,0 +1,341 @@
+"""F6: a run, phase after phase: a scan over solves of one smooth field each, with the change of structure between them.
+
+A phase ends at the next scheduled time or at the end of the first step in which a guard crosses zero; the crossing is then located by steps of the
+solver back from there, so that its time and state have the solver's own order and not that of an interpolation. Lanes of a batch
+that are done go on with phases of no length.
+"""
+
+import diffrax
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from svkc.chain import Chain, State
+from svkc.closure import decide_rank, loop_gaps
+from svkc.energy import energy
+from svkc.events import Plan, first_root
+from svkc.loops import active_dofs
+from svkc.request import Options, checked
+from svkc.stepping import Field, Motion, Scene, Settled, Watch
+from svkc.trajectory import RESULTS, Events, Phases, Trajectory
+from svkc.transition import change, connect_tolerance
+
+
+class Run(eqx.Module):
+    """What goes from phase to phase."""
+
+    t: Float[Array, ""]
+    state: State
+    work: Float[Array, ""] | None
+    guards: Float[Array, " guards"] | None
+    pending: Bool[Array, " timed"]
+    events: Events
+    phases: Phases
+    saved: State
+    result: RESULTS
+
+
+class Solved(eqx.Module):
+    """Where a phase ended: time, motion, the guards that fired there, which guard values go on, and the solver's words."""
+
+    t: Float[Array, ""]
+    motion: Motion
+    fired: Bool[Array, " guards"]
+    guards: Float[Array, " guards"] | None
+    saved: Motion
+    stats: tuple[Int[Array, ""], Int[Array, ""]]
+    result: RESULTS
+
+
+def simulate(
+    chain: Chain, state: State, t1, *, t0=0.0, ts=None, events=(), control=None, args=None, dt=None, rtol=None, atol=None, solver=None,
+    stepsize_controller=None, stabilization=None, adjoint=None, max_events=None, max_steps=None, throw=True, progress_meter=None,
+) -> Trajectory:  # fmt: skip
+    """The motion from t0 to t1 (s), through every change of structure in `events` (`svkc.at`, `svkc.when`).
+
+    ts: times to save, stepped to exactly; None: t0 and t1. A state saved at an event's time is the one after it.
+    control(t, state, args): joint torques (N m, N) over every coordinate, or the tree's.
+    dt: fixed steps (s). rtol, atol: adaptive steps, by default 1e-7 and 1e-9 (float32: 1e-4 and 1e-6).
+    solver, stepsize_controller, adjoint, progress_meter: diffrax objects, passed through; Tsit5 by default.
+    stabilization: `svkc.Projection()` (default), `svkc.Baumgarte(rate)` or `svkc.Drift()`.
+    max_events: how many events may happen (default: each timed one, four times each guard); max_steps: in one phase.
+    ValueError: a call that cannot be right. A run that goes wrong ends with a code in `result`, raised when throw=True.
+    """
+    options, save_at, made = checked(
+        chain, state, t0, t1, ts, events, control, dt, rtol, atol, solver, stepsize_controller, stabilization, adjoint, max_events, max_steps,
+        progress_meter,
+    )  # fmt: skip
+    dtype = state.q.dtype
+    traj = _run(chain, state, jnp.asarray(t0, dtype), jnp.asarray(t1, dtype), save_at, made, options, args)
+    if not throw:
+        return traj
+    failed = (traj.result != RESULTS.successful) & (traj.result != RESULTS.stopped)
+    if isinstance(failed, jax.core.Tracer):
+        return traj.result.error_if(traj, failed)
+    if np.any(np.asarray(failed)):
+        raise RuntimeError(f"simulate stopped at t = {float(traj.t_final):.9g} s: {RESULTS[traj.result]}")
+    return traj
+
+
+@eqx.filter_jit
+def _run(chain: Chain, state: State, t0, t1, ts, made: Plan, options: Options, args) -> Trajectory:
+    run = _start(chain, state, t0, ts, made, options, args)
+
+    def phase(run: Run, index):
+        return _phase(chain, run, index, t1, ts, made, options, args), None
+
+    if options.max_events == 0:
+        run, _ = phase(run, jnp.asarray(0))
+    else:
+        run, _ = jax.lax.scan(phase, run, jnp.arange(options.max_events + 1))
+    short = (run.t < t1) & (run.result == RESULTS.successful)
+    result = RESULTS.where(short, RESULTS.max_events, run.result)
+    saved = run.saved
+    gaps = jax.vmap(lambda s: _largest_gaps(chain, s))(saved)
+    result = RESULTS.where(
+        (result == RESULTS.successful) & (jnp.max(gaps) > options.gap), RESULTS.loop_open, result
+    )
+    return Trajectory(ts, saved, gaps, run.events, run.phases, run.state, run.t, result)
+
+
+def _largest_gaps(chain: Chain, state: State) -> Float[Array, "2"]:
+    """Largest rotation (rad) and distance (m) over the loops."""
+    if not len(chain.link_names):
+        return jnp.zeros(2, state.q.dtype)
+    gaps = loop_gaps(chain, state)
+    return jnp.stack([jnp.max(jnp.linalg.norm(gaps[:, k : k + 3] + 0, axis=-1)) for k in (0, 3)])
+
+
+def _start(chain: Chain, state: State, t0, ts, made: Plan, options: Options, args) -> Run:
+    """Empty records, sized by capacity; unwritten entries show: NaN, inf, -1."""
+    links, rows, dtype = len(chain.link_names), options.max_events, state.q.dtype
+    structure = decide_rank(chain, state.structure, state.q)
+    if made.locks and structure.locked is None:
+        structure = eqx.tree_at(lambda s: s.locked, structure, jnp.zeros(chain.dofs, bool), is_leaf=lambda x: x is None)
+    state = State(state.q, state.v, structure)
+    scene = Scene(chain, structure, args)
+    guards = _guard_values(made, t0, Motion(state.q, state.v), scene) if made.guards else None
+    nan = jnp.full((), jnp.nan, dtype)
+    zero = jnp.asarray(0, jnp.int32)
+    return Run(
+        t=t0,
+        state=state,
+        work=jnp.zeros((), dtype) if options.has_work else None,
+        guards=guards,
+        pending=jnp.ones(len(made.timed), bool),
+        events=Events(
+            jnp.full(rows, jnp.inf, dtype), jnp.full(rows, -1, jnp.int32), jnp.zeros((rows, links, 3), dtype), jnp.zeros((rows, links, 3), dtype),
+            jnp.zeros(rows, dtype), zero,
+        ),
+        phases=Phases(
+            jnp.full(rows + 1, nan), jnp.full(rows + 1, nan), jnp.zeros((rows + 1, links), bool), jnp.full(rows + 1, -1, jnp.int32),
+            jnp.full(rows + 1, -1, jnp.int32), jnp.full((rows + 1, 2), nan), jnp.full(rows + 1, nan), jnp.zeros(rows + 1, jnp.int32),
+            jnp.zeros(rows + 1, jnp.int32), zero,
+        ),
+        saved=jax.tree.map(lambda x: jnp.broadcast_to(x[None], (ts.shape[0], *x.shape)), state),
+        result=RESULTS.successful,
+    )  # fmt: skip
+
+
+def _guard_values(made: Plan, t, y: Motion, scene: Scene) -> Float[Array, " guards"]:
+    state = State(y.q, y.v, scene.structure)
+    return jnp.stack([jnp.asarray(g(t, state, scene.args), y.q.dtype).reshape(()) for g in made.guards])
+
+
+def _phase(chain: Chain, run: Run, index, t1, ts, made: Plan, options: Options, args) -> Run:
+    """One solve, the events at its end, and the records of both."""
+    going = (run.t < t1) | jnp.any(run.pending & (made.times <= t1))
+    going = going & (run.result == RESULTS.successful)
+    next_time = jnp.min(jnp.where(run.pending, made.times, jnp.inf), initial=jnp.inf)
+    stop = jnp.where(going, jnp.maximum(jnp.minimum(t1, next_time), run.t), run.t)
+    solved = _solve(chain, run, stop, ts, made, options, args)
+    reached = going & (solved.result == RESULTS.successful)
+    timed = run.pending & (made.times <= solved.t + event_tolerance(solved.t)) & reached
+    fired = jnp.zeros(len(made.actions), bool).at[np.array(made.timed + made.guarded, int)].set(
+        jnp.concatenate([timed, solved.fired & reached])
+    )
+    ended = State(solved.motion.q, solved.motion.v, run.state.structure)
+    saved = _save(run, ended, solved, ts)
+    phases = _record_phase(chain, run, index, going, solved, ended)
+    after, events, result = ended, run.events, solved.result
+    if made.actions:
+        after, events, result = _apply(chain, run, ended, solved, fired, made)
+    result = RESULTS.where(run.result == RESULTS.successful, result, run.result)
+    guards = solved.guards
+    return Run(solved.t, after, solved.motion.work, guards, run.pending & ~timed, events, phases, saved, result)
+
+
+def event_tolerance(t: Float[Array, ""]) -> Float[Array, ""]:
+    """Events this close (s) to the earliest happen together with it: sqrt(eps), 1.5e-8 in float64, relative from t = 1 s on."""
+    return jnp.finfo(t.dtype).eps ** 0.5 * jnp.maximum(1, jnp.abs(t))
+
+
+def _solve(chain: Chain, run: Run, stop, ts, made: Plan, options: Options, args) -> Solved:
+    """diffrax from run.t to `stop`, or to the first guard that crosses zero."""
+    structure = run.state.structure
+    watched = made.watched(chain, structure) if made.guards else None
+    scene = Scene(chain, structure, args, watched)
+    watch = None if run.guards is None else Watch(run.t, run.guards, run.guards)
+    start = Motion(run.state.q, run.state.v, run.work, watch)
+    guards = (lambda t, y, scene: _guard_values(made, t, y, scene)) if made.guards else None
+    solver = Settled(options.solver, options.stabilization, guards)
+    term = diffrax.ODETerm(Field(options.control, options.stabilization))
+    at = jnp.clip(ts, run.t, jnp.maximum(stop, run.t))
+    event = None
+    if made.guards:
+
+        def any_crossed(t, y, scene, **_):
+            return jnp.any(made.crossed(y.watch.before, y.watch.after) & scene.watched)
+
+        event = diffrax.Event(any_crossed)
+    controller, dt0 = options.steps(run.t, t1=stop, ts=at)
+    sol = diffrax.diffeqsolve(
+        term, solver, run.t, stop, dt0, start, scene,
+        saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(t1=True), diffrax.SubSaveAt(ts=at)]),
+        stepsize_controller=controller, adjoint=options.adjoint, event=event, max_steps=options.max_steps, throw=False,
+        progress_meter=options.progress_meter,
+    )  # fmt: skip
+    (end, saved), t = sol.ys, sol.ts[0][0]
+    motion = jax.tree.map(lambda x: x[0], end)
+    stats = (sol.stats["num_accepted_steps"], sol.stats["num_rejected_steps"])
+    result = _translate(sol.result, motion)
+    if not made.guards:
+        return Solved(t, motion, jnp.zeros(0, bool), None, saved, stats, result)
+    hit = sol.result == diffrax.RESULTS.event_occurred
+    t, motion, fired, values = _locate(hit, t, motion, term, solver, scene, made)
+    return Solved(t, motion, fired, values, saved, stats, result)
+
+
+def _translate(result, motion: Motion) -> RESULTS:
+    """diffrax's word for how a solve ended, as ours."""
+    out = RESULTS.where(result == diffrax.RESULTS.successful, RESULTS.successful, RESULTS.step_too_small)
+    out = RESULTS.where(result == diffrax.RESULTS.event_occurred, RESULTS.successful, out)
+    out = RESULTS.where(result == diffrax.RESULTS.max_steps_reached, RESULTS.max_steps, out)
+    finite = jnp.all(jnp.isfinite(motion.q)) & jnp.all(jnp.isfinite(motion.v))
+    return RESULTS.where(finite, out, RESULTS.non_finite)
+
+
+def _locate(hit, t_end, end: Motion, term, solver, scene: Scene, made: Plan):
+    """Time and motion of the earliest crossing in the last step, the guards that fired, and the guard values to go on with.
+
+    Steps of the solver back from the end of the step; the root is found without derivatives and then corrected once by Newton's formula
+    with everything differentiable, which makes dt/dp = -(dg/dp) / (dg/dt) exact. A guard that fired goes on from the side it went to.
+    """
+    crossed = made.crossed(end.watch.before, end.watch.after) & scene.watched & hit
+    side = jnp.where(crossed, jnp.where(end.watch.after >= end.watch.before, 1, -1), 0).astype(t_end.dtype)
+
+    def back(t):
+        return solver.step(term, t_end, t, end, scene, solver.init(term, t_end, t, end, scene), False)[0]
+
+    def found():
+        frozen = jax.lax.stop_gradient
+
+        def passed(t):
+            return jnp.where(crossed, side * _guard_values(made, t, frozen_back(t), frozen_scene), -jnp.inf)
+
+        end_, frozen_scene, t_end_ = frozen(end), frozen(scene), frozen(t_end)
+
+        def frozen_back(t):
+            return solver.step(term, t_end_, t, end_, frozen_scene, solver.init(term, t_end_, t, end_, frozen_scene), False)[0]
+
+        root = frozen(first_root(lambda t: jnp.max(passed(t)), end_.watch.start, t_end_))
+        late = jnp.minimum(root + event_tolerance(root), t_end_)
+        fired = crossed & (passed(late) >= 0)
+        first = jnp.argmax(passed(root))
+
+        def along(t):
+            y = back(t)
+            return _guard_values(made, t, y, scene), y
+
+        (values, y), (slopes, rate) = jax.jvp(along, (root,), (jnp.ones_like(root),))
+        slope = frozen(slopes[first])
+        correction = values[first] / jnp.where(slope == 0, 1, slope)
+        t = root - correction
+        y = jax.tree.map(lambda y, r: y - frozen(r) * correction, y, rate)
+        after = jnp.where(fired, side * jnp.finfo(t.dtype).tiny, frozen(values))
+        return t, y.q, y.v, y.work, fired, after
+
+    def missed():
+        return t_end, end.q, end.v, end.work, jnp.zeros_like(crossed), end.watch.after
+
+    t, q, v, work, fired, after = jax.lax.cond(eqxi.unvmap_any(hit), found, missed)
+    pick = lambda a, b: jnp.where(hit, a, b)  # noqa: E731
+    t, q, v, after = pick(t, t_end), pick(q, end.q), pick(v, end.v), pick(after, end.watch.after)
+    work = None if work is None else pick(work, end.work)
+    return t, Motion(q, v, work), fired & hit, after
+
+
+def _save(run: Run, ended: State, solved: Solved, ts) -> State:
+    """The saved states with those of this phase written in: from its start to its end, both included."""
+    here = (ts >= run.t) & (ts <= solved.t)
+    q = jnp.where(here[:, None], solved.saved.q, run.saved.q)
+    v = jnp.where(here[:, None], solved.saved.v, run.saved.v)
+
+    def write(new, old):
+        return jnp.where((ts >= run.t).reshape(-1, *(1,) * new.ndim), new[None], old)
+
+    return State(q, v, jax.tree.map(write, ended.structure, run.saved.structure))
+
+
+def _record_phase(chain: Chain, run: Run, index, going, solved: Solved, ended: State) -> Phases:
+    s, row = run.state.structure, jnp.arange(run.phases.start.shape[0]) == index
+    row = row & going
+    work = jnp.zeros_like(run.t) if run.work is None else solved.motion.work - run.work
+    active = active_dofs(chain, s)
+    p = run.phases
+    energies = jnp.stack([energy(chain, run.state), energy(chain, ended)])
+    return Phases(
+        jnp.where(row, run.t, p.start),
+        jnp.where(row, solved.t, p.stop),
+        jnp.where(row[:, None], s.connected[None], p.connected),
+        jnp.where(row, s.rank, p.rank),
+        jnp.where(row, jnp.sum(active, dtype=jnp.int32), p.joint_freedoms),
+        jnp.where(row[:, None], energies[None], p.energy),
+        jnp.where(row, work, p.work),
+        jnp.where(row, jnp.asarray(solved.stats[0], jnp.int32), p.accepted),
+        jnp.where(row, jnp.asarray(solved.stats[1], jnp.int32), p.rejected),
+        p.count + jnp.where(going, 1, 0).astype(jnp.int32),
+    )
+
+
+def _apply(chain: Chain, run: Run, ended: State, solved: Solved, fired: Bool[Array, " events"], made: Plan):
+    """The change of structure that all events of this instant make together; one record row for each of them."""
+    any_of = lambda what: jnp.any(fired[:, None] & made.table(chain, what), 0)  # noqa: E731
+    connected = (ended.structure.connected | any_of("connect")) & ~any_of("cut")
+    locked = (ended.structure.locked | any_of("lock")) & ~any_of("unlock") if made.locks else None
+    grips = made.table(chain, "here").any()
+    happened = jnp.any(fired)
+
+    def changed():
+        return change(chain, ended, connected, locked, any_of("here") if grips else None)
+
+    def same():
+        return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), eqx.filter_eval_shape(changed))
+
+    done = jax.lax.cond(eqxi.unvmap_any(happened), changed, same)
+    after = jax.tree.map(lambda new, old: jnp.where(happened, new, old), done.state, ended)
+    r, count = run.events, jnp.sum(fired, dtype=jnp.int32)
+    place = r.count + jnp.cumsum(fired, dtype=jnp.int32) - 1
+    rows = jnp.arange(r.time.shape[0], dtype=jnp.int32)
+    hit = (rows[:, None] == place[None]) & fired[None]
+    written = jnp.any(hit, 1)
+    first = written & (rows == r.count)
+    mine = jnp.any(hit[:, :, None] & made.table(chain, "connect")[None], 1)[:, :, None]
+    events = Events(
+        jnp.where(written, solved.t, r.time),
+        jnp.where(written, jnp.argmax(hit, 1).astype(jnp.int32), r.which),
+        jnp.where(mine, done.impulse[None], r.impulse),
+        jnp.where(mine, done.angular_impulse[None], r.angular_impulse),
+        jnp.where(first, done.energy_lost, r.energy_lost),
+        r.count + count,
+    )
+    stops = jnp.any(fired & np.array([a.stop for a in made.actions], bool))
+    result = RESULTS.where(stops, RESULTS.stopped, solved.result)
+    result = RESULTS.where(happened & (done.gap > connect_tolerance), RESULTS.not_in_place, result)
+    result = RESULTS.where(events.count > r.time.shape[0], RESULTS.max_events, result)
+    return after, events, result
+
+

@@ -1,0 +1,193 @@
+"""F5: what is integrated, and the solver around the user's solver that keeps loops closed and watches guards after every step."""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from svkc.chain import Chain, State, Structure
+from svkc.closure import agree, close
+from svkc.forward_dynamics import acceleration, joint_torques
+from svkc.inverse_dynamics import limit_forces
+from svkc.kinematics import normalize, rates
+from svkc.loops import active_dofs
+
+
+class Watch(eqx.Module):
+    """Guards at both ends of the last step, which began at `start`."""
+
+    start: Float[Array, ""]
+    before: Float[Array, " guards"]
+    after: Float[Array, " guards"]
+
+
+class Motion(eqx.Module):
+    """What is integrated: q, v, and the work (J) done by control, limits and dampers; None where the scene has none of them."""
+
+    q: Float[Array, " q"]
+    v: Float[Array, " dofs"]
+    work: Float[Array, ""] | None = None
+    watch: Watch | None = None
+
+
+class Scene(eqx.Module):
+    """The `args` of the vector field: all it depends on besides time and motion."""
+
+    chain: Chain
+    structure: Structure
+    args: Any
+    watched: Bool[Array, " guards"] | None = None
+
+
+class Projection(eqx.Module):
+    """Loop drift is taken away after every step by the least change of q and v (scaled coordinates) that closes the loops.
+
+    iterations: Newton steps on the position; one leaves a gap of the second order in the drift of a step.
+    """
+
+    iterations: int = eqx.field(static=True, default=2)
+
+
+class Baumgarte(eqx.Module):
+    """Loop drift is pulled back while integrating, as by a critically damped spring of this rate (1/s); nothing is projected."""
+
+    rate: Float[Array, ""] | float = 20.0
+
+
+class Drift(eqx.Module):
+    """Nothing is done about loop drift."""
+
+
+class Field(eqx.Module):
+    """The vector field of one phase: qdot, vdot, power."""
+
+    control: Callable | None
+    stabilization: Projection | Baumgarte | Drift
+
+    def __call__(self, t, y: Motion, scene: Scene) -> Motion:
+        chain, structure = scene.chain, scene.structure
+        tau, power = self.torques(t, y, scene)
+        rate = self.stabilization.rate if isinstance(self.stabilization, Baumgarte) else None
+        vdot = acceleration(chain, structure, y.q, y.v, tau, baumgarte=rate)
+        moving = jnp.where(active_dofs(chain, structure), y.v, 0)
+        watch = None if y.watch is None else jax.tree.map(jnp.zeros_like, y.watch)
+        return Motion(rates(chain, y.q, moving), vdot, power, watch)
+
+    def torques(self, t, y: Motion, scene: Scene):
+        """Joint torques of the control and the limits, and the power of all that is not conservative (None: there is none)."""
+        chain, v = scene.chain, y.v[: scene.chain.nv]
+        tau = jnp.zeros_like(y.v)
+        if self.control is not None:
+            asked = self.control(t, State(y.q, y.v, scene.structure), scene.args)
+            tau = tau + joint_torques(chain, jnp.asarray(asked, y.v.dtype))
+        if chain.limit is not None:
+            tau = tau.at[: chain.nv].add(limit_forces(chain, y.q, y.v))
+        if y.work is None:
+            return tau, None
+        power = tau @ jnp.where(active_dofs(chain, scene.structure), y.v, 0)
+        return tau, power if chain.damping is None else power - jnp.sum(chain.damping * v * v)
+
+
+def settle(stabilization, scene: Scene, y: Motion) -> Motion:
+    """The motion put back: quaternions to unit length, loops closed, velocities in agreement."""
+    chain, structure = scene.chain, scene.structure
+    if not len(chain.topology.link_names) or not isinstance(stabilization, Projection):
+        return eqx.tree_at(lambda y: y.q, y, normalize(chain, y.q))
+    q = close(chain, structure, y.q, stabilization.iterations)
+    return eqx.tree_at(lambda y: (y.q, y.v), y, (q, agree(chain, structure, q, y.v)))
+
+
+class _Interpolation(diffrax.AbstractLocalInterpolation):
+    """The inner solver's dense output, drawn to the settled end of the step."""
+
+    t0: Any
+    t1: Any
+    inner: Any
+    shift: Motion
+
+    def evaluate(self, t0, t1=None, left=True):
+        def at(t):
+            part = (t - self.t0) / (self.t1 - self.t0)
+            return jax.tree.map(lambda y, s: y + part * s, self.inner.evaluate(t, left=left), self.shift)
+
+        if t1 is None:
+            return at(t0)
+        return jax.tree.map(lambda a, b: b - a, at(t0), at(t1))
+
+
+def _interpolation(cls, *, t0, t1, inner, shift):
+    return _Interpolation(t0, t1, cls(t0=t0, t1=t1, **inner), shift)
+
+
+class Settled(diffrax.AbstractWrappedSolver):
+    """Any diffrax solver, its steps settled and its guards read at their ends."""
+
+    solver: diffrax.AbstractSolver
+    stabilization: Projection | Baumgarte | Drift
+    guards: Callable | None
+
+    @property
+    def term_structure(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.solver.term_structure
+
+    @property
+    def interpolation_cls(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        return functools.partial(_interpolation, self.solver.interpolation_cls)
+
+    def order(self, terms):
+        return self.solver.order(terms)
+
+    def strong_order(self, terms):
+        return self.solver.strong_order(terms)
+
+    def error_order(self, terms):
+        return self.solver.error_order(terms)
+
+    def init(self, terms, t0, t1, y0, args):
+        return self.solver.init(terms, t0, t1, y0, args)
+
+    def func(self, terms, t0, y0, args):
+        return self.solver.func(terms, t0, y0, args)
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        raw, error, dense, solver_state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
+        y1 = settle(self.stabilization, args, raw)
+        if self.guards is not None:
+            # what only says where to look for an event is not differentiated; the event's time is, where it is located
+            after = jax.lax.stop_gradient(self.guards(t1, y1, args))
+            y1 = eqx.tree_at(lambda y: y.watch, y1, Watch(jax.lax.stop_gradient(t0), y0.watch.after, after))
+        shift = jax.tree.map(lambda a, b: a - b, y1, raw)
+        return y1, error, {"inner": dense, "shift": shift}, solver_state, result
+
+
+class FixedSteps(diffrax.AbstractStepSizeController):
+    """Steps of dt, shortened to meet every time in `ts`."""
+
+    dt: Float[Array, ""]
+    ts: Float[Array, " times"]
+
+    def wrap(self, direction):
+        return self
+
+    def _next(self, t):
+        times = jnp.where(self.ts > t, self.ts, jnp.inf)
+        stop = jnp.min(times, initial=jnp.inf)
+        # a step that would leave less than a millionth of itself goes all the way
+        return jnp.where(t + self.dt * (1 + 1e-6) >= stop, stop, t + self.dt)
+
+    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+        return self._next(t0), None
+
+    def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
+        return True, t1, self._next(t1), False, controller_state, diffrax.RESULTS.successful
+
+
+def motion_norm(error: Motion) -> Float[Array, ""]:
+    """Root mean square over q and v alone: work and guards do not choose the step."""
+    both = jnp.concatenate([error.q, error.v])
+    return jnp.sqrt(jnp.mean(both * both))

@@ -1,0 +1,101 @@
+"""F2: what a run leaves behind."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from svkc.chain import State
+
+
+class RESULTS(eqx.Enumeration):
+    """How a run ended, lane by lane."""
+
+    successful = ""
+    stopped = "An event asked the run to stop."
+    max_events = "More events than max_events: the state is that of the last event handled. Raise max_events, or look for chattering."
+    max_steps = "More steps than max_steps in one phase. Raise max_steps, or loosen rtol and atol."
+    step_too_small = "The step size fell to its lower bound: the problem is too stiff, or singular, for this solver and tolerance."
+    not_in_place = "A link was to be connected at its declared placement, but its bodies were elsewhere. Use here, or a guard that waits."
+    loop_open = "A loop is open by more than the tolerance. Use smaller steps, or projection."
+    non_finite = "A number that is not finite appeared."
+
+
+class Events(eqx.Module):
+    """What happened, in the order of time; rows past `count` are unused (time inf, which -1).
+
+    `which`: the event's place in the list given; `impulse` (N s), `angular_impulse` (N m s): on each real link from its parent, at the joint, in
+    world axes, for the links this event connected; `energy_lost` (J): of events at one instant, in the first one's row.
+    """
+
+    time: Float[Array, " events"]
+    which: Int[Array, " events"]
+    impulse: Float[Array, "events links 3"]
+    angular_impulse: Float[Array, "events links 3"]
+    energy_lost: Float[Array, " events"]
+    count: Int[Array, ""]
+
+
+class Phases(eqx.Module):
+    """The stretches between changes of structure; rows past `count` are unused.
+
+    `energy`: mechanical energy (J) at start and end; `work`: done in between by control, limits and dampers (J).
+    """
+
+    start: Float[Array, " phases"]
+    stop: Float[Array, " phases"]
+    connected: Bool[Array, "phases links"]
+    rank: Int[Array, " phases"]
+    joint_freedoms: Int[Array, " phases"]
+    energy: Float[Array, "phases 2"]
+    work: Float[Array, " phases"]
+    accepted: Int[Array, " phases"]
+    rejected: Int[Array, " phases"]
+    count: Int[Array, ""]
+
+    @property
+    def freedoms(self) -> Int[Array, " phases"]:
+        """Mobility N_F = N_J - m (13)."""
+        return self.joint_freedoms - self.rank
+
+    @property
+    def energy_drift(self) -> Float[Array, " phases"]:
+        """Energy gained that no work explains (J)."""
+        return self.energy[..., 1] - self.energy[..., 0] - self.work
+
+
+class Trajectory(eqx.Module):
+    """A run: `states` at `ts` (leading time axis), the loop gaps there, events, phases, the final state and how it ended."""
+
+    ts: Float[Array, " times"]
+    states: State
+    gaps: Float[Array, "times 2"]
+    events: Events
+    phases: Phases
+    final: State
+    t_final: Float[Array, ""]
+    result: RESULTS
+
+    @property
+    def connected(self) -> Bool[Array, "times links"]:
+        """Which virtual links hold at each time."""
+        return self.states.structure.connected
+
+    def report(self) -> "Report":
+        """The run's certificate."""
+        accepted, rejected = jnp.sum(self.phases.accepted, -1), jnp.sum(self.phases.rejected, -1)
+        drift = jnp.sum(jnp.where(jnp.isfinite(self.phases.start), self.phases.energy_drift, 0), -1)
+        finite = jnp.isfinite(self.gaps)
+        gaps = jnp.max(jnp.where(finite, self.gaps, 0), -2)
+        return Report(gaps[..., 1], gaps[..., 0], drift, jnp.sum(self.events.energy_lost, -1), accepted, rejected, self.result)
+
+
+class Report(eqx.Module):
+    """Largest loop gaps (m, rad) at the saved times, energy that no work or impact explains (J), energy lost in impacts (J), steps, result."""
+
+    gap: Float[Array, ""]
+    angular_gap: Float[Array, ""]
+    energy_drift: Float[Array, ""]
+    energy_lost: Float[Array, ""]
+    accepted: Int[Array, ""]
+    rejected: Int[Array, ""]
+    result: RESULTS

@@ -1,0 +1,239 @@
+"""F5: the structure changes: connect, cut, lock, and the velocity just after (paper, section V)."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.linalg import cho_factor, cho_solve
+from jaxtyping import Array, Bool, Float
+
+from svkc.assembly import check_closed, connection_mask, joint_slice, link_index
+from svkc.chain import V_SIZE, Chain, State, Structure
+from svkc.closure import close, constrain, decide_rank, scales
+from svkc.forward_dynamics import constraint_forces, reduced_inertia
+from svkc.inverse_dynamics import inertia_by_composites
+from svkc.kinematics import kinematics, twists
+from svkc.loops import ends, gap, joint_coordinates, loop_jacobian
+from svkc.spatial import quat_conjugate, quat_multiply, quat_rotate
+
+
+class Change(eqx.Module):
+    """What a change of structure did: the state after it, impulses on the real links from their parents, at the joints, and energy lost (J)."""
+
+    state: State
+    impulse: Float[Array, "links 3"]
+    angular_impulse: Float[Array, "links 3"]
+    energy_lost: Float[Array, ""]
+    gap: Float[Array, ""]
+
+
+def gripped_here(chain: Chain, structure: Structure, q, here: Bool[Array, " links"]) -> Structure:
+    """Placements of the links in `here` taken from where the bodies are: the point is the real link's own, the axes stay the parent's.
+
+    So a palm grips the bar where it touches it, about the bar's direction; floats of the placement stay differentiable.
+    """
+    kin = kinematics(chain, q)
+    end = ends(chain, structure, kin, q)
+    p = structure.parent
+    to_parent = quat_conjugate(kin.quat[p])
+    place = end.real - kin.r[p] - (kin.root[p] - kin.root[structure.real])
+    pos = quat_rotate(to_parent, place)
+    real_quat = quat_multiply(quat_conjugate(kin.quat[structure.real]), end.base_quat)
+    take = here[:, None]
+    return eqx.tree_at(
+        lambda s: (s.pos, s.real_quat),
+        structure,
+        (jnp.where(take, pos, structure.pos), jnp.where(take, real_quat, structure.real_quat)),
+    )
+
+
+def _project(chain: Chain, structure: Structure, q, v):
+    """v+ = W (W^T M W)^-1 W^T M v-: the projection, orthogonal in the metric of the inertia, on what the structure allows.
+
+    The paper's (29)-(38) said shortly; it holds where loops are redundant too. Returns v+, the impulses and the energy lost.
+    """
+    nv = chain.nv
+    kin = kinematics(chain, q)
+    co = constrain(chain, structure, q, v, kin, twists(chain, kin, v))
+    M = inertia_by_composites(chain, kin)
+    A = reduced_inertia(chain, co, M)
+    after = co.W @ cho_solve(cho_factor(A), co.W[:nv].T @ (M @ v[:nv]))
+    jump = after[:nv] - v[:nv]
+    momentum = jnp.concatenate([M @ jump, jnp.zeros(chain.dofs - nv, v.dtype)])
+    # v- and v+ differ by a vector orthogonal to v+, so that the loss is a square and cannot be negative
+    return after, -constraint_forces(chain, structure, q, co, momentum), jump @ (M @ jump) / 2
+
+
+def change(
+    chain: Chain, state: State, connected: Bool[Array, " links"], locked: Bool[Array, " dofs"] | None = None, here: Bool[Array, " links"] | None = None
+) -> Change:
+    """The state under another set of connected links and locked joints.
+
+    Where links are only cut or joints only unlocked, q and v are kept bit for bit; where something new holds, coordinates of the new joints
+    are read off, the remaining gap is closed by the least change, and the velocity is projected.
+    """
+    old = state.structure
+    new_links = connected & ~old.connected
+    structure = old if here is None else gripped_here(chain, old, state.q, here & new_links)
+    structure = eqx.tree_at(lambda s: s.connected, structure, connected)
+    holds = jnp.any(new_links)
+    if locked is not None:
+        was = jnp.zeros(chain.dofs, bool) if old.locked is None else old.locked
+        holds = holds | jnp.any(locked & ~was)
+        structure = eqx.tree_at(lambda s: s.locked, structure, locked, is_leaf=lambda x: x is None)
+    q, v, nothing = state.q, state.v, jnp.zeros((len(chain.link_names), 3), state.v.dtype)
+    if not len(chain.link_names):
+        after, lost = lock_projection(chain, structure, q, v)
+        v = jnp.where(holds, after, v)
+        return Change(State(q, v, structure), nothing, nothing, jnp.where(holds, lost, 0), jnp.zeros((), v.dtype))
+    read = joint_coordinates(chain, structure, kinematics(chain, q), q)
+    new_q = _of_new_links(chain, new_links, read, q)
+    kin = kinematics(chain, new_q)
+    open_ = gap(structure, ends(chain, structure, kin, new_q)).ravel()
+    row, _ = scales(chain)
+    structure = decide_rank(chain, structure, new_q)
+    closed = close(chain, structure, new_q)
+    after, wrench, lost = _project(chain, structure, closed, v)
+    q, v = jnp.where(holds, closed, q), jnp.where(holds, after, v)
+    wrench, lost = jnp.where(holds, wrench, 0), jnp.where(holds, lost, 0)
+    return Change(State(q, v, structure), wrench[:, 3:], wrench[:, :3], lost, jnp.where(holds, jnp.max(jnp.abs(row * open_)), 0))
+
+
+def lock_projection(chain: Chain, structure: Structure, q, v):
+    """The projection where only joints are locked and there are no virtual links; velocity after, energy lost."""
+    if structure.locked is None:
+        return v, jnp.zeros((), v.dtype)
+    M = inertia_by_composites(chain, kinematics(chain, q))
+    free = ~structure.locked
+    A = jnp.where(free[:, None] & free[None], M, jnp.eye(chain.nv, dtype=M.dtype))
+    after = cho_solve(cho_factor(A), jnp.where(free, M @ v, 0))
+    jump = after - v
+    return after, jump @ (M @ jump) / 2
+
+
+def _of_new_links(chain: Chain, new_links, read, q):
+    """Coordinates read off for the links just connected, the old ones everywhere else."""
+    table, top = chain.topology.links, chain.topology
+    for index in (table.angle, table.slide, table.quat):
+        at = np.flatnonzero((index < top.nq_all).ravel())
+        slots = index.ravel()[at]
+        link = at // index.shape[1]
+        q = q.at[slots].set(jnp.where(new_links[link], read[slots], q[slots]))
+    return q
+
+
+_change = eqx.filter_jit(change)
+
+
+def transition(chain: Chain, state: State, connected) -> State:
+    """The state with exactly these virtual links connected (mask, or names): new ones with their impact, the others cut."""
+    mask = jnp.asarray(connection_mask(chain, connected))
+    return _checked(chain, _change(chain, state, mask))
+
+
+def connect(chain: Chain, state: State, *names: str, here: bool = False) -> State:
+    """Connects virtual links: coordinates of the new joints, and the velocity after the impact (paper, section V-C).
+
+    At their declared placement, where the bodies must already be; here=True: the joint is made where the real link is. ValueError: unknown
+    names, or bodies that are not at the placement (says by how much).
+    """
+    chosen = np.isin(np.arange(len(chain.link_names)), [link_index(chain, n) for n in names])
+    mask = state.structure.connected | jnp.asarray(chosen)
+    return _checked(chain, _change(chain, state, mask, here=jnp.asarray(chosen) if here else None))
+
+
+def _checked(chain: Chain, done: Change) -> State:
+    """The state after a change; an error where bodies were too far from the declared placement to be joined."""
+    limit = connect_tolerance
+    if isinstance(done.gap, jax.core.Tracer):
+        return eqx.error_if(done.state, done.gap > limit, "connect: the bodies are not where the joint is declared; use here=True")
+    if done.gap > limit:
+        raise ValueError(
+            f"connect: the bodies are {float(done.gap):.3g} (rad, or lengths of {float(chain.length):.3g} m) away from where the joint is "
+            "declared; move them there, or grip where they are with here=True"
+        )
+    return check_closed(chain, done.state)
+
+
+# gap, in rad or in `chain.length`s, up to which connecting may still move the bodies to their declared placement
+connect_tolerance = 1e-2
+
+
+def cut(chain: Chain, state: State, *names: str) -> State:
+    """Cuts virtual links: q and v stay as they are, bit for bit (paper, section V-C)."""
+    chosen = np.isin(np.arange(len(chain.link_names)), [link_index(chain, n) for n in names])
+    return _change(chain, state, state.structure.connected & ~jnp.asarray(chosen)).state
+
+
+def _locked(chain: Chain, state: State, joints, value: bool) -> State:
+    locked = jnp.zeros(chain.dofs, bool) if state.structure.locked is None else state.structure.locked
+    for name in joints:
+        locked = locked.at[joint_slice(chain, name, V_SIZE, chain.topology.v_start)].set(value)
+    return _change(chain, state, state.structure.connected, locked).state
+
+
+def lock(chain: Chain, state: State, *joints: str) -> State:
+    """Holds joints of the tree still from now on, with the impact of stopping them."""
+    return _locked(chain, state, joints, True)
+
+
+def unlock(chain: Chain, state: State, *joints: str) -> State:
+    """Lets locked joints move again."""
+    return _locked(chain, state, joints, False)
+
+
+def bind(chain: Chain, state: State, name: str, parent: str, real: str, *, joint="weld", pos=(0.0, 0.0, 0.0), real_pos=(0.0, 0.0, 0.0)) -> State:
+    """A spare slot put between two bodies, not connected yet: run-time data, no retrace. Connect it with here=True, or at this placement.
+
+    joint: any but universal and pairs of turns, whose coordinates a spare slot has no room for. pos, real_pos (m): in the two bodies.
+    """
+    from svkc.chain import joint_freedoms
+
+    slot = link_index(chain, name)
+    if not chain.topology.link_spare[slot]:
+        raise ValueError(f"bind: {name!r} is not a spare slot; spare slots: {[n for n, s in zip(chain.link_names, chain.topology.link_spare, strict=True) if s]}")
+    for body in (parent, real):
+        if body not in chain.body_names:
+            raise ValueError(f"bind: no body {body!r}; bodies: {', '.join(chain.body_names)}")
+    freedoms = joint_freedoms(joint)
+    if sum(freedoms[:3]) == 2:
+        raise ValueError(f"bind: a spare slot has no coordinates for {joint!r}; declare the link when loading")
+    s, rows = state.structure, [chain.topology.body_row[chain.body_names.index(b)] for b in (parent, real)]
+    dtype = s.pos.dtype
+    structure = eqx.tree_at(
+        lambda s: (s.parent, s.real, s.freedoms, s.pos, s.real_pos),
+        s,
+        (
+            s.parent.at[slot].set(rows[0]),
+            s.real.at[slot].set(rows[1]),
+            s.freedoms.at[slot].set(jnp.asarray(freedoms)),
+            s.pos.at[slot].set(jnp.asarray(pos, dtype)),
+            s.real_pos.at[slot].set(jnp.asarray(real_pos, dtype)),
+        ),
+    )
+    return State(state.q, state.v, structure)
+
+
+def velocity_by_impulse(chain: Chain, state: State, name: str) -> tuple[Float[Array, " dofs"], Float[Array, "6"]]:
+    """The velocity after connecting one link and the impulse F_1 on it, by the paper's (34)-(38) in the coordinates theta_G of the old structure.
+
+    The paper's own form, good where B is regular; it checks the projection that `connect` uses. State: not connected yet, bodies in place.
+    """
+    slot, nv = link_index(chain, name), chain.nv
+    kin = kinematics(chain, state.q)
+    before = constrain(chain, state.structure, state.q, state.v, kin, twists(chain, kin, state.v))
+    after = eqx.tree_at(lambda s: s.connected, state.structure, state.structure.connected.at[slot].set(True))
+    q = _of_new_links(chain, after.connected & ~state.structure.connected, joint_coordinates(chain, after, kin, state.q), state.q)
+    J = loop_jacobian(chain, after, kin, ends(chain, after, kin, q))[6 * slot : 6 * slot + 6]
+    own = np.array([d for d in chain.topology.links.dof[slot] if d < chain.dofs], int)
+    # J_1 - J_2 along theta_G, and the axes of the new joint, on the side where (27) has them
+    J_G, J_r = J[:, :nv] @ before.W[:nv], -J[:, own]
+    A = cho_factor(reduced_inertia(chain, before, inertia_by_composites(chain, kin)))
+    B_inverse = jnp.linalg.inv(J_G @ cho_solve(A, J_G.T))
+    C = J_r @ jnp.linalg.solve(J_r.T @ B_inverse @ J_r, J_r.T @ B_inverse) if len(own) else jnp.zeros_like(B_inverse)
+    u = J[:, :nv] @ state.v[:nv]
+    F = -B_inverse @ (jnp.eye(6, dtype=u.dtype) - C) @ u
+    v = state.v + before.W @ cho_solve(A, J_G.T @ F)
+    if len(own):
+        v = v.at[own].set(jnp.linalg.lstsq(J_r, J[:, :nv] @ v[:nv])[0])
+    return v, F
