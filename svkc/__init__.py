@@ -1,5 +1,36 @@
-from svkc.chain import *
-from svkc.load import load
-from svkc.events import at, when
-from svkc.simulate import simulate
-from svkc.stepping import Baumgarte, Drift, Projection
+"""svkc: structure-varying kinematic chains in JAX, after Nakamura and Yamane (2000)."""
+
+from importlib.metadata import PackageNotFoundError as _Missing
+from importlib.metadata import version as _version
+
+# nouns
+from svkc.chain import Chain as Chain, State as State, Structure as Structure, VirtualLink as VirtualLink
+
+# models in, runs out
+from svkc.archive import load_trajectory as load_trajectory
+from svkc.load import load as load
+from svkc.trajectory import RESULTS as RESULTS, Trajectory as Trajectory
+from svkc.view import plot as plot, render as render
+
+# how bodies are and move
+from svkc.kinematics import difference as difference, integrate as integrate, poses as poses, velocities as velocities
+from svkc.energy import energy as energy, kinetic_energy as kinetic_energy, momentum as momentum, potential_energy as potential_energy
+from svkc.inverse_dynamics import bias_force as bias_force, inverse_dynamics as inverse_dynamics, mass_matrix as mass_matrix
+
+# loops
+from svkc.closure import coordinates as coordinates, loop_gaps as loop_gaps, velocity_gaps as velocity_gaps
+from svkc.forward_dynamics import forward_dynamics as forward_dynamics, loop_forces as loop_forces
+from svkc.mobility import mobility as mobility
+
+# changes of structure
+from svkc.transition import bind as bind, connect as connect, cut as cut, lock as lock, transition as transition, unlock as unlock
+from svkc.events import at as at, when as when
+
+# runs
+from svkc.simulate import simulate as simulate
+from svkc.stepping import Baumgarte as Baumgarte, Drift as Drift, Projection as Projection
+
+try:
+    __version__ = _version("svkc")
+except _Missing:  # a source tree that is not installed
+    __version__ = "0"

@@ -4,6 +4,8 @@ Rows in metres and columns of slides are divided by the chain's `length`, so tha
 stop_gradient(J); H and W come from one masked square solve with that choice frozen, exact to differentiate wherever the rank does not change.
 """
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -120,7 +122,8 @@ def square(selection: Selection, J: Float[Array, "rows dofs"]) -> tuple[Float[Ar
     return Jm, Jm @ selection.P.T + jnp.diag(jnp.where(selection.used, 0, 1).astype(J.dtype))
 
 
-def _scaled_jacobian(chain: Chain, structure: Structure, kin, end) -> Float[Array, "rows dofs"]:
+def scaled_jacobian(chain: Chain, structure: Structure, kin, end) -> Float[Array, "rows dofs"]:
+    """J_C without units: rows and columns multiplied by `scales`."""
     row, column = scales(chain)
     return row[:, None] * loop_jacobian(chain, structure, kin, end) * column[None]
 
@@ -129,7 +132,7 @@ def constrain(chain: Chain, structure: Structure, q, v, kin, V, baumgarte=None) 
     """W and Hdot v at one state, from its kinematics: (14)-(21). baumgarte: rate (1/s) at which gaps are pulled back."""
     row, column = scales(chain)
     end = ends(chain, structure, kin, q)
-    J = _scaled_jacobian(chain, structure, kin, end)
+    J = scaled_jacobian(chain, structure, kin, end)
     active = active_dofs(chain, structure)
     selection = select(J, structure.rank, structure.independent)
     bias = loop_bias(chain, structure, kin, end, V, bias_accelerations(chain, kin, V, v), jnp.where(active, v, 0))
@@ -164,6 +167,7 @@ def velocity_gaps(chain: Chain, state: State) -> Float[Array, "links 6"]:
     return (loop_jacobian(chain, state.structure, kin, end) @ state.v).reshape(-1, 6)
 
 
+@jax.jit
 def decide_rank(chain: Chain, structure: Structure, q: Float[Array, " q"]) -> Structure:
     """The structure with its rank m: the larger of those at q and at a closed configuration nearby, for q itself may be singular."""
     if not len(chain.topology.link_names):
@@ -173,7 +177,7 @@ def decide_rank(chain: Chain, structure: Structure, q: Float[Array, " q"]) -> St
     def sizes(q):
         kin = kinematics(chain, q)
         end = ends(chain, structure, kin, q)
-        return select(_scaled_jacobian(chain, structure, kin, end)).size, jnp.max(jnp.abs(row * gap(structure, end).ravel()))
+        return select(scaled_jacobian(chain, structure, kin, end)).size, jnp.max(jnp.abs(row * gap(structure, end).ravel()))
 
     # a fixed direction without pattern, a few degrees away; left out where Newton's method does not come back onto the loops
     direction = np.sin(1.0 + 2.3 * np.arange(chain.dofs))
@@ -200,6 +204,7 @@ def _solvable(selection: Selection) -> Selection:
     return Selection(jnp.where(keep[:, None], selection.Q, 0), jnp.where(keep[:, None], selection.P, 0), selection.size, keep)
 
 
+@functools.partial(jax.jit, static_argnames="iterations")
 def close(
     chain: Chain, structure: Structure, q: Float[Array, " q"], iterations: int = 2, hold=None
 ) -> Float[Array, " q"]:
@@ -212,7 +217,7 @@ def close(
     def newton(_, q):
         kin = kinematics(chain, q)
         end = ends(chain, structure, kin, q)
-        J = _scaled_jacobian(chain, structure, kin, end)
+        J = scaled_jacobian(chain, structure, kin, end)
         if hold is not None:
             J = jnp.where(hold[None], 0, J)
         selection = _solvable(select(J, structure.rank))
@@ -221,11 +226,12 @@ def close(
     return jax.lax.fori_loop(0, iterations, newton, normalize(chain, q))
 
 
+@jax.jit
 def agree(chain: Chain, structure: Structure, q, v, hold=None) -> Float[Array, " dofs"]:
     """v with the least change (scaled coordinates) that makes J_C v = 0."""
     row, column = scales(chain)
     kin = kinematics(chain, q)
-    J = _scaled_jacobian(chain, structure, kin, ends(chain, structure, kin, q))
+    J = scaled_jacobian(chain, structure, kin, ends(chain, structure, kin, q))
     free = J if hold is None else jnp.where(hold[None], 0, J)
     selection = _solvable(select(free, structure.rank))
     relative = J @ jnp.where(active_dofs(chain, structure), v / column, 0)

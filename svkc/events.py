@@ -146,10 +146,10 @@ def plan(chain: Chain, events, dtype) -> Plan:
     return made
 
 
-def first_root(f, a: Float[Array, ""], b: Float[Array, ""]) -> Float[Array, ""]:
-    """A zero of f in [a, b], f(b) >= 0, to round-off: false position with the Illinois weight, every third step a bisection.
+def first_root(f, a: Float[Array, ""], fa: Float[Array, ""], b: Float[Array, ""], fb: Float[Array, ""]) -> Float[Array, ""]:
+    """A zero of f in [a, b], fa = f(a), fb = f(b) >= 0, to round-off: false position with the Illinois weight, every third step a bisection.
 
-    Returns the side where f >= 0; a itself if f is not negative there. Not differentiable.
+    Returns the side where f >= 0; a itself if fa is not negative. Not differentiable.
     """
     eps = jnp.finfo(b.dtype).eps
     fine = 2 * eps * jnp.maximum(jnp.abs(a), jnp.abs(b)) + eps * (b - a)
@@ -167,6 +167,5 @@ def first_root(f, a: Float[Array, ""], b: Float[Array, ""]) -> Float[Array, ""]:
         b, fb = jnp.where(right, c, b), jnp.where(right, fc, fb)
         return i + 1, a, fa, b, fb, jnp.where(right, 1, -1)
 
-    fa = f(a)
-    start = (jnp.asarray(0), a, fa, jnp.where(fa >= 0, a, b), f(b), jnp.asarray(0))
+    start = (jnp.asarray(0), a, fa, jnp.where(fa >= 0, a, b), fb, jnp.asarray(0))
     return jax.lax.while_loop(lambda c: (c[3] - c[1] > fine) & (c[0] < 200), narrow, start)[3]

@@ -1,5 +1,8 @@
 """F4: the acceleration of any structure (paper, section III-B) and the forces its loops carry."""
 
+import functools
+
+import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import cho_factor, cho_solve
 from jaxtyping import Array, Float
@@ -26,6 +29,7 @@ def reduced_inertia(chain: Chain, co: Coordinates, M: Float[Array, "nv nv"]) -> 
     return W.T @ (M @ W) + jnp.diag(jnp.where(co.independent, 0, 1).astype(M.dtype))
 
 
+@functools.partial(jax.jit, static_argnames="inertia")
 def acceleration(
     chain: Chain, structure: Structure, q, v, tau: Float[Array, " dofs"], inertia=inertia_by_composites, baumgarte=None
 ) -> Float[Array, " dofs"]:

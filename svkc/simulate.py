@@ -227,36 +227,36 @@ def _locate(hit, t_end, end: Motion, term, solver, scene: Scene, made: Plan):
     crossed = made.crossed(end.watch.before, end.watch.after) & scene.watched & hit
     side = jnp.where(crossed, jnp.where(end.watch.after >= end.watch.before, 1, -1), 0).astype(t_end.dtype)
 
-    def back(t):
+    # an inner loop that can be differentiated both ways, outside of diffrax's adjoints
+    if isinstance(solver.solver, diffrax.AbstractRungeKutta):
+        solver = eqx.tree_at(lambda s: s.solver.scan_kind, solver, "bounded", is_leaf=lambda x: x is None)
+
+    def back(t, t_end, end, scene):
         return solver.step(term, t_end, t, end, scene, solver.init(term, t_end, t, end, scene), False)[0]
 
     def found():
-        frozen = jax.lax.stop_gradient
+        frozen = jax.lax.stop_gradient((t_end, end, scene))
 
-        def passed(t):
-            return jnp.where(crossed, side * _guard_values(made, t, frozen_back(t), frozen_scene), -jnp.inf)
+        def passed(values):
+            return jnp.where(crossed, side * values, -jnp.inf)
 
-        end_, frozen_scene, t_end_ = frozen(end), frozen(scene), frozen(t_end)
+        def ahead(t):
+            return jnp.max(passed(_guard_values(made, t, back(t, *frozen), frozen[2])))
 
-        def frozen_back(t):
-            return solver.step(term, t_end_, t, end_, frozen_scene, solver.init(term, t_end_, t, end_, frozen_scene), False)[0]
-
-        root = frozen(first_root(lambda t: jnp.max(passed(t)), end_.watch.start, t_end_))
-        late = jnp.minimum(root + event_tolerance(root), t_end_)
-        fired = crossed & (passed(late) >= 0)
-        first = jnp.argmax(passed(root))
-
-        def along(t):
-            y = back(t)
-            return _guard_values(made, t, y, scene), y
-
-        (values, y), (slopes, rate) = jax.jvp(along, (root,), (jnp.ones_like(root),))
-        slope = frozen(slopes[first])
-        correction = values[first] / jnp.where(slope == 0, 1, slope)
-        t = root - correction
-        y = jax.tree.map(lambda y, r: y - frozen(r) * correction, y, rate)
-        after = jnp.where(fired, side * jnp.finfo(t.dtype).tiny, frozen(values))
-        return t, y.q, y.v, y.work, fired, after
+        at_start, at_end = jnp.max(passed(end.watch.before)), jnp.max(passed(end.watch.after))
+        root = jax.lax.stop_gradient(first_root(ahead, end.watch.start, at_start, frozen[0], at_end))
+        y = back(root, t_end, end, scene)
+        rate = jax.lax.stop_gradient(term.vf(root, y, scene))
+        along = (jnp.ones_like(root), rate)
+        values, slopes = jax.jvp(lambda t, y: _guard_values(made, t, y, scene), (root, y), along)
+        slopes = jax.lax.stop_gradient(slopes)
+        first = jnp.argmax(passed(values))
+        fired = crossed & (passed(values) + side * slopes * event_tolerance(root) >= 0)
+        fired = fired | (jnp.arange(side.shape[0]) == first)
+        correction = values[first] / jnp.where(slopes[first] == 0, 1, slopes[first])
+        y = jax.tree.map(lambda y, r: y - r * correction, y, rate)
+        after = jnp.where(fired, side * jnp.finfo(root.dtype).tiny, jax.lax.stop_gradient(values))
+        return root - correction, y.q, y.v, y.work, fired, after
 
     def missed():
         return t_end, end.q, end.v, end.work, jnp.zeros_like(crossed), end.watch.after

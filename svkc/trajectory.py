@@ -80,6 +80,19 @@ class Trajectory(eqx.Module):
         """Which virtual links hold at each time."""
         return self.states.structure.connected
 
+    def save(self, path, chain=None) -> None:
+        """Writes the run to one .npz, whole or not at all; `svkc.load_trajectory` gives back an equal object."""
+        # a verb the contract puts on the noun; its room is one floor up
+        from svkc.archive import save
+
+        save(self, path, chain)
+
+    def plot(self, chain=None):
+        """A matplotlib figure of joint coordinates, loop gaps, energy and mobility over time, events as lines."""
+        from svkc.view import plot
+
+        return plot(self, chain)
+
     def report(self) -> "Report":
         """The run's certificate."""
         accepted, rejected = jnp.sum(self.phases.accepted, -1), jnp.sum(self.phases.rejected, -1)

@@ -1,0 +1,114 @@
+"""F7: the command line. `python -m svkc` runs the high bar: two hands, one hand, flight."""
+
+import argparse
+import pathlib
+import sys
+import time
+
+RELEASE_RIGHT, RELEASE_LEFT, END = 1.0, 1.4, 2.0  # s
+
+
+def _info(path: str) -> int:
+    """What a model is to svkc."""
+    import svkc
+
+    try:
+        chain = svkc.load(path)
+    except ValueError as error:
+        print(error)
+        if "not simulated" not in str(error):
+            return 1
+        chain = svkc.load(path, ignore="all")
+    state = chain.state() if not len(chain.link_names) else _state_or_none(chain)
+    print(f"{len(chain.body_names) - 1} bodies: {', '.join(chain.body_names[1:])}")
+    print(f"{len(chain.joint_names)} joints: {', '.join(chain.joint_names)}")
+    print(f"{len(chain.link_names)} virtual links: {', '.join(chain.link_names) or 'none'}")
+    print(f"{chain.nv} joint freedoms in the tree, {chain.dofs} with every virtual link; {chain.gear.shape[0]} actuators")
+    if state is not None:
+        m = svkc.mobility(chain, state)
+        print(f"as loaded: {int(m.joint_freedoms)} joint freedoms, rank {int(m.rank)}, mobility {int(m.freedoms)}")
+    for line in chain.left_out:
+        print(f"left out: {line}")
+    return 0
+
+
+def _state_or_none(chain):
+    try:
+        return chain.state()
+    except ValueError as error:
+        print(error)
+        return None
+
+
+def _high_bar(out: pathlib.Path) -> int:
+    """The main job."""
+    import jax
+
+    # the command's own process: float64, and the sums XLA would otherwise hand to a slower kernel
+    jax.config.update("jax_enable_x64", True)
+    import jax.numpy as jnp
+
+    import svkc
+    from svkc.scenes import high_bar
+
+    begin = time.perf_counter()
+    chain, state = high_bar()
+    loaded = time.perf_counter()
+    ts = jnp.linspace(0, END, round(END / 0.025) + 1)
+    events = (svkc.at(RELEASE_RIGHT, cut="right_hand_grip"), svkc.at(RELEASE_LEFT, cut="left_hand_grip"))
+
+    def run():
+        return jax.block_until_ready(svkc.simulate(chain, state, END, ts=ts, events=events, rtol=1e-8, atol=1e-10))
+
+    traj = run()
+    compiled = time.perf_counter()
+    traj = run()
+    done = time.perf_counter()
+    _print_phases(chain, traj)
+    print(f"load and close the loops {loaded - begin:.1f} s, first run with compilation {compiled - loaded:.1f} s, a run {done - compiled:.3f} s")
+    out.mkdir(parents=True, exist_ok=True)
+    traj.save(out / "high_bar.npz", chain)
+    written = [out / "high_bar.npz"]
+    for name, missing in (("high_bar.png", "matplotlib"), ("high_bar.gif", "a GL library")):
+        try:
+            written.append(svkc.render(chain, traj, out / name, azimuth=90))
+        except (RuntimeError, ImportError) as error:
+            print(f"{name} not drawn, {missing} is missing: {error}")
+    print("wrote " + ", ".join(str(p) for p in written))
+    return 0
+
+
+def _print_phases(chain, traj):
+    """Freedoms, rank, mobility, steps and energy before and after each event, then the certificate."""
+    p, report = traj.phases, traj.report()
+    print("      from        to  held by                            joint   rank  mobility   steps  energy drift")
+    print("         s         s                                  freedoms                              J")
+    for i in range(int(p.count)):
+        if float(p.start[i]) == float(p.stop[i]) and i:
+            continue
+        held = ", ".join(n for n, on in zip(chain.link_names, p.connected[i], strict=True) if on) or "nothing"
+        print(
+            f"{float(p.start[i]):10.6f}{float(p.stop[i]):10.6f}  {held:<34}{int(p.joint_freedoms[i]):6d}{int(p.rank[i]):7d}"
+            f"{int(p.freedoms[i]):10d}{int(p.accepted[i]):8d}{float(p.energy_drift[i]):14.2e}"
+        )
+    times = ", ".join(f"{float(t):.6f} s" for t in traj.events.time[: int(traj.events.count)])
+    print(f"events at {times}; energy at the start {float(p.energy[0, 0]):.3f} J")
+    print(f"largest loop gap {float(report.gap):.2e} m, {float(report.angular_gap):.2e} rad; {int(report.accepted)} steps, {int(report.rejected)} rejected")
+
+
+def main(argv=None) -> int:
+    """Entry point."""
+    parser = argparse.ArgumentParser("svkc", description="Structure-varying kinematic chains: the high bar, release and all.")
+    parser.add_argument("command", nargs="?", choices=["info"], help="info MODEL: what a model is to svkc")
+    parser.add_argument("model", nargs="?", help="MJCF or URDF file")
+    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out"), help="folder for results (default: out)")
+    options = parser.parse_args(argv)
+    if options.command == "info":
+        if options.model is None:
+            parser.error("info needs a model file")
+        return _info(options.model)
+    return _high_bar(options.out)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

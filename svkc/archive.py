@@ -1,0 +1,82 @@
+"""F3: trajectories on disk: one npz, written whole or not at all."""
+
+import dataclasses
+import json
+import os
+import pathlib
+import tempfile
+import zipfile
+
+import jax.numpy as jnp
+import numpy as np
+
+from svkc.chain import State, Structure
+from svkc.trajectory import RESULTS, Events, Phases, Trajectory
+
+SCHEMA = 1
+_PARTS = {"states": State, "final": State, "structure": Structure, "events": Events, "phases": Phases}
+
+
+def _flatten(node, prefix: str = "") -> dict[str, np.ndarray]:
+    """{"states.q": array, ...}; parts that are None are left out."""
+    out = {}
+    for field in dataclasses.fields(node):
+        value, name = getattr(node, field.name), prefix + field.name
+        if field.name in _PARTS:
+            out |= _flatten(value, name + ".")
+        elif field.name != "result" and value is not None:
+            out[name] = np.asarray(value)
+    return out
+
+
+def _build(cls, arrays: dict[str, np.ndarray], prefix: str = "", **known):
+    fields = dict(known)
+    for field in dataclasses.fields(cls):
+        name = prefix + field.name
+        if field.name in _PARTS:
+            fields[field.name] = _build(_PARTS[field.name], arrays, name + ".")
+        elif field.name not in fields:
+            fields[field.name] = jnp.asarray(arrays[name]) if name in arrays else None
+    return cls(**fields)
+
+
+def save(traj: Trajectory, path, chain=None) -> None:
+    """Writes one .npz: every array by name, and a JSON line of metadata (schema, result, versions, names if the chain is given)."""
+    import jax
+
+    import svkc
+
+    meta = {"schema": SCHEMA, "result": int(np.asarray(traj.result._value)), "svkc": svkc.__version__, "jax": jax.__version__, "units": "SI, rad, wxyz"}
+    if chain is not None:
+        meta |= {"bodies": chain.body_names, "joints": chain.joint_names, "links": chain.link_names}
+    path = pathlib.Path(path)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".part")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            np.savez_compressed(file, metadata=np.array(json.dumps(meta)), **_flatten(traj))
+        os.replace(temporary, path)
+    except BaseException:
+        os.unlink(temporary)
+        raise
+
+
+def load_trajectory(path) -> Trajectory:
+    """The trajectory that `Trajectory.save` wrote. ValueError: not such a file, cut short, or of a newer schema."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        meta = json.loads(str(arrays.pop("metadata")))
+    except (KeyError, ValueError, EOFError, OSError, zipfile.BadZipFile) as error:
+        if isinstance(error, FileNotFoundError):
+            raise
+        raise ValueError(f"{path} is not a whole trajectory written by svkc: {error}") from error
+    if meta["schema"] > SCHEMA:
+        raise ValueError(f"{path} has schema {meta['schema']}, this version reads up to {SCHEMA}; use a newer svkc")
+    missing = {"ts", "states.q", "final.q", "events.time"} - set(arrays)
+    if missing:
+        raise ValueError(f"{path} lacks {', '.join(sorted(missing))}; it is not a trajectory written by svkc")
+    result = RESULTS.successful
+    for item in (RESULTS.stopped, RESULTS.max_events, RESULTS.max_steps, RESULTS.step_too_small, RESULTS.not_in_place, RESULTS.loop_open, RESULTS.non_finite):
+        if int(np.asarray(item._value)) == meta["result"]:
+            result = item
+    return _build(Trajectory, arrays, result=result)

@@ -1,0 +1,43 @@
+"""F4: how free a structure is (paper (13)): freedoms, rank, redundant rows."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from svkc.chain import Chain, State
+from svkc.closure import coordinates, count_rank, scaled_jacobian, select
+from svkc.kinematics import kinematics
+from svkc.loops import active_dofs, ends
+
+
+class Mobility(eqx.Module):
+    """`freedoms` N_F = N_J - m (13), `joint_freedoms` N_J, `rank` m of the phase, `redundant`: rows of each loop that those before it already imply,
+    `independent`: the coordinates chosen as theta_G, `margin`: |R_mm| / |R_11|, how far the weakest row that counts is from being redundant."""
+
+    freedoms: Int[Array, ""]
+    joint_freedoms: Int[Array, ""]
+    rank: Int[Array, ""]
+    redundant: Int[Array, " links"]
+    independent: Bool[Array, " dofs"]
+    margin: Float[Array, ""]
+
+
+def mobility(chain: Chain, state: State) -> Mobility:
+    """Freedoms of the structure that the state is under, with the rank its phase decided on."""
+    active = active_dofs(chain, state.structure)
+    joint_freedoms = jnp.sum(active, dtype=jnp.int32)
+    links = len(chain.link_names)
+    if not links:
+        zero = jnp.zeros((), jnp.int32)
+        return Mobility(joint_freedoms, joint_freedoms, zero, jnp.zeros(0, jnp.int32), active, jnp.ones((), state.q.dtype))
+    kin = kinematics(chain, state.q)
+    J = scaled_jacobian(chain, state.structure, kin, ends(chain, state.structure, kin, state.q))
+    ranks = jnp.stack([count_rank(select(J[: 6 * (i + 1)]).size) for i in range(links)])
+    rows = jnp.where(state.structure.connected, 6, 0).astype(jnp.int32)
+    redundant = rows - jnp.diff(ranks, prepend=jnp.zeros(1, jnp.int32))
+    co = coordinates(chain, state)
+    size = co.selection.size
+    rank = state.structure.rank
+    last = jnp.where(jnp.arange(size.shape[0]) == rank - 1, size, 0).sum()
+    margin = jnp.where(rank > 0, last / jnp.where(size[0] > 0, size[0], 1), 1)
+    return Mobility(joint_freedoms - rank, joint_freedoms, rank, redundant, co.independent, margin)
