@@ -5,7 +5,7 @@ import pathlib
 import sys
 import time
 
-RELEASE_RIGHT, RELEASE_LEFT, END = 1.0, 1.4, 2.0  # s
+RELEASE_RIGHT, RELEASE_LEFT, END = 0.9, 1.15, 1.8  # s
 
 
 def _info(path: str) -> int:

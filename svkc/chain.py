@@ -216,24 +216,24 @@ class Structure(eqx.Module):
     where nothing can be locked; `independent`: coordinates asked to be independent where they can be; `rank`: m, decided once for the phase.
     """
 
-    connected: Bool[Array, " links"]
-    parent: Int[Array, " links"]
-    real: Int[Array, " links"]
-    pos: Float[Array, "links 3"]
-    quat: Float[Array, "links 4"]
-    real_pos: Float[Array, "links 3"]
-    real_quat: Float[Array, "links 4"]
-    freedoms: Bool[Array, "links 6"]
-    rank: Int[Array, ""]
-    locked: Bool[Array, " dofs"] | None = None
-    independent: Bool[Array, " dofs"] | None = None
+    connected: Bool[Array, "... links"]
+    parent: Int[Array, "... links"]
+    real: Int[Array, "... links"]
+    pos: Float[Array, "... links 3"]
+    quat: Float[Array, "... links 4"]
+    real_pos: Float[Array, "... links 3"]
+    real_quat: Float[Array, "... links 4"]
+    freedoms: Bool[Array, "... links 6"]
+    rank: Int[Array, "..."]
+    locked: Bool[Array, "... dofs"] | None = None
+    independent: Bool[Array, "... dofs"] | None = None
 
 
 class State(eqx.Module):
     """How the bodies move: `q` (m, rad, wxyz; MuJoCo's qpos, then the virtual joints'), `v` (m/s, rad/s), and the structure they move under."""
 
-    q: Float[Array, " q"]
-    v: Float[Array, " dofs"]
+    q: Float[Array, "... q"]
+    v: Float[Array, "... dofs"]
     structure: Structure
 
 

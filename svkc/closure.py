@@ -148,18 +148,21 @@ def constrain(chain: Chain, structure: Structure, q, v, kin, V, baumgarte=None) 
     return Coordinates(column[:, None] * W / column[None], -column * from_pivots[:, -1], independent, dependent, selection)
 
 
+@jax.jit
 def coordinates(chain: Chain, state: State) -> Coordinates:
     """H, W, S, Hdot v and the selection, as the paper names them (section II)."""
     kin = kinematics(chain, state.q)
     return constrain(chain, state.structure, state.q, state.v, kin, twists(chain, kin, state.v))
 
 
+@jax.jit
 def loop_gaps(chain: Chain, state: State) -> Float[Array, "links 6"]:
     """How far each connected loop is open: rotation vector (rad), then distance (m), in the world; zero where not connected."""
     kin = kinematics(chain, state.q)
     return gap(state.structure, ends(chain, state.structure, kin, state.q))
 
 
+@jax.jit
 def velocity_gaps(chain: Chain, state: State) -> Float[Array, "links 6"]:
     """J_C v: relative twist (rad/s, m/s) across each connected virtual link."""
     kin = kinematics(chain, state.q)

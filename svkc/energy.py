@@ -1,5 +1,6 @@
 """F3: energy and momentum of the tree; virtual links have no mass."""
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -18,6 +19,7 @@ def _bodies(chain: Chain, kin: Kinematics, v):
     return c, V[:, 3:] + cross(w, c), w, spin
 
 
+@jax.jit
 def kinetic_energy(chain: Chain, state: State) -> Float[Array, ""]:
     """Kinetic energy (J), armature included: v^T M v / 2."""
     _, u, w, spin = _bodies(chain, kinematics(chain, state.q), state.v)
@@ -27,6 +29,7 @@ def kinetic_energy(chain: Chain, state: State) -> Float[Array, ""]:
     return energy
 
 
+@jax.jit
 def potential_energy(chain: Chain, state: State) -> Float[Array, ""]:
     """Gravity's potential (J), zero at the world's origin, and that of the joints' springs."""
     kin = kinematics(chain, state.q)
@@ -37,11 +40,13 @@ def potential_energy(chain: Chain, state: State) -> Float[Array, ""]:
     return energy
 
 
+@jax.jit
 def energy(chain: Chain, state: State) -> Float[Array, ""]:
     """Mechanical energy (J): kinetic, gravity's and the joint springs'."""
     return kinetic_energy(chain, state) + potential_energy(chain, state)
 
 
+@jax.jit
 def momentum(chain: Chain, state: State) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
     """Linear momentum (N s) and angular momentum about the world's origin (N m s), in world axes."""
     kin = kinematics(chain, state.q)

@@ -58,6 +58,7 @@ def acceleration(
     return W @ vdot_G + co.bias
 
 
+@jax.jit
 def forward_dynamics(chain: Chain, state: State, tau: Float[Array, " torques"]) -> Float[Array, " dofs"]:
     """Accelerations (rad/s^2, m/s^2) of every joint coordinate for the joint torques tau (N m, N), loops kept (paper, section III-B).
 
@@ -66,6 +67,7 @@ def forward_dynamics(chain: Chain, state: State, tau: Float[Array, " torques"]) 
     return acceleration(chain, state.structure, state.q, state.v, joint_torques(chain, tau))
 
 
+@jax.jit
 def forward_dynamics_by_unit_vectors(chain: Chain, state: State, tau: Float[Array, " torques"]) -> Float[Array, " dofs"]:
     """The same with the inertia matrix column by column from inverse dynamics: the paper's own way."""
     return acceleration(chain, state.structure, state.q, state.v, joint_torques(chain, tau), inertia_by_unit_vectors)
@@ -81,6 +83,7 @@ def constraint_forces(chain: Chain, structure: Structure, q, co: Coordinates, ex
     return (row * (co.selection.Q.T @ mu)).reshape(-1, 6)
 
 
+@jax.jit
 def loop_forces(chain: Chain, state: State, tau: Float[Array, " torques"]) -> tuple[Float[Array, "links 3"], Float[Array, "links 3"]]:
     """Force (N) and torque (N m) that each connected virtual link carries: on `real` from `parent`, at the joint, in world axes.
 

@@ -119,11 +119,13 @@ def limit_forces(chain: Chain, q: Float[Array, " q"], v: Float[Array, " dofs"]) 
     return tau.at[at_v].set(-(k[at_v] * out + c[at_v] * v[at_v]) * jnp.abs(out) / (jnp.abs(out) + 0.01))
 
 
+@jax.jit
 def mass_matrix(chain: Chain, state: State) -> Float[Array, "nv nv"]:
     """Joint-space inertia of the tree (kg, kg m, kg m^2), armature included, by composite bodies."""
     return inertia_by_composites(chain, kinematics(chain, state.q))
 
 
+@jax.jit
 def bias_force(chain: Chain, state: State) -> Float[Array, " nv"]:
     """Velocity-product and gravity forces of the tree: ID(q, v, 0) (MuJoCo's qfrc_bias)."""
     kin = kinematics(chain, state.q)
@@ -131,6 +133,7 @@ def bias_force(chain: Chain, state: State) -> Float[Array, " nv"]:
     return generalized_forces(chain, kin, V, state.v, jnp.zeros(chain.nv, state.v.dtype))
 
 
+@jax.jit
 def inverse_dynamics(chain: Chain, state: State, vdot: Float[Array, " accelerations"]) -> Float[Array, " nv"]:
     """Torques (N m, N) the tree's joints must be given for vdot (over the tree, or over every coordinate): recursive Newton-Euler.
 

@@ -5,6 +5,7 @@ All vectors are in world axes about the origin of the tree's root body, so that 
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -189,6 +190,7 @@ def rates(chain: Chain, q: Float[Array, " q"], v: Float[Array, " dofs"]) -> Floa
     return jnp.concatenate([v[scalar_v], turn.ravel()])[order]
 
 
+@jax.jit
 def integrate(chain: Chain, q: Float[Array, " q"], dv: Float[Array, " dofs"]) -> Float[Array, " q"]:
     """q moved by the tangent vector dv (m, rad; body axes for rotations): the exponential map, Rodrigues' formula (39)."""
     quat_q, quat_v = chain.topology.quaternions
@@ -199,6 +201,7 @@ def integrate(chain: Chain, q: Float[Array, " q"], dv: Float[Array, " dofs"]) ->
     return jnp.concatenate([q[scalar_q] + dv[scalar_v], turned.ravel()])[order]
 
 
+@jax.jit
 def difference(chain: Chain, q1: Float[Array, " q"], q2: Float[Array, " q"]) -> Float[Array, " dofs"]:
     """The tangent vector that takes q1 to q2: integrate(q1, difference(q1, q2)) = q2."""
     quat_q, quat_v = chain.topology.quaternions
@@ -218,6 +221,7 @@ def normalize(chain: Chain, q: Float[Array, " q"]) -> Float[Array, " q"]:
     return q.at[at].set(quat_normalize(q[at]))
 
 
+@jax.jit
 def poses(chain: Chain, state: State) -> tuple[Float[Array, "bodies 3"], Float[Array, "bodies 4"]]:
     """Positions (m) and quaternions (wxyz, body to world) of the body frames in the world; row 0 is the world."""
     rows = np.array(chain.topology.body_row)
@@ -225,6 +229,7 @@ def poses(chain: Chain, state: State) -> tuple[Float[Array, "bodies 3"], Float[A
     return (kin.root + kin.r)[rows], kin.quat[rows]
 
 
+@jax.jit
 def velocities(chain: Chain, state: State) -> tuple[Float[Array, "bodies 3"], Float[Array, "bodies 3"]]:
     """Linear velocity of each body's origin (m/s) and angular velocity (rad/s), both in world axes; row 0 is the world."""
     rows = np.array(chain.topology.body_row)

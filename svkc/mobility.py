@@ -1,6 +1,7 @@
 """F4: how free a structure is (paper (13)): freedoms, rank, redundant rows."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -22,6 +23,7 @@ class Mobility(eqx.Module):
     margin: Float[Array, ""]
 
 
+@jax.jit
 def mobility(chain: Chain, state: State) -> Mobility:
     """Freedoms of the structure that the state is under, with the rank its phase decided on."""
     active = active_dofs(chain, state.structure)
@@ -38,6 +40,6 @@ def mobility(chain: Chain, state: State) -> Mobility:
     co = coordinates(chain, state)
     size = co.selection.size
     rank = state.structure.rank
-    last = jnp.where(jnp.arange(size.shape[0]) == rank - 1, size, 0).sum()
+    last = jnp.where(jnp.arange(size.shape[0], dtype=jnp.int32) == rank - 1, size, 0).sum()
     margin = jnp.where(rank > 0, last / jnp.where(size[0] > 0, size[0], 1), 1)
     return Mobility(joint_freedoms - rank, joint_freedoms, rank, redundant, co.independent, margin)

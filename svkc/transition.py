@@ -1,5 +1,7 @@
 """F5: the structure changes: connect, cut, lock, and the velocity just after (paper, section V)."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -214,6 +216,7 @@ def bind(chain: Chain, state: State, name: str, parent: str, real: str, *, joint
     return State(state.q, state.v, structure)
 
 
+@functools.partial(jax.jit, static_argnames="name")
 def velocity_by_impulse(chain: Chain, state: State, name: str) -> tuple[Float[Array, " dofs"], Float[Array, "6"]]:
     """The velocity after connecting one link and the impulse F_1 on it, by the paper's (34)-(38) in the coordinates theta_G of the old structure.
 

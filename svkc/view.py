@@ -77,15 +77,20 @@ def _strobe(chain: Chain, traj: Trajectory, path: pathlib.Path, frames: int) -> 
     figure = Figure(figsize=(10, 7.5), layout="constrained")
     axes = figure.add_subplot(aspect="equal", xlabel="x (m)", ylabel="z (m)")
     segments = _segments(chain)
+    shown = np.concatenate([positions[:, 1:].reshape(-1, 3)] + [np.array([p, q]) for b, p, q, _ in segments if b == 0])[:, [0, 2]]
+    low, high = shown.min(0) - 0.3, shown.max(0) + 0.3
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    # points a metre, limbs at two thirds of their thickness, so that poses can be told apart
+    scale = 72 * min(9 / (high[0] - low[0]), 6.7 / (high[1] - low[1]))
     for frame, i in enumerate(pick):
         phase = int(np.sum(times <= ts[i]))
-        shade = 0.25 + 0.75 * (frame + 1) / len(pick)
+        shade = 0.2 + 0.7 * (frame + 1) / len(pick)
         for body, a, b, radius in segments:
             if body == 0 and frame:
                 continue
             ends = np.array([positions[frame, body] + R[frame, body] @ x for x in (a, b)])
             color = "#9a9aa2" if body == 0 else COLORS[phase % len(COLORS)]
-            axes.plot(ends[:, 0], ends[:, 2], color=color, alpha=0.8 if body == 0 else shade, solid_capstyle="round", linewidth=max(1.0, 90 * radius))
+            axes.plot(ends[:, 0], ends[:, 2], color=color, alpha=0.8 if body == 0 else shade, solid_capstyle="round", linewidth=max(1.0, 1.3 * radius * scale))
     for phase in range(len(times) + 1):
         start = ts[0] if phase == 0 else times[phase - 1]
         held = [n for n, on in zip(chain.link_names, np.asarray(traj.phases.connected[phase]), strict=True) if on] if phase < int(traj.phases.count) else []
@@ -128,7 +133,7 @@ def _animation(chain: Chain, traj: Trajectory, path: pathlib.Path, fps, size, lo
     low, high = moving.min(0), moving.max(0)
     camera = mujoco.MjvCamera()
     camera.lookat[:] = (low + high) / 2 if lookat is None else lookat
-    camera.distance = 1.6 * float(np.linalg.norm(high - low)) + 1 if distance is None else distance
+    camera.distance = 1.0 * float(np.linalg.norm(high - low)) + 1 if distance is None else distance
     camera.azimuth, camera.elevation = azimuth, -8
     rows = {row: body for body, row in enumerate(chain.topology.body_row)}
     images = []

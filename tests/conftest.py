@@ -1,0 +1,43 @@
+"""float64, strict promotion, warnings as errors, every annotation checked; compilations shared between workers and runs."""
+
+import os
+import tempfile
+
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+os.environ.setdefault("MPLBACKEND", "Agg")
+
+import jax
+import pytest
+from jaxtyping import install_import_hook
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_compilation_cache_dir", os.path.join(tempfile.gettempdir(), f"svkc-test-cache-{os.getuid()}"))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+
+hook = install_import_hook("svkc", "beartype.beartype")
+import svkc  # noqa: F401
+import svkc.__main__
+import svkc.scenes
+
+hook.uninstall()
+
+
+def pytest_configure(config):
+    config.addinivalue_line("filterwarnings", "error")
+
+
+@pytest.fixture(scope="session")
+def high_bar():
+    """Chain and state of the main job, without joint ranges: nothing that takes or gives energy."""
+    return svkc.scenes.high_bar(ignore=("limit",))
+
+
+# the same sums in another order; another algorithm for the same numbers; numbers that went through an integrator
+SAME_ALGEBRA, OTHER_ALGORITHM, INTEGRATED = 1e-13, 1e-10, 1e-8
+
+
+@pytest.fixture(scope="session")
+def tolerances():
+    return SAME_ALGEBRA, OTHER_ALGORITHM, INTEGRATED

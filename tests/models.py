@@ -1,0 +1,101 @@
+"""Mechanisms for the tests, as MJCF and virtual links."""
+
+import numpy as np
+
+import svkc
+
+MJCF = '<mujoco><option gravity="0.3 -0.2 -9.81"/><worldbody>{}</worldbody></mujoco>'
+BAR = '<geom type="capsule" fromto="0 0 0 {0}" size="0.03" contype="0" conaffinity="0"/>'
+
+
+def random_tree(bodies: int, seed: int, kinds=("hinge", "slide", "ball", "free")) -> str:
+    """A random tree: random shapes and frames, several joints on some bodies, one to three trees."""
+    rng = np.random.default_rng(seed)
+    children: list[list[int]] = [[] for _ in range(bodies + 1)]
+    for i in range(1, bodies + 1):
+        children[0 if i == 1 or rng.random() < 0.05 else int(rng.integers(max(1, i - 6), i))].append(i)
+
+    def numbers(x):
+        return " ".join(f"{v:.6f}" for v in np.atleast_1d(x))
+
+    def joints(i, root):
+        kind = rng.choice([k for k in kinds if k != "free" or root])
+        if kind == "free":
+            return "<freejoint/>"
+        count = int(rng.integers(1, 3)) if kind in ("hinge", "slide") else 1
+        out = ""
+        for k in range(count):
+            extra = f'armature="{rng.uniform(0, 0.1):.4f}" damping="{rng.uniform(0, 1):.4f}"'
+            stiff = f'stiffness="{rng.uniform(0, 5):.4f}" springref="0.2"' if kind == "hinge" else ""
+            out += f'<joint name="j{i}_{k}" type="{kind}" axis="{numbers(rng.normal(size=3))}" pos="{numbers(rng.normal(size=3) / 10)}" {extra} {stiff}/>'
+        return out
+
+    def body(i, root):
+        quat = rng.normal(size=4)
+        here = f'<body name="b{i}" pos="{numbers(rng.normal(size=3) / 3)}" quat="{numbers(quat / np.linalg.norm(quat))}">{joints(i, root)}'
+        size = rng.uniform(0.03, 0.1, 3)
+        here += f'<geom type="box" size="{numbers(size)}" pos="{numbers(rng.normal(size=3) / 10)}" contype="0" conaffinity="0"/>'
+        return here + "".join(body(c, False) for c in children[i]) + "</body>"
+
+    return MJCF.format("".join(body(i, True) for i in children[0]))
+
+
+def bar(name: str, joint: str, to: str, pos="0 0 0", inside="") -> str:
+    return f'<body name="{name}" pos="{pos}"><joint name="{name}" {joint}/>{BAR.format(to)}{inside}</body>'
+
+
+Y = 'type="hinge" axis="0 1 0" damping="0"'
+
+
+def four_bar() -> svkc.Chain:
+    """Crank, coupler, rocker on hinges about y; closed by a hinge. In space: 3 of the 6 rows are redundant."""
+    xml = bar("crank", Y, "0 0 0.4", inside=bar("coupler", Y, "1 0 0.2", "0 0 0.4", bar("rocker", Y, "0.2 0 -0.6", "1 0 0.2")))
+    link = svkc.VirtualLink("pin", "world", "rocker", "hinge", pos=(1.2, 0, 0), axis=(0, 1, 0), real_pos=(0.2, 0, -0.6), connected=True)
+    return svkc.load(MJCF.format(xml), virtual_links=[link])
+
+
+def parallelogram(middle: bool = True) -> svkc.Chain:
+    """Two, or three, parallel bars that carry a platform: the third loop is redundant as a whole."""
+    legs = "".join(bar(f"leg{i}", Y, "0 0 1", f"{i * 0.7} 0 0", bar("plate", Y, "1.4 0 0", "0 0 1") if i == 0 else "") for i in (0, 1, 2))
+    links = [
+        svkc.VirtualLink(f"pin{i}", "plate", f"leg{i}", "hinge", pos=(i * 0.7, 0, 0), real_pos=(0, 0, 1), axis=(0, 1, 0), connected=middle or i == 2)
+        for i in (1, 2)
+    ]
+    return svkc.load(MJCF.format(legs), virtual_links=links)
+
+
+def rod_on_balls() -> svkc.Chain:
+    """Spatial R-S-S-R: a coupler with a ball at each end, free to spin about itself."""
+    crank = bar("crank", 'type="hinge" axis="1 0 0"', "0 0 0.3", inside=bar("rod", 'type="ball"', "1 0.4 0.1", "0 0 0.3"))
+    rocker = bar("rocker", 'type="hinge" axis="0 1 0"', "0 0.2 0.4", "1 0.2 0")
+    link = svkc.VirtualLink("far_ball", "rocker", "rod", "ball", pos=(0, 0.2, 0.4), real_pos=(1, 0.4, 0.1), connected=True)
+    return svkc.load(MJCF.format(crank + rocker), virtual_links=[link])
+
+
+def stewart() -> svkc.Chain:
+    """A platform on six legs, each a universal joint (two hinges), a slide and a ball; the first leg carries the platform."""
+    angle = np.deg2rad([0, 60, 120, 180, 240, 300])
+    feet = np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
+    tops = np.stack([0.5 * np.cos(angle + 0.5), 0.5 * np.sin(angle + 0.5), 0 * angle + 1], 1)
+    xml, links = "", []
+    for i, (foot, top) in enumerate(zip(feet, tops)):
+        axis, length = (top - foot) / np.linalg.norm(top - foot), np.linalg.norm(top - foot)
+        z = " ".join(map(str, axis))
+        plate = '<body name="plate" pos="0 0 {0}"><joint name="plate" type="ball"/><geom type="cylinder" size="0.5 0.03" contype="0" conaffinity="0"/></body>'
+        leg = (
+            f'<body name="leg{i}" pos="{foot[0]} {foot[1]} 0" zaxis="{z}"><joint name="ux{i}" axis="1 0 0"/><joint name="uy{i}" axis="0 1 0"/>'
+            f'{BAR.format("0 0 0.5")}<body name="rod{i}"><joint name="slide{i}" type="slide" axis="0 0 1"/>'
+            f'<geom type="capsule" fromto="0 0 0.5 0 0 {length}" size="0.02" contype="0" conaffinity="0"/>'
+        )
+        xml += leg + (plate.format(length) if i == 0 else "") + "</body></body>"
+        if i:
+            links.append(svkc.VirtualLink(f"top{i}", "plate", f"rod{i}", "ball", real_pos=(0, 0, length), pos=(0, 0, 0), connected=True))
+    # places of the joints in the plate, from the load pose
+    import mujoco
+
+    model = mujoco.MjModel.from_xml_string(MJCF.format(xml))
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    R, p = data.body("plate").xmat.reshape(3, 3), data.body("plate").xpos
+    placed = [svkc.VirtualLink(k.name, k.parent, k.real, "ball", pos=tuple(R.T @ (tops[i + 1] - p)), real_pos=k.real_pos, connected=True) for i, k in enumerate(links)]
+    return svkc.load(MJCF.format(xml), virtual_links=placed)

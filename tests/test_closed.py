@@ -1,0 +1,153 @@
+"""Closed chains: accelerations against multipliers, whatever coordinates are chosen; redundant loops; the loop forces."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import models
+import numpy as np
+import pytest
+from kkt import acceleration
+
+import svkc
+
+CASES = {"four_bar": models.four_bar, "parallelogram": models.parallelogram, "rod_on_balls": models.rod_on_balls, "stewart": models.stewart}
+MOBILITY = {"four_bar": 1, "parallelogram": 1, "rod_on_balls": 2, "stewart": 6}
+
+
+@pytest.fixture(params=[*CASES, "two_hands"], scope="module")
+def case(request, high_bar):
+    """Chain, and a state in motion: velocities at random, projected on what the loops allow."""
+    rng = np.random.default_rng(3)
+    chain = high_bar[0] if request.param == "two_hands" else CASES[request.param]()
+    q = high_bar[1].q[: chain.nq] if request.param == "two_hands" else None
+    return request.param, chain, chain.state(q, rng.normal(size=chain.nv)), jnp.asarray(rng.normal(size=chain.dofs))
+
+
+def test_acceleration_is_that_of_the_multipliers(case):
+    _, chain, state, tau = case
+    tau = tau.at[chain.nv :].set(0)
+    expected = acceleration(chain, state, tau)
+    scale = np.abs(expected).max()
+    fast = svkc.forward_dynamics(chain, state, tau)
+    from svkc.forward_dynamics import forward_dynamics_by_unit_vectors
+
+    paper = forward_dynamics_by_unit_vectors(chain, state, tau)
+    assert np.abs(fast[: chain.nv] - expected).max() < 1e-9 * scale
+    assert np.abs(paper - fast).max() < 1e-10 * np.abs(fast).max()
+
+
+def test_the_choice_of_coordinates_does_not_matter(case):
+    """Asking for what was dependent gives another choice of theta_G and the same acceleration."""
+    _, chain, state, tau = case
+    first = svkc.coordinates(chain, state)
+    asked = eqx.tree_at(lambda s: s.structure.independent, state, first.dependent, is_leaf=lambda x: x is None)
+    second = svkc.coordinates(chain, asked)
+    assert bool(jnp.any(first.independent != second.independent))
+    a, b = svkc.forward_dynamics(chain, state, tau), svkc.forward_dynamics(chain, asked, tau)
+    np.testing.assert_allclose(a, b, rtol=0, atol=1e-9 * float(jnp.max(jnp.abs(a))))
+
+
+def test_velocities_and_accelerations_keep_the_loops(case):
+    """J_C W = 0 and J_C vdot + Jdot_C v = 0, the latter against the derivative of J_C v along the motion."""
+    name, chain, state, tau = case
+    assert float(jnp.max(jnp.abs(svkc.loop_gaps(chain, state)))) < 1e-12
+    assert float(jnp.max(jnp.abs(svkc.velocity_gaps(chain, state)))) < 1e-12
+    from svkc.kinematics import rates
+
+    vdot = svkc.forward_dynamics(chain, state, tau)
+
+    def relative(q, v):
+        return svkc.velocity_gaps(chain, svkc.State(q, v, state.structure))
+
+    _, change = jax.jvp(relative, (state.q, state.v), (rates(chain, state.q, state.v), vdot))
+    assert float(jnp.max(jnp.abs(change))) < 1e-9 * max(1, float(jnp.max(jnp.abs(vdot))))
+    if name in MOBILITY:
+        assert int(svkc.mobility(chain, state).freedoms) == MOBILITY[name]
+
+
+def test_loop_forces_and_torques_explain_the_acceleration(case):
+    """What the tree needs beyond what is applied is J^T of the loop forces: checked as power on any velocity of the cut-open tree."""
+    _, chain, state, tau = case
+    force, torque = svkc.loop_forces(chain, state, tau)
+    vdot = svkc.forward_dynamics(chain, state, tau)
+    missing = svkc.inverse_dynamics(chain, state, vdot) - tau[: chain.nv]
+    rng = np.random.default_rng(0)
+    v = jnp.asarray(rng.normal(size=chain.nv))
+    moved = svkc.State(state.q, jnp.concatenate([v, jnp.zeros(chain.dofs - chain.nv)]), state.structure)
+    relative = svkc.velocity_gaps(chain, moved)
+    power = -jnp.sum(relative[:, :3] * torque) - jnp.sum(relative[:, 3:] * force)
+    assert abs(float(missing @ v - power)) < 1e-8 * max(1.0, float(jnp.max(jnp.abs(force))))
+
+
+def test_redundant_loop_moves_like_its_minimal_form():
+    chain = models.parallelogram()
+    both = chain.state(v={"leg0": 0.7})
+    one = chain.state(v={"leg0": 0.7}, connected=["pin2"])
+    m = svkc.mobility(chain, both)
+    assert int(m.freedoms) == 1
+    assert int(jnp.sum(m.redundant)) == 12 - int(m.rank)
+    tau = jnp.zeros(chain.dofs)
+    a, b = svkc.forward_dynamics(chain, both, tau), svkc.forward_dynamics(chain, one, tau)
+    # the leg that is let go swings by itself; the others must not notice only if it moves the same: compare with it held
+    held = np.array([n in ("leg0", "plate", "leg2") for n in chain.joint_names])
+    assert float(jnp.abs(svkc.velocity_gaps(chain, both)).max()) < 1e-13
+    expected = acceleration(chain, one, tau)
+    np.testing.assert_allclose(np.asarray(b)[: chain.nv][held], expected[held], rtol=1e-9)
+    np.testing.assert_allclose(np.asarray(a)[: chain.nv], acceleration(chain, both, tau), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("joint", ["weld", "hinge", "slide", "cylinder", "universal", "planar", "ball", "free", (True, False, True, False, True, False)])
+def test_every_kind_of_virtual_joint(joint):
+    """Two free bodies joined by the joint: rank, acceleration that keeps the loop, coordinates read off and back."""
+    xml = models.MJCF.format(
+        '<body name="a" pos="0 0 1"><freejoint/><geom type="box" size="0.1 0.2 0.3" contype="0"/></body>'
+        '<body name="b" pos="0.5 0.1 1" quat="0.8 0 0.6 0"><freejoint/><geom type="box" size="0.2 0.1 0.15" contype="0"/></body>'
+    )
+    link = svkc.VirtualLink("j", "a", "b", joint, pos=(0.3, 0, 0), axis=(0.2, 0.3, 1), connected=True)
+    chain = svkc.load(xml, virtual_links=[link])
+    rng = np.random.default_rng(5)
+    q = np.array(chain.q_load)
+    q[chain.nq :] += 0.2 * rng.normal(size=len(q) - chain.nq)
+    state = chain.state(v=rng.normal(size=chain.nv))
+    freedoms = chain.dofs - chain.nv
+    assert int(svkc.mobility(chain, state).rank) == 6
+    assert int(svkc.mobility(chain, state).freedoms) == 6 + freedoms
+    assert float(jnp.max(jnp.abs(svkc.velocity_gaps(chain, state)))) < 1e-12
+    final = svkc.simulate(chain, state, 0.3, rtol=1e-9, atol=1e-11).final
+    assert float(jnp.max(jnp.abs(svkc.loop_gaps(chain, final)))) < 1e-12
+    # energy of the two bodies under gravity alone is kept: the joint does no work
+    assert abs(float(svkc.energy(chain, final) - svkc.energy(chain, state))) < 1e-6
+    from svkc.kinematics import kinematics
+    from svkc.loops import joint_coordinates
+
+    read = joint_coordinates(chain, final.structure, kinematics(chain, final.q), final.q)
+    np.testing.assert_allclose(svkc.difference(chain, final.q, read), 0, atol=1e-10)
+
+
+def test_spare_slots_change_nothing():
+    numbers = []
+    for spare in (0, 1, 4):
+        links = [svkc.VirtualLink("pin", "world", "rocker", "hinge", pos=(1.2, 0, 0), axis=(0, 1, 0), real_pos=(0.2, 0, -0.6), connected=True)]
+        xml = models.bar("crank", models.Y, "0 0 0.4", inside=models.bar("coupler", models.Y, "1 0 0.2", "0 0 0.4", models.bar("rocker", models.Y, "0.2 0 -0.6", "1 0 0.2")))
+        chain = svkc.load(models.MJCF.format(xml), virtual_links=links, spare=spare)
+        state = chain.state(v={"crank": 1.0})
+        vdot = svkc.forward_dynamics(chain, state, jnp.zeros(chain.nv))
+        m = svkc.mobility(chain, state)
+        assert (int(m.joint_freedoms), int(m.rank), int(m.freedoms)) == (4, 3, 1)
+        numbers.append(np.concatenate([state.q[:4], state.v[:4], vdot[:4]]))
+    for other in numbers[1:]:
+        np.testing.assert_allclose(other, numbers[0], rtol=1e-13, atol=1e-13)
+
+
+def test_bind_a_spare_slot():
+    """A grip between bodies not known beforehand: the same motion as the declared link."""
+    declared = models.four_bar()
+    a = declared.state(v={"crank": 1.0})
+    xml = models.bar("crank", models.Y, "0 0 0.4", inside=models.bar("coupler", models.Y, "1 0 0.2", "0 0 0.4", models.bar("rocker", models.Y, "0.2 0 -0.6", "1 0 0.2")))
+    chain = svkc.load(models.MJCF.format(xml), spare=1)
+    open_ = chain.state(v=np.asarray(a.v)[:3])
+    bound = svkc.bind(chain, open_, "spare_0", "world", "rocker", joint="ball", real_pos=(0.2, 0, -0.6))
+    gripped = svkc.connect(chain, bound, "spare_0", here=True)
+    np.testing.assert_allclose(gripped.v[:3], a.v[:3], atol=1e-12)
+    f = svkc.forward_dynamics
+    np.testing.assert_allclose(f(chain, gripped, jnp.zeros(3))[:3], f(declared, a, jnp.zeros(3))[:3], rtol=1e-9)
