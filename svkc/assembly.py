@@ -98,13 +98,10 @@ def _close_and_agree(chain: Chain, structure: Structure, q, v, held_q, held_v):
     """Loops closed with the named coordinates held, then, for what is still open, with all of them free; the same for velocities."""
     q = joint_coordinates(chain, structure, kinematics(chain, q), q)
     full = eqx.tree_at(lambda s: s.rank, structure, jnp.asarray(min(6 * len(chain.link_names), chain.dofs), jnp.int32))
-    q = close(chain, full, q, _NEWTON, hold=held_q)
-    q = close(chain, full, q, _NEWTON)
+    q = close(chain, full, q, 2 * _NEWTON, hold=held_q)
     structure = decide_rank(chain, structure, q)
-    q = close(chain, structure, q)
     v = jnp.where(active_dofs(chain, structure), v, 0)
-    v = agree(chain, full, q, v, hold=held_v)
-    return State(q, agree(chain, structure, q, v), structure)
+    return State(q, agree(chain, structure, q, v, hold=held_v), structure)
 
 
 def assemble(chain: Chain, q, v, connected) -> State:
@@ -116,7 +113,7 @@ def assemble(chain: Chain, q, v, connected) -> State:
     _check_quaternions(chain, q)
     if not len(top.link_names):
         return State(normalize(chain, q), v, structure)
-    state = _close_and_agree(chain, structure, q, v, _as_dofs(chain, held_q), held_v)
+    state = _close_and_agree(chain, structure, q, v, jnp.asarray(_as_dofs(chain, held_q)), jnp.asarray(held_v))
     return check_closed(chain, state)
 
 

@@ -31,7 +31,7 @@ class Coordinates(eqx.Module):
     """The paper's matrices, over every joint coordinate (rows of dependent, locked and unconnected coordinates' columns are zero).
 
     `W` [dofs, dofs]: all velocities from the independent ones (16); `bias` [dofs]: Hdot v_G (21) on the dependent ones;
-    `independent`, `dependent`: the choice theta_G, theta_S; `selection`: the pivots it came from.
+    `independent`, `dependent`: the choice theta_G, theta_S; `selection`: the pivots it came from; `J`: the scaled J_C.
     """
 
     W: Float[Array, "dofs dofs"]
@@ -39,6 +39,7 @@ class Coordinates(eqx.Module):
     independent: Bool[Array, " dofs"]
     dependent: Bool[Array, " dofs"]
     selection: Selection
+    J: Float[Array, "rows dofs"]
 
     @property
     def H(self) -> Float[Array, "dofs dofs"]:
@@ -145,7 +146,7 @@ def constrain(chain: Chain, structure: Structure, q, v, kin, V, baumgarte=None) 
     solved = solve_frozen(JS, jnp.concatenate([Jm, (selection.Q @ drift)[:, None]], 1))
     from_pivots = selection.P.T @ solved
     W = jnp.where(independent[None], jnp.eye(len(column), dtype=J.dtype) - from_pivots[:, :-1], 0)
-    return Coordinates(column[:, None] * W / column[None], -column * from_pivots[:, -1], independent, dependent, selection)
+    return Coordinates(column[:, None] * W / column[None], -column * from_pivots[:, -1], independent, dependent, selection, J)
 
 
 @jax.jit
@@ -187,9 +188,9 @@ def decide_rank(chain: Chain, structure: Structure, q: Float[Array, " q"]) -> St
     near = jnp.where(active_dofs(chain, structure), 0.05 * direction * column, 0).astype(q.dtype)
     full = eqx.tree_at(lambda s: s.rank, structure, jnp.asarray(min(row.shape[0], chain.dofs), jnp.int32))
     moved = close(chain, full, integrate(chain, q, near), iterations=12)
-    (here, _), (there, open_) = sizes(q), sizes(moved)
-    closed = open_ < jnp.finfo(q.dtype).eps ** 0.75
-    rank = jnp.where(closed, jnp.maximum(count_rank(here), count_rank(there)), count_rank(here))
+    size, open_ = jax.lax.map(sizes, jnp.stack([q, moved]))
+    closed = open_[1] < jnp.finfo(q.dtype).eps ** 0.75
+    rank = jnp.where(closed, jnp.maximum(count_rank(size[0]), count_rank(size[1])), count_rank(size[0]))
     return eqx.tree_at(lambda s: s.rank, structure, jax.lax.stop_gradient(rank))
 
 
@@ -213,16 +214,16 @@ def close(
 ) -> Float[Array, " q"]:
     """q moved by the least change (scaled coordinates) that closes the loops: Newton's method on the gaps, `iterations` times.
 
-    `hold`: coordinates that must not move.
+    `hold`: coordinates that must not move in the first half of the iterations.
     """
     row, column = scales(chain)
 
-    def newton(_, q):
+    def newton(i, q):
         kin = kinematics(chain, q)
         end = ends(chain, structure, kin, q)
         J = scaled_jacobian(chain, structure, kin, end)
         if hold is not None:
-            J = jnp.where(hold[None], 0, J)
+            J = jnp.where(hold[None] & (i < iterations // 2), 0, J)
         selection = _solvable(select(J, structure.rank))
         return integrate(chain, q, -column * _least_change(selection, J, row * gap(structure, end).ravel()))
 
@@ -231,11 +232,15 @@ def close(
 
 @jax.jit
 def agree(chain: Chain, structure: Structure, q, v, hold=None) -> Float[Array, " dofs"]:
-    """v with the least change (scaled coordinates) that makes J_C v = 0."""
+    """v with the least change (scaled coordinates) that makes J_C v = 0; first without changing those in `hold`, then as far as needed."""
     row, column = scales(chain)
     kin = kinematics(chain, q)
     J = scaled_jacobian(chain, structure, kin, ends(chain, structure, kin, q))
-    free = J if hold is None else jnp.where(hold[None], 0, J)
-    selection = _solvable(select(free, structure.rank))
-    relative = J @ jnp.where(active_dofs(chain, structure), v / column, 0)
-    return v - column * _least_change(selection, free, relative)
+    active = active_dofs(chain, structure)
+
+    def project(i, v):
+        free = J if hold is None else jnp.where(hold[None] & (i == 0), 0, J)
+        selection = _solvable(select(free, structure.rank))
+        return v - column * _least_change(selection, free, J @ jnp.where(active, v / column, 0))
+
+    return project(0, v) if hold is None else jax.lax.fori_loop(0, 2, project, v)

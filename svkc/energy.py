@@ -19,31 +19,34 @@ def _bodies(chain: Chain, kin: Kinematics, v):
     return c, V[:, 3:] + cross(w, c), w, spin
 
 
+def _energies(chain: Chain, state: State) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    kin = kinematics(chain, state.q)
+    c, u, w, spin = _bodies(chain, kin, state.v)
+    kinetic = jnp.sum(chain.mass * jnp.sum(u * u, -1)) / 2 + jnp.sum(w * spin) / 2
+    if chain.armature is not None:
+        kinetic = kinetic + jnp.sum(chain.armature * state.v[: chain.nv] ** 2) / 2
+    potential = -jnp.sum(chain.mass * jnp.sum((kin.root + c) * chain.gravity[None], -1))
+    if chain.stiffness is not None:
+        potential = potential + jnp.sum(chain.stiffness * spring_stretch(chain, state.q) ** 2) / 2
+    return kinetic, potential
+
+
 @jax.jit
 def kinetic_energy(chain: Chain, state: State) -> Float[Array, ""]:
     """Kinetic energy (J), armature included: v^T M v / 2."""
-    _, u, w, spin = _bodies(chain, kinematics(chain, state.q), state.v)
-    energy = jnp.sum(chain.mass * jnp.sum(u * u, -1)) / 2 + jnp.sum(w * spin) / 2
-    if chain.armature is not None:
-        energy = energy + jnp.sum(chain.armature * state.v[: chain.nv] ** 2) / 2
-    return energy
+    return _energies(chain, state)[0]
 
 
 @jax.jit
 def potential_energy(chain: Chain, state: State) -> Float[Array, ""]:
     """Gravity's potential (J), zero at the world's origin, and that of the joints' springs."""
-    kin = kinematics(chain, state.q)
-    c = kin.root + kin.r + rotate(kin.R, chain.com)
-    energy = -jnp.sum(chain.mass * jnp.sum(c * chain.gravity[None], -1))
-    if chain.stiffness is not None:
-        energy = energy + jnp.sum(chain.stiffness * spring_stretch(chain, state.q) ** 2) / 2
-    return energy
+    return _energies(chain, state)[1]
 
 
 @jax.jit
 def energy(chain: Chain, state: State) -> Float[Array, ""]:
     """Mechanical energy (J): kinetic, gravity's and the joint springs'."""
-    return kinetic_energy(chain, state) + potential_energy(chain, state)
+    return sum(_energies(chain, state), jnp.zeros((), state.q.dtype))
 
 
 @jax.jit

@@ -11,7 +11,6 @@ from svkc.chain import Chain, State, Structure
 from svkc.closure import Coordinates, constrain, scales, square
 from svkc.inverse_dynamics import generalized_forces, inertia_by_composites, inertia_by_unit_vectors, passive_forces
 from svkc.kinematics import kinematics, twists
-from svkc.loops import ends, loop_jacobian
 
 
 def joint_torques(chain: Chain, tau: Float[Array, " torques"]) -> Float[Array, " dofs"]:
@@ -73,12 +72,10 @@ def forward_dynamics_by_unit_vectors(chain: Chain, state: State, tau: Float[Arra
     return acceleration(chain, state.structure, state.q, state.v, joint_torques(chain, tau), inertia_by_unit_vectors)
 
 
-def constraint_forces(chain: Chain, structure: Structure, q, co: Coordinates, excess: Float[Array, " dofs"]) -> Float[Array, "links 6"]:
+def constraint_forces(chain: Chain, co: Coordinates, excess: Float[Array, " dofs"]) -> Float[Array, "links 6"]:
     """Lambda with J_C^T lambda = excess, of least norm where loops are redundant: wrench (N m, N) on the virtual link, at the joint."""
     row, column = scales(chain)
-    kin = kinematics(chain, q)
-    J = row[:, None] * loop_jacobian(chain, structure, kin, ends(chain, structure, kin, q)) * column[None]
-    _, JS = square(co.selection, J)
+    _, JS = square(co.selection, co.J)
     mu = jnp.linalg.solve(JS.T, co.selection.P @ (column * excess))
     return (row * (co.selection.Q.T @ mu)).reshape(-1, 6)
 
@@ -97,5 +94,5 @@ def loop_forces(chain: Chain, state: State, tau: Float[Array, " torques"]) -> tu
     needed = generalized_forces(chain, kin, V, v, vdot[:nv]) - passive_forces(chain, q, v)
     co = constrain(chain, state.structure, q, v, kin, V)
     excess = jnp.concatenate([needed, jnp.zeros(chain.dofs - nv, q.dtype)]) - tau
-    wrench = -constraint_forces(chain, state.structure, q, co, excess)
+    wrench = -constraint_forces(chain, co, excess)
     return wrench[:, 3:], wrench[:, :3]

