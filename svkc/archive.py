@@ -63,7 +63,7 @@ def save(traj: Trajectory, path, chain=None) -> None:
 def load_trajectory(path) -> Trajectory:
     """The trajectory that `Trajectory.save` wrote. ValueError: not such a file, cut short, or of a newer schema."""
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         meta = json.loads(str(arrays.pop("metadata")))
     except (KeyError, ValueError, EOFError, OSError, zipfile.BadZipFile) as error:

@@ -110,7 +110,7 @@ def _largest_gaps(chain: Chain, state: State) -> Float[Array, "2"]:
 
 
 def _start(chain: Chain, state: State, t0, ts, made: Plan, options: Options, args) -> Run:
-    """Empty records, sized by capacity; unwritten entries show: NaN, inf, -1."""
+    """Empty records, sized by capacity; unwritten entries show: inf, -1."""
     links, rows, dtype = len(chain.link_names), options.max_events, state.q.dtype
     structure = state.structure
     if made.locks and structure.locked is None:
@@ -118,7 +118,6 @@ def _start(chain: Chain, state: State, t0, ts, made: Plan, options: Options, arg
     state = State(state.q, state.v, structure)
     scene = Scene(chain, structure, args)
     guards = _guard_values(made, t0, Motion(state.q, state.v), scene) if made.guards else None
-    nan = jnp.full((), jnp.nan, dtype)
     zero = jnp.asarray(0, jnp.int32)
     return Run(
         t=t0,
@@ -131,8 +130,8 @@ def _start(chain: Chain, state: State, t0, ts, made: Plan, options: Options, arg
             jnp.zeros(rows, dtype), zero,
         ),
         phases=Phases(
-            jnp.full(rows + 1, nan), jnp.full(rows + 1, nan), jnp.zeros((rows + 1, links), bool), jnp.full(rows + 1, -1, jnp.int32),
-            jnp.full(rows + 1, -1, jnp.int32), jnp.full((rows + 1, 2), nan), jnp.full(rows + 1, nan), jnp.zeros(rows + 1, jnp.int32),
+            jnp.full(rows + 1, jnp.inf, dtype), jnp.full(rows + 1, jnp.inf, dtype), jnp.zeros((rows + 1, links), bool), jnp.full(rows + 1, -1, jnp.int32),
+            jnp.full(rows + 1, -1, jnp.int32), jnp.zeros((rows + 1, 2), dtype), jnp.zeros(rows + 1, dtype), jnp.zeros(rows + 1, jnp.int32),
             jnp.zeros(rows + 1, jnp.int32), zero,
         ),
         saved=jax.tree.map(lambda x: jnp.broadcast_to(x[None], (ts.shape[0], *x.shape)), state),
@@ -222,7 +221,7 @@ def _locate(hit, t_end, end: Motion, term, solver, scene: Scene, made: Plan):
     """Time and motion of the earliest crossing in the last step, the guards that fired, and the guard values to go on with.
 
     Steps of the solver back from the end of the step; the root is found without derivatives and then corrected once by Newton's formula
-    with everything differentiable, which makes dt/dp = -(dg/dp) / (dg/dt) exact. A guard that fired goes on from the side it went to.
+    with everything differentiable, which makes dt/dp = -(dg/dp) / (dg/dt) exact. A guard that fired is armed again once it has left zero.
     """
     crossed = made.crossed(end.watch.before, end.watch.after) & scene.watched & hit
     side = jnp.where(crossed, jnp.where(end.watch.after >= end.watch.before, 1, -1), 0).astype(t_end.dtype)
@@ -255,7 +254,8 @@ def _locate(hit, t_end, end: Motion, term, solver, scene: Scene, made: Plan):
         fired = fired | (jnp.arange(side.shape[0]) == first)
         correction = values[first] / jnp.where(slopes[first] == 0, 1, slopes[first])
         y = jax.tree.map(lambda y, r: y - r * correction, y, rate)
-        after = jnp.where(fired, side * jnp.finfo(root.dtype).tiny, jax.lax.stop_gradient(values))
+        # zero: not armed, until it has left zero
+        after = jnp.where(fired, 0, jax.lax.stop_gradient(values))
         return root - correction, y.q, y.v, y.work, fired, after
 
     def missed():
@@ -331,12 +331,12 @@ def _apply(chain: Chain, run: Run, ended: State, solved: Solved, fired: Bool[Arr
         jnp.where(mine, done.impulse[None], r.impulse),
         jnp.where(mine, done.angular_impulse[None], r.angular_impulse),
         jnp.where(first, done.energy_lost, r.energy_lost),
-        r.count + count,
+        jnp.minimum(r.count + count, r.time.shape[0]),
     )
     stops = jnp.any(fired & np.array([a.stop for a in made.actions], bool))
     result = RESULTS.where(stops, RESULTS.stopped, solved.result)
     result = RESULTS.where(happened & (done.gap > connect_tolerance), RESULTS.not_in_place, result)
-    result = RESULTS.where(events.count > r.time.shape[0], RESULTS.max_events, result)
+    result = RESULTS.where(r.count + count > r.time.shape[0], RESULTS.max_events, result)
     return after, events, result
 
 

@@ -160,6 +160,9 @@ class Settled(diffrax.AbstractWrappedSolver):
         if self.guards is not None:
             # what only says where to look for an event is not differentiated; the event's time is, where it is located
             after = jax.lax.stop_gradient(self.guards(t1, y1, args))
+            # a guard at zero is not armed before it has left it by more than round-off
+            resting = (y0.watch.after == 0) & (jnp.abs(after) < jnp.finfo(after.dtype).eps ** 0.75)
+            after = jnp.where(resting, 0, after)
             y1 = eqx.tree_at(lambda y: y.watch, y1, Watch(jax.lax.stop_gradient(t0), y0.watch.after, after))
         shift = jax.tree.map(lambda a, b: a - b, y1, raw)
         return y1, error, {"inner": dense, "shift": shift}, solver_state, result

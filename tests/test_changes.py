@@ -153,5 +153,5 @@ def test_loops_that_cannot_be_closed():
     """Two links too short to reach: says which loop, and by how much."""
     xml = models.MJCF.format(models.bar("short", models.Y, "0 0 0.2", inside=models.bar("tip", models.Y, "0.2 0 0.1", "0 0 0.2")))
     chain = svkc.load(xml, virtual_links=[svkc.VirtualLink("far", "world", "tip", "ball", pos=(3, 0, 0), real_pos=(0.2, 0, 0), connected=True)])
-    with pytest.raises(ValueError, match=r"cannot be closed.*far by 2\.\d+ m"):
+    with pytest.raises(ValueError, match=r"cannot be closed.*far by \d\.\d+ m and"):
         chain.state()

@@ -1,0 +1,131 @@
+"""The house: imports only go down, the door is light, files and functions are small; README and example run."""
+
+import ast
+import pathlib
+import re
+import subprocess
+import sys
+
+import pytest
+
+ROOT = pathlib.Path(__file__).parent.parent
+FLOORS = {
+    "spatial": 0, "chain": 1, "unsupported": 1, "kinematics": 2, "trajectory": 2, "load": 2, "inverse_dynamics": 3, "energy": 4, "loops": 3, "closure": 4,
+    "archive": 3, "forward_dynamics": 5, "assembly": 5, "mobility": 5, "transition": 6, "events": 6, "stepping": 6, "request": 7, "simulate": 8, "view": 8,
+    "scenes": 6, "__main__": 9,
+}  # fmt: skip
+# a verb that the contract puts on a noun is imported where it is called
+UPWARDS = {("chain", "assembly"), ("trajectory", "archive"), ("trajectory", "view")}
+
+
+def test_imports_only_go_down():
+    for path in (ROOT / "svkc").rglob("*.py"):
+        name = path.stem if path.parent.name == "svkc" else path.parent.name
+        if name == "__init__":
+            continue
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("svkc."):
+                target = node.module.split(".")[1]
+                assert FLOORS[target] < FLOORS[name] or (name, target) in UPWARDS, f"{name} imports {target}"
+
+
+def test_files_and_functions_are_small():
+    for path in (ROOT / "svkc").rglob("*.py"):
+        text = path.read_text()
+        assert text.count("\n") <= 400, path
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.FunctionDef):
+                lines = node.end_lineno - node.lineno + 1 - len((ast.get_docstring(node) or "").splitlines())
+                assert lines <= 60, f"{path}: {node.name}"
+
+
+def run(*args, cwd=ROOT):
+    return subprocess.run([sys.executable, *map(str, args)], capture_output=True, text=True, cwd=cwd, timeout=500, check=False)
+
+
+def test_the_door_is_light():
+    code = (
+        "import sys, jax; before = dict(jax.config.values); import svkc; import jax._src.xla_bridge as b;"
+        "assert 'mujoco' not in sys.modules and 'matplotlib' not in sys.modules, 'heavy';"
+        "assert dict(jax.config.values) == before, 'settings'; assert not b._backends, 'backend'"
+    )
+    done = run("-W", "error", "-c", code)
+    assert done.returncode == 0, done.stderr
+
+
+def test_every_public_name_says_what_it_is():
+    import svkc
+
+    for name in dir(svkc):
+        thing = getattr(svkc, name)
+        if name.startswith("_") or type(thing).__name__ == "module":
+            continue
+        assert thing.__doc__, name
+
+
+def test_readme_example_runs():
+    code = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.S).group(1)
+    done = run("-c", code)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("[0."), done.stdout
+
+
+def test_example_draws_its_picture(tmp_path):
+    assert len((ROOT / "examples" / "01_high_bar.py").read_text().splitlines()) < 60
+    done = run(ROOT / "examples" / "01_high_bar.py", tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "24 joint freedoms" in done.stdout
+    assert "22 joint freedoms" in done.stdout
+    _looks_drawn(tmp_path / "01_high_bar.png")
+
+
+def test_main_job(tmp_path):
+    """python -m svkc: the table, the npz, the strobe and, where there is GL, the animation."""
+    done = run("-m", "svkc", "--out", tmp_path)
+    assert done.returncode == 0, done.stderr
+    for word in ("24     12        12", "23      6        17", "22      0        22", "largest loop gap", "energy drift", "compilation"):
+        assert word in done.stdout, done.stdout
+    _looks_drawn(tmp_path / "high_bar.png")
+    import svkc
+
+    traj = svkc.load_trajectory(tmp_path / "high_bar.npz")
+    assert traj.events.time.tolist() == [0.9, 1.15]
+    if "libegl1" in done.stdout:
+        assert not (tmp_path / "high_bar.gif").exists()
+    else:
+        from PIL import Image
+
+        with Image.open(tmp_path / "high_bar.gif") as image:
+            assert image.n_frames > 40
+            assert len(image.convert("RGB").getcolors(1 << 20)) > 10
+
+
+def _looks_drawn(path):
+    from PIL import Image
+
+    with Image.open(path) as image:
+        assert len(image.convert("RGB").getcolors(1 << 22)) > 20
+
+
+def test_info(tmp_path):
+    xml = '<mujoco><worldbody><body name="a"><joint name="j" frictionloss="1"/><geom size="0.1"/></body></worldbody></mujoco>'
+    (tmp_path / "m.xml").write_text(xml)
+    done = run("-m", "svkc", "info", tmp_path / "m.xml")
+    assert done.returncode == 0, done.stderr
+    assert "friction" in done.stdout
+    assert "1 joint freedoms in the tree" in done.stdout
+    (tmp_path / "bad.xml").write_text("<mujoco")
+    assert run("-m", "svkc", "info", tmp_path / "bad.xml").returncode == 1
+
+
+def test_pictures_say_what_they_cannot_draw(high_bar, tmp_path):
+    import svkc
+
+    with pytest.raises(ValueError, match=r"\.png or \.gif"):
+        svkc.render(high_bar[0], None, tmp_path / "x.bmp")
+
+
+def test_ruff_and_pyright():
+    assert run("-m", "ruff", "check", ".").returncode == 0
+    done = run("-m", "pyright")
+    assert done.returncode == 0, done.stdout[-3000:]
