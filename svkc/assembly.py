@@ -1,6 +1,5 @@
 """F4: a consistent state from what the user knows of it: names to numbers, loops closed, velocities made to agree."""
 
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -141,8 +140,7 @@ def check_closed(chain: Chain, state: State) -> State:
     if not np.all(worst < limit):
         gaps = np.asarray(loop_gaps(chain, state))
         open_ = [
-            f"{chain.link_names[i]} by {np.linalg.norm(gaps[i, 3:]):.3g} m and {np.linalg.norm(gaps[i, :3]):.3g} rad"
-            for i in np.flatnonzero(~(worst < limit))
+            f"{chain.link_names[i]} by {np.linalg.norm(gaps[i, 3:]):.3g} m and {np.linalg.norm(gaps[i, :3]):.3g} rad" for i in np.flatnonzero(~(worst < limit))
         ]
         raise ValueError(f"the loops cannot be closed from this configuration: {'; '.join(open_)}. Give a q nearer to a closed one.")
     return state

@@ -33,9 +33,7 @@ def joint_freedoms(joint) -> tuple[bool, ...]:
             return JOINTS[joint]
     elif len(tuple(joint)) == 6:
         return tuple(bool(x) for x in joint)
-    raise ValueError(
-        f"joint: got {joint!r}, expected one of {', '.join(JOINTS)} or six Booleans (three rotations, three translations)"
-    )
+    raise ValueError(f"joint: got {joint!r}, expected one of {', '.join(JOINTS)} or six Booleans (three rotations, three translations)")
 
 
 @dataclasses.dataclass(frozen=True)

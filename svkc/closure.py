@@ -43,11 +43,11 @@ class Coordinates(eqx.Module):
 
     @property
     def H(self) -> Float[Array, "dofs dofs"]:
-        """d theta_S / d theta_G (17): the dependent rows of W."""
+        """D theta_S / d theta_G (17): the dependent rows of W."""
         return jnp.where(self.dependent[:, None], self.W, 0)
 
     def S(self, actuated: Bool[Array, " dofs"]) -> Float[Array, "dofs dofs"]:
-        """d theta_A / d theta_G (paper (6)): the actuated rows of W."""
+        """D theta_A / d theta_G (paper (6)): the actuated rows of W."""
         return jnp.where(actuated[:, None], self.W, 0)
 
 
@@ -69,9 +69,7 @@ def scales(chain: Chain) -> tuple[Float[Array, " rows"], Float[Array, " dofs"]]:
     return rows, jnp.where(linear, chain.length, 1)
 
 
-def select(
-    J: Float[Array, "rows dofs"], rank: Int[Array, ""] | None = None, wanted: Bool[Array, " dofs"] | None = None
-) -> Selection:
+def select(J: Float[Array, "rows dofs"], rank: Int[Array, ""] | None = None, wanted: Bool[Array, " dofs"] | None = None) -> Selection:
     """min(rows, dofs) steps of column-pivoted Gram-Schmidt, orthogonalised twice; steps from `rank` on are inert (None: all are taken).
 
     `wanted`: columns to leave independent, taken as pivots only where nothing else is left.
@@ -209,10 +207,8 @@ def _solvable(selection: Selection) -> Selection:
 
 
 @functools.partial(jax.jit, static_argnames="iterations")
-def close(
-    chain: Chain, structure: Structure, q: Float[Array, " q"], iterations: int = 2, hold=None
-) -> Float[Array, " q"]:
-    """q moved by the least change (scaled coordinates) that closes the loops: Newton's method on the gaps, `iterations` times.
+def close(chain: Chain, structure: Structure, q: Float[Array, " q"], iterations: int = 2, hold=None) -> Float[Array, " q"]:
+    """Q moved by the least change (scaled coordinates) that closes the loops: Newton's method on the gaps, `iterations` times.
 
     `hold`: coordinates that must not move in the first half of the iterations.
     """
@@ -232,8 +228,8 @@ def close(
 
 @jax.jit
 def agree(chain: Chain, structure: Structure, q, v, hold=None) -> Float[Array, " dofs"]:
-    """v with the least change (scaled coordinates) that makes J_C v = 0; first without changing those in `hold`, then as far as needed."""
-    row, column = scales(chain)
+    """V with the least change (scaled coordinates) that makes J_C v = 0; first without changing those in `hold`, then as far as needed."""
+    _, column = scales(chain)
     kin = kinematics(chain, q)
     J = scaled_jacobian(chain, structure, kin, ends(chain, structure, kin, q))
     active = active_dofs(chain, structure)

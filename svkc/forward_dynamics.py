@@ -29,9 +29,7 @@ def reduced_inertia(chain: Chain, co: Coordinates, M: Float[Array, "nv nv"]) -> 
 
 
 @functools.partial(jax.jit, static_argnames="inertia")
-def acceleration(
-    chain: Chain, structure: Structure, q, v, tau: Float[Array, " dofs"], inertia=inertia_by_composites, baumgarte=None
-) -> Float[Array, " dofs"]:
+def acceleration(chain: Chain, structure: Structure, q, v, tau: Float[Array, " dofs"], inertia=inertia_by_composites, baumgarte=None) -> Float[Array, " dofs"]:
     """Steps 1 to 5 of section III-B. On an open chain W is the identity and nothing of the closure is computed.
 
     baumgarte: rate (1/s) at which open loops are pulled back; None: not at all.

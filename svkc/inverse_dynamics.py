@@ -10,9 +10,7 @@ from svkc.kinematics import Kinematics, down, kinematics, to_rows, twists, up, v
 from svkc.spatial import cross, quat_conjugate, quat_log, quat_multiply, quat_normalize, rotate
 
 
-def newton_euler(
-    chain: Chain, kin: Kinematics, V: Float[Array, "rows 6"] | None, A: Float[Array, "rows 6"]
-) -> Float[Array, " nv"]:
+def newton_euler(chain: Chain, kin: Kinematics, V: Float[Array, "rows 6"] | None, A: Float[Array, "rows 6"]) -> Float[Array, " nv"]:
     """Joint forces S^T F that give every row the spatial acceleration A at the twist V (None: at rest); Featherstone section 5.3.
 
     Each body's force is taken at its centre of mass, where gyroscopic terms need no parallel axes, and moved to the root's origin.

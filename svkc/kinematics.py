@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from svkc.chain import BALL, FREE, HINGE, SLIDE, Chain, State, Topology
-from svkc.spatial import cross, motion_cross, quat_about, quat_exp, quat_log, quat_matrix, quat_multiply, quat_normalize, quat_rate, rotate
-from svkc.spatial import quat_conjugate
+from svkc.spatial import cross, motion_cross, quat_about, quat_conjugate, quat_exp, quat_log, quat_matrix, quat_multiply, quat_normalize, quat_rate, rotate
 
 # deeper trees sum by one product with the table of ancestors: compile time would grow with every level
 LEVELS_UNROLLED = 24
@@ -182,7 +181,7 @@ def bias_accelerations(chain: Chain, kin: Kinematics, V: Float[Array, "rows 6"],
 
 
 def rates(chain: Chain, q: Float[Array, " q"], v: Float[Array, " dofs"]) -> Float[Array, " q"]:
-    """qdot for the velocities v: quaternions turn by qdot = q w / 2, everything else is its own rate."""
+    """Qdot for the velocities v: quaternions turn by qdot = q w / 2, everything else is its own rate."""
     quat_q, quat_v = chain.topology.quaternions
     scalar_q, scalar_v = chain.topology.scalars
     turn = quat_rate(q[quat_q[:, None] + np.arange(4)], v[quat_v[:, None] + np.arange(3)])
@@ -192,7 +191,7 @@ def rates(chain: Chain, q: Float[Array, " q"], v: Float[Array, " dofs"]) -> Floa
 
 @jax.jit
 def integrate(chain: Chain, q: Float[Array, " q"], dv: Float[Array, " dofs"]) -> Float[Array, " q"]:
-    """q moved by the tangent vector dv (m, rad; body axes for rotations): the exponential map, Rodrigues' formula (39)."""
+    """Q moved by the tangent vector dv (m, rad; body axes for rotations): the exponential map, Rodrigues' formula (39)."""
     quat_q, quat_v = chain.topology.quaternions
     scalar_q, scalar_v = chain.topology.scalars
     at = quat_q[:, None] + np.arange(4)
@@ -213,7 +212,7 @@ def difference(chain: Chain, q1: Float[Array, " q"], q2: Float[Array, " q"]) -> 
 
 
 def normalize(chain: Chain, q: Float[Array, " q"]) -> Float[Array, " q"]:
-    """q with every quaternion of unit length."""
+    """Q with every quaternion of unit length."""
     quat_q, _ = chain.topology.quaternions
     if not len(quat_q):
         return q

@@ -8,8 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from svkc.chain import BALL, FREE, HINGE, SLIDE, Chain, Structure, Topology, VirtualLink, joint_freedoms
-from svkc.chain import FIXED, V_SIZE
+from svkc.chain import BALL, FIXED, FREE, HINGE, SLIDE, V_SIZE, Chain, Structure, Topology, VirtualLink, joint_freedoms
 from svkc.unsupported import plain_motors, what_is_left_out
 
 _LIMIT_RATE = 50.0  # rad/s: a joint outside its range is an oscillator of this frequency, critically damped, at its load-pose inertia

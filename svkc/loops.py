@@ -11,8 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from svkc.chain import Chain, Structure
 from svkc.kinematics import Kinematics
-from svkc.spatial import cross, motion_cross, quat_about, quat_conjugate, quat_log, quat_matrix, quat_multiply, quat_normalize, quat_rotate
-from svkc.spatial import shift_motion
+from svkc.spatial import motion_cross, quat_about, quat_conjugate, quat_log, quat_matrix, quat_multiply, quat_normalize, quat_rotate, shift_motion
 
 
 class Ends(eqx.Module):
@@ -143,7 +142,7 @@ def loop_bias(
 
 
 def joint_coordinates(chain: Chain, structure: Structure, kin: Kinematics, q: Float[Array, " q"]) -> Float[Array, " q"]:
-    """q with the coordinates of every virtual joint read off from where its two bodies are: what the joint's freedoms can express of it."""
+    """Q with the coordinates of every virtual joint read off from where its two bodies are: what the joint's freedoms can express of it."""
     top = chain.topology
     base = ends(chain, structure, kin, q)
     turn = quat_multiply(quat_conjugate(base.base_quat), base.real_quat)
@@ -168,5 +167,3 @@ def _angles(turn: Float[Array, "links 4"], freedoms: Bool[Array, "links 6"]) -> 
     y = jnp.where(fy, jnp.arctan2(R[:, 0, 2], jnp.where(fz, R[:, 2, 2], R[:, 0, 0])), 0)
     z = jnp.where(fz, jnp.where(fx, jnp.arctan2(-R[:, 0, 1], R[:, 0, 0]), jnp.arctan2(R[:, 1, 0], R[:, 1, 1])), 0)
     return jnp.stack([x, y, z], -1)
-
-

@@ -95,9 +95,7 @@ def _run(chain: Chain, state: State, t0, t1, ts, made: Plan, options: Options, a
     result = RESULTS.where(short, RESULTS.max_events, run.result)
     saved = run.saved
     gaps = jax.vmap(lambda s: _largest_gaps(chain, s))(saved)
-    result = RESULTS.where(
-        (result == RESULTS.successful) & (jnp.max(gaps) > options.gap), RESULTS.loop_open, result
-    )
+    result = RESULTS.where((result == RESULTS.successful) & (jnp.max(gaps) > options.gap), RESULTS.loop_open, result)
     return Trajectory(ts, saved, gaps, run.events, run.phases, run.state, run.t, result)
 
 
@@ -153,9 +151,7 @@ def _phase(chain: Chain, run: Run, index, t1, ts, made: Plan, options: Options, 
     solved = _solve(chain, run, stop, ts, made, options, args)
     reached = going & (solved.result == RESULTS.successful)
     timed = run.pending & (made.times <= solved.t + event_tolerance(solved.t)) & reached
-    fired = jnp.zeros(len(made.actions), bool).at[np.array(made.timed + made.guarded, int)].set(
-        jnp.concatenate([timed, solved.fired & reached])
-    )
+    fired = jnp.zeros(len(made.actions), bool).at[np.array(made.timed + made.guarded, int)].set(jnp.concatenate([timed, solved.fired & reached]))
     ended = State(solved.motion.q, solved.motion.v, run.state.structure)
     saved = _save(run, ended, solved, ts)
     phases = _record_phase(chain, run, index, going, solved, ended)
@@ -173,7 +169,7 @@ def event_tolerance(t: Float[Array, ""]) -> Float[Array, ""]:
 
 
 def _solve(chain: Chain, run: Run, stop, ts, made: Plan, options: Options, args) -> Solved:
-    """diffrax from run.t to `stop`, or to the first guard that crosses zero."""
+    """Diffrax from run.t to `stop`, or to the first guard that crosses zero."""
     structure = run.state.structure
     watched = made.watched(chain, structure) if made.guards else None
     scene = Scene(chain, structure, args, watched)
@@ -209,7 +205,7 @@ def _solve(chain: Chain, run: Run, stop, ts, made: Plan, options: Options, args)
 
 
 def _translate(result, motion: Motion) -> RESULTS:
-    """diffrax's word for how a solve ended, as ours."""
+    """Diffrax's word for how a solve ended, as ours."""
     out = RESULTS.where(result == diffrax.RESULTS.successful, RESULTS.successful, RESULTS.step_too_small)
     out = RESULTS.where(result == diffrax.RESULTS.event_occurred, RESULTS.successful, out)
     out = RESULTS.where(result == diffrax.RESULTS.max_steps_reached, RESULTS.max_steps, out)
@@ -262,7 +258,7 @@ def _locate(hit, t_end, end: Motion, term, solver, scene: Scene, made: Plan):
         return t_end, end.q, end.v, end.work, jnp.zeros_like(crossed), end.watch.after
 
     t, q, v, work, fired, after = jax.lax.cond(eqxi.unvmap_any(hit), found, missed)
-    pick = lambda a, b: jnp.where(hit, a, b)  # noqa: E731
+    pick = lambda a, b: jnp.where(hit, a, b)
     t, q, v, after = pick(t, t_end), pick(q, end.q), pick(v, end.v), pick(after, end.watch.after)
     work = None if work is None else pick(work, end.work)
     return t, Motion(q, v, work), fired & hit, after
@@ -304,7 +300,7 @@ def _record_phase(chain: Chain, run: Run, index, going, solved: Solved, ended: S
 
 def _apply(chain: Chain, run: Run, ended: State, solved: Solved, fired: Bool[Array, " events"], made: Plan):
     """The change of structure that all events of this instant make together; one record row for each of them."""
-    any_of = lambda what: jnp.any(fired[:, None] & made.table(chain, what), 0)  # noqa: E731
+    any_of = lambda what: jnp.any(fired[:, None] & made.table(chain, what), 0)
     connected = (ended.structure.connected | any_of("connect")) & ~any_of("cut")
     locked = (ended.structure.locked | any_of("lock")) & ~any_of("unlock") if made.locks else None
     grips = made.table(chain, "here").any()
@@ -338,5 +334,3 @@ def _apply(chain: Chain, run: Run, ended: State, solved: Solved, fired: Bool[Arr
     result = RESULTS.where(happened & (done.gap > connect_tolerance), RESULTS.not_in_place, result)
     result = RESULTS.where(r.count + count > r.time.shape[0], RESULTS.max_events, result)
     return after, events, result
-
-

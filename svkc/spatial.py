@@ -21,7 +21,7 @@ def rotate(R: Float[Array, "*#n 3 3"], x: Float[Array, "*#n 3"]) -> Float[Array,
 
 
 def motion_cross(a: Float[Array, "*#n 6"], b: Float[Array, "*#n 6"]) -> Float[Array, "*n 6"]:
-    """a x b of two motion vectors (Featherstone 2.9, eq. 2.31)."""
+    """A x b of two motion vectors (Featherstone 2.9, eq. 2.31)."""
     w, v = a[..., :3], a[..., 3:]
     m, n = b[..., :3], b[..., 3:]
     return jnp.concatenate([cross(w, m), cross(v, m) + cross(w, n)], -1)
@@ -110,5 +110,5 @@ def quat_log(q: Float[Array, "*n 4"]) -> Float[Array, "*n 3"]:
 
 
 def quat_rate(q: Float[Array, "*#n 4"], w: Float[Array, "*#n 3"]) -> Float[Array, "*n 4"]:
-    """qdot = q (0, w) / 2 with the angular velocity w (rad/s) in body coordinates."""
+    """Qdot = q (0, w) / 2 with the angular velocity w (rad/s) in body coordinates."""
     return quat_multiply(q, jnp.concatenate([jnp.zeros_like(w[..., :1]), w], -1)) / 2

@@ -193,7 +193,9 @@ def bind(chain: Chain, state: State, name: str, parent: str, real: str, *, joint
 
     slot = link_index(chain, name)
     if not chain.topology.link_spare[slot]:
-        raise ValueError(f"bind: {name!r} is not a spare slot; spare slots: {[n for n, s in zip(chain.link_names, chain.topology.link_spare, strict=True) if s]}")
+        raise ValueError(
+            f"bind: {name!r} is not a spare slot; spare slots: {[n for n, s in zip(chain.link_names, chain.topology.link_spare, strict=True) if s]}"
+        )
     for body in (parent, real):
         if body not in chain.body_names:
             raise ValueError(f"bind: no body {body!r}; bodies: {', '.join(chain.body_names)}")

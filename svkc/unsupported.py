@@ -17,6 +17,12 @@ def plain_motors(model) -> np.ndarray:
     return plain & (model.actuator_biastype == int(mujoco.mjtBias.mjBIAS_NONE))
 
 
+KINDS = frozenset(
+    "tendon actuator equality friction contact gravcomp fluid polynomial plastic actuatorforce actuatorgravcomp actuatordamping "
+    "balllimit flex mocap plugin".split()
+)
+
+
 def _findings(model) -> list[tuple[str, str]]:
     """(kind, what was found) for everything that would change the motion and is not simulated."""
     import mujoco
@@ -67,8 +73,3 @@ def what_is_left_out(model, ignore) -> tuple[str, ...]:
     colliding = int(np.sum((model.geom_contype != 0) | (model.geom_conaffinity != 0)))
     collisions = (f"collision: {colliding} geoms of the model could touch; collisions are not simulated",) if colliding else ()
     return tuple(f"{kind}: {text}" for kind, text in found) + collisions
-
-
-KINDS = frozenset(
-    "tendon actuator equality friction contact gravcomp fluid polynomial plastic actuatorforce actuatorgravcomp actuatordamping balllimit flex mocap plugin".split()
-)

@@ -17,7 +17,7 @@ jax.config.update("jax_compilation_cache_dir", os.path.join(tempfile.gettempdir(
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 
 hook = install_import_hook("svkc", "beartype.beartype")
-import svkc  # noqa: F401
+import svkc
 import svkc.__main__
 import svkc.scenes
 

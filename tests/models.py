@@ -47,11 +47,13 @@ def bar(name: str, joint: str, to: str, pos="0 0 0", inside="") -> str:
 Y = 'type="hinge" axis="0 1 0" damping="0"'
 
 
+FOUR_BAR = bar("crank", Y, "0 0 0.4", inside=bar("coupler", Y, "1 0 0.2", "0 0 0.4", bar("rocker", Y, "0.2 0 -0.6", "1 0 0.2")))
+
+
 def four_bar() -> svkc.Chain:
     """Crank, coupler, rocker on hinges about y; closed by a hinge. In space: 3 of the 6 rows are redundant."""
-    xml = bar("crank", Y, "0 0 0.4", inside=bar("coupler", Y, "1 0 0.2", "0 0 0.4", bar("rocker", Y, "0.2 0 -0.6", "1 0 0.2")))
     link = svkc.VirtualLink("pin", "world", "rocker", "hinge", pos=(1.2, 0, 0), axis=(0, 1, 0), real_pos=(0.2, 0, -0.6), connected=True)
-    return svkc.load(MJCF.format(xml), virtual_links=[link])
+    return svkc.load(MJCF.format(FOUR_BAR), virtual_links=[link])
 
 
 def parallelogram(middle: bool = True) -> svkc.Chain:
@@ -97,5 +99,7 @@ def stewart() -> svkc.Chain:
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     R, p = data.body("plate").xmat.reshape(3, 3), data.body("plate").xpos
-    placed = [svkc.VirtualLink(k.name, k.parent, k.real, "ball", pos=tuple(R.T @ (tops[i + 1] - p)), real_pos=k.real_pos, connected=True) for i, k in enumerate(links)]
+    placed = [
+        svkc.VirtualLink(k.name, k.parent, k.real, "ball", pos=tuple(R.T @ (tops[i + 1] - p)), real_pos=k.real_pos, connected=True) for i, k in enumerate(links)
+    ]
     return svkc.load(MJCF.format(xml), virtual_links=placed)

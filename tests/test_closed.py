@@ -139,7 +139,7 @@ def test_spare_slots_change_nothing():
     numbers = []
     for spare in (0, 1, 4):
         links = [svkc.VirtualLink("pin", "world", "rocker", "hinge", pos=(1.2, 0, 0), axis=(0, 1, 0), real_pos=(0.2, 0, -0.6), connected=True)]
-        xml = models.bar("crank", models.Y, "0 0 0.4", inside=models.bar("coupler", models.Y, "1 0 0.2", "0 0 0.4", models.bar("rocker", models.Y, "0.2 0 -0.6", "1 0 0.2")))
+        xml = models.FOUR_BAR
         chain = svkc.load(models.MJCF.format(xml), virtual_links=links, spare=spare)
         state = chain.state(v={"crank": 1.0})
         vdot = svkc.forward_dynamics(chain, state, jnp.zeros(chain.nv))
@@ -154,7 +154,7 @@ def test_bind_a_spare_slot():
     """A grip between bodies not known beforehand: the same motion as the declared link."""
     declared = models.four_bar()
     a = declared.state(v={"crank": 1.0})
-    xml = models.bar("crank", models.Y, "0 0 0.4", inside=models.bar("coupler", models.Y, "1 0 0.2", "0 0 0.4", models.bar("rocker", models.Y, "0.2 0 -0.6", "1 0 0.2")))
+    xml = models.FOUR_BAR
     chain = svkc.load(models.MJCF.format(xml), spare=1)
     open_ = chain.state(v=np.asarray(a.v)[:3])
     bound = svkc.bind(chain, open_, "spare_0", "world", "rocker", joint="ball", real_pos=(0.2, 0, -0.6))

@@ -76,7 +76,7 @@ def test_what_is_not_simulated_is_listed_once():
 
 def test_limits_and_springs_are_the_models():
     """A spring as MuJoCo has it; a range that holds a pendulum up against gravity."""
-    xml = PENDULUM.replace('damping="0"', 'damping="2" range="-0.5 0.5" limited="true"').replace('<mujoco>', '<mujoco><compiler angle="radian"/>')
+    xml = PENDULUM.replace('damping="0"', 'damping="2" range="-0.5 0.5" limited="true"').replace("<mujoco>", '<mujoco><compiler angle="radian"/>')
     chain = svkc.load(xml)
     end = svkc.simulate(chain, chain.state(), 3.0).final
     free = svkc.simulate(svkc.load(xml, ignore="limit"), chain.state(), 3.0).final

@@ -208,7 +208,11 @@ def test_results_tell_what_went_wrong(pendulum):
     ],
 )
 def test_wrong_calls(kw, message):
-    chain = svkc.load(PENDULUM, virtual_links=[svkc.VirtualLink("hook", "world", "arm", "weld")]) if message in ("hoook", "before the start") else svkc.load(PENDULUM)
+    chain = (
+        svkc.load(PENDULUM, virtual_links=[svkc.VirtualLink("hook", "world", "arm", "weld")])
+        if message in ("hoook", "before the start")
+        else svkc.load(PENDULUM)
+    )
     kw = {"state": chain.state(), "t1": 1.0} | kw
     with pytest.raises(ValueError, match=message):
         svkc.simulate(chain, **kw)

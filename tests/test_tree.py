@@ -135,7 +135,8 @@ def test_deep_chain_agrees_with_mujoco():
     """40 levels: past the depth that is unrolled."""
     xml = ""
     for i in range(40):
-        xml = f'<body name="l{i}" pos="0 0 -0.1"><joint axis="{i % 2} {1 - i % 2} 0"/><geom type="capsule" fromto="0 0 0 0 0 -0.1" size="0.02" contype="0"/>{xml}</body>'
+        rod = '<geom type="capsule" fromto="0 0 0 0 0 -0.1" size="0.02" contype="0"/>'
+        xml = f'<body name="l{i}" pos="0 0 -0.1"><joint axis="{i % 2} {1 - i % 2} 0"/>{rod}{xml}</body>'
     chain = svkc.load(models.MJCF.format(xml))
     model = chain.model.model
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
