@@ -231,22 +231,25 @@ def _inertia(model, body):
     return R @ np.diag(model.body_inertia[body]) @ R.T
 
 
-def _chain(model, topology, rows, structure, ignore, left_out) -> Chain:
-    import mujoco
-
+def _bodies(model, topology, rows) -> dict[str, np.ndarray]:
+    """Of each row: frame in the parent, joint axis and anchor, mass, centre of mass, inertia."""
     n = len(rows)
-    pos, quat, axis = np.zeros((n, 3)), np.tile([1.0, 0, 0, 0], (n, 1)), np.tile([0.0, 0, 1], (n, 1))
-    anchor, mass, com, inertia = np.zeros((n, 3)), np.zeros(n), np.zeros((n, 3)), np.zeros((n, 3, 3))
+    out = {"pos": np.zeros((n, 3)), "quat": np.tile([1.0, 0, 0, 0], (n, 1)), "axis": np.tile([0.0, 0, 1], (n, 1)), "anchor": np.zeros((n, 3))}
+    out |= {"mass": np.zeros(n), "com": np.zeros((n, 3)), "inertia": np.zeros((n, 3, 3))}
     for i, (body, joint) in enumerate(rows):
         if topology.kind[i] != FREE and joint in (-1, int(model.body_jntadr[body])):
-            pos[i], quat[i] = model.body_pos[body], model.body_quat[body]
+            out["pos"][i], out["quat"][i] = model.body_pos[body], model.body_quat[body]
         if joint >= 0:
-            axis[i] = model.jnt_axis[joint]
+            out["axis"][i] = model.jnt_axis[joint]
             if topology.kind[i] in (HINGE, BALL):
-                anchor[i] = model.jnt_pos[joint]
+                out["anchor"][i] = model.jnt_pos[joint]
         if topology.body_row[body] == i:
-            mass[i], com[i], inertia[i] = model.body_mass[body], model.body_ipos[body], _inertia(model, body)
-    ignored = set(ignore)
+            out["mass"][i], out["com"][i], out["inertia"][i] = model.body_mass[body], model.body_ipos[body], _inertia(model, body)
+    return out
+
+
+def _joint_forces(model, ignored) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Stiffness [nv], range [2 nv] (infinite where there is none) and its spring and damper [2 nv]."""
     stiffness, limit, spring = np.zeros(model.nv), np.tile([[-np.inf], [np.inf]], (1, model.nv)), np.zeros((2, model.nv))
     for j in range(model.njnt):
         dofs = slice(int(model.jnt_dofadr[j]), int(model.jnt_dofadr[j]) + V_SIZE[(FREE, BALL, SLIDE, HINGE)[model.jnt_type[j]]])
@@ -256,11 +259,19 @@ def _chain(model, topology, rows, structure, ignore, left_out) -> Chain:
             limit[:, dofs] = model.jnt_range[j][:, None]
             m = 1 / model.dof_invweight0[dofs] if np.all(model.dof_invweight0[dofs] > 0) else model.dof_M0[dofs]
             spring[:, dofs] = m * _LIMIT_RATE**2, 2 * m * _LIMIT_RATE
+    return stiffness, limit, spring
+
+
+def _chain(model, topology, rows, structure, ignore, left_out) -> Chain:
+    import mujoco
+
+    ignored, bodies = set(ignore), _bodies(model, topology, rows)
+    stiffness, limit, spring = _joint_forces(model, ignored)
     damping = np.zeros(model.nv) if "damping" in ignored else np.ravel(model.dof_damping)
     armature = np.zeros(model.nv) if "armature" in ignored else model.dof_armature
     gravity = np.zeros(3) if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY) else model.opt.gravity
     gear, control, force = _motors(model, ignored)
-    offsets = np.linalg.norm(np.concatenate([pos[np.array(topology.parent) > 0], com]), axis=1)
+    offsets = np.linalg.norm(np.concatenate([bodies["pos"][np.array(topology.parent) > 0], bodies["com"]]), axis=1)
     offsets = offsets[offsets > 1e-12]
     filled = topology.links
     q_load = np.concatenate([model.qpos0, np.zeros(filled.nq_all - topology.nq)])
@@ -271,12 +282,7 @@ def _chain(model, topology, rows, structure, ignore, left_out) -> Chain:
 
     return Chain(
         topology=topology,
-        pos=_floats(pos),
-        quat=_floats(quat),
-        axis=_floats(axis),
-        mass=_floats(mass),
-        com=_floats(com),
-        inertia=_floats(inertia),
+        **{name: _floats(bodies[name]) for name in ("pos", "quat", "axis", "mass", "com", "inertia")},
         gravity=_floats(gravity),
         q_load=_floats(q_load),
         length=_floats(np.sqrt(np.mean(offsets**2)) if len(offsets) else 1.0),
@@ -284,7 +290,7 @@ def _chain(model, topology, rows, structure, ignore, left_out) -> Chain:
         control_range=_floats(control),
         force_range=_floats(force),
         structure=structure,
-        anchor=unless(not anchor.any(), anchor),
+        anchor=unless(not bodies["anchor"].any(), bodies["anchor"]),
         armature=unless(not np.any(armature), armature),
         damping=unless(not np.any(damping), damping),
         stiffness=unless(not stiffness.any(), stiffness),
