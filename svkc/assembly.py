@@ -5,10 +5,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from svkc.chain import Q_SIZE, V_SIZE, Chain, State, Structure
+from svkc.chain import Chain, State, Structure
 from svkc.closure import agree, close, decide_rank, loop_gaps
 from svkc.kinematics import kinematics, normalize
 from svkc.loops import active_dofs, joint_coordinates
+from svkc.topology import Q_SIZE, V_SIZE
 
 _NEWTON = 30
 

@@ -13,9 +13,10 @@ import numpy as np
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
-from svkc.chain import FREE, SLIDE, Chain, State, Structure
+from svkc.chain import Chain, State, Structure
 from svkc.kinematics import bias_accelerations, integrate, kinematics, normalize, twists
 from svkc.loops import active_dofs, ends, gap, loop_bias, loop_jacobian
+from svkc.topology import FREE, SLIDE
 
 
 class Selection(eqx.Module):

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from svkc.assembly import joint_slice, link_index
-from svkc.chain import V_SIZE, Chain, Structure
+from svkc.chain import Chain, Structure
+from svkc.topology import V_SIZE
 
 
 class Action(eqx.Module):

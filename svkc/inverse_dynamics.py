@@ -5,9 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from svkc.chain import BALL, FREE, HINGE, SLIDE, Chain, State
+from svkc.chain import Chain, State
 from svkc.kinematics import Kinematics, down, kinematics, to_rows, twists, up, velocity_products
 from svkc.spatial import cross, quat_conjugate, quat_log, quat_multiply, quat_normalize, rotate
+from svkc.topology import BALL, FREE, HINGE, SLIDE
 
 
 def newton_euler(chain: Chain, kin: Kinematics, V: Float[Array, "rows 6"] | None, A: Float[Array, "rows 6"]) -> Float[Array, " nv"]:

@@ -10,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from svkc.chain import BALL, FREE, HINGE, SLIDE, Chain, State, Topology
+from svkc.chain import Chain, State
 from svkc.spatial import cross, motion_cross, quat_about, quat_conjugate, quat_exp, quat_log, quat_matrix, quat_multiply, quat_normalize, quat_rate, rotate
+from svkc.topology import BALL, FREE, HINGE, SLIDE, Topology
 
 # deeper trees sum by one product with the table of ancestors: compile time would grow with every level
 LEVELS_UNROLLED = 24

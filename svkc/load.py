@@ -8,10 +8,10 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from svkc.chain import BALL, FIXED, FREE, HINGE, SLIDE, V_SIZE, Chain, Structure, Topology, VirtualLink, joint_freedoms
-from svkc.unsupported import plain_motors, what_is_left_out
-
-_LIMIT_RATE = 50.0  # rad/s: a joint outside its range is an oscillator of this frequency, critically damped, at its load-pose inertia
+from svkc.chain import Chain, Structure, VirtualLink
+from svkc.reading import bodies_of, joint_forces_of, motors_of, name_of, rows_of
+from svkc.topology import Topology, joint_freedoms
+from svkc.unsupported import what_is_left_out
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ def load(source, *, virtual_links=(), cuttable=(), spare=0, ignore=()) -> Chain:
     if isinstance(ignore, str):
         ignore = (ignore,)
     left_out = what_is_left_out(model, ignore)
-    rows, topology = _rows(model)
+    rows, topology = rows_of(model)
     links = [*_equalities(model, ignore), *virtual_links]
     for link in links:
         if not isinstance(link, VirtualLink):
@@ -89,46 +89,6 @@ def _read(text: str):
     return spec.compile()
 
 
-def _name(model, kind: str, index: int) -> str:
-    import mujoco
-
-    name = mujoco.mj_id2name(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), index)
-    return name or (f"{kind}_{index}" if index or kind != "body" else "world")
-
-
-def _rows(model) -> tuple[list[tuple[int, int]], Topology]:
-    """One row a joint, sorted by level: [(body, joint or -1)] and the topology without virtual links."""
-    order, depth, last = [(0, -1, -1)], [0], {0: 0}
-    for body in range(1, model.nbody):
-        parent = last[int(model.body_parentid[body])]
-        first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
-        for joint in range(first, first + count) if count else (-1,):
-            order.append((body, joint, parent))
-            depth.append(depth[parent] + 1)
-            parent = len(order) - 1
-        last[body] = parent
-    rank = np.argsort(depth, kind="stable")
-    new = np.argsort(rank)
-    kinds = {0: FREE, 1: BALL, 2: SLIDE, 3: HINGE}
-    kind = [FIXED if j < 0 else kinds[int(model.jnt_type[j])] for _, j, _ in order]
-    topology = Topology(
-        body_names=tuple(_name(model, "body", i) for i in range(model.nbody)),
-        joint_names=tuple(_name(model, "joint", i) for i in range(model.njnt)),
-        link_names=(),
-        parent=tuple(int(new[order[i][2]]) if order[i][2] >= 0 else -1 for i in rank),
-        kind=tuple(kind[i] for i in rank),
-        q_start=tuple(int(model.jnt_qposadr[order[i][1]]) if order[i][1] >= 0 else 0 for i in rank),
-        v_start=tuple(int(model.jnt_dofadr[order[i][1]]) if order[i][1] >= 0 else 0 for i in rank),
-        nq=int(model.nq),
-        nv=int(model.nv),
-        body_row=tuple(int(new[last[i]]) for i in range(model.nbody)),
-        joint_row=tuple(int(new[[o[1] for o in order].index(j)]) for j in range(model.njnt)),
-        link_freedoms=(),
-        link_spare=(),
-    )
-    return [order[i][:2] for i in rank], topology
-
-
 def _equalities(model, ignore) -> list[VirtualLink]:
     """<equality> connect and weld as virtual links: ball and weld, child of the first body, under their own names."""
     import mujoco
@@ -152,9 +112,9 @@ def _equalities(model, ignore) -> list[VirtualLink]:
             places = [(data[:3], (1, 0, 0, 0)), (data[3:6], None)]
         links.append(
             VirtualLink(
-                name=_name(model, "equality", i),
-                parent=_name(model, "body", ends[0]),
-                real=_name(model, "body", ends[1]),
+                name=name_of(model, "equality", i),
+                parent=name_of(model, "body", ends[0]),
+                real=name_of(model, "body", ends[1]),
                 joint="weld" if weld else "ball",
                 pos=tuple(places[0][0]),
                 quat=_unit(places[0][1]),
@@ -221,56 +181,15 @@ def _floats(x):
     return jnp.asarray(np.asarray(x, np.float64), dtype=jnp.result_type(float))
 
 
-def _inertia(model, body):
-    """About the centre of mass, in body axes."""
-    import mujoco
-
-    R = np.zeros(9)
-    mujoco.mju_quat2Mat(R, model.body_iquat[body])
-    R = R.reshape(3, 3)
-    return R @ np.diag(model.body_inertia[body]) @ R.T
-
-
-def _bodies(model, topology, rows) -> dict[str, np.ndarray]:
-    """Of each row: frame in the parent, joint axis and anchor, mass, centre of mass, inertia."""
-    n = len(rows)
-    out = {"pos": np.zeros((n, 3)), "quat": np.tile([1.0, 0, 0, 0], (n, 1)), "axis": np.tile([0.0, 0, 1], (n, 1)), "anchor": np.zeros((n, 3))}
-    out |= {"mass": np.zeros(n), "com": np.zeros((n, 3)), "inertia": np.zeros((n, 3, 3))}
-    for i, (body, joint) in enumerate(rows):
-        if topology.kind[i] != FREE and joint in (-1, int(model.body_jntadr[body])):
-            out["pos"][i], out["quat"][i] = model.body_pos[body], model.body_quat[body]
-        if joint >= 0:
-            out["axis"][i] = model.jnt_axis[joint]
-            if topology.kind[i] in (HINGE, BALL):
-                out["anchor"][i] = model.jnt_pos[joint]
-        if topology.body_row[body] == i:
-            out["mass"][i], out["com"][i], out["inertia"][i] = model.body_mass[body], model.body_ipos[body], _inertia(model, body)
-    return out
-
-
-def _joint_forces(model, ignored) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Stiffness [nv], range [2 nv] (infinite where there is none) and its spring and damper [2 nv]."""
-    stiffness, limit, spring = np.zeros(model.nv), np.tile([[-np.inf], [np.inf]], (1, model.nv)), np.zeros((2, model.nv))
-    for j in range(model.njnt):
-        dofs = slice(int(model.jnt_dofadr[j]), int(model.jnt_dofadr[j]) + V_SIZE[(FREE, BALL, SLIDE, HINGE)[model.jnt_type[j]]])
-        if "spring" not in ignored:
-            stiffness[dofs] = np.ravel(model.jnt_stiffness[j])[0]
-        if model.jnt_limited[j] and model.jnt_type[j] in (2, 3) and "limit" not in ignored:
-            limit[:, dofs] = model.jnt_range[j][:, None]
-            m = 1 / model.dof_invweight0[dofs] if np.all(model.dof_invweight0[dofs] > 0) else model.dof_M0[dofs]
-            spring[:, dofs] = m * _LIMIT_RATE**2, 2 * m * _LIMIT_RATE
-    return stiffness, limit, spring
-
-
 def _chain(model, topology, rows, structure, ignore, left_out) -> Chain:
     import mujoco
 
-    ignored, bodies = set(ignore), _bodies(model, topology, rows)
-    stiffness, limit, spring = _joint_forces(model, ignored)
+    ignored, bodies = set(ignore), bodies_of(model, topology, rows)
+    stiffness, limit, spring = joint_forces_of(model, ignored)
     damping = np.zeros(model.nv) if "damping" in ignored else np.ravel(model.dof_damping)
     armature = np.zeros(model.nv) if "armature" in ignored else model.dof_armature
     gravity = np.zeros(3) if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY) else model.opt.gravity
-    gear, control, force = _motors(model, ignored)
+    gear, control, force = motors_of(model, ignored)
     offsets = np.linalg.norm(np.concatenate([bodies["pos"][np.array(topology.parent) > 0], bodies["com"]]), axis=1)
     offsets = offsets[offsets > 1e-12]
     filled = topology.links
@@ -300,19 +219,3 @@ def _chain(model, topology, rows, structure, ignore, left_out) -> Chain:
         model=Source(model),
         left_out=left_out,
     )
-
-
-def _motors(model, ignored):
-    """Gear matrix and ranges of the actuators that are plain torques on joints."""
-    count = 0 if {"actuator", "all"} & ignored and not plain_motors(model).all() else model.nu
-    gear, control, force = np.zeros((count, model.nv)), np.tile([-np.inf, np.inf], (count, 1)), np.tile([-np.inf, np.inf], (count, 1))
-    for i in range(count):
-        joint = int(model.actuator_trnid[i, 0])
-        size = V_SIZE[(FREE, BALL, SLIDE, HINGE)[model.jnt_type[joint]]]
-        start = int(model.jnt_dofadr[joint])
-        gear[i, start : start + size] = model.actuator_gear[i, :size] * model.actuator_gainprm[i, 0]
-        if model.actuator_ctrllimited[i]:
-            control[i] = model.actuator_ctrlrange[i]
-        if model.actuator_forcelimited[i]:
-            force[i] = np.sort(model.actuator_forcerange[i] / model.actuator_gainprm[i, 0])
-    return gear, control, force

@@ -5,49 +5,23 @@ solver back from there, so that its time and state have the solver's own order a
 that are done go on with phases of no length.
 """
 
-import diffrax
 import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from svkc.chain import Chain, State
 from svkc.closure import loop_gaps
 from svkc.energy import energy
-from svkc.events import Plan, first_root
+from svkc.events import Plan
 from svkc.loops import active_dofs
+from svkc.phase import Run, Solved, event_tolerance, guard_values, solve
 from svkc.request import Options, checked
-from svkc.stepping import Field, Motion, Scene, Settled, Watch
+from svkc.stepping import Motion, Scene
 from svkc.trajectory import RESULTS, Events, Phases, Trajectory
 from svkc.transition import change, connect_tolerance
-
-
-class Run(eqx.Module):
-    """What goes from phase to phase."""
-
-    t: Float[Array, ""]
-    state: State
-    work: Float[Array, ""] | None
-    guards: Float[Array, " guards"] | None
-    pending: Bool[Array, " timed"]
-    events: Events
-    phases: Phases
-    saved: State
-    result: RESULTS
-
-
-class Solved(eqx.Module):
-    """Where a phase ended: time, motion, the guards that fired there, which guard values go on, and the solver's words."""
-
-    t: Float[Array, ""]
-    motion: Motion
-    fired: Bool[Array, " guards"]
-    guards: Float[Array, " guards"] | None
-    saved: Motion
-    stats: tuple[Int[Array, ""], Int[Array, ""]]
-    result: RESULTS
 
 
 def simulate(
@@ -115,7 +89,7 @@ def _start(chain: Chain, state: State, t0, ts, made: Plan, options: Options, arg
         structure = eqx.tree_at(lambda s: s.locked, structure, jnp.zeros(chain.dofs, bool), is_leaf=lambda x: x is None)
     state = State(state.q, state.v, structure)
     scene = Scene(chain, structure, args)
-    guards = _guard_values(made, t0, Motion(state.q, state.v), scene) if made.guards else None
+    guards = guard_values(made, t0, Motion(state.q, state.v), scene) if made.guards else None
     zero = jnp.asarray(0, jnp.int32)
     return Run(
         t=t0,
@@ -137,18 +111,13 @@ def _start(chain: Chain, state: State, t0, ts, made: Plan, options: Options, arg
     )  # fmt: skip
 
 
-def _guard_values(made: Plan, t, y: Motion, scene: Scene) -> Float[Array, " guards"]:
-    state = State(y.q, y.v, scene.structure)
-    return jnp.stack([jnp.asarray(g(t, state, scene.args), y.q.dtype).reshape(()) for g in made.guards])
-
-
 def _phase(chain: Chain, run: Run, index, t1, ts, made: Plan, options: Options, args) -> Run:
     """One solve, the events at its end, and the records of both."""
     going = (run.t < t1) | jnp.any(run.pending & (made.times <= t1))
     going = going & (run.result == RESULTS.successful)
     next_time = jnp.min(jnp.where(run.pending, made.times, jnp.inf), initial=jnp.inf)
     stop = jnp.where(going, jnp.maximum(jnp.minimum(t1, next_time), run.t), run.t)
-    solved = _solve(chain, run, stop, ts, made, options, args)
+    solved = solve(chain, run, stop, ts, made, options, args)
     reached = going & (solved.result == RESULTS.successful)
     timed = run.pending & (made.times <= solved.t + event_tolerance(solved.t)) & reached
     fired = jnp.zeros(len(made.actions), bool).at[np.array(made.timed + made.guarded, int)].set(jnp.concatenate([timed, solved.fired & reached]))
@@ -161,107 +130,6 @@ def _phase(chain: Chain, run: Run, index, t1, ts, made: Plan, options: Options, 
     result = RESULTS.where(run.result == RESULTS.successful, result, run.result)
     guards = solved.guards
     return Run(solved.t, after, solved.motion.work, guards, run.pending & ~timed, events, phases, saved, result)
-
-
-def event_tolerance(t: Float[Array, ""]) -> Float[Array, ""]:
-    """Events this close (s) to the earliest happen together with it: sqrt(eps), 1.5e-8 in float64, relative from t = 1 s on."""
-    return jnp.finfo(t.dtype).eps ** 0.5 * jnp.maximum(1, jnp.abs(t))
-
-
-def _solve(chain: Chain, run: Run, stop, ts, made: Plan, options: Options, args) -> Solved:
-    """Diffrax from run.t to `stop`, or to the first guard that crosses zero."""
-    structure = run.state.structure
-    watched = made.watched(chain, structure) if made.guards else None
-    scene = Scene(chain, structure, args, watched)
-    watch = None if run.guards is None else Watch(run.t, run.guards, run.guards)
-    start = Motion(run.state.q, run.state.v, run.work, watch)
-    guards = (lambda t, y, scene: _guard_values(made, t, y, scene)) if made.guards else None
-    solver = Settled(options.solver, options.stabilization, guards)
-    term = diffrax.ODETerm(Field(options.control, options.stabilization))
-    at = jnp.clip(ts, run.t, jnp.maximum(stop, run.t))
-    event = None
-    if made.guards:
-
-        def any_crossed(t, y, scene, **_):
-            return jnp.any(made.crossed(y.watch.before, y.watch.after) & scene.watched)
-
-        event = diffrax.Event(any_crossed)
-    controller, dt0 = options.steps(run.t, t1=stop, ts=at)
-    sol = diffrax.diffeqsolve(
-        term, solver, run.t, stop, dt0, start, scene,
-        saveat=diffrax.SaveAt(subs=[diffrax.SubSaveAt(t1=True), diffrax.SubSaveAt(ts=at)]),
-        stepsize_controller=controller, adjoint=options.adjoint, event=event, max_steps=options.max_steps, throw=False,
-        progress_meter=options.progress_meter,
-    )  # fmt: skip
-    (end, saved), t = sol.ys, sol.ts[0][0]
-    motion = jax.tree.map(lambda x: x[0], end)
-    stats = (sol.stats["num_accepted_steps"], sol.stats["num_rejected_steps"])
-    result = _translate(sol.result, motion)
-    if not made.guards:
-        return Solved(t, motion, jnp.zeros(0, bool), None, saved, stats, result)
-    hit = sol.result == diffrax.RESULTS.event_occurred
-    t, motion, fired, values = _locate(hit, t, motion, term, solver, scene, made)
-    return Solved(t, motion, fired, values, saved, stats, result)
-
-
-def _translate(result, motion: Motion) -> RESULTS:
-    """Diffrax's word for how a solve ended, as ours."""
-    out = RESULTS.where(result == diffrax.RESULTS.successful, RESULTS.successful, RESULTS.step_too_small)
-    out = RESULTS.where(result == diffrax.RESULTS.event_occurred, RESULTS.successful, out)
-    out = RESULTS.where(result == diffrax.RESULTS.max_steps_reached, RESULTS.max_steps, out)
-    finite = jnp.all(jnp.isfinite(motion.q)) & jnp.all(jnp.isfinite(motion.v))
-    return RESULTS.where(finite, out, RESULTS.non_finite)
-
-
-def _locate(hit, t_end, end: Motion, term, solver, scene: Scene, made: Plan):
-    """Time and motion of the earliest crossing in the last step, the guards that fired, and the guard values to go on with.
-
-    Steps of the solver back from the end of the step; the root is found without derivatives and then corrected once by Newton's formula
-    with everything differentiable, which makes dt/dp = -(dg/dp) / (dg/dt) exact. A guard that fired is armed again once it has left zero.
-    """
-    crossed = made.crossed(end.watch.before, end.watch.after) & scene.watched & hit
-    side = jnp.where(crossed, jnp.where(end.watch.after >= end.watch.before, 1, -1), 0).astype(t_end.dtype)
-
-    # an inner loop that can be differentiated both ways, outside of diffrax's adjoints
-    if isinstance(solver.solver, diffrax.AbstractRungeKutta):
-        solver = eqx.tree_at(lambda s: s.solver.scan_kind, solver, "bounded", is_leaf=lambda x: x is None)
-
-    def back(t, t_end, end, scene):
-        return solver.step(term, t_end, t, end, scene, solver.init(term, t_end, t, end, scene), False)[0]
-
-    def found():
-        frozen = jax.lax.stop_gradient((t_end, end, scene))
-
-        def passed(values):
-            return jnp.where(crossed, side * values, -jnp.inf)
-
-        def ahead(t):
-            return jnp.max(passed(_guard_values(made, t, back(t, *frozen), frozen[2])))
-
-        at_start, at_end = jnp.max(passed(end.watch.before)), jnp.max(passed(end.watch.after))
-        root = jax.lax.stop_gradient(first_root(ahead, end.watch.start, at_start, frozen[0], at_end))
-        y = back(root, t_end, end, scene)
-        rate = jax.lax.stop_gradient(term.vf(root, y, scene))
-        along = (jnp.ones_like(root), rate)
-        values, slopes = jax.jvp(lambda t, y: _guard_values(made, t, y, scene), (root, y), along)
-        slopes = jax.lax.stop_gradient(slopes)
-        first = jnp.argmax(passed(values))
-        fired = crossed & (passed(values) + side * slopes * event_tolerance(root) >= 0)
-        fired = fired | (jnp.arange(side.shape[0]) == first)
-        correction = values[first] / jnp.where(slopes[first] == 0, 1, slopes[first])
-        y = jax.tree.map(lambda y, r: y - r * correction, y, rate)
-        # zero: not armed, until it has left zero
-        after = jnp.where(fired, 0, jax.lax.stop_gradient(values))
-        return root - correction, y.q, y.v, y.work, fired, after
-
-    def missed():
-        return t_end, end.q, end.v, end.work, jnp.zeros_like(crossed), end.watch.after
-
-    t, q, v, work, fired, after = jax.lax.cond(eqxi.unvmap_any(hit), found, missed)
-    pick = lambda a, b: jnp.where(hit, a, b)
-    t, q, v, after = pick(t, t_end), pick(q, end.q), pick(v, end.v), pick(after, end.watch.after)
-    work = None if work is None else pick(work, end.work)
-    return t, Motion(q, v, work), fired & hit, after
 
 
 def _save(run: Run, ended: State, solved: Solved, ts) -> State:

@@ -10,13 +10,14 @@ from jax.scipy.linalg import cho_factor, cho_solve
 from jaxtyping import Array, Bool, Float
 
 from svkc.assembly import check_closed, connection_mask, joint_slice, link_index
-from svkc.chain import V_SIZE, Chain, State, Structure
+from svkc.chain import Chain, State, Structure
 from svkc.closure import close, constrain, decide_rank, scales
 from svkc.forward_dynamics import constraint_forces, reduced_inertia
 from svkc.inverse_dynamics import inertia_by_composites
 from svkc.kinematics import kinematics, twists
 from svkc.loops import ends, gap, joint_coordinates, loop_jacobian
 from svkc.spatial import quat_conjugate, quat_multiply, quat_rotate
+from svkc.topology import V_SIZE, joint_freedoms
 
 
 class Change(eqx.Module):
@@ -189,8 +190,6 @@ def bind(chain: Chain, state: State, name: str, parent: str, real: str, *, joint
 
     joint: any but universal and pairs of turns, whose coordinates a spare slot has no room for. pos, real_pos (m): in the two bodies.
     """
-    from svkc.chain import joint_freedoms
-
     slot = link_index(chain, name)
     if not chain.topology.link_spare[slot]:
         raise ValueError(

@@ -9,11 +9,21 @@ import sys
 import pytest
 
 ROOT = pathlib.Path(__file__).parent.parent
-FLOORS = {
-    "spatial": 0, "chain": 1, "unsupported": 1, "kinematics": 2, "trajectory": 2, "load": 2, "inverse_dynamics": 3, "energy": 4, "loops": 3, "closure": 4,
-    "archive": 3, "forward_dynamics": 5, "assembly": 5, "mobility": 5, "transition": 6, "events": 6, "stepping": 6, "request": 7, "simulate": 8, "view": 8,
-    "scenes": 6, "__main__": 9,
-}  # fmt: skip
+# the house floor by floor, the ground first
+HOUSE = [
+    "spatial topology unsupported",
+    "chain reading",
+    "kinematics trajectory load",
+    "inverse_dynamics loops archive",
+    "energy closure",
+    "forward_dynamics assembly mobility",
+    "transition events stepping scenes",
+    "request",
+    "phase view",
+    "simulate",
+    "__main__",
+]
+FLOORS = {name: floor for floor, names in enumerate(HOUSE) for name in names.split()}
 # a verb that the contract puts on a noun is imported where it is called
 UPWARDS = {("chain", "assembly"), ("trajectory", "archive"), ("trajectory", "view")}
 
@@ -32,7 +42,7 @@ def test_imports_only_go_down():
 def test_files_and_functions_are_small():
     for path in (ROOT / "svkc").rglob("*.py"):
         text = path.read_text()
-        assert text.count("\n") <= 400, path
+        assert text.count("\n") <= 300, path
         for node in ast.walk(ast.parse(text)):
             if isinstance(node, ast.FunctionDef):
                 lines = node.end_lineno - node.lineno + 1 - len((ast.get_docstring(node) or "").splitlines())

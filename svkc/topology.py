@@ -1,0 +1,168 @@
+"""F1: everything about a chain that never changes: rows, levels, joint kinds, where coordinates stand."""
+
+import dataclasses
+import functools
+
+import numpy as np
+
+FIXED, HINGE, SLIDE, BALL, FREE = range(5)
+Q_SIZE = (0, 1, 1, 4, 7)
+V_SIZE = (0, 1, 1, 3, 6)
+
+# the freedoms of the named joints: rotations about x, y, z, then translations along x, y, z; the axis of the joint is z
+JOINTS = {
+    "weld": (False, False, False, False, False, False),
+    "hinge": (False, False, True, False, False, False),
+    "slide": (False, False, False, False, False, True),
+    "cylinder": (False, False, True, False, False, True),
+    "universal": (True, True, False, False, False, False),
+    "planar": (False, False, True, True, True, False),
+    "ball": (True, True, True, False, False, False),
+    "free": (True, True, True, True, True, True),
+}
+
+
+def joint_freedoms(joint) -> tuple[bool, ...]:
+    """The six Booleans of a joint given by name or as six Booleans; ValueError otherwise."""
+    if isinstance(joint, str):
+        if joint in JOINTS:
+            return JOINTS[joint]
+    elif len(tuple(joint)) == 6:
+        return tuple(bool(x) for x in joint)
+    raise ValueError(f"joint: got {joint!r}, expected one of {', '.join(JOINTS)} or six Booleans (three rotations, three translations)")
+
+
+@dataclasses.dataclass(frozen=True)
+class Topology:
+    """Everything about a chain that never changes and that the compiler may specialise on. Rows are links, sorted by level, row 0 the world.
+
+    A body with several joints takes one row a joint, the last of them the body itself; the others have no mass.
+    """
+
+    body_names: tuple[str, ...]
+    joint_names: tuple[str, ...]
+    link_names: tuple[str, ...]
+    parent: tuple[int, ...]
+    kind: tuple[int, ...]
+    q_start: tuple[int, ...]
+    v_start: tuple[int, ...]
+    nq: int
+    nv: int
+    body_row: tuple[int, ...]
+    joint_row: tuple[int, ...]
+    link_freedoms: tuple[tuple[bool, ...], ...]
+    link_spare: tuple[bool, ...]
+
+    @functools.cached_property
+    def _hash(self):
+        return hash(tuple(getattr(self, f.name) for f in dataclasses.fields(self)))
+
+    def __hash__(self):
+        return self._hash
+
+    @functools.cached_property
+    def levels(self) -> tuple[tuple[int, int], ...]:
+        """(first row, last row + 1) of each level of the tree, the world's first."""
+        depth = np.zeros(len(self.parent), int)
+        for i in range(1, len(depth)):
+            depth[i] = depth[self.parent[i]] + 1
+        edges = np.searchsorted(depth, np.arange(depth.max() + 2))
+        return tuple((int(a), int(b)) for a, b in zip(edges[:-1], edges[1:], strict=True))
+
+    @functools.cached_property
+    def root(self) -> np.ndarray:
+        """The child of the world that each row hangs on; 0 for the world."""
+        root = np.arange(len(self.parent))
+        for i in range(1, len(root)):
+            root[i] = i if self.parent[i] == 0 else root[self.parent[i]]
+        return root
+
+    @functools.cached_property
+    def dof_row(self) -> np.ndarray:
+        """The row whose joint each coordinate of the tree belongs to."""
+        row = np.zeros(self.nv, int)
+        for i, (kind, start) in enumerate(zip(self.kind, self.v_start, strict=True)):
+            row[start : start + V_SIZE[kind]] = i
+        return row
+
+    @functools.cached_property
+    def ancestor(self) -> np.ndarray:
+        """[rows, rows] Boolean: the column is the row itself or one of its ancestors."""
+        table = np.eye(len(self.parent), dtype=bool)
+        for i in range(1, len(table)):
+            table[i] |= table[self.parent[i]]
+        return table
+
+    def rows_of(self, *kinds: int) -> np.ndarray:
+        """The rows whose joint is one of these kinds."""
+        return np.flatnonzero(np.isin(self.kind, kinds))
+
+    @functools.cached_property
+    def links(self) -> "LinkTables":
+        """Where the virtual links' coordinates stand in q and v."""
+        return LinkTables.of(self)
+
+    @property
+    def nq_all(self) -> int:
+        """Length of State.q: the tree's coordinates, then the virtual links'."""
+        return self.links.nq_all
+
+    @property
+    def dofs(self) -> int:
+        """Length of State.v: N_J with every virtual link connected."""
+        return self.links.dofs
+
+    @functools.cached_property
+    def quaternions(self) -> tuple[np.ndarray, np.ndarray]:
+        """(first index in q, first index in v) of every rotation kept as a quaternion, virtual links' included."""
+        offset_q, offset_v = (0, 0, 0, 0, 3), (0, 0, 0, 0, 3)
+        rows = self.rows_of(BALL, FREE)
+        q = [self.q_start[i] + offset_q[self.kind[i]] for i in rows] + [int(i[0]) for i in self.links.quat if i[0] < self.nq_all]
+        v = [self.v_start[i] + offset_v[self.kind[i]] for i in rows]
+        v += [int(d[0]) for i, d in zip(self.links.quat, self.links.dof, strict=True) if i[0] < self.nq_all]
+        return np.array(q, int), np.array(v, int)
+
+    @functools.cached_property
+    def scalars(self) -> tuple[np.ndarray, np.ndarray]:
+        """(index in q, index in v) of every coordinate whose rate is its velocity."""
+        quat_q, quat_v = self.quaternions
+        q = np.setdiff1d(np.arange(self.nq_all), (quat_q[:, None] + np.arange(4)).ravel())
+        v = np.setdiff1d(np.arange(self.dofs), (quat_v[:, None] + np.arange(3)).ravel())
+        return q, v
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class LinkTables:
+    """Index tables of the virtual joints: x, y, z turns, then x, y, z slides; an index past the end reads a constant.
+
+    Three rotations are one quaternion. A spare slot has room for all six freedoms; its mask in the Structure says which it uses.
+    """
+
+    nq_all: int
+    dofs: int
+    angle: np.ndarray  # [L 3] into (q, 0, 1)
+    slide: np.ndarray  # [L 3] into (q, 0, 1)
+    quat: np.ndarray  # [L 4] into (q, 0, 1)
+    dof: np.ndarray  # [L 6] into (v, 0)
+
+    @classmethod
+    def of(cls, topology: Topology) -> "LinkTables":
+        count = len(topology.link_names)
+        q, v = topology.nq, topology.nv
+        angle, slide, quat, dof = (np.full((count, k), -1) for k in (3, 3, 4, 6))
+        for i, freedoms in enumerate(topology.link_freedoms):
+            if sum(freedoms[:3]) == 3:
+                quat[i] = np.arange(q, q + 4)
+                q += 4
+            else:
+                for k in np.flatnonzero(freedoms[:3]):
+                    angle[i, k], q = q, q + 1
+            for k in np.flatnonzero(freedoms[3:]):
+                slide[i, k], q = q, q + 1
+            for k in np.flatnonzero(freedoms):
+                dof[i, k], v = v, v + 1
+        angle[angle < 0] = q
+        slide[slide < 0] = q
+        quat[quat[:, 0] < 0] = [q + 1, q, q, q]
+        dof[dof < 0] = v
+        return cls(q, v, angle, slide, quat, dof)
