@@ -1,7 +1,6 @@
-"""float64, strict promotion, warnings as errors, every annotation checked; compilations shared between workers and runs."""
+"""float64, strict promotion, warnings as errors, every annotation checked."""
 
 import os
-import tempfile
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("MPLBACKEND", "Agg")
@@ -13,8 +12,6 @@ from jaxtyping import install_import_hook
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
-jax.config.update("jax_compilation_cache_dir", os.path.join(tempfile.gettempdir(), f"svkc-test-cache-{os.getuid()}"))
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 
 hook = install_import_hook("svkc", "beartype.beartype")
 import svkc

@@ -1,5 +1,6 @@
 """Structure changes: the velocity after, two ways; momentum, energy; cuts, locks, grips where the hand is."""
 
+import jax
 import jax.numpy as jnp
 import models
 import numpy as np
@@ -89,7 +90,7 @@ def test_momentum_across_a_connect(joint):
     state = chain.state(v=rng.normal(size=12))
     after = svkc.connect(chain, state, "grip")
     for a, b in zip(svkc.momentum(chain, state), svkc.momentum(chain, after), strict=True):
-        np.testing.assert_allclose(a, b, atol=1e-12 * float(jnp.abs(a).max()) + 1e-11)
+        np.testing.assert_allclose(a, b, atol=1e-12 * float(jnp.abs(a).max()))
     assert float(svkc.kinetic_energy(chain, after)) < float(svkc.kinetic_energy(chain, state))
     assert float(jnp.abs(svkc.velocity_gaps(chain, after)).max()) < 1e-12
     v, _ = velocity_by_impulse(chain, state, "grip")
@@ -147,6 +148,22 @@ def test_lock_and_unlock(high_bar):
 def test_wrong_calls(high_bar, call, message):
     with pytest.raises(ValueError, match=message):
         call(*high_bar)
+
+
+def test_states_and_changes_under_jit_and_vmap(high_bar):
+    """The verbs are functions of arrays: the same numbers compiled, and lane by lane."""
+    chain, state = high_bar
+    v = jnp.stack([jnp.full(chain.nv, s) for s in (0.1, -0.2)])
+
+    @jax.jit
+    @jax.vmap
+    def lanes(v):
+        moving = chain.state(state.q[: chain.nq], v)
+        return moving, svkc.connect(chain, svkc.cut(chain, moving, "left_hand_grip"), "left_hand_grip")
+
+    moving, again = lanes(v)
+    np.testing.assert_allclose(moving.v[1], chain.state(state.q[: chain.nq], v[1]).v, atol=1e-12)
+    np.testing.assert_allclose(again.v, moving.v, atol=1e-12)
 
 
 def test_loops_that_cannot_be_closed():

@@ -128,11 +128,22 @@ def test_info(tmp_path):
     assert run("-m", "svkc", "info", tmp_path / "bad.xml").returncode == 1
 
 
-def test_pictures_say_what_they_cannot_draw(high_bar, tmp_path):
+def test_pictures_say_what_they_cannot_draw(high_bar, tmp_path, monkeypatch):
+    """Another ending; a machine without GL, as Python would see it."""
+    import importlib
+
     import svkc
 
+    def missing(name):
+        raise ImportError(name)
+
+    traj = svkc.simulate(*high_bar, 0.0)
+    with monkeypatch.context() as patch:
+        patch.setattr(importlib, "import_module", missing)
+        with pytest.raises(RuntimeError, match="libegl1 libgl1"):
+            svkc.render(high_bar[0], traj, tmp_path / "x.gif")
     with pytest.raises(ValueError, match=r"\.png or \.gif"):
-        svkc.render(high_bar[0], svkc.simulate(*high_bar, 0.0), tmp_path / "x.bmp")
+        svkc.render(high_bar[0], traj, tmp_path / "x.bmp")
 
 
 def test_ruff_is_content():

@@ -149,13 +149,16 @@ def test_fixed_and_adaptive_steps_agree(pendulum):
     assert 1e-5 < float(jnp.abs(euler.states.q - adaptive.states.q).max()) < 1e-1
 
 
-def test_control_and_work(pendulum):
+def test_control_and_work(pendulum, capsys):
     """Torque of a control, and the energy it puts in, are accounted for."""
 
     def control(t, state, args):
         return args * jnp.ones(1) * jnp.sin(5 * t)
 
-    traj = quarter(pendulum, control=control, args=jnp.asarray(3.0), rtol=1e-10, atol=1e-12)
+    meter = diffrax.TextProgressMeter()
+    traj = quarter(pendulum, control=control, args=jnp.asarray(3.0), rtol=1e-10, atol=1e-12, progress_meter=meter)
+    jax.effects_barrier()
+    assert "100" in capsys.readouterr().out
     assert abs(float(traj.phases.work[0])) > 1e-2
     assert abs(float(traj.phases.energy_drift[0])) < 1e-8
 
@@ -170,6 +173,17 @@ def test_drift_is_held_or_not():
         gaps[type(held).__name__] = float(traj.gaps.max())
     assert gaps["Projection"] < 1e-13
     assert gaps["Projection"] < gaps["Baumgarte"] < gaps["Drift"]
+
+
+def test_the_motion_does_not_depend_on_the_coordinates():
+    """A four-bar through 1 s with its own choice of theta_G and with another asked for."""
+    chain = models.four_bar()
+    state = chain.state(v={"crank": 4.0})
+    asked = eqx.tree_at(lambda s: s.structure.independent, state, svkc.coordinates(chain, state).dependent, is_leaf=lambda x: x is None)
+    a, b = (svkc.simulate(chain, s, 1.0, rtol=1e-10, atol=1e-12).final for s in (state, asked))
+    assert bool(jnp.any(svkc.mobility(chain, state).independent != svkc.mobility(chain, asked).independent))
+    np.testing.assert_allclose(a.q, b.q, atol=1e-9)
+    np.testing.assert_allclose(a.v, b.v, atol=1e-8)
 
 
 def test_results_tell_what_went_wrong(pendulum):
@@ -216,6 +230,9 @@ def test_wrong_calls(kw, message):
     kw = {"state": chain.state(), "t1": 1.0} | kw
     with pytest.raises(ValueError, match=message):
         svkc.simulate(chain, **kw)
+    single = eqx.tree_at(lambda s: (s.q, s.v), chain.state(), replace_fn=lambda x: x.astype(jnp.float32))
+    with pytest.raises(ValueError, match="same precision"):
+        svkc.simulate(chain, single, 1.0)
     for wrong in (lambda: svkc.at(0.5, connect=3), lambda: svkc.when(3), lambda: svkc.when(angle(0), direction="up"), lambda: svkc.at(1.0, here="a")):
         with pytest.raises((ValueError, TypeError)):
             wrong()
