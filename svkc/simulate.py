@@ -30,7 +30,8 @@ def simulate(
 ) -> Trajectory:  # fmt: skip
     """The motion from t0 to t1 (s), through every change of structure in `events` (`svkc.at`, `svkc.when`).
 
-    ts: times to save, stepped to exactly; None: t0 and t1. A state saved at an event's time is the one after it.
+    ts: times to save, stepped to exactly; None: t0 and t1. A state saved at an event's time is the one after it; times past the end of a run that
+    stopped early hold its last state.
     control(t, state, args): joint torques (N m, N) over every coordinate, or the tree's.
     dt: fixed steps (s). rtol, atol: adaptive steps, by default 1e-7 and 1e-9 (float32: 1e-4 and 1e-6).
     solver, stepsize_controller, adjoint, progress_meter: diffrax objects, passed through; Tsit5 by default.
@@ -77,8 +78,10 @@ def _largest_gaps(chain: Chain, state: State) -> Float[Array, "2"]:
     """Largest rotation (rad) and distance (m) over the loops."""
     if not len(chain.link_names):
         return jnp.zeros(2, state.q.dtype)
-    gaps = loop_gaps(chain, state)
-    return jnp.stack([jnp.max(jnp.linalg.norm(gaps[:, k : k + 3] + 0, axis=-1)) for k in (0, 3)])
+    square = jnp.sum(loop_gaps(chain, state).reshape(-1, 2, 3) ** 2, -1)
+    closed = square == 0
+    # a root that can be differentiated where the loop is closed to the last bit
+    return jnp.max(jnp.where(closed, 0, jnp.sqrt(jnp.where(closed, 1, square))), 0)
 
 
 def _start(chain: Chain, state: State, t0, ts, made: Plan, options: Options, args) -> Run:
@@ -133,10 +136,10 @@ def _phase(chain: Chain, run: Run, index, t1, ts, made: Plan, options: Options, 
 
 
 def _save(run: Run, ended: State, solved: Solved, ts) -> State:
-    """The saved states with those of this phase written in: from its start to its end, both included."""
-    here = (ts >= run.t) & (ts <= solved.t)
-    q = jnp.where(here[:, None], solved.saved.q, run.saved.q)
-    v = jnp.where(here[:, None], solved.saved.v, run.saved.v)
+    """The saved states with those of this phase written in: from its start to its end, both included; later ones hold its end."""
+    here, later = ((ts >= run.t) & (ts <= solved.t))[:, None], (ts > solved.t)[:, None]
+    q = jnp.where(here, solved.saved.q, jnp.where(later, ended.q[None], run.saved.q))
+    v = jnp.where(here, solved.saved.v, jnp.where(later, ended.v[None], run.saved.v))
 
     def write(new, old):
         return jnp.where((ts >= run.t).reshape(-1, *(1,) * new.ndim), new[None], old)

@@ -89,6 +89,7 @@ def test_guards_two_in_one_step_the_earliest_wins(pendulum):
         assert abs(float(traj.events.time[0] - fine.events.time[0])) < 3e-5
         assert abs(float(traj.final.q[0]) - 0.7) < 1e-12
         assert traj.result == svkc.RESULTS.stopped
+        assert float(traj.states.q[-1, 0]) == pytest.approx(0.7)
 
 
 def test_guards_at_the_same_instant(pendulum):
