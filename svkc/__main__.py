@@ -44,7 +44,7 @@ def _high_bar(out: pathlib.Path) -> int:
     """The main job."""
     import jax
 
-    # the command's own process: float64, and the sums XLA would otherwise hand to a slower kernel
+    # the process is the command's own, so the setting is too
     jax.config.update("jax_enable_x64", True)
     import jax.numpy as jnp
 

@@ -29,12 +29,3 @@ def pytest_configure(config):
 def high_bar():
     """Chain and state of the main job, without joint ranges: nothing that takes or gives energy."""
     return svkc.scenes.high_bar(ignore=("limit",))
-
-
-# the same sums in another order; another algorithm for the same numbers; numbers that went through an integrator
-SAME_ALGEBRA, OTHER_ALGORITHM, INTEGRATED = 1e-13, 1e-10, 1e-8
-
-
-@pytest.fixture(scope="session")
-def tolerances():
-    return SAME_ALGEBRA, OTHER_ALGORITHM, INTEGRATED
