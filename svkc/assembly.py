@@ -8,7 +8,7 @@ import numpy as np
 from svkc.chain import Chain, State, Structure
 from svkc.closure import agree, close, decide_rank, loop_gaps
 from svkc.kinematics import kinematics, normalize
-from svkc.loops import active_dofs, joint_coordinates
+from svkc.loops import active_dofs, joint_coordinates, with_coordinates
 from svkc.topology import Q_SIZE, V_SIZE
 
 _NEWTON = 30
@@ -40,8 +40,16 @@ def link_index(chain: Chain, name: str) -> int:
 
 
 def joint_slice(chain: Chain, name: str, sizes, start) -> slice:
-    """Where a joint of the tree stands in q or v; ValueError naming those there are."""
+    """Where a joint of the tree, or one that may be cut, stands in q (sizes=Q_SIZE) or v; ValueError naming those there are."""
     top = chain.topology
+    for joint, link, freedom in top.cut_joints:
+        if joint == name:
+            ball = sum(top.link_freedoms[link][:3]) == 3
+            if sizes is V_SIZE:
+                first = top.links.dof[link, freedom]
+                return slice(int(first), int(first) + (3 if ball else 1))
+            first = top.links.quat[link, 0] if ball else np.concatenate([top.links.angle, top.links.slide], 1)[link, freedom]
+            return slice(int(first), int(first) + (4 if ball else 1))
     if name not in top.joint_names:
         raise ValueError(f"no joint {name!r}; joints: {', '.join(top.joint_names)}")
     row = top.joint_row[top.joint_names.index(name)]
@@ -65,6 +73,10 @@ def _filled(chain: Chain, what: str, value, default, tree: int, sizes, start):
                 named[at] = True
         return out, named
     value = _numbers(what, value, default.dtype)
+    of_model = np.array(chain.topology.model_q if what == "q" else chain.topology.model_v, int)
+    if chain.topology.cut_joints and value.shape == of_model.shape:
+        # as for the plain tree
+        return default.at[of_model].set(value), named
     if value.shape == (tree,):
         return default.at[:tree].set(value), named
     if value.shape != default.shape:
@@ -93,10 +105,30 @@ def _check_quaternions(chain: Chain, q):
         raise ValueError(f"q: the quaternion at q[{first[i]}:{first[i] + 4}] has norm {norms[i]:.6g}, expected 1")
 
 
+def _carried(chain: Chain, structure: Structure, q, v, placed):
+    """Bodies that may be cut, put where the joints that hold them say, in position and velocity, all else as it is."""
+    top = chain.topology
+    carried = np.zeros(top.dofs, bool)
+    for row in top.link_child:
+        if row >= 0:
+            carried[top.v_start[row] : top.v_start[row] + 6] = True
+    only = eqx.tree_at(lambda s: (s.connected, s.rank), structure, (structure.connected & placed, jnp.asarray(min(6 * len(placed), top.dofs), jnp.int32)))
+    q = close(chain, only, q, 2 * _NEWTON, hold=jnp.asarray(~carried))
+    v = agree(chain, only, q, jnp.where(active_dofs(chain, structure), v, 0), hold=jnp.asarray(~carried))
+    return q, v
+
+
 @eqx.filter_jit
-def _close_and_agree(chain: Chain, structure: Structure, q, v, held_q, held_v):
-    """Loops closed with the named coordinates held, then, for what is still open, with all of them free; the same for velocities."""
-    q = joint_coordinates(chain, structure, kinematics(chain, q), q)
+def _close_and_agree(chain: Chain, structure: Structure, q, v, held_q, held_v, whole: bool):
+    """Loops closed with the named coordinates held, then, for what is still open, with all of them free; the same for velocities.
+
+    whole: q says where every body is; else those that may be cut are put where their joint's coordinates say.
+    """
+    placed = (np.array(chain.topology.link_child, int) >= 0) & (not whole)
+    if placed.any():
+        q, v = _carried(chain, structure, q, v, placed)
+    read = joint_coordinates(chain, structure, kinematics(chain, q), q)
+    q = with_coordinates(chain, jnp.asarray(~placed) | ~structure.connected, read, q)
     full = eqx.tree_at(lambda s: s.rank, structure, jnp.asarray(min(6 * len(chain.link_names), chain.dofs), jnp.int32))
     q = close(chain, full, q, 2 * _NEWTON, hold=held_q)
     structure = decide_rank(chain, structure, q)
@@ -108,12 +140,14 @@ def assemble(chain: Chain, q, v, connected) -> State:
     """See `Chain.state`."""
     top = chain.topology
     structure = eqx.tree_at(lambda s: s.connected, chain.structure, jnp.asarray(connection_mask(chain, connected)))
+    given = q
     q, held_q = _filled(chain, "q", q, chain.q_load, top.nq, Q_SIZE, top.q_start)
     v, held_v = _filled(chain, "v", v, jnp.zeros(top.dofs, chain.q_load.dtype), top.nv, V_SIZE, top.v_start)
     _check_quaternions(chain, q)
     if not len(top.link_names):
         return State(normalize(chain, q), v, structure)
-    state = _close_and_agree(chain, structure, q, v, jnp.asarray(_as_dofs(chain, held_q)), jnp.asarray(held_v))
+    whole = given is not None and not isinstance(given, dict) and np.shape(given) != (len(top.model_q),)
+    state = _close_and_agree(chain, structure, q, v, jnp.asarray(_as_dofs(chain, held_q)), jnp.asarray(held_v), whole)
     return check_closed(chain, state)
 
 

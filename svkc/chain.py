@@ -18,6 +18,7 @@ class VirtualLink:
     `parent`, `real`: body names ("world" is the ground). `pos` (m), `quat`: the joint's frame in the parent; `real_pos`, `real_quat`: the
     same frame in the real link, None: from the load pose. `axis`: of the joint, in the frame `pos`, `quat` makes in the parent.
     `joint`: weld, hinge, slide, cylinder, universal, planar, ball, free, or six Booleans (three rotations, three translations).
+    `actuated`: a motor drives the joint's own coordinates (paper, Fig. 6).
     """
 
     name: str
@@ -30,6 +31,7 @@ class VirtualLink:
     real_quat: Any = None
     axis: Any = (0.0, 0.0, 1.0)
     connected: bool = False
+    actuated: bool = False
 
     def __post_init__(self):
         joint_freedoms(self.joint)
@@ -91,17 +93,18 @@ class Chain(eqx.Module):
     gravity: Float[Array, "3"]
     q_load: Float[Array, " q"]
     length: Float[Array, ""]
-    gear: Float[Array, "motors nv"]
+    gear: Float[Array, "motors dofs"]
     control_range: Float[Array, "motors 2"]
     force_range: Float[Array, "motors 2"]
     structure: Structure
     anchor: Float[Array, "rows 3"] | None = None
     armature: Float[Array, " nv"] | None = None
-    damping: Float[Array, " nv"] | None = None
-    stiffness: Float[Array, " nv"] | None = None
-    q_spring: Float[Array, " nq"] | None = None
-    limit: Float[Array, "2 nv"] | None = None
-    limit_spring: Float[Array, "2 nv"] | None = None
+    link_armature: Float[Array, " own"] | None = None
+    damping: Float[Array, " dofs"] | None = None
+    stiffness: Float[Array, " dofs"] | None = None
+    q_spring: Float[Array, " q"] | None = None
+    limit: Float[Array, "2 dofs"] | None = None
+    limit_spring: Float[Array, "2 dofs"] | None = None
     model: Any = eqx.field(static=True, default=None)
     left_out: tuple[str, ...] = eqx.field(static=True, default=())
 
@@ -153,13 +156,20 @@ class Chain(eqx.Module):
 
     @property
     def actuated(self) -> Bool[Array, " dofs"]:
-        """What the model's actuators drive; without actuators every joint of the tree that is not free."""
+        """What the model's actuators drive (without actuators every joint that is not free), and virtual joints declared as actuated."""
         top = self.topology
         if self.gear.shape[0]:
-            tree = jnp.any(self.gear != 0, 0)
+            driven = jnp.any(self.gear != 0, 0)
         else:
-            tree = jnp.asarray(np.array(top.kind)[top.dof_row] != FREE)
-        return jnp.concatenate([tree, jnp.zeros(top.dofs - top.nv, bool)])
+            driven = jnp.asarray(np.append(np.array(top.kind)[top.dof_row] != FREE, np.zeros(top.dofs - top.nv, bool)))
+            driven = driven | self._own(np.array(top.link_child, int) >= 0)
+        return driven | self._own(np.array(top.link_actuated, bool))
+
+    def _own(self, links: np.ndarray) -> np.ndarray:
+        """[dofs] the own coordinates of some virtual links."""
+        table, mask = self.topology.links.dof[links], np.zeros(self.dofs, bool)
+        mask[table[table < self.dofs]] = True
+        return mask
 
     def motors(self, u: Float[Array, " motors"]) -> Float[Array, " dofs"]:
         """Joint torques (N m, N) of the model's actuators for the controls u: gear times u, each clipped to its range."""
@@ -167,7 +177,7 @@ class Chain(eqx.Module):
             raise ValueError(f"u: got shape {u.shape}, the model has {self.gear.shape[0]} actuators")
         force = jnp.clip(u, self.control_range[:, 0], self.control_range[:, 1])
         force = jnp.clip(force, self.force_range[:, 0], self.force_range[:, 1])
-        return jnp.concatenate([force @ self.gear, jnp.zeros(self.dofs - self.nv, u.dtype)])
+        return force @ self.gear
 
     def state(self, q=None, v=None, connected=None) -> State:
         """A consistent state: loops closed by Newton's method, velocities made to agree with them.

@@ -32,24 +32,32 @@ class Coordinates(eqx.Module):
     """The paper's matrices, over every joint coordinate (rows of dependent, locked and unconnected coordinates' columns are zero).
 
     `W` [dofs, dofs]: all velocities from the independent ones (16); `bias` [dofs]: Hdot v_G (21) on the dependent ones;
-    `independent`, `dependent`: the choice theta_G, theta_S; `selection`: the pivots it came from; `J`: the scaled J_C.
+    `independent`, `dependent`: the choice theta_G, theta_S; `actuated`: theta_A; `selection`: the pivots; `J`: the scaled J_C.
+    The paper's smaller matrices are rows and columns of these: W[: chain.nv, independent], H[dependent][:, independent], S[actuated][:, independent].
     """
 
     W: Float[Array, "dofs dofs"]
     bias: Float[Array, " dofs"]
     independent: Bool[Array, " dofs"]
     dependent: Bool[Array, " dofs"]
+    actuated: Bool[Array, " dofs"]
     selection: Selection
     J: Float[Array, "rows dofs"]
 
     @property
     def H(self) -> Float[Array, "dofs dofs"]:
-        """D theta_S / d theta_G (17): the dependent rows of W."""
+        """The derivative of theta_S by theta_G (17): the dependent rows of W."""
         return jnp.where(self.dependent[:, None], self.W, 0)
 
-    def S(self, actuated: Bool[Array, " dofs"]) -> Float[Array, "dofs dofs"]:
-        """D theta_A / d theta_G (paper (6)): the actuated rows of W."""
-        return jnp.where(actuated[:, None], self.W, 0)
+    @property
+    def S(self) -> Float[Array, "dofs dofs"]:
+        """The derivative of theta_A by theta_G (paper (6)): the actuated rows of W."""
+        return jnp.where(self.actuated[:, None], self.W, 0)
+
+    @property
+    def Hdot_v(self) -> Float[Array, " dofs"]:
+        """The part of the dependent accelerations that velocities make (21)."""
+        return self.bias
 
 
 def rank_tolerance(dtype) -> float:
@@ -145,7 +153,8 @@ def constrain(chain: Chain, structure: Structure, q, v, kin, V, baumgarte=None) 
     solved = solve_frozen(JS, jnp.concatenate([Jm, (selection.Q @ drift)[:, None]], 1))
     from_pivots = selection.P.T @ solved
     W = jnp.where(independent[None], jnp.eye(len(column), dtype=J.dtype) - from_pivots[:, :-1], 0)
-    return Coordinates(column[:, None] * W / column[None], -column * from_pivots[:, -1], independent, dependent, selection, J)
+    W = column[:, None] * W / column[None]
+    return Coordinates(W, -column * from_pivots[:, -1], independent, dependent, chain.actuated, selection, J)
 
 
 @jax.jit
@@ -160,6 +169,15 @@ def loop_gaps(chain: Chain, state: State) -> Float[Array, "links 6"]:
     """How far each connected loop is open: rotation vector (rad), then distance (m), in the world; zero where not connected."""
     kin = kinematics(chain, state.q)
     return gap(state.structure, ends(chain, state.structure, kin, state.q))
+
+
+@jax.jit
+def jacobian(chain: Chain, state: State) -> tuple[Float[Array, "links 3 dofs"], Float[Array, "links 3 dofs"]]:
+    """J_C (paper (11)): linear (m/s) and angular (rad/s) velocity of each connected virtual link relative to its real link, for a unit rate of each
+    joint coordinate, at the joint, in world axes."""
+    kin = kinematics(chain, state.q)
+    J = loop_jacobian(chain, state.structure, kin, ends(chain, state.structure, kin, state.q)).reshape(-1, 6, chain.dofs)
+    return J[:, 3:], J[:, :3]
 
 
 @jax.jit

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from svkc.chain import Chain, State
-from svkc.inverse_dynamics import spring_stretch
-from svkc.kinematics import Kinematics, kinematics, twists
+from svkc.kinematics import Kinematics, difference, kinematics, twists
+from svkc.loops import active_dofs
 from svkc.spatial import cross, rotate
 
 
@@ -25,9 +25,13 @@ def _energies(chain: Chain, state: State) -> tuple[Float[Array, ""], Float[Array
     kinetic = jnp.sum(chain.mass * jnp.sum(u * u, -1)) / 2 + jnp.sum(w * spin) / 2
     if chain.armature is not None:
         kinetic = kinetic + jnp.sum(chain.armature * state.v[: chain.nv] ** 2) / 2
+    active = active_dofs(chain, state.structure)
+    if chain.link_armature is not None:
+        kinetic = kinetic + jnp.sum(jnp.where(active, state.v, 0)[chain.nv :] ** 2 * chain.link_armature) / 2
     potential = -jnp.sum(chain.mass * jnp.sum((kin.root + c) * chain.gravity[None], -1))
     if chain.stiffness is not None:
-        potential = potential + jnp.sum(chain.stiffness * spring_stretch(chain, state.q) ** 2) / 2
+        stretch = jnp.where(active, difference(chain, chain.q_spring, state.q), 0)
+        potential = potential + jnp.sum(chain.stiffness * stretch**2) / 2
     return kinetic, potential
 
 

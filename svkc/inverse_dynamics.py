@@ -2,13 +2,11 @@
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from svkc.chain import Chain, State
-from svkc.kinematics import Kinematics, down, kinematics, to_rows, twists, up, velocity_products
-from svkc.spatial import cross, quat_conjugate, quat_log, quat_multiply, quat_normalize, rotate
-from svkc.topology import BALL, FREE, HINGE, SLIDE
+from svkc.kinematics import Kinematics, difference, down, kinematics, to_rows, twists, up, velocity_products
+from svkc.spatial import cross, rotate
 
 
 def newton_euler(chain: Chain, kin: Kinematics, V: Float[Array, "rows 6"] | None, A: Float[Array, "rows 6"]) -> Float[Array, " nv"]:
@@ -73,45 +71,27 @@ def inertia_by_composites(chain: Chain, kin: Kinematics) -> Float[Array, "nv nv"
     return M if chain.armature is None else M + jnp.diag(chain.armature)
 
 
-def passive_forces(chain: Chain, q: Float[Array, " q"], v: Float[Array, " dofs"]) -> Float[Array, " nv"]:
+def passive_forces(chain: Chain, q: Float[Array, " q"], v: Float[Array, " dofs"]) -> Float[Array, " dofs"]:
     """Springs and dampers of the model's joints (N m, N), MuJoCo's meaning: -stiffness (q - q_spring) - damping v."""
-    tau = jnp.zeros_like(v[: chain.nv])
+    tau = jnp.zeros_like(v)
     if chain.damping is not None:
-        tau = tau - chain.damping * v[: chain.nv]
+        tau = tau - chain.damping * v
     if chain.stiffness is not None:
-        tau = tau - chain.stiffness * spring_stretch(chain, q)
+        # the stretch of a ball is a rotation vector in body axes
+        tau = tau - chain.stiffness * difference(chain, chain.q_spring, q)
     return tau
 
 
-def spring_stretch(chain: Chain, q: Float[Array, " q"]) -> Float[Array, " nv"]:
-    """How far each coordinate of the tree is from its spring's rest (rad, m); rotation vector in body axes for balls."""
-    top, rest = chain.topology, chain.q_spring
-    stretch = jnp.zeros(chain.nv, q.dtype)
-    for kinds, offset_q, offset_v, size in (((HINGE, SLIDE), 0, 0, 1), ((FREE,), 0, 0, 3)):
-        rows = top.rows_of(*kinds)
-        at_q = np.array(top.q_start, int)[rows][:, None] + offset_q + np.arange(size)
-        at_v = np.array(top.v_start, int)[rows][:, None] + offset_v + np.arange(size)
-        stretch = stretch.at[at_v].set(q[at_q] - rest[at_q])
-    for kind, offset in ((BALL, 0), (FREE, 3)):
-        rows = top.rows_of(kind)
-        at_q = np.array(top.q_start, int)[rows][:, None] + offset + np.arange(4)
-        at_v = np.array(top.v_start, int)[rows][:, None] + offset + np.arange(3)
-        turn = quat_log(quat_multiply(quat_conjugate(rest[at_q]), quat_normalize(q[at_q])))
-        stretch = stretch.at[at_v].set(turn)
-    return stretch
-
-
-def limit_forces(chain: Chain, q: Float[Array, " q"], v: Float[Array, " dofs"]) -> Float[Array, " nv"]:
+def limit_forces(chain: Chain, q: Float[Array, " q"], v: Float[Array, " dofs"]) -> Float[Array, " dofs"]:
     """The torque that keeps joints inside their range (paper, section VII-B): a stiff spring and damper that act outside of it only.
 
     With x the distance outside and a = 0.01 rad or m: -(k x + c v) x / (x + a). Smooth once where it sets in; zero inside.
     """
-    top, tau = chain.topology, jnp.zeros_like(v[: chain.nv])
+    tau = jnp.zeros_like(v)
     if chain.limit is None:
         return tau
     k, c = chain.limit_spring
-    rows = top.rows_of(HINGE, SLIDE)
-    at_q, at_v = np.array(top.q_start, int)[rows], np.array(top.v_start, int)[rows]
+    at_q, at_v = chain.topology.scalars
     lower, upper = chain.limit[:, at_v]
     x = q[at_q]
     out = jnp.maximum(x - upper, 0) - jnp.maximum(lower - x, 0)
@@ -143,4 +123,4 @@ def inverse_dynamics(chain: Chain, state: State, vdot: Float[Array, " accelerati
     kin = kinematics(chain, state.q)
     V = twists(chain, kin, state.v)
     tau = generalized_forces(chain, kin, V, state.v, vdot[: chain.nv])
-    return tau - passive_forces(chain, state.q, state.v)
+    return tau - passive_forces(chain, state.q, state.v)[: chain.nv]

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from svkc.chain import Chain, Structure, VirtualLink
-from svkc.reading import bodies_of, joint_forces_of, motors_of, name_of, rows_of
+from svkc.cuttable import cuts_of, placed_in
+from svkc.reading import bodies_of, by_dof, joint_forces_of, motors_of, name_of, rows_of
 from svkc.topology import Topology, joint_freedoms
 from svkc.unsupported import what_is_left_out
 
@@ -31,20 +32,22 @@ def load(source, *, virtual_links=(), cuttable=(), spare=0, ignore=()) -> Chain:
     """A Chain from MJCF or URDF (path or text), a mujoco.MjSpec or a mujoco.MjModel.
 
     `virtual_links`: more of them, beside the <equality> connect (ball) and weld of the model; `spare`: slots for links bound at run time;
+    `cuttable`: names of joints of the tree that may be cut, each a virtual link of its name, connected at first (paper, Fig. 15);
     `ignore`: kinds of elements to leave out, by the names the error message uses, or "all". "limit" leaves out joint ranges.
     Collisions between geoms are never modelled. ValueError: the source does not parse, elements not supported, unknown names.
     """
-    if cuttable:
-        raise ValueError(f"cuttable: got {cuttable!r}; joints of the tree cannot be cut yet, cut virtual links instead")
     model = compile_model(source)
+    cuts = cuts_of(model, cuttable)
     if isinstance(ignore, str):
         ignore = (ignore,)
     left_out = what_is_left_out(model, ignore)
-    rows, topology = rows_of(model)
+    rows, topology = rows_of(model, {cut.body: cut.link.name for cut in cuts})
     links = [*_equalities(model, ignore), *virtual_links]
+    first = len(links)
     for link in links:
         if not isinstance(link, VirtualLink):
             raise ValueError(f"virtual_links: expected svkc.VirtualLink objects, got {link!r}")
+    links += [cut.link for cut in cuts]
     links += [VirtualLink(f"spare_{i}", "world", "world", "free") for i in range(int(spare))]
     names = [link.name for link in links]
     if len(set(names)) < len(names):
@@ -54,7 +57,9 @@ def load(source, *, virtual_links=(), cuttable=(), spare=0, ignore=()) -> Chain:
         link_names=tuple(names),
         link_freedoms=tuple(joint_freedoms(link.joint) for link in links),
         link_spare=tuple(i >= len(links) - int(spare) for i in range(len(links))),
+        link_actuated=tuple(bool(link.actuated) for link in links),
     )
+    topology = placed_in(model, topology, cuts, first)
     structure = _structure(model, topology, links, int(spare))
     return _chain(model, topology, rows, structure, ignore, left_out)
 
@@ -181,20 +186,38 @@ def _floats(x):
     return jnp.asarray(np.asarray(x, np.float64), dtype=jnp.result_type(float))
 
 
+def _load_pose(model, topology: Topology) -> np.ndarray:
+    """[q] the model's qpos0, bodies that may be cut where that puts them, virtual joints at zero."""
+    import mujoco
+
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    tables = topology.links
+    q = np.zeros(topology.nq_all)
+    q[tables.quat[tables.quat[:, 0] < topology.nq_all, 0]] = 1
+    q[np.array(topology.model_q, int)] = model.qpos0
+    for row in topology.link_child:
+        if row >= 0:
+            body, start = topology.body_row.index(row), topology.q_start[row]
+            q[start : start + 7] = *data.xpos[body], *data.xquat[body]
+    return q
+
+
 def _chain(model, topology, rows, structure, ignore, left_out) -> Chain:
     import mujoco
 
     ignored, bodies = set(ignore), bodies_of(model, topology, rows)
-    stiffness, limit, spring = joint_forces_of(model, ignored)
-    damping = np.zeros(model.nv) if "damping" in ignored else np.ravel(model.dof_damping)
-    armature = np.zeros(model.nv) if "armature" in ignored else model.dof_armature
+    stiffness, limit, spring = joint_forces_of(model, ignored, topology)
+    damping = by_dof(topology, 0 * model.dof_damping if "damping" in ignored else model.dof_damping)
+    armature = by_dof(topology, 0 * model.dof_armature if "armature" in ignored else model.dof_armature)
     gravity = np.zeros(3) if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY) else model.opt.gravity
-    gear, control, force = motors_of(model, ignored)
+    gear, control, force = motors_of(model, ignored, topology)
     offsets = np.linalg.norm(np.concatenate([bodies["pos"][np.array(topology.parent) > 0], bodies["com"]]), axis=1)
     offsets = offsets[offsets > 1e-12]
-    filled = topology.links
-    q_load = np.concatenate([model.qpos0, np.zeros(filled.nq_all - topology.nq)])
-    q_load[filled.quat[filled.quat[:, 0] < filled.nq_all, 0]] = 1
+    q_load = _load_pose(model, topology)
+    q_spring = np.array(q_load)
+    q_spring[np.array(topology.model_q, int)] = model.qpos_spring
+    nv = topology.nv
 
     def unless(empty, value):
         return None if empty else _floats(value)
@@ -210,10 +233,11 @@ def _chain(model, topology, rows, structure, ignore, left_out) -> Chain:
         force_range=_floats(force),
         structure=structure,
         anchor=unless(not bodies["anchor"].any(), bodies["anchor"]),
-        armature=unless(not np.any(armature), armature),
+        armature=unless(not np.any(armature[:nv]), armature[:nv]),
+        link_armature=unless(not np.any(armature[nv:]), armature[nv:]),
         damping=unless(not np.any(damping), damping),
         stiffness=unless(not stiffness.any(), stiffness),
-        q_spring=unless(not stiffness.any(), model.qpos_spring),
+        q_spring=unless(not stiffness.any(), q_spring),
         limit=unless(not np.isfinite(limit).any(), limit),
         limit_spring=unless(not np.isfinite(limit).any(), spring),
         model=Source(model),

@@ -158,6 +158,16 @@ def joint_coordinates(chain: Chain, structure: Structure, kin: Kinematics, q: Fl
     return q
 
 
+def with_coordinates(chain: Chain, which: Bool[Array, " links"], new: Float[Array, " q"], q: Float[Array, " q"]) -> Float[Array, " q"]:
+    """The coordinates of the virtual joints in `which` from `new`, everything else from `q`."""
+    table, top = chain.topology.links, chain.topology
+    for index in (table.angle, table.slide, table.quat):
+        at = np.flatnonzero((index < top.nq_all).ravel())
+        slots = index.ravel()[at]
+        q = q.at[slots].set(jnp.where(which[at // index.shape[1]], new[slots], q[slots]))
+    return q
+
+
 def _angles(turn: Float[Array, "links 4"], freedoms: Bool[Array, "links 6"]) -> Float[Array, "links 3"]:
     """Turns about x, y, z in sequence; those not free are taken as zero, the others solved from the rotation."""
     R = quat_matrix(turn)

@@ -1,11 +1,14 @@
 """F2: what a MuJoCo model says of bodies, joints and motors, as numpy arrays by row."""
 
+import dataclasses
+
 import numpy as np
 
-from svkc.topology import BALL, FIXED, FREE, HINGE, SLIDE, V_SIZE, Topology
+from svkc.topology import BALL, FIXED, FREE, HINGE, Q_SIZE, SLIDE, V_SIZE, Topology
 from svkc.unsupported import plain_motors
 
 _LIMIT_RATE = 50.0  # rad/s: a joint outside its range is an oscillator of this frequency, critically damped, at its load-pose inertia
+_KINDS = {0: FREE, 1: BALL, 2: SLIDE, 3: HINGE}  # mjtJoint
 
 
 def name_of(model, kind: str, index: int) -> str:
@@ -16,33 +19,61 @@ def name_of(model, kind: str, index: int) -> str:
     return name or (f"{kind}_{index}" if index or kind != "body" else "world")
 
 
-def rows_of(model) -> tuple[list[tuple[int, int]], Topology]:
+@dataclasses.dataclass(frozen=True)
+class Joint:
+    """A joint of the tree and where its coordinates stand; `joint` is -1 for the free joint that a body gets whose own joints may be cut."""
+
+    name: str
+    kind: int
+    body: int
+    joint: int
+    q: int
+    v: int
+
+
+def joints_of(model, cut_bodies) -> list[Joint]:
+    """The joints of the tree in the model's order; a body in `cut_bodies` (body -> name) hangs on the base by a free joint (paper, Fig. 15)."""
+    out, q, v, seen = [], 0, 0, set()
+    for j in range(model.njnt):
+        body = int(model.jnt_bodyid[j])
+        if body in seen:
+            continue
+        kind, name, joint = _KINDS[int(model.jnt_type[j])], name_of(model, "joint", j), j
+        if body in cut_bodies:
+            seen.add(body)
+            kind, name, joint = FREE, f"{cut_bodies[body]}_free", -1
+        out.append(Joint(name, kind, body, joint, q, v))
+        q, v = q + Q_SIZE[kind], v + V_SIZE[kind]
+    return out
+
+
+def rows_of(model, cut_bodies) -> tuple[list[tuple[int, int]], Topology]:
     """One row a joint, sorted by level: [(body, joint or -1)] and the topology without virtual links."""
-    order, depth, last = [(0, -1, -1)], [0], {0: 0}
+    joints = joints_of(model, cut_bodies)
+    order, depth, last, own = [(0, -1, -1)], [0], {0: 0}, {0: None}
     for body in range(1, model.nbody):
-        parent = last[int(model.body_parentid[body])]
-        first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
-        for joint in range(first, first + count) if count else (-1,):
-            order.append((body, joint, parent))
+        parent = 0 if body in cut_bodies else last[int(model.body_parentid[body])]
+        for joint in [j for j in joints if j.body == body] or [None]:
+            own[len(order)] = joint
+            order.append((body, -1 if joint is None else joint.joint, parent))
             depth.append(depth[parent] + 1)
             parent = len(order) - 1
         last[body] = parent
     rank = np.argsort(depth, kind="stable")
     new = np.argsort(rank)
-    kinds = {0: FREE, 1: BALL, 2: SLIDE, 3: HINGE}
-    kind = [FIXED if j < 0 else kinds[int(model.jnt_type[j])] for _, j, _ in order]
+    row_of = {joint.name: int(new[i]) for i, joint in own.items() if joint is not None}
     topology = Topology(
         body_names=tuple(name_of(model, "body", i) for i in range(model.nbody)),
-        joint_names=tuple(name_of(model, "joint", i) for i in range(model.njnt)),
+        joint_names=tuple(j.name for j in joints),
         link_names=(),
         parent=tuple(int(new[order[i][2]]) if order[i][2] >= 0 else -1 for i in rank),
-        kind=tuple(kind[i] for i in rank),
-        q_start=tuple(int(model.jnt_qposadr[order[i][1]]) if order[i][1] >= 0 else 0 for i in rank),
-        v_start=tuple(int(model.jnt_dofadr[order[i][1]]) if order[i][1] >= 0 else 0 for i in rank),
-        nq=int(model.nq),
-        nv=int(model.nv),
+        kind=tuple(FIXED if own[i] is None else own[i].kind for i in rank),
+        q_start=tuple(0 if own[i] is None else own[i].q for i in rank),
+        v_start=tuple(0 if own[i] is None else own[i].v for i in rank),
+        nq=sum(Q_SIZE[j.kind] for j in joints),
+        nv=sum(V_SIZE[j.kind] for j in joints),
         body_row=tuple(int(new[last[i]]) for i in range(model.nbody)),
-        joint_row=tuple(int(new[[o[1] for o in order].index(j)]) for j in range(model.njnt)),
+        joint_row=tuple(row_of[j.name] for j in joints),
         link_freedoms=(),
         link_spare=(),
     )
@@ -76,29 +107,38 @@ def _inertia(model, body):
     return R @ np.diag(model.body_inertia[body]) @ R.T
 
 
-def joint_forces_of(model, ignored) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Stiffness [nv], range [2 nv] (infinite where there is none) and its spring and damper [2 nv]."""
-    stiffness, limit, spring = np.zeros(model.nv), np.tile([[-np.inf], [np.inf]], (1, model.nv)), np.zeros((2, model.nv))
+def joint_forces_of(model, ignored, topology) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Stiffness [dofs], range [2 dofs] (infinite where there is none) and its spring and damper [2 dofs]."""
+    n, place = topology.dofs, np.array(topology.model_v, int)
+    stiffness, limit, spring = np.zeros(n), np.tile([[-np.inf], [np.inf]], (1, n)), np.zeros((2, n))
     for j in range(model.njnt):
-        dofs = slice(int(model.jnt_dofadr[j]), int(model.jnt_dofadr[j]) + V_SIZE[(FREE, BALL, SLIDE, HINGE)[model.jnt_type[j]]])
+        own = slice(int(model.jnt_dofadr[j]), int(model.jnt_dofadr[j]) + V_SIZE[_KINDS[int(model.jnt_type[j])]])
+        dofs = place[own]
         if "spring" not in ignored:
             stiffness[dofs] = np.ravel(model.jnt_stiffness[j])[0]
         if model.jnt_limited[j] and model.jnt_type[j] in (2, 3) and "limit" not in ignored:
             limit[:, dofs] = model.jnt_range[j][:, None]
-            m = 1 / model.dof_invweight0[dofs] if np.all(model.dof_invweight0[dofs] > 0) else model.dof_M0[dofs]
+            m = 1 / model.dof_invweight0[own] if np.all(model.dof_invweight0[own] > 0) else model.dof_M0[own]
             spring[:, dofs] = m * _LIMIT_RATE**2, 2 * m * _LIMIT_RATE
     return stiffness, limit, spring
 
 
-def motors_of(model, ignored):
+def by_dof(topology, values) -> np.ndarray:
+    """[dofs] from the model's own [nv]: zero for virtual joints that are none of its."""
+    out = np.zeros(topology.dofs)
+    out[np.array(topology.model_v, int)] = np.ravel(values)
+    return out
+
+
+def motors_of(model, ignored, topology):
     """Gear matrix and ranges of the actuators that are plain torques on joints."""
     count = 0 if {"actuator", "all"} & ignored and not plain_motors(model).all() else model.nu
-    gear, control, force = np.zeros((count, model.nv)), np.tile([-np.inf, np.inf], (count, 1)), np.tile([-np.inf, np.inf], (count, 1))
+    place = np.array(topology.model_v, int)
+    gear, control, force = np.zeros((count, topology.dofs)), np.tile([-np.inf, np.inf], (count, 1)), np.tile([-np.inf, np.inf], (count, 1))
     for i in range(count):
         joint = int(model.actuator_trnid[i, 0])
-        size = V_SIZE[(FREE, BALL, SLIDE, HINGE)[model.jnt_type[joint]]]
-        start = int(model.jnt_dofadr[joint])
-        gear[i, start : start + size] = model.actuator_gear[i, :size] * model.actuator_gainprm[i, 0]
+        size, start = V_SIZE[_KINDS[int(model.jnt_type[joint])]], int(model.jnt_dofadr[joint])
+        gear[i, place[start : start + size]] = model.actuator_gear[i, :size] * model.actuator_gainprm[i, 0]
         if model.actuator_ctrllimited[i]:
             control[i] = model.actuator_ctrlrange[i]
         if model.actuator_forcelimited[i]:

@@ -80,17 +80,17 @@ class Field(eqx.Module):
 
     def torques(self, t, y: Motion, scene: Scene):
         """Joint torques of the control and the limits, and the power of all that is not conservative (None: there is none)."""
-        chain, v = scene.chain, y.v[: scene.chain.nv]
+        chain = scene.chain
         tau = jnp.zeros_like(y.v)
         if self.control is not None:
             asked = self.control(t, State(y.q, y.v, scene.structure), scene.args)
             tau = tau + joint_torques(chain, jnp.asarray(asked, y.v.dtype))
         if chain.limit is not None:
-            tau = tau.at[: chain.nv].add(limit_forces(chain, y.q, y.v))
+            tau = tau + limit_forces(chain, y.q, y.v)
         if y.work is None:
             return tau, None
-        power = tau @ jnp.where(active_dofs(chain, scene.structure), y.v, 0)
-        return tau, power if chain.damping is None else power - jnp.sum(chain.damping * v * v)
+        v = jnp.where(active_dofs(chain, scene.structure), y.v, 0)
+        return tau, tau @ v if chain.damping is None else tau @ v - jnp.sum(chain.damping * v * v)
 
 
 def settle(stabilization, scene: Scene, y: Motion) -> Motion:

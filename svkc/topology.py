@@ -52,6 +52,13 @@ class Topology:
     joint_row: tuple[int, ...]
     link_freedoms: tuple[tuple[bool, ...], ...]
     link_spare: tuple[bool, ...]
+    # what follows tells of joints of the tree that may be cut: the child's row of such a link, else -1; (joint, link, freedom) of each joint
+    link_child: tuple[int, ...] = ()
+    cut_joints: tuple[tuple[str, int, int], ...] = ()
+    # where the model's own qpos and qvel stand in q and v
+    model_q: tuple[int, ...] = ()
+    model_v: tuple[int, ...] = ()
+    link_actuated: tuple[bool, ...] = ()
 
     @functools.cached_property
     def _hash(self):

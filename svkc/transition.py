@@ -12,10 +12,10 @@ from jaxtyping import Array, Bool, Float
 from svkc.assembly import check_closed, connection_mask, joint_slice, link_index
 from svkc.chain import Chain, State, Structure
 from svkc.closure import close, constrain, decide_rank, scales
-from svkc.forward_dynamics import constraint_forces, reduced_inertia
+from svkc.forward_dynamics import constraint_forces, reduced_inertia, with_links
 from svkc.inverse_dynamics import inertia_by_composites
 from svkc.kinematics import kinematics, twists
-from svkc.loops import ends, gap, joint_coordinates, loop_jacobian
+from svkc.loops import active_dofs, ends, gap, joint_coordinates, loop_jacobian, with_coordinates
 from svkc.spatial import quat_conjugate, quat_multiply, quat_rotate
 from svkc.topology import V_SIZE, joint_freedoms
 
@@ -60,11 +60,12 @@ def _project(chain: Chain, structure: Structure, q, v):
     co = constrain(chain, structure, q, v, kin, twists(chain, kin, v))
     M = inertia_by_composites(chain, kin)
     A = reduced_inertia(chain, co, M)
-    after = co.W @ cho_solve(cho_factor(A), co.W[:nv].T @ (M @ v[:nv]))
-    jump = after[:nv] - v[:nv]
-    momentum = jnp.concatenate([M @ jump, jnp.zeros(chain.dofs - nv, v.dtype)])
+    after = co.W @ cho_solve(cho_factor(A), co.W.T @ with_links(chain, M @ v[:nv], v))
+    jump = after - v
+    momentum = with_links(chain, M @ jump[:nv], jump)
     # v- and v+ differ by a vector orthogonal to v+, so that the loss is a square and cannot be negative
-    return after, -constraint_forces(chain, co, momentum), jump @ (M @ jump) / 2
+    jump = jnp.where(active_dofs(chain, structure), jump, 0)
+    return after, -constraint_forces(chain, co, momentum), jump @ momentum / 2
 
 
 def change(
@@ -89,14 +90,15 @@ def change(
         after, lost = lock_projection(chain, structure, q, v)
         v = jnp.where(holds, after, v)
         return Change(State(q, v, structure), nothing, nothing, jnp.where(holds, lost, 0), jnp.zeros((), v.dtype))
-    read = joint_coordinates(chain, structure, kinematics(chain, q), q)
-    new_q = _of_new_links(chain, new_links, read, q)
+    new_q = with_coordinates(chain, new_links, joint_coordinates(chain, structure, kinematics(chain, q), q), q)
     kin = kinematics(chain, new_q)
     open_ = gap(structure, ends(chain, structure, kin, new_q)).ravel()
     row, _ = scales(chain)
     structure = decide_rank(chain, structure, new_q)
     closed = close(chain, structure, new_q)
-    after, wrench, lost = _project(chain, structure, closed, v)
+    # the armature of a joint that is made anew is at rest before
+    before = v if chain.link_armature is None else jnp.where(active_dofs(chain, old), v, 0)
+    after, wrench, lost = _project(chain, structure, closed, before)
     q, v = jnp.where(holds, closed, q), jnp.where(holds, after, v)
     wrench, lost = jnp.where(holds, wrench, 0), jnp.where(holds, lost, 0)
     return Change(State(q, v, structure), wrench[:, 3:], wrench[:, :3], lost, jnp.where(holds, jnp.max(jnp.abs(row * open_)), 0))
@@ -112,17 +114,6 @@ def lock_projection(chain: Chain, structure: Structure, q, v):
     after = cho_solve(cho_factor(A), jnp.where(free, M @ v, 0))
     jump = after - v
     return after, jump @ (M @ jump) / 2
-
-
-def _of_new_links(chain: Chain, new_links, read, q):
-    """Coordinates read off for the links just connected, the old ones everywhere else."""
-    table, top = chain.topology.links, chain.topology
-    for index in (table.angle, table.slide, table.quat):
-        at = np.flatnonzero((index < top.nq_all).ravel())
-        slots = index.ravel()[at]
-        link = at // index.shape[1]
-        q = q.at[slots].set(jnp.where(new_links[link], read[slots], q[slots]))
-    return q
 
 
 _change = eqx.filter_jit(change)
@@ -227,7 +218,7 @@ def velocity_by_impulse(chain: Chain, state: State, name: str) -> tuple[Float[Ar
     kin = kinematics(chain, state.q)
     before = constrain(chain, state.structure, state.q, state.v, kin, twists(chain, kin, state.v))
     after = eqx.tree_at(lambda s: s.connected, state.structure, state.structure.connected.at[slot].set(True))
-    q = _of_new_links(chain, after.connected & ~state.structure.connected, joint_coordinates(chain, after, kin, state.q), state.q)
+    q = with_coordinates(chain, after.connected & ~state.structure.connected, joint_coordinates(chain, after, kin, state.q), state.q)
     J = loop_jacobian(chain, after, kin, ends(chain, after, kin, q))[6 * slot : 6 * slot + 6]
     own = np.array([d for d in chain.topology.links.dof[slot] if d < chain.dofs], int)
     # J_1 - J_2 along theta_G, and the axes of the new joint, on the side where (27) has them
