@@ -1,0 +1,189 @@
+"""F5: which actuator torques give an acceleration, in any structure (paper, section III-A): S^T tau_A = W^T tau_O, square, redundant or missing."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from svkc.chain import Chain, State
+from svkc.closure import Coordinates, Selection, constrain, count_rank, scales, select
+from svkc.forward_dynamics import constraint_forces, with_links
+from svkc.inverse_dynamics import generalized_forces, passive_forces
+from svkc.kinematics import kinematics, twists
+
+
+class Actuation(eqx.Module):
+    """Torques of the actuators for an acceleration, and what is left open or out of reach. Columns of the two bases that do not count are zero.
+
+    `tau` [dofs]: the particular solution (N m, N), of least weighted norm; `residual` [dofs]: generalized force on theta_G that no torque gives (zero:
+    the acceleration is reached); `rank`: of S; `redundancy`: actuators more than that, `deficiency`: freedoms that nobody drives.
+    `null_space` [dofs, dofs]: torques that change no motion (they only load the loops), one for each actuator that the others can stand in for;
+    `null_force`, `null_torque`: what each of them does to the links' wrenches, on `real` from `parent`, world axes;
+    `undriven` [dofs, dofs]: joint velocities on which no actuator does work.
+    """
+
+    tau: Float[Array, " dofs"]
+    residual: Float[Array, " dofs"]
+    null_space: Float[Array, "dofs dofs"]
+    null_force: Float[Array, "links 3 dofs"]
+    null_torque: Float[Array, "links 3 dofs"]
+    undriven: Float[Array, "dofs dofs"]
+    rank: Int[Array, ""]
+    redundancy: Int[Array, ""]
+    deficiency: Int[Array, ""]
+
+
+def actuation(chain: Chain, state: State, vdot_G, weight=None, *, actuated=None, bounds=None) -> Actuation:
+    """Inverse dynamics of any structure (paper, section III-A): the torques at `actuated` for the accelerations vdot_G of theta_G.
+
+    vdot_G: over every coordinate [dofs], of which those of theta_G (`coordinates(chain, state).independent`) are read, or theta_G's alone, in order.
+    weight [dofs]: positive; what is least is sum(weight tau^2), by default the plain sum. actuated: mask, by default `chain.actuated`.
+    bounds: (lower, upper) torques, scalars or [dofs]: the least within them, by scipy's SLSQP on the host (not under jit); where they leave no exact
+    solution, the one of least residual. Springs and dampers are counted. ValueError: wrong sizes, weights that are not positive, crossed bounds.
+    """
+    independent = None
+    vdot_G = jnp.asarray(vdot_G, state.v.dtype)
+    if vdot_G.shape != (chain.dofs,):
+        independent = np.asarray(_coordinates(chain, state)[0].independent) if not isinstance(state.q, jax.core.Tracer) else None
+        if independent is None or vdot_G.shape != (independent.sum(),):
+            count = "the number of independent ones" if independent is None else int(independent.sum())
+            raise ValueError(f"vdot_G: got shape {vdot_G.shape}, expected ({chain.dofs},), every joint coordinate, or ({count},), theta_G")
+        vdot_G = jnp.zeros(chain.dofs, vdot_G.dtype).at[np.flatnonzero(independent)].set(vdot_G)
+    weight = _per_dof(chain, "weight", weight, 1.0, state)
+    if not isinstance(weight, jax.core.Tracer) and not np.all(np.asarray(weight) > 0):
+        raise ValueError(f"weight: expected positive numbers, got {np.asarray(weight)}")
+    actuated = chain.actuated if actuated is None else jnp.asarray(actuated)
+    if actuated.shape != (chain.dofs,) or actuated.dtype != bool:
+        raise ValueError(f"actuated: expected {chain.dofs} Booleans, got {actuated.dtype} of shape {actuated.shape}")
+    done, problem = _solve(chain, state, vdot_G, weight, actuated)
+    return done if bounds is None else _within(chain, state, done, problem, weight, bounds)
+
+
+def _per_dof(chain: Chain, name: str, value, default, state: State) -> Float[Array, " dofs"]:
+    value = jnp.asarray(default if value is None else value, state.v.dtype)
+    if value.shape not in ((), (chain.dofs,)):
+        raise ValueError(f"{name}: got shape {value.shape}, expected a number or ({chain.dofs},)")
+    return jnp.broadcast_to(value, (chain.dofs,))
+
+
+@jax.jit
+def _coordinates(chain: Chain, state: State):
+    kin = kinematics(chain, state.q)
+    V = twists(chain, kin, state.v)
+    if not len(chain.link_names):
+        free = jnp.ones(chain.dofs, bool) if state.structure.locked is None else ~state.structure.locked
+        W = jnp.diag(jnp.where(free, 1, 0).astype(state.q.dtype))
+        return _open(W, free, chain), kin, V
+    return constrain(chain, state.structure, state.q, state.v, kin, V), kin, V
+
+
+def _open(W, free, chain: Chain) -> Coordinates:
+    """The coordinates of a chain without virtual links: every joint that is not locked is independent."""
+    n, none = chain.dofs, jnp.zeros(0, bool)
+    selection = Selection(jnp.zeros((0, 0), W.dtype), jnp.zeros((0, n), W.dtype), jnp.zeros(0, W.dtype), none)
+    return Coordinates(W, jnp.zeros(n, W.dtype), free, jnp.zeros(n, bool), chain.actuated, selection, jnp.zeros((0, n), W.dtype))
+
+
+def _basis(B: Float[Array, "rows dofs"]) -> tuple[Selection, Int[Array, ""], Float[Array, "dofs dofs"]]:
+    """Pivots of B, its rank, and a basis of its null space: for each column that is no pivot a one there, balanced by the pivots."""
+    found = select(B)
+    rank = count_rank(found.size)
+    chosen = select(B, rank)
+    P = chosen.P
+    Bm = chosen.Q @ B
+    R = Bm @ P.T + jnp.diag(jnp.where(chosen.used, 0, 1).astype(B.dtype))
+    others = jnp.eye(B.shape[1], dtype=B.dtype) - P.T @ jnp.linalg.solve(R, Bm)
+    return chosen, rank, jnp.where(jnp.any(P > 0, 0)[None], 0, others)
+
+
+def _reach(chosen: Selection, B, wanted, cost):
+    """The y of least sum(cost y^2) that makes |B y - wanted| least, by an orthonormal basis Z of B's range."""
+    R = jax.lax.stop_gradient((chosen.Q @ B) @ chosen.P.T) + jnp.diag(jnp.where(chosen.used, 0, 1).astype(B.dtype))
+    Z = jnp.linalg.solve(R.T, chosen.P @ B.T).T
+    ZB = Z.T @ B
+    over_cost = ZB.T / cost[:, None]
+    G = ZB @ over_cost + jnp.diag(jnp.where(chosen.used, 0, 1).astype(B.dtype))
+    y = over_cost @ jnp.linalg.solve(G, Z.T @ wanted)
+    # once more for what round-off left
+    return y + over_cost @ jnp.linalg.solve(G, Z.T @ (wanted - B @ y))
+
+
+@jax.jit
+def _solve(chain: Chain, state: State, vdot_G, weight, actuated: Bool[Array, " dofs"]):
+    nv = chain.nv
+    co, kin, V = _coordinates(chain, state)
+    _, column = scales(chain)
+    vdot = co.W @ jnp.where(co.independent, vdot_G, 0) + co.bias
+    forces = with_links(chain, generalized_forces(chain, kin, V, state.v, vdot[:nv]), vdot) - passive_forces(chain, state.q, state.v)
+    wanted = co.W.T @ forces
+    # without units: torques over metres, as the columns of J_C
+    S = jnp.where(actuated[:, None], co.W, 0)
+    B = column[:, None] * S.T / column[None]
+    chosen, rank, null = _basis(B)
+    y = _reach(chosen, B, column * wanted, weight / column**2)
+    null = column[:, None] ** -1 * jnp.where(actuated[None], null, 0)
+    reachable = actuated & jnp.any(co.W != 0, 1)
+    _, _, undriven = _basis(B.T)
+    undriven = co.W @ (column[:, None] * jnp.where(co.independent[None], undriven, 0))
+    if len(chain.link_names):
+        carried = jax.vmap(lambda tau: constraint_forces(chain, co, tau), in_axes=1, out_axes=-1)(null)
+    else:
+        carried = jnp.zeros((0, 6, chain.dofs), y.dtype)
+    count = lambda mask: jnp.sum(mask, dtype=jnp.int32)
+    tau = y / column
+    residual = wanted - S.T @ tau
+    done = Actuation(tau, residual, null, carried[:, 3:], carried[:, :3], undriven, rank, count(reachable) - rank, count(co.independent) - rank)
+    return done, (B, column * wanted, column)
+
+
+def _within(chain: Chain, state: State, done: Actuation, problem, weight, bounds) -> Actuation:
+    """The least weighted torques within the bounds that give what is wanted, or come nearest to it."""
+    if isinstance(done.tau, jax.core.Tracer):
+        raise ValueError("bounds: the bounded problem is solved on the host; call actuation with bounds outside of jit, vmap and grad")
+    lower, upper = (np.asarray(_per_dof(chain, "bounds", b, 0.0, state), float) for b in bounds)
+    if not np.all(lower <= upper):
+        raise ValueError(f"bounds: expected lower at or below upper, got {lower} and {upper}")
+    B, wanted, column = (np.asarray(x, float) for x in problem)
+    drives, lower, upper = np.any(B != 0, 0), lower * column, upper * column
+    y = np.where(drives, np.clip(0, lower, upper), 0.0)
+    used = drives & (upper > lower)
+    if used.any():
+        cost = (np.asarray(weight, float) / column**2)[used]
+        y[used] = _least_within(B[:, used], wanted - B[:, ~used] @ y[~used], cost, (lower[used], upper[used]))
+    tau = jnp.asarray(y / column, done.tau.dtype)
+    residual = jnp.asarray((wanted - B @ y) / column, done.tau.dtype)
+    return eqx.tree_at(lambda d: (d.tau, d.residual), done, (tau, residual))
+
+
+def _least_within(A, b, cost, box):
+    """The x in the box of least sum(cost x^2) among those that make |A x - b| least."""
+    from scipy.optimize import lsq_linear, minimize
+
+    nearest = lsq_linear(A, b, box, method="bvls", tol=1e-15).x
+    # independent rows of what is to be kept
+    U, size, _ = np.linalg.svd(A, full_matrices=False)
+    A = U[:, size > 1e-9 * size[0]].T @ A
+    kept, scale = A @ nearest, max(1.0, np.abs(nearest).max())
+    best = minimize(
+        lambda x: np.sum(cost * (x / scale) ** 2), nearest, jac=lambda x: 2 * cost * x / scale**2, bounds=list(zip(*box, strict=True)), method="SLSQP",
+        constraints=[{"type": "eq", "fun": lambda x: (A @ x - kept) / scale, "jac": lambda x: A / scale}], options={"ftol": 1e-14, "maxiter": 500},
+    )  # fmt: skip
+    return _polished(A, kept, cost, box, best.x if best.success else nearest)
+
+
+def _polished(A, b, cost, box, x):
+    """The same point to round-off: what is at a bound stays there, the others are the least that give b."""
+    lower, upper = box
+    x = np.clip(x, lower, upper)
+    width = 1e-7 * np.maximum(1, np.abs(x))
+    free = (x > lower + width) & (x < upper - width)
+    if not free.any():
+        return x
+    rest = b - A[:, ~free] @ x[~free]
+    half = A[:, free] / np.sqrt(cost[free])
+    y = np.linalg.lstsq(half, rest, rcond=1e-10)[0] / np.sqrt(cost[free])
+    inside = np.all((y >= lower[free]) & (y <= upper[free])) and np.abs(A[:, free] @ y - rest).max() <= 1e-9 * max(1.0, np.abs(b).max())
+    if inside:
+        x[free] = y
+    return x
