@@ -18,17 +18,21 @@ from svkc.energy import energy as energy, kinetic_energy as kinetic_energy, mome
 from svkc.inverse_dynamics import bias_force as bias_force, inverse_dynamics as inverse_dynamics, mass_matrix as mass_matrix
 
 # loops
-from svkc.closure import coordinates as coordinates, loop_gaps as loop_gaps, velocity_gaps as velocity_gaps
+from svkc.closure import coordinates as coordinates, jacobian as jacobian, loop_gaps as loop_gaps, velocity_gaps as velocity_gaps
 from svkc.forward_dynamics import forward_dynamics as forward_dynamics, loop_forces as loop_forces
+from svkc.actuation import actuation as actuation
 from svkc.mobility import mobility as mobility
 
 # changes of structure
-from svkc.transition import bind as bind, connect as connect, cut as cut, lock as lock, transition as transition, unlock as unlock
+from svkc.transition import connect as connect, cut as cut, lock as lock, transition as transition, unbind as unbind, unlock as unlock
+from svkc.binding import Grip as Grip, bind as bind
 from svkc.events import at as at, when as when
+from svkc.guards import leaves as leaves, overload as overload, touch as touch
 
 # runs
 from svkc.simulate import simulate as simulate
 from svkc.stepping import Baumgarte as Baumgarte, Drift as Drift, Projection as Projection
+from svkc.solvers import RodriguesEuler as RodriguesEuler
 
 try:
     __version__ = _version("svkc")

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from svkc.chain import State, Structure
-from svkc.trajectory import RESULTS, Events, Phases, Trajectory
+from svkc.trajectory import RESULT_NAMES, RESULTS, Events, Phases, Trajectory
 
 SCHEMA = 1
 _PARTS = {"states": State, "final": State, "structure": Structure, "events": Events, "phases": Phases}
@@ -76,7 +76,7 @@ def load_trajectory(path) -> Trajectory:
     if missing:
         raise ValueError(f"{path} lacks {', '.join(sorted(missing))}; it is not a trajectory written by svkc")
     result = RESULTS.successful
-    for item in (RESULTS.stopped, RESULTS.max_events, RESULTS.max_steps, RESULTS.step_too_small, RESULTS.not_in_place, RESULTS.loop_open, RESULTS.non_finite):
+    for item in (getattr(RESULTS, name) for name in RESULT_NAMES):
         if int(np.asarray(item._value)) == meta["result"]:
             result = item
     return _build(Trajectory, arrays, result=result)

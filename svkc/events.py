@@ -1,5 +1,6 @@
 """F5: changes of structure to come, at a time or when a guard crosses zero, and where in a step it does."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -10,12 +11,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from svkc.assembly import joint_slice, link_index
+from svkc.binding import Grip, checked_freedoms, holding, rows_of, spare_slot, to_axis
 from svkc.chain import Chain, Structure
 from svkc.topology import V_SIZE
 
 
 class Action(eqx.Module):
-    """What an event does: names of virtual links to connect (those in `here`: where they are) and cut, of joints to lock and unlock."""
+    """What an event does: names of virtual links to connect (those in `here`: where they are) and cut, of joints to lock and unlock, grips to
+    make with spare slots and, by slot or by pair of bodies, to give up."""
 
     connect: tuple[str, ...] = eqx.field(static=True, default=())
     cut: tuple[str, ...] = eqx.field(static=True, default=())
@@ -23,6 +26,13 @@ class Action(eqx.Module):
     unlock: tuple[str, ...] = eqx.field(static=True, default=())
     here: tuple[str, ...] = eqx.field(static=True, default=())
     stop: bool = eqx.field(static=True, default=False)
+    unbind: tuple = eqx.field(static=True, default=())
+    bind: tuple[Grip, ...] = ()
+
+    @property
+    def idle(self) -> bool:
+        """Changes nothing: it only records, or stops."""
+        return self.stop or not (self.connect + self.cut + self.lock + self.unlock + self.unbind + self.bind)
 
 
 class At(eqx.Module):
@@ -47,23 +57,32 @@ def _names(value) -> tuple[str, ...]:
     return names
 
 
-def _action(connect, cut, lock, unlock, here, stop) -> Action:
+def _action(connect, cut, lock, unlock, here, stop, bind, unbind) -> Action:
+    bind = (bind,) if isinstance(bind, Grip) else tuple(bind)
+    if not all(isinstance(g, Grip) for g in bind):
+        raise ValueError(f"bind: expected svkc.Grip objects, got {bind!r}")
+    unbind = (unbind,) if isinstance(unbind, str) else tuple(unbind)
+    if len(unbind) == 2 and all(isinstance(u, str) for u in unbind) and not all(u.startswith("spare_") for u in unbind):
+        unbind = (unbind,)
+    if not all(isinstance(u, str) or (isinstance(u, tuple) and len(u) == 2) for u in unbind):
+        raise ValueError(f"unbind: expected names of spare slots or pairs of body names (parent, real), got {unbind!r}")
     connect = _names(connect)
     here = connect if here is True else () if here is False else _names(here)
     if not set(here) <= set(connect):
         raise ValueError(f"here: {here} must be among the links to connect, {connect}")
-    return Action(connect, _names(cut), _names(lock), _names(unlock), here, stop)
+    return Action(connect, _names(cut), _names(lock), _names(unlock), here, stop, unbind, bind)
 
 
-def at(time, connect=(), cut=(), *, lock=(), unlock=(), here=False, stop=False) -> At:
+def at(time, connect=(), cut=(), *, lock=(), unlock=(), here=False, stop=False, bind=(), unbind=()) -> At:
     """At this time (s): connect and cut virtual links, lock and unlock joints, by name. Where a link is both connected and cut, it is cut.
 
-    here: True, or names: grip where the bodies are. stop: end the run then.
+    here: True, or names: grip where the bodies are. stop: end the run then. bind: `svkc.Grip`s to make with spare slots, where the bodies are; where all
+    are taken the run ends with a code. unbind: spare slots by name, or all between a pair (parent, real) of bodies, cut and emptied.
     """
-    return At(time, _action(connect, cut, lock, unlock, here, stop))
+    return At(time, _action(connect, cut, lock, unlock, here, stop, bind, unbind))
 
 
-def when(guard, connect=(), cut=(), direction=None, *, lock=(), unlock=(), here=False, stop=False) -> When:
+def when(guard, connect=(), cut=(), direction=None, *, lock=(), unlock=(), here=False, stop=False, bind=(), unbind=()) -> When:
     """When guard(t, state, args) -> real crosses zero, located to round-off and differentiable in time; the actions are those of `at`.
 
     direction: True for upwards only, False for downwards only. A guard is watched while its action would change something, or always if it has
@@ -74,7 +93,7 @@ def when(guard, connect=(), cut=(), direction=None, *, lock=(), unlock=(), here=
         raise ValueError(f"when: guard must be a function of (t, state, args), got {guard!r}")
     if direction not in (None, True, False):
         raise ValueError(f"when: direction must be True, False or None, got {direction!r}")
-    return When(guard, _action(connect, cut, lock, unlock, here, stop), direction)
+    return When(guard, _action(connect, cut, lock, unlock, here, stop, bind, unbind), direction)
 
 
 class Plan(eqx.Module):
@@ -86,6 +105,23 @@ class Plan(eqx.Module):
     guarded: tuple[int, ...] = eqx.field(static=True)
     directions: tuple[bool | None, ...] = eqx.field(static=True)
     actions: tuple[Action, ...] = eqx.field(static=True)
+    grips: tuple[tuple[Grip, ...], ...] = ()
+
+    @property
+    def binds(self) -> bool:
+        return any(self.grips) or any(a.unbind for a in self.actions)
+
+    def unbound(self, chain: Chain, structure: Structure) -> Bool[Array, "events links"]:
+        """Spare slots that each event would empty now."""
+        none = jnp.zeros(len(chain.link_names), bool)
+        rows = []
+        for action in self.actions:
+            row = none
+            for what in action.unbind:
+                slots = np.array(chain.link_names) == what if isinstance(what, str) else holding(chain, structure, *what)
+                row = row | slots
+            rows.append(row)
+        return jnp.stack(rows)
 
     @property
     def locks(self) -> bool:
@@ -104,6 +140,10 @@ class Plan(eqx.Module):
             row[[link_index(chain, name) for name in getattr(action, what)]] = True
         return table
 
+    def table_of_grips(self, chain: Chain) -> np.ndarray:
+        """[events, links] Boolean of the spare slots an event may bind."""
+        return np.array([bool(g) for g in self.grips], bool)[:, None] & np.array(chain.topology.link_spare, bool)[None]
+
     def watched(self, chain: Chain, structure: Structure) -> Bool[Array, " guards"]:
         """Guards whose action would change something now, or that have none."""
         rows = list(self.guarded)
@@ -113,8 +153,12 @@ class Plan(eqx.Module):
         if self.locks:
             on, off = (self.table(chain, what)[rows] for what in ("lock", "unlock"))
             change = change | jnp.any(on & ~structure.locked[None], 1) | jnp.any(off & structure.locked[None], 1)
-        idle = [self.actions[i].stop or not any((a := self.actions[i]).connect + a.cut + a.lock + a.unlock) for i in rows]
-        return change | np.array(idle, bool)
+        if self.binds:
+            empties = jnp.any(self.unbound(chain, structure)[np.array(rows)] & structure.connected[None], 1)
+            held = lambda g: jnp.any(holding(chain, structure, g.parent, g.real))
+            grips = [jnp.any(~jnp.stack([held(g) for g in self.grips[i]])) if self.grips[i] else jnp.zeros((), bool) for i in rows]
+            change = change | empties | jnp.stack(grips)
+        return change | np.array([self.actions[i].idle and not self.grips[i] for i in rows], bool)
 
     def crossed(self, before: Float[Array, " guards"], after: Float[Array, " guards"]) -> Bool[Array, " guards"]:
         """Guards that went through zero; one that starts at zero has not."""
@@ -140,11 +184,30 @@ def plan(chain: Chain, events, dtype) -> Plan:
         timed=timed,
         guarded=guarded,
         directions=tuple(events[i].direction for i in guarded),
-        actions=tuple(e.action for e in events),
+        # what is static and what can be differentiated, apart
+        actions=tuple(dataclasses.replace(e.action, bind=()) if e.action.bind else e.action for e in events),
+        grips=tuple(tuple(_checked_grip(chain, g, dtype) for g in e.action.bind) for e in events),
     )
     for what in ("connect", "cut", "lock", "unlock"):
         made.table(chain, what)
+    for action in made.actions:
+        for what in action.unbind:
+            spare_slot(chain, what) if isinstance(what, str) else rows_of(chain, *what)
     return made
+
+
+def _checked_grip(chain: Chain, wish: Grip, dtype) -> Grip:
+    rows_of(chain, wish.parent, wish.real)
+    checked_freedoms(wish.joint)
+    to_axis(wish.axis)
+    if wish.slot is not None:
+        spare_slot(chain, wish.slot)
+    elif not any(chain.topology.link_spare):
+        raise ValueError("bind: the chain has no spare slots; load it with spare=n")
+    place = jnp.asarray(wish.real_pos, dtype)
+    if place.shape != (3,):
+        raise ValueError(f"bind: real_pos: expected three numbers (m), got shape {place.shape}")
+    return dataclasses.replace(wish, real_pos=place)
 
 
 def first_root(f, a: Float[Array, ""], fa: Float[Array, ""], b: Float[Array, ""], fb: Float[Array, ""]) -> Float[Array, ""]:

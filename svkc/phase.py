@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from svkc.chain import Chain, State
 from svkc.events import Plan, first_root
+from svkc.guards import Sensor
 from svkc.request import Options
 from svkc.stepping import Field, Motion, Scene, Settled, Watch
 from svkc.trajectory import RESULTS, Events, Phases
@@ -45,10 +46,12 @@ def event_tolerance(t: Float[Array, ""]) -> Float[Array, ""]:
     return jnp.finfo(t.dtype).eps ** 0.5 * jnp.maximum(1, jnp.abs(t))
 
 
-def guard_values(made: Plan, t, y: Motion, scene: Scene) -> Float[Array, " guards"]:
-    """What every guard says of this moment."""
+def guard_values(made: Plan, field: Field, t, y: Motion, scene: Scene) -> Float[Array, " guards"]:
+    """What every guard says of this moment; those that measure the mechanism are told its torques."""
     state = State(y.q, y.v, scene.structure)
-    return jnp.stack([jnp.asarray(g(t, state, scene.args), y.q.dtype).reshape(()) for g in made.guards])
+    tau = field.torques(t, y, scene)[0] if any(isinstance(g, Sensor) for g in made.guards) else None
+    values = [g.measure(scene.chain, state, tau) if isinstance(g, Sensor) else g(t, state, scene.args) for g in made.guards]
+    return jnp.stack([jnp.asarray(x, y.q.dtype).reshape(()) for x in values])
 
 
 def solve(chain: Chain, run: Run, stop, ts, made: Plan, options: Options, args) -> Solved:
@@ -58,9 +61,10 @@ def solve(chain: Chain, run: Run, stop, ts, made: Plan, options: Options, args) 
     scene = Scene(chain, structure, args, watched)
     watch = None if run.guards is None else Watch(run.t, run.guards, run.guards)
     start = Motion(run.state.q, run.state.v, run.work, watch)
-    guards = (lambda t, y, scene: guard_values(made, t, y, scene)) if made.guards else None
+    field = options.field
+    guards = (lambda t, y, scene: guard_values(made, field, t, y, scene)) if made.guards else None
     solver = Settled(options.solver, options.stabilization, guards)
-    term = diffrax.ODETerm(Field(options.control, options.stabilization))
+    term = diffrax.ODETerm(field)
     at = jnp.clip(ts, run.t, jnp.maximum(stop, run.t))
     event = None
     if made.guards:
@@ -119,14 +123,14 @@ def _locate(hit, t_end, end: Motion, term, solver, scene: Scene, made: Plan):
             return jnp.where(crossed, side * values, -jnp.inf)
 
         def ahead(t):
-            return jnp.max(passed(guard_values(made, t, back(t, *frozen), frozen[2])))
+            return jnp.max(passed(solver.guards(t, back(t, *frozen), frozen[2])))
 
         at_start, at_end = jnp.max(passed(end.watch.before)), jnp.max(passed(end.watch.after))
         root = jax.lax.stop_gradient(first_root(ahead, end.watch.start, at_start, frozen[0], at_end))
         y = back(root, t_end, end, scene)
         rate = jax.lax.stop_gradient(term.vf(root, y, scene))
         along = (jnp.ones_like(root), rate)
-        values, slopes = jax.jvp(lambda t, y: guard_values(made, t, y, scene), (root, y), along)
+        values, slopes = jax.jvp(lambda t, y: solver.guards(t, y, scene), (root, y), along)
         slopes = jax.lax.stop_gradient(slopes)
         first = jnp.argmax(passed(values))
         fired = crossed & (passed(values) + side * slopes * event_tolerance(root) >= 0)

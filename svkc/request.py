@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from svkc.assembly import gap_tolerance
 from svkc.chain import Chain, State
 from svkc.events import At, Plan, plan
-from svkc.stepping import Baumgarte, Drift, FixedSteps, Projection, motion_norm
+from svkc.stepping import Baumgarte, Drift, Field, FixedSteps, Projection, motion_norm
 
 
 class Options(eqx.Module):
@@ -31,6 +31,11 @@ class Options(eqx.Module):
     max_steps: int = eqx.field(static=True)
     has_work: bool = eqx.field(static=True)
     gap: float = eqx.field(static=True)
+
+    @property
+    def field(self) -> Field:
+        """The vector field of a phase."""
+        return Field(self.control, self.stabilization)
 
     def steps(self, t0, t1, ts):
         """The step-size controller of one phase, that stops at every save time, and the first step."""

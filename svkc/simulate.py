@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from svkc.chain import Chain, State
+from svkc.binding import emptied, grip
+from svkc.chain import Chain, State, Structure
 from svkc.closure import loop_gaps
 from svkc.energy import energy
 from svkc.events import Plan
@@ -92,7 +93,7 @@ def _start(chain: Chain, state: State, t0, ts, made: Plan, options: Options, arg
         structure = eqx.tree_at(lambda s: s.locked, structure, jnp.zeros(chain.dofs, bool), is_leaf=lambda x: x is None)
     state = State(state.q, state.v, structure)
     scene = Scene(chain, structure, args)
-    guards = guard_values(made, t0, Motion(state.q, state.v), scene) if made.guards else None
+    guards = guard_values(made, options.field, t0, Motion(state.q, state.v), scene) if made.guards else None
     zero = jnp.asarray(0, jnp.int32)
     return Run(
         t=t0,
@@ -174,11 +175,16 @@ def _apply(chain: Chain, run: Run, ended: State, solved: Solved, fired: Bool[Arr
     any_of = lambda what: jnp.any(fired[:, None] & made.table(chain, what), 0)
     connected = (ended.structure.connected | any_of("connect")) & ~any_of("cut")
     locked = (ended.structure.locked | any_of("lock")) & ~any_of("unlock") if made.locks else None
-    grips = made.table(chain, "here").any()
-    happened = jnp.any(fired)
+    here = any_of("here") if made.table(chain, "here").any() or made.binds else None
+    happened, full, emptying = jnp.any(fired), jnp.zeros((), bool), None
+    if made.binds:
+        structure, gripped, full, emptying = _bound(chain, ended.structure, fired, made)
+        ended = State(ended.q, ended.v, structure)
+        connected, here = (connected | gripped) & ~emptying, here | gripped
 
     def changed():
-        return change(chain, ended, connected, locked, any_of("here") if grips else None)
+        done = change(chain, ended, connected, locked, here)
+        return done if emptying is None else eqx.tree_at(lambda d: d.state.structure, done, emptied(done.state.structure, emptying))
 
     def same():
         return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), eqx.filter_eval_shape(changed))
@@ -191,7 +197,7 @@ def _apply(chain: Chain, run: Run, ended: State, solved: Solved, fired: Bool[Arr
     hit = (rows[:, None] == place[None]) & fired[None]
     written = jnp.any(hit, 1)
     first = written & (rows == r.count)
-    mine = jnp.any(hit[:, :, None] & made.table(chain, "connect")[None], 1)[:, :, None]
+    mine = jnp.any(hit[:, :, None] & (made.table(chain, "connect") | made.table_of_grips(chain))[None], 1)[:, :, None]
     events = Events(
         jnp.where(written, solved.t, r.time),
         jnp.where(written, jnp.argmax(hit, 1).astype(jnp.int32), r.which),
@@ -203,5 +209,21 @@ def _apply(chain: Chain, run: Run, ended: State, solved: Solved, fired: Bool[Arr
     stops = jnp.any(fired & np.array([a.stop for a in made.actions], bool))
     result = RESULTS.where(stops, RESULTS.stopped, solved.result)
     result = RESULTS.where(happened & (done.gap > connect_tolerance), RESULTS.not_in_place, result)
+    result = RESULTS.where(full, RESULTS.no_slot, result)
     result = RESULTS.where(r.count + count > r.time.shape[0], RESULTS.max_events, result)
     return after, events, result
+
+
+def _bound(chain: Chain, structure: Structure, fired: Bool[Array, " events"], made: Plan):
+    """The structure with the slots that the events of this instant bind, the slots to connect, whether one was lacking, and the slots to empty."""
+    emptying = jnp.any(fired[:, None] & made.unbound(chain, structure), 0)
+    gripped, full = jnp.zeros(len(chain.link_names), bool), jnp.zeros((), bool)
+    for event, wishes in enumerate(made.grips):
+        for wish in wishes:
+            # slots given to others at this instant are no longer free
+            taken = eqx.tree_at(lambda s: s.connected, structure, structure.connected | gripped)
+            bound, slot, lacking = grip(chain, taken, wish)
+            bound = eqx.tree_at(lambda s: s.connected, bound, structure.connected)
+            structure = jax.tree.map(lambda new, old, e=event: jnp.where(fired[e], new, old), bound, structure)
+            gripped, full = gripped | (slot & fired[event]), full | (lacking & fired[event])
+    return structure, gripped, full, emptying

@@ -18,6 +18,11 @@ class RESULTS(eqx.Enumeration):
     not_in_place = "A link was to be connected at its declared placement, but its bodies were elsewhere. Use here, or a guard that waits."
     loop_open = "A loop is open by more than the tolerance. Use smaller steps, or projection."
     non_finite = "A number that is not finite appeared."
+    no_slot = "A grip was to be made and every spare slot was taken: it was not made, everything else was. Load with more spare slots, or unbind."
+
+
+# equinox has no public way to list them
+RESULT_NAMES = tuple(RESULTS._name_to_item)
 
 
 class Events(eqx.Module):

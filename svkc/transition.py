@@ -10,6 +10,7 @@ from jax.scipy.linalg import cho_factor, cho_solve
 from jaxtyping import Array, Bool, Float
 
 from svkc.assembly import check_closed, connection_mask, joint_slice, link_index
+from svkc.binding import emptied, spare_slot
 from svkc.chain import Chain, State, Structure
 from svkc.closure import close, constrain, decide_rank, scales
 from svkc.forward_dynamics import constraint_forces, reduced_inertia, with_links
@@ -17,7 +18,7 @@ from svkc.inverse_dynamics import inertia_by_composites
 from svkc.kinematics import kinematics, twists
 from svkc.loops import active_dofs, ends, gap, joint_coordinates, loop_jacobian, with_coordinates
 from svkc.spatial import quat_conjugate, quat_multiply, quat_rotate
-from svkc.topology import V_SIZE, joint_freedoms
+from svkc.topology import V_SIZE
 
 
 class Change(eqx.Module):
@@ -176,36 +177,11 @@ def unlock(chain: Chain, state: State, *joints: str) -> State:
     return _locked(chain, state, joints, False)
 
 
-def bind(chain: Chain, state: State, name: str, parent: str, real: str, *, joint="weld", pos=(0.0, 0.0, 0.0), real_pos=(0.0, 0.0, 0.0)) -> State:
-    """A spare slot put between two bodies, not connected yet: run-time data, no retrace. Connect it with here=True, or at this placement.
-
-    joint: any but universal and pairs of turns, whose coordinates a spare slot has no room for. pos, real_pos (m): in the two bodies.
-    """
-    slot = link_index(chain, name)
-    if not chain.topology.link_spare[slot]:
-        raise ValueError(
-            f"bind: {name!r} is not a spare slot; spare slots: {[n for n, s in zip(chain.link_names, chain.topology.link_spare, strict=True) if s]}"
-        )
-    for body in (parent, real):
-        if body not in chain.body_names:
-            raise ValueError(f"bind: no body {body!r}; bodies: {', '.join(chain.body_names)}")
-    freedoms = joint_freedoms(joint)
-    if sum(freedoms[:3]) == 2:
-        raise ValueError(f"bind: a spare slot has no coordinates for {joint!r}; declare the link when loading")
-    s, rows = state.structure, [chain.topology.body_row[chain.body_names.index(b)] for b in (parent, real)]
-    dtype = s.pos.dtype
-    structure = eqx.tree_at(
-        lambda s: (s.parent, s.real, s.freedoms, s.pos, s.real_pos),
-        s,
-        (
-            s.parent.at[slot].set(rows[0]),
-            s.real.at[slot].set(rows[1]),
-            s.freedoms.at[slot].set(jnp.asarray(freedoms)),
-            s.pos.at[slot].set(jnp.asarray(pos, dtype)),
-            s.real_pos.at[slot].set(jnp.asarray(real_pos, dtype)),
-        ),
-    )
-    return State(state.q, state.v, structure)
+def unbind(chain: Chain, state: State, *names: str) -> State:
+    """Cuts spare virtual links and empties their slots for other bodies; q and v stay as they are."""
+    slots = np.isin(np.arange(len(chain.link_names)), [spare_slot(chain, n) for n in names])
+    after = _change(chain, state, state.structure.connected & ~jnp.asarray(slots)).state
+    return State(after.q, after.v, emptied(after.structure, jnp.asarray(slots)))
 
 
 @functools.partial(jax.jit, static_argnames="name")

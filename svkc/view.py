@@ -33,19 +33,26 @@ def _segments(chain: Chain) -> list[tuple[int, np.ndarray, np.ndarray, float]]:
     model, out = chain.model.model, []
     for g in range(model.ngeom):
         kind, size = mujoco.mjtGeom(int(model.geom_type[g])), model.geom_size[g]
-        R = np.zeros(9)
-        mujoco.mju_quat2Mat(R, model.geom_quat[g])
-        axis = R.reshape(3, 3)[:, 2]
+        R = _matrix(model.geom_quat[g])
+        axis = R[:, 2]
         if kind in (mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER):
             half, radius = axis * size[1], size[0]
         elif kind in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_ELLIPSOID):
             half, radius = axis * 1e-3, float(np.mean(size)) if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID else size[0]
         elif kind == mujoco.mjtGeom.mjGEOM_BOX:
-            half, radius = np.array([size[0], 0, 0]) @ R.reshape(3, 3).T, size[2]
+            half, radius = R[:, 0] * size[0], size[2]
         else:
             continue
         out.append((int(model.geom_bodyid[g]), model.geom_pos[g] - half, model.geom_pos[g] + half, float(radius)))
     return out
+
+
+def _matrix(quat) -> np.ndarray:
+    import mujoco
+
+    R = np.zeros(9)
+    mujoco.mju_quat2Mat(R, quat)
+    return R.reshape(3, 3)
 
 
 def _world_poses(chain: Chain, states: State) -> tuple[np.ndarray, np.ndarray]:
@@ -136,12 +143,15 @@ def _animation(chain: Chain, traj: Trajectory, path: pathlib.Path, fps, size, lo
     camera.distance = 1.0 * float(np.linalg.norm(high - low)) + 1 if distance is None else distance
     camera.azimuth, camera.elevation = azimuth, -8
     rows = {row: body for body, row in enumerate(chain.topology.body_row)}
-    images = []
+    shapes, images = [_matrix(quat) for quat in model.geom_quat], []
+    mujoco.mj_forward(model, data)
     with mujoco.Renderer(model, height=size[1], width=size[0]) as renderer:
         for t in np.arange(ts[0], ts[-1] + 0.5 / fps, 1 / fps):
             i = int(np.argmin(np.abs(ts - t)))
-            data.qpos[:] = np.asarray(traj.states.q[i, : chain.nq])
-            mujoco.mj_forward(model, data)
+            # bodies where svkc has them: the tree may be another one where joints can be cut
+            for g, body in enumerate(model.geom_bodyid):
+                data.geom_xpos[g] = positions[i, body] + R[i, body] @ model.geom_pos[g]
+                data.geom_xmat[g] = (R[i, body] @ shapes[g]).ravel()
             renderer.update_scene(data, camera)
             _draw_links(renderer.scene, traj, i, positions, R, rows)
             images.append(Image.fromarray(renderer.render()).quantize(64))

@@ -13,10 +13,11 @@ ROOT = pathlib.Path(__file__).parent.parent
 HOUSE = [
     "spatial topology unsupported",
     "chain reading",
-    "kinematics trajectory load",
-    "inverse_dynamics loops archive",
+    "kinematics trajectory cuttable",
+    "inverse_dynamics loops archive load",
     "energy closure",
     "forward_dynamics assembly mobility",
+    "binding actuation guards solvers",
     "transition events stepping scenes",
     "request",
     "phase view",
