@@ -22,6 +22,7 @@ from svkc.closure import coordinates as coordinates, jacobian as jacobian, loop_
 from svkc.forward_dynamics import forward_dynamics as forward_dynamics, loop_forces as loop_forces
 from svkc.actuation import actuation as actuation
 from svkc.mobility import mobility as mobility
+from svkc.assembly import prefer as prefer
 
 # changes of structure
 from svkc.transition import connect as connect, cut as cut, lock as lock, transition as transition, unbind as unbind, unlock as unlock

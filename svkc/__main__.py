@@ -25,8 +25,7 @@ def _info(path: str) -> int:
     print(f"{len(chain.link_names)} virtual links: {', '.join(chain.link_names) or 'none'}")
     print(f"{chain.nv} joint freedoms in the tree, {chain.dofs} with every virtual link; {chain.gear.shape[0]} actuators")
     if state is not None:
-        m = svkc.mobility(chain, state)
-        print(f"as loaded: {int(m.joint_freedoms)} joint freedoms, rank {int(m.rank)}, mobility {int(m.freedoms)}")
+        print(f"as loaded:\n{svkc.mobility(chain, state)}")
     for line in chain.left_out:
         print(f"left out: {line}")
     return 0

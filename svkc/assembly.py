@@ -56,6 +56,21 @@ def joint_slice(chain: Chain, name: str, sizes, start) -> slice:
     return slice(start[row], start[row] + sizes[top.kind[row]])
 
 
+def prefer(chain: Chain, state: State, *names: str) -> State:
+    """The state with these joint coordinates asked to be independent (theta_G), as far as the loops let them be; no names: the choice is svkc's again.
+
+    names: of joints, virtual links, or single coordinates (`chain.dof_names`). The motion does not depend on it. ValueError: unknown names.
+    """
+    asked = np.zeros(chain.dofs, bool)
+    for name in names:
+        here = np.array([n == name or n.rpartition(".")[0] == name for n in chain.dof_names])
+        if not here.any():
+            raise ValueError(f"no joint coordinate {name!r}; coordinates: {', '.join(chain.dof_names)}")
+        asked |= here
+    wanted = jnp.asarray(asked) if names else None
+    return eqx.tree_at(lambda s: s.structure.independent, state, wanted, is_leaf=lambda x: x is None)
+
+
 def _filled(chain: Chain, what: str, value, default, tree: int, sizes, start):
     """The full vector of a user's array or dict, and which coordinates the dict named."""
     named = np.zeros(len(default), bool)

@@ -122,6 +122,11 @@ class Chain(eqx.Module):
         return self.topology.link_names
 
     @property
+    def dof_names(self) -> tuple[str, ...]:
+        """Of every joint coordinate: the joint's name, with .x .y .z for slides and .rx .ry .rz for turns where it has several."""
+        return self.topology.dof_names
+
+    @property
     def nq(self) -> int:
         return self.topology.nq
 

@@ -13,7 +13,8 @@ from svkc.loops import active_dofs, ends
 
 class Mobility(eqx.Module):
     """`freedoms` N_F = N_J - m (13), `joint_freedoms` N_J, `rank` m of the phase, `redundant`: rows of each loop that those before it already imply,
-    `independent`: the coordinates chosen as theta_G, `margin`: |R_mm| / |R_11|, how far the weakest row that counts is from being redundant."""
+    `independent`: the coordinates chosen as theta_G, `margin`: |R_mm| / |R_11|, how far the weakest row that counts is from being redundant.
+    Printed, it is a table with the names."""
 
     freedoms: Int[Array, ""]
     joint_freedoms: Int[Array, ""]
@@ -21,6 +22,23 @@ class Mobility(eqx.Module):
     redundant: Int[Array, " links"]
     independent: Bool[Array, " dofs"]
     margin: Float[Array, ""]
+    connected: Bool[Array, " links"]
+    link_names: tuple[str, ...] = eqx.field(static=True)
+    dof_names: tuple[str, ...] = eqx.field(static=True)
+
+    def __str__(self) -> str:
+        if isinstance(self.rank, jax.core.Tracer) or self.rank.ndim:
+            return repr(self)
+        chosen = ", ".join(n for n, on in zip(self.dof_names, self.independent, strict=True) if on)
+        lines = [
+            f"joint freedoms (N_J)      {int(self.joint_freedoms):4d}",
+            f"rank of the loops (m)     {int(self.rank):4d}   margin {float(self.margin):.2e}",
+            f"mobility (N_F = N_J - m)  {int(self.freedoms):4d}",
+            f"independent coordinates: {chosen or 'none'}",
+        ]
+        for name, on, rows in zip(self.link_names, self.connected, self.redundant, strict=True):
+            lines.append(f"  {name}: " + (f"6 rows, {int(rows)} of them redundant" if on else "not connected"))
+        return "\n".join(lines)
 
 
 @jax.jit
@@ -31,7 +49,8 @@ def mobility(chain: Chain, state: State) -> Mobility:
     links = len(chain.link_names)
     if not links:
         zero = jnp.zeros((), jnp.int32)
-        return Mobility(joint_freedoms, joint_freedoms, zero, jnp.zeros(0, jnp.int32), active, jnp.ones((), state.q.dtype))
+        one, none = jnp.ones((), state.q.dtype), jnp.zeros(0, jnp.int32)
+        return Mobility(joint_freedoms, joint_freedoms, zero, none, active, one, none > 0, (), chain.dof_names)
     kin = kinematics(chain, state.q)
     J = scaled_jacobian(chain, state.structure, kin, ends(chain, state.structure, kin, state.q))
     ranks = jnp.stack([count_rank(select(J[: 6 * (i + 1)]).size) for i in range(links)])
@@ -42,4 +61,5 @@ def mobility(chain: Chain, state: State) -> Mobility:
     rank = state.structure.rank
     last = jnp.where(jnp.arange(size.shape[0], dtype=jnp.int32) == rank - 1, size, 0).sum()
     margin = jnp.where(rank > 0, last / jnp.where(size[0] > 0, size[0], 1), 1)
-    return Mobility(joint_freedoms - rank, joint_freedoms, rank, redundant, co.independent, margin)
+    on = state.structure.connected
+    return Mobility(joint_freedoms - rank, joint_freedoms, rank, redundant, co.independent, margin, on, chain.link_names, chain.dof_names)

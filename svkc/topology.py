@@ -130,6 +130,24 @@ class Topology:
         return np.array(q, int), np.array(v, int)
 
     @functools.cached_property
+    def dof_names(self) -> tuple[str, ...]:
+        """A name for each joint coordinate: the joint's, with .x .y .z for slides and .rx .ry .rz for turns where it has several."""
+        names = [""] * self.dofs
+        turns, slides = (".rx", ".ry", ".rz"), (".x", ".y", ".z")
+        endings = {HINGE: ("",), SLIDE: ("",), BALL: turns, FREE: slides + turns}
+        for name, row in zip(self.joint_names, self.joint_row, strict=True):
+            for k, ending in enumerate(endings[self.kind[row]]):
+                names[self.v_start[row] + k] = name + ending
+        for name, dofs in zip(self.link_names, self.links.dof, strict=True):
+            own = [(d, ending) for d, ending in zip(dofs, turns + slides, strict=True) if d < self.dofs]
+            for d, ending in own:
+                names[d] = name + (ending if len(own) > 1 else "")
+        for name, link, freedom in self.cut_joints:
+            if sum(self.link_freedoms[link]) < 3:
+                names[self.links.dof[link, freedom]] = name
+        return tuple(names)
+
+    @functools.cached_property
     def scalars(self) -> tuple[np.ndarray, np.ndarray]:
         """(index in q, index in v) of every coordinate whose rate is its velocity."""
         quat_q, quat_v = self.quaternions

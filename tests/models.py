@@ -103,3 +103,11 @@ def stewart() -> svkc.Chain:
         svkc.VirtualLink(k.name, k.parent, k.real, "ball", pos=tuple(R.T @ (tops[i + 1] - p)), real_pos=k.real_pos, connected=True) for i, k in enumerate(links)
     ]
     return svkc.load(MJCF.format(xml), virtual_links=placed)
+
+
+def five_bar() -> svkc.Chain:
+    """Two arms of two links that meet: mobility 2, motors on both shoulders and one elbow to choose from."""
+    left = bar("left_arm", Y, "0 0 0.5", "-0.3 0 0", bar("left_fore", Y, "0.3 0 0.5", "0 0 0.5"))
+    right = bar("right_arm", Y, "0 0 0.5", "0.3 0 0", bar("right_fore", Y, "-0.3 0 0.5", "0 0 0.5"))
+    link = svkc.VirtualLink("tip", "left_fore", "right_fore", "hinge", pos=(0.3, 0, 0.5), real_pos=(-0.3, 0, 0.5), axis=(0, 1, 0), connected=True)
+    return svkc.load(MJCF.format(left + right), virtual_links=[link])

@@ -1,0 +1,139 @@
+"""The paper's own examples and formulas: section VII-A to the printed digit, attachment in flight, Rodrigues' integration."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import svkc
+from svkc.scenes.two_links import two_links
+from svkc.spatial import quat_exp, quat_multiply
+
+
+@pytest.fixture(scope="module")
+def links():
+    return two_links()
+
+
+def test_printed_matrices(links):
+    """(45)-(48): J_C, rank 6, mobility 2, W and S for theta_G = (theta_1, theta_7)."""
+    chain, state = links
+    assert chain.dof_names == ("base.x", "base.y", "base.z", "base.rx", "base.ry", "base.rz", "link1", "link1v")
+    linear, angular = svkc.jacobian(chain, state)
+    J = [[1, 0, 0, 0, 0, -2, -1, 0], [0, 1, 0, 0, 0, 0, 0, 0], [0, 0, 1, 2, 0, 0, 0, 0]]
+    J += [[0, 0, 0, 1, 0, 0, 0, 0], [0, 0, 0, 0, 1, 0, 0, 0], [0, 0, 0, 0, 0, 1, 1, -1]]
+    np.testing.assert_allclose(np.concatenate([linear[0], angular[0]]), J, atol=1e-15)
+    m = svkc.mobility(chain, state)
+    assert (int(m.joint_freedoms), int(m.rank), int(m.freedoms)) == (8, 6, 2)
+    co = svkc.coordinates(chain, svkc.prefer(chain, state, "base.x", "link1"))
+    W = [[1, 0], [0, 0], [0, 0], [0, 0], [0, 0], [0.5, -0.5], [0, 1]]
+    np.testing.assert_allclose(co.W[:7][:, co.independent], W, atol=1e-15)
+    np.testing.assert_allclose(co.S[co.actuated][:, co.independent], [[0, 1], [0.5, 0.5]], atol=1e-15)
+    np.testing.assert_allclose(co.H[co.dependent][:, co.independent], [[0, 0], [0, 0], [0, 0], [0, 0], [0.5, -0.5], [0.5, 0.5]], atol=1e-15)
+
+
+def test_every_admissible_pair_gives_the_same_motion(links):
+    """Of the 28 pairs those of theta_1, theta_6, theta_7, theta_8 can be theta_G, and no others; all six give one motion."""
+    chain, _ = links
+    state = chain.state(v={"base": [0.9, 0, 0, 0, 0, 0.2], "link1": 0.5})
+    admissible, asked = [], []
+    for pair in itertools.combinations(range(8), 2):
+        wish = svkc.prefer(chain, state, *(chain.dof_names[i] for i in pair))
+        chosen = tuple(np.flatnonzero(svkc.coordinates(chain, wish).independent).tolist())
+        assert set(chosen) <= {0, 5, 6, 7}
+        if chosen == pair:
+            admissible.append(pair)
+            asked.append(wish)
+    assert admissible == list(itertools.combinations((0, 5, 6, 7), 2))
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *asked)
+    final = jax.vmap(lambda s: svkc.simulate(chain, s, 1.0, rtol=1e-11, atol=1e-13, throw=False).final)(stacked)
+    assert float(jnp.abs(final.q - final.q[:1]).max()) < 1e-9
+    assert float(jnp.abs(final.v - final.v[:1]).max()) < 1e-9
+
+
+def planar_impact(model, x, theta, v):
+    """Velocities [base x, y, turn; link turn] after the tip of link 1 is pinned to the ground, by Newton and Euler: three planar impulses."""
+    m = model.body_mass[1:]
+    inertia = [np.max(i) for i in model.body_inertia[1:]]
+    c = [b[1] for b in model.body_ipos[1:]]
+    along = lambda a: np.array([-np.sin(a), np.cos(a)])
+    turn = lambda r: np.array([-r[1], r[0]])
+    a1, a2 = theta[0], theta[0] + theta[1]
+    elbow, tip = along(a1), along(a2)
+    w1, w2 = v[2], v[2] + v[3]
+    u1 = v[:2] + w1 * turn(c[0] * elbow)
+    u2 = v[:2] + w1 * turn(elbow) + w2 * turn(c[1] * tip)
+    # unknowns: u1, w1, u2, w2 after, the impulse P from link 1 on the base, and G from the ground on link 1
+    A, b = np.zeros((10, 10)), np.zeros(10)
+    r1, r2, r2e = (1 - c[0]) * elbow, (1 - c[1]) * tip, -c[1] * tip
+    A[0:2, 0:2], A[0:2, 6:8], b[0:2] = m[0] * np.eye(2), -np.eye(2), m[0] * u1
+    A[2, 2], A[2, 6:8], b[2] = inertia[0], -turn(r1), inertia[0] * w1
+    A[3:5, 3:5], A[3:5, 6:8], A[3:5, 8:10], b[3:5] = m[1] * np.eye(2), np.eye(2), -np.eye(2), m[1] * u2
+    A[5, 5], A[5, 6:8], A[5, 8:10], b[5] = inertia[1], turn(r2e), -turn(r2), inertia[1] * w2
+    A[6:8, 0:2], A[6:8, 2], A[6:8, 3:5], A[6:8, 5] = np.eye(2), turn(r1), -np.eye(2), -turn(r2e)
+    A[8:10, 3:5], A[8:10, 5] = np.eye(2), turn(r2)
+    u1x, u1y, w1, _, _, w2 = np.linalg.solve(A, b)[:6]
+    return np.array([*(np.array([u1x, u1y]) - w1 * turn(c[0] * elbow)), w1, w2 - w1])
+
+
+SERIAL = """<mujoco><option gravity="0 -9.81 0"/><worldbody><body name="link1" pos="0 2 0"><joint name="ground" axis="0 0 1"/>
+  <geom type="capsule" fromto="0 -1 0 0 0 0" size="0.03" mass="0.6" contype="0"/><body name="base" pos="0 -1 0"><joint name="elbow" axis="0 0 1"/>
+  <geom type="capsule" fromto="0 -1 0 0 0 0" size="0.03" mass="1.0" contype="0"/></body></body></worldbody></mujoco>"""
+
+
+def test_attached_in_flight_it_is_the_serial_chain(links):
+    """Fig. 13: flight, the tip pinned to the ground as it passes, then the motion of the serial two-joint chain for 5 s, to 1e-9."""
+    chain, _ = links
+    theta, v = np.array([0.5, -0.9]), np.array([0.4, 1.1, 0.7, -1.3])
+    along = lambda a: np.array([-np.sin(a), np.cos(a)])
+    foot = np.array([0, 2]) - along(theta[0]) - along(theta[0] + theta[1])
+    q = {"base": [*foot, 0, np.cos(theta[0] / 2), 0, 0, np.sin(theta[0] / 2)], "link1": theta[1]}
+    tol = {"rtol": 1e-12, "atol": 1e-13}
+    # back in time from the moment of contact, then forth
+    early = svkc.simulate(chain, chain.state(q, {"base": [-v[0], -v[1], 0, 0, 0, -v[2]], "link1": -v[3]}, connected=()), 0.3, **tol).final
+    start = svkc.State(early.q, -early.v, early.structure)
+    ts = jnp.linspace(0, 5.3, 54)
+    traj = svkc.simulate(chain, start, 5.3, ts=ts, events=[svkc.at(0.3, connect="link1v")], **tol)
+    after = planar_impact(chain.model.model, foot, theta, v)
+    just = traj.states.v[3]
+    np.testing.assert_allclose(just[np.array([0, 1, 5, 6])], after, atol=1e-9)
+    assert float(traj.events.energy_lost[0]) > 0.1
+    assert np.linalg.norm(traj.events.impulse[0]) > 0.1
+    serial = svkc.load(SERIAL)
+    # the serial chain's joints turn link 1 first, then the base
+    there = serial.state({"ground": theta[0] + theta[1], "elbow": -theta[1]}, {"ground": after[2] + after[3], "elbow": -after[3]})
+    same = svkc.simulate(serial, there, 5.0, ts=ts[3:] - 0.3, **tol)
+    ours, _ = jax.vmap(lambda s: svkc.poses(chain, s))(traj.states)
+    theirs, _ = jax.vmap(lambda s: svkc.poses(serial, s))(same.states)
+    np.testing.assert_allclose(ours[3:, chain.body_names.index("link1")], theirs[:, serial.body_names.index("base")], atol=1e-9)
+    assert float(traj.gaps.max()) < 1e-12
+
+
+FREE_TOP = '<mujoco><option gravity="0 0 0"/><worldbody><body name="top"><freejoint name="top"/><geom type="box" size="0.1 0.2 0.3"/></body></worldbody></mujoco>'
+
+
+def test_rodrigues_euler_is_of_first_order():
+    """(39)-(44) on a tumbling free top: halving the step halves the error of orientation and velocity."""
+    chain = svkc.load(FREE_TOP)
+    state = chain.state(v=np.array([0, 0, 0, 3.0, 0.1, 2.0]))
+    exact = svkc.simulate(chain, state, 1.0, rtol=1e-12, atol=1e-13).final
+    errors = []
+    for dt in (4e-3, 2e-3, 1e-3):
+        final = svkc.simulate(chain, state, 1.0, dt=dt, solver=svkc.RodriguesEuler()).final
+        errors.append([float(jnp.abs(svkc.difference(chain, exact.q, final.q)).max()), float(jnp.abs(final.v - exact.v).max())])
+    ratios = np.array(errors)[:-1] / np.array(errors)[1:]
+    assert np.all((ratios > 1.85) & (ratios < 2.15)), ratios
+
+
+def test_rodrigues_euler_keeps_quaternions_at_unit_length():
+    """1e5 steps of a tumbling top: the length is one to round-off at the end, and Rodrigues' formula by itself loses no more than adds up of round-off."""
+    chain = svkc.load(FREE_TOP)
+    state = chain.state(v=np.array([0, 0, 0, 3.0, 0.1, 2.0]))
+    traj = svkc.simulate(chain, state, 100.0, dt=1e-3, solver=svkc.RodriguesEuler(), max_steps=100001)
+    assert int(traj.report().accepted) == 100000
+    assert abs(float(jnp.linalg.norm(traj.final.q[3:7])) - 1) < 5e-16
+    turn = quat_exp(jnp.array([3e-3, 1e-4, 2e-3]))
+    bare = jax.lax.fori_loop(0, 100000, lambda i, q: quat_multiply(q, turn), jnp.array([1.0, 0, 0, 0]))
+    assert abs(float(jnp.linalg.norm(bare)) - 1) < 100000 * 2.3e-16
