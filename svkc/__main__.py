@@ -1,11 +1,11 @@
-"""F7: the command line. `python -m svkc` runs the high bar: two hands, one hand, flight."""
+"""F7: the command line. `python -m svkc` runs the high bar: two hands, one hand, flight; `python -m svkc swing` the swing."""
 
 import argparse
 import pathlib
 import sys
 import time
 
-RELEASE_RIGHT, RELEASE_LEFT, END = 0.9, 1.15, 1.8  # s
+RELEASE_RIGHT, RELEASE_LEFT, END, SWING_END = 0.9, 1.15, 1.8, 2.0  # s
 
 
 def _info(path: str) -> int:
@@ -39,8 +39,27 @@ def _state_or_none(chain):
         return None
 
 
-def _high_bar(out: pathlib.Path) -> int:
-    """The main job."""
+def _high_bar():
+    """Two hands, one hand, flight: Fig. 20."""
+    import svkc
+    from svkc.scenes import high_bar
+
+    return *high_bar(), (svkc.at(RELEASE_RIGHT, cut="right_hand_grip"), svkc.at(RELEASE_LEFT, cut="left_hand_grip")), END
+
+
+def _swing():
+    """A swing whose seat gives way: Fig. 21."""
+    from svkc.scenes.swing import leaving, swing
+
+    chain, state = swing()
+    return chain, state, leaving(chain), SWING_END
+
+
+SCENES = {"high_bar": _high_bar, "swing": _swing}
+
+
+def _run(name: str, out: pathlib.Path) -> int:
+    """One scene: the table of its phases, the run, the pictures."""
     import jax
 
     # the process is the command's own, so the setting is too
@@ -48,16 +67,14 @@ def _high_bar(out: pathlib.Path) -> int:
     import jax.numpy as jnp
 
     import svkc
-    from svkc.scenes import high_bar
 
     begin = time.perf_counter()
-    chain, state = high_bar()
+    chain, state, events, end = SCENES[name]()
     loaded = time.perf_counter()
-    ts = jnp.linspace(0, END, round(END / 0.025) + 1)
-    events = (svkc.at(RELEASE_RIGHT, cut="right_hand_grip"), svkc.at(RELEASE_LEFT, cut="left_hand_grip"))
+    ts = jnp.linspace(0, end, round(end / 0.025) + 1)
 
     def run():
-        return jax.block_until_ready(svkc.simulate(chain, state, END, ts=ts, events=events, rtol=1e-8, atol=1e-10))
+        return jax.block_until_ready(svkc.simulate(chain, state, end, ts=ts, events=events, rtol=1e-8, atol=1e-10))
 
     traj = run()
     compiled = time.perf_counter()
@@ -66,13 +83,13 @@ def _high_bar(out: pathlib.Path) -> int:
     _print_phases(chain, traj)
     print(f"load and close the loops {loaded - begin:.1f} s, first run with compilation {compiled - loaded:.1f} s, a run {done - compiled:.3f} s")
     out.mkdir(parents=True, exist_ok=True)
-    traj.save(out / "high_bar.npz", chain)
-    written = [out / "high_bar.npz"]
-    for name, missing in (("high_bar.png", "matplotlib"), ("high_bar.gif", "a GL library")):
+    traj.save(out / f"{name}.npz", chain)
+    written = [out / f"{name}.npz"]
+    for file, missing in ((f"{name}.png", "matplotlib"), (f"{name}.gif", "a GL library")):
         try:
-            written.append(svkc.render(chain, traj, out / name, azimuth=90))
+            written.append(svkc.render(chain, traj, out / file, azimuth=90))
         except (RuntimeError, ImportError) as error:
-            print(f"{name} not drawn, {missing} is missing: {error}")
+            print(f"{file} not drawn, {missing} is missing: {error}")
     print("wrote " + ", ".join(str(p) for p in written))
     return 0
 
@@ -80,14 +97,15 @@ def _high_bar(out: pathlib.Path) -> int:
 def _print_phases(chain, traj):
     """Freedoms, rank, mobility, steps and energy before and after each event, then the certificate."""
     p, report = traj.phases, traj.report()
-    print("      from        to  held by                            joint   rank  mobility   steps  energy drift")
-    print("         s         s                                  freedoms                              J")
+    names = {i: ", ".join(n for n, on in zip(chain.link_names, p.connected[i], strict=True) if on) or "nothing" for i in range(int(p.count))}
+    wide = max(34, *map(len, names.values()))
+    print(f"      from        to  {'held by':<{wide}} joint   rank  mobility   steps  energy drift")
+    print(f"         s         s  {'':<{wide}} freedoms                           J")
     for i in range(int(p.count)):
         if float(p.start[i]) == float(p.stop[i]) and i:
             continue
-        held = ", ".join(n for n, on in zip(chain.link_names, p.connected[i], strict=True) if on) or "nothing"
         print(
-            f"{float(p.start[i]):10.6f}{float(p.stop[i]):10.6f}  {held:<34}{int(p.joint_freedoms[i]):6d}{int(p.rank[i]):7d}"
+            f"{float(p.start[i]):10.6f}{float(p.stop[i]):10.6f}  {names[i]:<{wide}}{int(p.joint_freedoms[i]):6d}{int(p.rank[i]):7d}"
             f"{int(p.freedoms[i]):10d}{int(p.accepted[i]):8d}{float(p.energy_drift[i]):14.2e}"
         )
     times = ", ".join(f"{float(t):.6f} s" for t in traj.events.time[: int(traj.events.count)])
@@ -98,7 +116,7 @@ def _print_phases(chain, traj):
 def main(argv=None) -> int:
     """Entry point."""
     parser = argparse.ArgumentParser("svkc", description="Structure-varying kinematic chains: the high bar, release and all.")
-    parser.add_argument("command", nargs="?", choices=["info"], help="info MODEL: what a model is to svkc")
+    parser.add_argument("command", nargs="?", default="high_bar", choices=[*SCENES, "info"], help="a scene, or info MODEL: what a model is to svkc")
     parser.add_argument("model", nargs="?", help="MJCF or URDF file")
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out"), help="folder for results (default: out)")
     options = parser.parse_args(argv)
@@ -106,7 +124,7 @@ def main(argv=None) -> int:
         if options.model is None:
             parser.error("info needs a model file")
         return _info(options.model)
-    return _high_bar(options.out)
+    return _run(options.command, options.out)
 
 
 if __name__ == "__main__":

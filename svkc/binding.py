@@ -22,7 +22,7 @@ class Grip(eqx.Module):
     parent: str = eqx.field(static=True)
     real: str = eqx.field(static=True)
     joint: Any = eqx.field(static=True, default="weld")
-    axis: tuple[float, float, float] = eqx.field(static=True, default=(0.0, 0.0, 1.0))
+    axis: Any = eqx.field(static=True, default=(0.0, 0.0, 1.0), converter=tuple)
     real_pos: Any = (0.0, 0.0, 0.0)
     slot: str | None = eqx.field(static=True, default=None)
 

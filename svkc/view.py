@@ -79,8 +79,10 @@ def _strobe(chain: Chain, traj: Trajectory, path: pathlib.Path, frames: int) -> 
     ts = np.asarray(traj.ts)
     pick = np.unique(np.searchsorted(ts, np.linspace(ts[0], ts[-1], frames)).clip(0, len(ts) - 1))
     positions, R = _world_poses(chain, jax.tree.map(lambda x: x[pick], traj.states))
-    times = np.asarray(traj.events.time)
-    times = times[np.isfinite(times)]
+    p = traj.phases
+    # phases of no length, between events of one instant, are not seen
+    phases = [i for i in range(int(p.count)) if p.stop[i] > p.start[i]] or [0]
+    starts = np.asarray(p.start)[phases]
     figure = Figure(figsize=(10, 7.5), layout="constrained")
     axes = figure.add_subplot(aspect="equal", xlabel="x (m)", ylabel="z (m)")
     segments = _segments(chain)
@@ -90,7 +92,7 @@ def _strobe(chain: Chain, traj: Trajectory, path: pathlib.Path, frames: int) -> 
     # points a metre, limbs at two thirds of their thickness, so that poses can be told apart
     scale = 72 * min(9 / (high[0] - low[0]), 6.7 / (high[1] - low[1]))
     for frame, i in enumerate(pick):
-        phase = int(np.sum(times <= ts[i]))
+        phase = max(int(np.sum(starts <= ts[i])) - 1, 0)
         shade = 0.2 + 0.7 * (frame + 1) / len(pick)
         for body, a, b, radius in segments:
             if body == 0 and frame:
@@ -98,11 +100,9 @@ def _strobe(chain: Chain, traj: Trajectory, path: pathlib.Path, frames: int) -> 
             ends = np.array([positions[frame, body] + R[frame, body] @ x for x in (a, b)])
             color = "#9a9aa2" if body == 0 else COLORS[phase % len(COLORS)]
             axes.plot(ends[:, 0], ends[:, 2], color=color, alpha=0.8 if body == 0 else shade, solid_capstyle="round", linewidth=max(1.0, 1.3 * radius * scale))
-    for phase in range(len(times) + 1):
-        start = ts[0] if phase == 0 else times[phase - 1]
-        held = [n for n, on in zip(chain.link_names, np.asarray(traj.phases.connected[phase]), strict=True) if on] if phase < int(traj.phases.count) else []
-        label = f"from {start:.2f} s: {', '.join(held) or 'free'}"
-        axes.plot([], [], color=COLORS[phase % len(COLORS)], linewidth=5, label=label)
+    for phase, i in enumerate(phases):
+        held = [n for n, on in zip(chain.link_names, np.asarray(p.connected[i]), strict=True) if on]
+        axes.plot([], [], color=COLORS[phase % len(COLORS)], linewidth=5, label=f"from {starts[phase]:.2f} s: {', '.join(held) or 'free'}")
     axes.legend(loc="best", fontsize=9, title="held by")
     axes.grid(alpha=0.2)
     axes.set_title(f"{len(pick)} poses, {ts[pick[0]]:.2f} s to {ts[pick[-1]]:.2f} s")

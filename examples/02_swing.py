@@ -1,0 +1,35 @@
+"""A swing whose seat gives way: thighs slide along the plate until each has passed its edge, hands hold on. Writes a picture to the folder given."""
+
+import pathlib
+import sys
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+import jax.numpy as jnp
+
+import svkc
+from svkc.scenes.swing import EDGE, swing
+
+chain, state = swing()
+thighs = ["right_thigh_plate", "left_thigh_plate"]
+
+
+def passes_the_edge(link):
+    along = svkc.touch(chain, link, 0.0, axes="z")  # where the thigh is on its slide
+    return lambda t, state, args: jnp.abs(along(t, state)) - EDGE
+
+
+# two guards; the figure sits straight, so that both fire at one instant and make one change of structure
+events = [svkc.when(passes_the_edge(link), cut=link, direction=True) for link in thighs]
+traj = svkc.simulate(chain, state, 2.0, ts=jnp.linspace(0, 2.0, 81), events=events, rtol=1e-7, atol=1e-9)
+
+p = traj.phases
+for i in range(int(p.count)):
+    held = [name for name, on in zip(chain.link_names, p.connected[i], strict=True) if on]
+    print(f"{float(p.start[i]):.3f} s to {float(p.stop[i]):.3f} s: {int(p.joint_freedoms[i])} joint freedoms with the swing's own, held by {', '.join(held)}")
+print(f"largest loop gap {float(traj.report().gap):.1e} m")
+
+folder = pathlib.Path(sys.argv[1] if len(sys.argv) > 1 else ".")
+print("wrote", svkc.render(chain, traj, folder / "02_swing.png"))
