@@ -1,8 +1,7 @@
-"""The paper's claim for joints of several freedoms (section VI), fewer links and less computation, measured on the figure of its Fig. 16.
+"""Section VI of the paper, joints of several freedoms mean fewer links and less computation, measured on the 40-freedom figure of its Fig. 16.
 
-The same 40 joint freedoms as 12 balls and 4 hinges, and as 40 hinges. `python benchmarks/joints.py` prints a table for float64 and for float32 and
-writes results/joints.csv. The two figures take turns, so that a busy machine slows both. Times of a batch are those of all its lanes together.
-"""
+As 12 balls and 4 hinges, and as 40 hinges. `python benchmarks/joints.py` prints and writes results/joints.csv. The figures take turns, so that
+a busy machine slows both. Times of a batch are those of all its lanes together."""
 
 import csv
 import functools

@@ -41,7 +41,7 @@ def plan(t, structure):
         ahead = start + ((step + 1) * STRIDE - start) * part**3 * (10 - 15 * part + 6 * part**2)
         above = 0.5 * u**2 * (1 - u) * (1.3 - u)  # comes down with some speed, and would go below the ground
         angles = leg(jnp.where(stands, start, ahead) - SOLE - hips, HIP - ANKLE - jnp.where(stands, 0, above))
-        angles["ankle"] -= jnp.where(stands, 0, 4 * part**2 * (1 - part) ** 2)  # toes down on the way
+        angles["ankle"] -= jnp.where(stands, 0, 6 * part**2 * (1 - part) ** 2)  # toes down on the way
         arm = {"shoulder_flexion": swing if odd else -swing, "elbow": 0.35}
         joints |= {f"{side}_{name}": angle for name, angle in (angles | arm).items()}
     return jnp.stack([jnp.asarray(joints.get(name, 0.0), t.dtype) for name in chain.joint_names[1:]])

@@ -111,3 +111,47 @@ def five_bar() -> svkc.Chain:
     right = bar("right_arm", Y, "0 0 0.5", "0.3 0 0", bar("right_fore", Y, "-0.3 0 0.5", "0 0 0.5"))
     link = svkc.VirtualLink("tip", "left_fore", "right_fore", "hinge", pos=(0.3, 0, 0.5), real_pos=(-0.3, 0, 0.5), axis=(0, 1, 0), connected=True)
     return svkc.load(MJCF.format(left + right), virtual_links=[link])
+
+
+def dh_loop(theta, length, twist, axes_named="j") -> svkc.Chain:
+    """A single loop of hinges by Denavit and Hartenberg: joint i turns by theta[i] about z, then the next is `length[i]` along x, turned by `twist[i]` about x."""
+    turn = lambda angle: np.array([np.cos(angle / 2), np.sin(angle / 2)])
+    about_x = lambda angle: (turn(angle)[0], turn(angle)[1], 0, 0)
+    xml = ""
+    for i in reversed(range(len(theta) - 1)):
+        # Rot_x(twist) Rot_z(theta), from the joint before
+        (cx, sx), (cz, sz) = turn(twist[i - 1] if i else 0), turn(theta[i])
+        quat = f"{cx * cz} {sx * cz} {-sx * sz} {cx * sz}"
+        pos = f"{length[i - 1] if i else 0} 0 0"
+        hinge = f'<body name="{axes_named}{i}" pos="{pos}" quat="{quat}"><joint name="{axes_named}{i}" axis="0 0 1"/>'
+        xml = hinge + f'<geom type="capsule" fromto="0 0 0 {length[i]} 0 0.01" size="0.03" contype="0"/>' + xml + "</body>"
+    last = len(theta) - 2
+    end = svkc.VirtualLink(
+        "last", f"{axes_named}{last}", "world", "hinge", pos=(length[last], 0, 0), quat=about_x(twist[last]),
+        real_pos=(-length[-1], 0, 0), real_quat=about_x(-twist[-1]), connected=True,
+    )  # fmt: skip
+    return svkc.load(MJCF.format(xml), virtual_links=[end])
+
+
+def bennett(theta=0.9) -> svkc.Chain:
+    """Four skew hinges that can move only because sin(alpha) / a = sin(beta) / b."""
+    alpha, a, b = np.deg2rad(30.0), 0.5, 0.8
+    beta = np.arcsin(np.sin(alpha) * b / a)
+    second = 2 * np.arctan(np.sin((beta + alpha) / 2) / np.sin((beta - alpha) / 2) / np.tan(theta / 2))
+    return dh_loop((theta, second, -theta, -second), (a, b, a, b), (alpha, beta, alpha, beta))
+
+
+def bricard(theta=np.pi / 3) -> svkc.Chain:
+    """Six hinges, equal links, twists of 90 and -90 degrees in turn: cos t + cos u + cos t cos u = 0."""
+    other = np.arccos(-np.cos(theta) / (1 + np.cos(theta)))
+    quarter = np.pi / 2
+    return dh_loop((theta, other) * 3, (0.5,) * 6, (quarter, -quarter) * 3)
+
+
+def sarrus() -> svkc.Chain:
+    """Two legs of three parallel hinges at right angles to each other: the platform goes straight up and down."""
+    X = 'type="hinge" axis="1 0 0"'
+    leg_x = bar("a1", Y, "0.5 0 0.5", "1 0 0", bar("a2", Y, "-0.5 0 0.5", "0.5 0 0.5", bar("plate", Y, "-1 0 0.01", "-0.5 0 0.5")))
+    leg_y = bar("b1", X, "0 0.5 0.5", "0 1 0", bar("b2", X, "0 -0.5 0.5", "0 0.5 0.5"))
+    link = svkc.VirtualLink("top", "plate", "b2", "hinge", axis=(1, 0, 0), pos=(-1, 1, 0), real_pos=(0, -0.5, 0.5), connected=True)
+    return svkc.load(MJCF.format(leg_x + leg_y), virtual_links=[link])

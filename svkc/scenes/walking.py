@@ -7,7 +7,7 @@ from svkc.chain import Chain, State, VirtualLink
 from svkc.load import load
 from svkc.scenes import FOLDER
 
-STRIDE, HIP = 0.36, 0.90  # m: from foot to foot where both stand; the hips above the ground
+STRIDE, HIP = 0.35, 0.903  # m: from foot to foot where both stand; the hips above the ground
 HIPS = 0.085  # m: half the distance between the hips, and between the feet
 THIGH, SHANK, ANKLE, SOLE = 0.4222, 0.434, 0.075, 0.04  # m: the ankle above the ground; the sole's point that holds ahead of the ankle
 

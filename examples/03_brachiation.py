@@ -1,0 +1,83 @@
+"""Brachiation: a figure travels hand over hand along three bars, catching and letting go by guards. Writes a picture to the folder given (default: here)."""
+
+import pathlib
+import sys
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+import jax.numpy as jnp
+
+import svkc
+from svkc.scenes.brachiation import brachiation
+
+chain, state = brachiation()
+joints = chain.joint_names[1:]  # all but the free base: q[7:23], v[6:22]
+to_bar2, to_bar3 = (svkc.touch(chain, link, 0.0, axes="xy") for link in ("left_hand_bar2", "right_hand_bar3"))
+
+
+def each(side="", **numbers):
+    """A number for each joint, by the end of its name; zero for the others."""
+    return jnp.array([sum((x for end, x in numbers.items() if name.startswith(side) and name.endswith(end)), 0.0) for name in joints])
+
+
+right_arm, left_arm = (each(side, shoulder_flexion=1, shoulder_abduction=1, elbow=1, wrist=1) > 0 for side in ("right", "left"))
+hanging = each(shoulder_flexion=3.0, shoulder_abduction=-0.1, elbow=0.85, wrist=0.2)
+loose = each(shoulder_flexion=1.2, elbow=0.6, hip_flexion=0.3, knee=0.4, ankle=-0.5)
+pump = each(hip_flexion=0.9, knee=0.6)
+# kg m^2: what an arm that holds has to turn is the whole body; a free limb turns itself
+body = each(shoulder_flexion=3.0, elbow=3.0, shoulder_abduction=20.0, wrist=10.0)
+limb = jnp.diag(svkc.mass_matrix(chain, state))[6:]
+
+
+@jax.jit
+def control(t, state, args):
+    """Arms that hold stay bent, legs rise as the hips swing forwards (m/s: v[0]), a spring draws the free hand to the next bar."""
+    bar1, bar2, bar3 = state.structure.connected
+    q, v = state.q[7:23], state.v[6:22]
+    holding = (right_arm & (bar1 | bar3)) | (left_arm & bar2)
+    goal = jnp.where(holding, hanging, loose) + pump * jnp.tanh(2.0 * state.v[0])
+    rate = jnp.where(holding, 8.0, 9.0)
+    tau = jnp.where(holding, body, limb) * (rate * rate * (goal - q) - 2.0 * rate * v)
+
+    def stretched(dv):
+        moved = svkc.State(svkc.integrate(chain, state.q, dv), state.v, state.structure)
+        distance = jnp.where(bar1, to_bar2(t, moved), to_bar3(t, moved))
+        return 150.0 * jnp.sqrt(distance**2 + 0.01)
+
+    reach = -jax.grad(stretched)(jnp.zeros_like(state.v))[6:22] - 8.0 * limb * v
+    reaching = (left_arm & bar1 & ~bar2) | (right_arm & bar2 & ~bar1 & ~bar3)
+    return jnp.pad(jnp.where(reaching, reach, tau), (6, chain.dofs - 22))  # none at the base, none at the bars
+
+
+def swings_forward(bar):
+    """A guard: with one hand on this bar and one on bar 2, the hips turn from swinging back to swinging forwards."""
+
+    def guard(t, state, args):
+        connected = state.structure.connected
+        return jnp.where(connected[bar - 1] & connected[1], state.v[0], 1.0)
+
+    return guard
+
+
+events = [
+    svkc.when(svkc.touch(chain, "left_hand_bar2", 0.05, axes="xy"), connect="left_hand_bar2", here=True, direction=False),
+    svkc.when(swings_forward(bar=1), cut="right_hand_bar1", direction=True),
+    svkc.when(svkc.touch(chain, "right_hand_bar3", 0.05, axes="xy"), connect="right_hand_bar3", here=True, direction=False),
+    svkc.when(swings_forward(bar=3), cut="left_hand_bar2", direction=True),
+]
+ts = jnp.linspace(0, 4.5, 181)
+traj = svkc.simulate(chain, state, 4.5, ts=ts, events=events, control=control, rtol=1e-6, atol=1e-8, max_events=5)
+
+hands = ("right on 1", "left on 2", "right on 3")
+for phase in range(int(traj.phases.count)):
+    p = traj.phases
+    held = ", ".join(h for h, on in zip(hands, p.connected[phase], strict=True) if on)
+    print(f"{float(p.start[phase]):.3f} s to {float(p.stop[phase]):.3f} s: {held:<21} mobility {int(p.freedoms[phase])}, {int(p.accepted[phase])} steps")
+lost = [f"{float(x):.1f} J" for x in traj.events.energy_lost[:3:2]]
+torque = jnp.abs(jax.vmap(lambda t, s: control(t, s, None))(ts, traj.states)).max()
+print(f"lost in the catches {' and '.join(lost)}; largest torque {float(torque):.0f} N m; largest loop gap {float(traj.report().gap):.1e} m")
+
+folder = pathlib.Path(sys.argv[1] if len(sys.argv) > 1 else ".")
+print("wrote", svkc.render(chain, traj, folder / "03_brachiation.png"))

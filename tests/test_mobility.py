@@ -1,0 +1,88 @@
+"""Mobility where counting freedoms goes wrong, the table, and the loop forces of redundant loops."""
+
+import jax.numpy as jnp
+import models
+import numpy as np
+import pytest
+from kkt import acceleration
+
+import svkc
+
+# model, joint freedoms, rank, what Kutzbach and Gruebler count
+OVERCONSTRAINED = {
+    "bennett": (models.bennett, 4, 3, -2),
+    "bricard": (models.bricard, 6, 5, 0),
+    "sarrus": (models.sarrus, 6, 5, 0),
+    "double_parallelogram": (models.parallelogram, 6, 5, -6),
+}
+
+
+@pytest.fixture(params=OVERCONSTRAINED, scope="module")
+def linkage(request):
+    make, joints, rank, counted = OVERCONSTRAINED[request.param]
+    chain = make()
+    return chain, chain.state(), joints, rank, counted
+
+
+def test_one_freedom_where_counting_says_none(linkage):
+    chain, state, joints, rank, counted = linkage
+    m = svkc.mobility(chain, state)
+    assert (int(m.joint_freedoms), int(m.rank), int(m.freedoms)) == (joints, rank, 1)
+    assert joints - 6 * len(chain.link_names) == counted
+    assert int(jnp.sum(m.redundant)) == 6 * len(chain.link_names) - rank
+    assert float(m.margin) > 1e-3
+
+
+def test_it_moves_a_finite_way(linkage):
+    """Not only to first order: pushed along its freedom it goes through 0.6 s and tenths of a radian, loop closed, energy kept, rank as it was."""
+    chain, state, _, rank, _ = linkage
+    W = svkc.coordinates(chain, state).W
+    direction = np.asarray(W)[:, np.any(W != 0, 0)][:, 0]
+    start = chain.state(state.q, 2 * direction / np.abs(direction).max())
+    traj = svkc.simulate(chain, start, 0.6, rtol=1e-9, atol=1e-11)
+    assert float(jnp.abs(svkc.difference(chain, start.q, traj.final.q)).max()) > 0.3
+    assert float(traj.gaps.max()) < 1e-12
+    assert abs(float(traj.phases.energy_drift[0])) < 1e-6 * (1 + abs(float(traj.phases.energy[0, 0])))
+    there = chain.state(traj.final.q)
+    assert int(svkc.mobility(chain, there).rank) == rank
+    expected = acceleration(chain, start, np.zeros(chain.nv))
+    vdot = svkc.forward_dynamics(chain, start, jnp.zeros(chain.nv))
+    np.testing.assert_allclose(vdot[: chain.nv], expected, atol=1e-9 * np.abs(expected).max())
+
+
+def test_the_table_names_things():
+    chain = models.parallelogram()
+    state = chain.state()
+    text = str(svkc.mobility(chain, state))
+    assert "joint freedoms (N_J)         6" in text
+    assert "rank of the loops (m)        5" in text
+    assert "pin1: 6 rows, 3 of them redundant" in text
+    assert "pin2: 6 rows, 4 of them redundant" in text
+    assert "independent coordinates: " in text
+    assert "pin1: not connected" in str(svkc.mobility(chain, chain.state(connected=["pin2"])))
+    for name in ("leg0", "plate"):
+        chosen = svkc.mobility(chain, svkc.prefer(chain, state, name)).independent
+        assert chain.dof_names[int(jnp.argmax(chosen))] == name
+    with pytest.raises(ValueError, match="no joint coordinate 'leg9'"):
+        svkc.prefer(chain, state, "leg9")
+
+
+def test_loop_forces_are_the_multipliers():
+    """Against numpy's multipliers of the same rows: equal where unique, of least norm and said not to be unique where not."""
+    for make, unique in ((models.rod_on_balls, [True]), (models.stewart, [True] * 5), (models.four_bar, [False]), (models.parallelogram, [False, False])):
+        chain = make()
+        rng = np.random.default_rng(4)
+        state = chain.state(v=rng.normal(size=chain.nv))
+        tau = jnp.concatenate([jnp.asarray(rng.normal(size=chain.nv)), jnp.zeros(chain.dofs - chain.nv)])
+        carried = svkc.loop_forces(chain, state, tau)
+        assert carried.unique.tolist() == unique
+        linear, angular = (np.asarray(x) for x in svkc.jacobian(chain, state))
+        J = np.concatenate([angular, linear / float(chain.length)], 1).reshape(-1, chain.dofs)
+        vdot = acceleration(chain, state, tau)
+        excess = np.zeros(chain.dofs)
+        excess[: chain.nv] = np.asarray(svkc.inverse_dynamics(chain, state, jnp.asarray(vdot))) - np.asarray(tau)[: chain.nv]
+        # on the real link from the virtual one: the other sign
+        wrench = -np.linalg.lstsq(J.T, excess, rcond=1e-9)[0].reshape(-1, 6)
+        scale = max(1.0, np.abs(wrench).max())
+        np.testing.assert_allclose(carried.torque, wrench[:, :3], atol=1e-9 * scale)
+        np.testing.assert_allclose(carried.force, wrench[:, 3:] / float(chain.length), atol=1e-9 * scale)
