@@ -21,7 +21,7 @@ from svkc.spatial import quat_about, quat_conjugate, quat_multiply
 
 FIGURE = pathlib.Path(svkc.__file__).parent / "scenes" / "figure40.xml"
 RESULTS = pathlib.Path(__file__).parent / "results" / "joints.csv"
-DT, STEPS, BATCH, COMPILES, RUNS = 1e-3, 300, 64, 9, 5
+DT, STEPS, BATCH, COMPILES, RUNS = 1e-3, 300, 64, 7, 5
 
 
 def hinges_for_balls() -> tuple[mujoco.MjSpec, list[str]]:

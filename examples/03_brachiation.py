@@ -53,12 +53,7 @@ def control(t, state, args):
 
 def swings_forward(bar):
     """A guard: with one hand on this bar and one on bar 2, the hips turn from swinging back to swinging forwards."""
-
-    def guard(t, state, args):
-        connected = state.structure.connected
-        return jnp.where(connected[bar - 1] & connected[1], state.v[0], 1.0)
-
-    return guard
+    return lambda t, state, args: jnp.where(jnp.all(state.structure.connected[jnp.array([bar - 1, 1])]), state.v[0], 1.0)
 
 
 events = [
@@ -70,14 +65,13 @@ events = [
 ts = jnp.linspace(0, 4.5, 181)
 traj = svkc.simulate(chain, state, 4.5, ts=ts, events=events, control=control, rtol=1e-6, atol=1e-8, max_events=5)
 
-hands = ("right on 1", "left on 2", "right on 3")
-for phase in range(int(traj.phases.count)):
-    p = traj.phases
-    held = ", ".join(h for h, on in zip(hands, p.connected[phase], strict=True) if on)
-    print(f"{float(p.start[phase]):.3f} s to {float(p.stop[phase]):.3f} s: {held:<21} mobility {int(p.freedoms[phase])}, {int(p.accepted[phase])} steps")
-lost = [f"{float(x):.1f} J" for x in traj.events.energy_lost[:3:2]]
+p = traj.phases
+for phase in range(int(p.count)):
+    held = ", ".join(link for link, on in zip(chain.link_names, p.connected[phase], strict=True) if on)
+    print(f"{float(p.start[phase]):.3f} s to {float(p.stop[phase]):.3f} s: {held}; mobility {int(p.freedoms[phase])}, {int(p.accepted[phase])} steps")
 torque = jnp.abs(jax.vmap(lambda t, s: control(t, s, None))(ts, traj.states)).max()
-print(f"lost in the catches {' and '.join(lost)}; largest torque {float(torque):.0f} N m; largest loop gap {float(traj.report().gap):.1e} m")
+first, second = traj.events.energy_lost[0], traj.events.energy_lost[2]
+print(f"the catches cost {first:.1f} J and {second:.1f} J; largest torque {torque:.0f} N m; largest loop gap {float(traj.report().gap):.1e} m")
 
 folder = pathlib.Path(sys.argv[1] if len(sys.argv) > 1 else ".")
-print("wrote", svkc.render(chain, traj, folder / "03_brachiation.png"))
+print("wrote", svkc.render(chain, traj, folder / "03_brachiation.png", frames=7))

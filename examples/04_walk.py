@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import svkc
 from svkc.scenes.walking import ANKLE, HIP, SOLE, STRIDE, leg, walking
 
-STEPS, PERIOD, SHARED, RAMP = 5, 0.7, 0.12, 0.6  # steps, s a step, the part of it on both feet, s to get going and to stop
+STEPS, PERIOD, SHARED, RAMP = 5, 0.65, 0.12, 0.6  # steps, s a step, the part of it on both feet, s to get going and to stop
 END = RAMP + (STEPS + SHARED / 2) * PERIOD
 chain, state = walking()
 feet = {side: chain.link_names.index(f"{side}_foot_ground") for side in ("left", "right")}
@@ -39,17 +39,17 @@ def plan(t, structure):
         part = jnp.minimum(u, 1)
         start, stands = structure.pos[link, 0], structure.connected[link]
         ahead = start + ((step + 1) * STRIDE - start) * part**3 * (10 - 15 * part + 6 * part**2)
-        above = 0.5 * u**2 * (1 - u) * (1.3 - u)  # comes down with some speed, and would go below the ground
+        above = 0.6 * u**2 * (1 - u) * (1.15 - u)  # comes down with some speed, and would go below the ground
         angles = leg(jnp.where(stands, start, ahead) - SOLE - hips, HIP - ANKLE - jnp.where(stands, 0, above))
         angles["ankle"] -= jnp.where(stands, 0, 6 * part**2 * (1 - part) ** 2)  # toes down on the way
-        arm = {"shoulder_flexion": swing if odd else -swing, "elbow": 0.35}
+        arm = {"shoulder_flexion": -swing if odd else swing, "elbow": 0.35}
         joints |= {f"{side}_{name}": angle for name, angle in (angles | arm).items()}
     return jnp.stack([jnp.asarray(joints.get(name, 0.0), t.dtype) for name in chain.joint_names[1:]])
 
 
-def torques_on(side, state, vdot):
+def torques_on(foot, state, vdot):
     """Torques for an acceleration with this foot alone on the ground: what moves, moves; the other foot carries nothing."""
-    alone = (jnp.arange(len(chain.link_names)) == feet[side], jnp.asarray(6, jnp.int32))
+    alone = (jnp.arange(len(chain.link_names)) == foot, jnp.asarray(6, jnp.int32))
     state = eqx.tree_at(lambda s: (s.structure.connected, s.structure.rank), state, alone)
     return svkc.actuation(chain, state, vdot).tau
 
@@ -70,7 +70,8 @@ def control(t, state, args):
     front = 0.02 + 1.03 * part**2 * (3 - 2 * part)
     on_left = jnp.where(place[left] > place[right], front, 1 - front)
     on_left = jnp.where(stands[left] & stands[right], on_left, jnp.where(stands[left], 1.0, 0.0))
-    return on_left * torques_on("left", state, vdot) + (1 - on_left) * torques_on("right", state, vdot)
+    torques = jax.vmap(torques_on, (0, None, None))(jnp.asarray([left, right]), state, vdot)
+    return on_left * torques[0] + (1 - on_left) * torques[1]
 
 
 events = []
@@ -78,7 +79,7 @@ for side in feet:
     link = f"{side}_foot_ground"
     events += [svkc.when(svkc.touch(chain, link, 0.0, axes="z"), connect=link, direction=False, here=True)]
     events += [svkc.when(svkc.leaves(chain, link), cut=link, direction=False)]
-traj = svkc.simulate(chain, state, END, ts=jnp.linspace(0, END, 85), events=events, control=control, rtol=1e-6, atol=1e-8)
+traj = svkc.simulate(chain, state, END, ts=jnp.linspace(0, END, 79), events=events, control=control, rtol=1e-6, atol=1e-8)
 
 p = traj.phases
 for phase in range(int(p.count)):

@@ -1,5 +1,7 @@
 """F5: guards that measure the mechanism itself: bodies that touch, a support that would have to pull, a joint that carries too much."""
 
+from typing import ClassVar
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +20,8 @@ class Sensor(eqx.Module):
 
     chain: Chain
     link: int = eqx.field(static=True)
+    # it measures loads, for which it must be told the joint torques
+    loaded: ClassVar[bool] = True
 
     def measure(self, chain: Chain, state: State, tau: Float[Array, " dofs"]) -> Float[Array, ""]:
         raise NotImplementedError
@@ -29,6 +33,7 @@ class Sensor(eqx.Module):
 class Touch(Sensor):
     """See `touch`."""
 
+    loaded: ClassVar[bool] = False
     distance: Float[Array, ""]
     axes: tuple[int, ...] = eqx.field(static=True)
 
@@ -74,7 +79,7 @@ def touch(chain: Chain, link: str, distance=0.01, axes: str | None = None) -> To
     """A guard: how far the real end of a virtual link is from its place in the parent, less `distance` (m). Falls through zero as they come together.
 
     axes: those of the joint's frame in the parent that count, such as "xy" for a bar along z; by default the ones the joint does not slide along. With one
-    axis alone, "z", the height over that plane, with its sign. Use with direction=False.
+    axis alone, "z", the height over that plane, with its sign. Use with direction=False, and with a distance that is not passed within one step.
     """
     slot = link_index(chain, link)
     if axes is None:

@@ -49,7 +49,7 @@ def event_tolerance(t: Float[Array, ""]) -> Float[Array, ""]:
 def guard_values(made: Plan, field: Field, t, y: Motion, scene: Scene) -> Float[Array, " guards"]:
     """What every guard says of this moment; those that measure the mechanism are told its torques."""
     state = State(y.q, y.v, scene.structure)
-    tau = field.torques(t, y, scene)[0] if any(isinstance(g, Sensor) for g in made.guards) else None
+    tau = field.torques(t, y, scene)[0] if any(isinstance(g, Sensor) and g.loaded for g in made.guards) else jnp.zeros_like(y.v)
     values = [g.measure(scene.chain, state, tau) if isinstance(g, Sensor) else g(t, state, scene.args) for g in made.guards]
     return jnp.stack([jnp.asarray(x, y.q.dtype).reshape(()) for x in values])
 
@@ -104,7 +104,8 @@ def _locate(hit, t_end, end: Motion, term, solver, scene: Scene, made: Plan):
     """Time and motion of the earliest crossing in the last step, the guards that fired, and the guard values to go on with.
 
     Steps of the solver back from the end of the step; the root is found without derivatives and then corrected once by Newton's formula
-    with everything differentiable, which makes dt/dp = -(dg/dp) / (dg/dt) exact. A guard that fired is armed again once it has left zero.
+    with everything differentiable, which makes dt/dp = -(dg/dp) / (dg/dt) exact. A guard that jumps over zero happens where it jumps, uncorrected.
+    A guard that fired is armed again once it has left zero.
     """
     crossed = made.crossed(end.watch.before, end.watch.after) & scene.watched & hit
     side = jnp.where(crossed, jnp.where(end.watch.after >= end.watch.before, 1, -1), 0).astype(t_end.dtype)
@@ -136,6 +137,7 @@ def _locate(hit, t_end, end: Motion, term, solver, scene: Scene, made: Plan):
         fired = crossed & (passed(values) + side * slopes * event_tolerance(root) >= 0)
         fired = fired | (jnp.arange(side.shape[0]) == first)
         correction = values[first] / jnp.where(slopes[first] == 0, 1, slopes[first])
+        correction = jnp.where(jnp.abs(correction) <= event_tolerance(root), correction, 0)
         y = jax.tree.map(lambda y, r: y - r * correction, y, rate)
         # zero: not armed, until it has left zero
         after = jnp.where(fired, 0, jax.lax.stop_gradient(values))

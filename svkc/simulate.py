@@ -17,6 +17,7 @@ from svkc.chain import Chain, State, Structure
 from svkc.closure import loop_gaps
 from svkc.energy import energy
 from svkc.events import Plan
+from svkc.guards import Sensor
 from svkc.loops import active_dofs
 from svkc.phase import Run, Solved, event_tolerance, guard_values, solve
 from svkc.request import Options, checked
@@ -132,8 +133,21 @@ def _phase(chain: Chain, run: Run, index, t1, ts, made: Plan, options: Options, 
     if made.actions:
         after, events, result = _apply(chain, run, ended, solved, fired, made)
     result = RESULTS.where(run.result == RESULTS.successful, result, run.result)
-    guards = solved.guards
+    guards = _compared(chain, after, solved, jnp.any(fired), made, options, args)
     return Run(solved.t, after, solved.motion.work, guards, run.pending & ~timed, events, phases, saved, result)
+
+
+def _compared(chain: Chain, after: State, solved: Solved, happened, made: Plan, options: Options, args):
+    """Guard values to go on with: after a change of structure those of the new one, so that a guard is compared within one phase.
+
+    But for loads: what has to carry too much from the first moment is seen to break, or to leave.
+    """
+    fresh = [i for i, g in enumerate(made.guards) if not (isinstance(g, Sensor) and g.loaded)]
+    if not fresh:
+        return solved.guards
+    now = guard_values(made, options.field, solved.t, Motion(after.q, after.v), Scene(chain, after.structure, args))
+    take = np.isin(np.arange(len(made.guards)), fresh) & happened & (solved.guards != 0)
+    return jnp.where(take, now, solved.guards)
 
 
 def _save(run: Run, ended: State, solved: Solved, ts) -> State:

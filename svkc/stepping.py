@@ -83,7 +83,8 @@ class Field(eqx.Module):
         chain = scene.chain
         tau = jnp.zeros_like(y.v)
         if self.control is not None:
-            asked = self.control(t, State(y.q, y.v, scene.structure), scene.args)
+            # traced once for all the places that call it
+            asked = eqx.filter_jit(self.control)(t, State(y.q, y.v, scene.structure), scene.args)
             tau = tau + joint_torques(chain, jnp.asarray(asked, y.v.dtype))
         if chain.limit is not None:
             tau = tau + limit_forces(chain, y.q, y.v)

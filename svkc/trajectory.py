@@ -58,12 +58,12 @@ class Phases(eqx.Module):
     count: Int[Array, ""]
 
     @property
-    def freedoms(self) -> Int[Array, " phases"]:
+    def freedoms(self) -> Int[Array, "... phases"]:
         """Mobility N_F = N_J - m (13)."""
         return self.joint_freedoms - self.rank
 
     @property
-    def energy_drift(self) -> Float[Array, " phases"]:
+    def energy_drift(self) -> Float[Array, "... phases"]:
         """Energy gained that no work explains (J)."""
         return self.energy[..., 1] - self.energy[..., 0] - self.work
 
@@ -81,7 +81,7 @@ class Trajectory(eqx.Module):
     result: RESULTS
 
     @property
-    def connected(self) -> Bool[Array, "times links"]:
+    def connected(self) -> Bool[Array, "... times links"]:
         """Which virtual links hold at each time."""
         return self.states.structure.connected
 

@@ -99,7 +99,11 @@ def _strobe(chain: Chain, traj: Trajectory, path: pathlib.Path, frames: int) -> 
                 continue
             ends = np.array([positions[frame, body] + R[frame, body] @ x for x in (a, b)])
             color = "#9a9aa2" if body == 0 else COLORS[phase % len(COLORS)]
-            axes.plot(ends[:, 0], ends[:, 2], color=color, alpha=0.8 if body == 0 else shade, solid_capstyle="round", linewidth=max(1.0, 1.3 * radius * scale))
+            if np.hypot(*(ends[1] - ends[0])[[0, 2]]) * scale < 1:
+                # seen end-on: a line of no length would not be drawn
+                ends[1, 0] = ends[0, 0] + 1 / scale
+            width = max(1.0, 1.3 * radius * scale)
+            axes.plot(ends[:, 0], ends[:, 2], color=color, alpha=0.8 if body == 0 else shade, solid_capstyle="round", linewidth=width)
     for phase, i in enumerate(phases):
         held = [n for n, on in zip(chain.link_names, np.asarray(p.connected[i]), strict=True) if on]
         axes.plot([], [], color=COLORS[phase % len(COLORS)], linewidth=5, label=f"from {starts[phase]:.2f} s: {', '.join(held) or 'free'}")

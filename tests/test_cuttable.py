@@ -124,9 +124,7 @@ def test_springs_ranges_armature_and_motors_go_with_the_joint():
     a, b = (c.state({"a": 0.4, "b": 0.55}, {"a": 1.0, "b": 2.0}) for c in (plain, chain))
     np.testing.assert_allclose(svkc.energy(plain, a), svkc.energy(chain, b), rtol=1e-13)
     u = jnp.array([0.7])
-    ends = [
-        svkc.simulate(c, s, 0.5, control=lambda t, s, args, c=c: c.motors(u), rtol=1e-11, atol=1e-13) for c, s in ((plain, a), (chain, b))
-    ]
+    ends = [svkc.simulate(c, s, 0.5, control=lambda t, s, args, c=c: c.motors(u), rtol=1e-11, atol=1e-13) for c, s in ((plain, a), (chain, b))]
     np.testing.assert_allclose(svkc.poses(plain, ends[0].final)[0], svkc.poses(chain, ends[1].final)[0], atol=1e-9)
     np.testing.assert_allclose(ends[0].phases.work, ends[1].phases.work, rtol=1e-8)
     free = svkc.cut(chain, b, "b")

@@ -111,7 +111,9 @@ def test_attached_in_flight_it_is_the_serial_chain(links):
     assert float(traj.gaps.max()) < 1e-12
 
 
-FREE_TOP = '<mujoco><option gravity="0 0 0"/><worldbody><body name="top"><freejoint name="top"/><geom type="box" size="0.1 0.2 0.3"/></body></worldbody></mujoco>'
+FREE_TOP = (
+    '<mujoco><option gravity="0 0 0"/><worldbody><body name="top"><freejoint name="top"/><geom type="box" size="0.1 0.2 0.3"/></body></worldbody></mujoco>'
+)
 
 
 def test_rodrigues_euler_is_of_first_order():

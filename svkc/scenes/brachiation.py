@@ -6,6 +6,7 @@ from svkc.chain import Chain, State, VirtualLink
 from svkc.load import load
 from svkc.scenes import BAR_HEIGHT, FOLDER, PALM
 
+RADIUS = 0.02  # m: of bars and of the rails that carry them
 SPACING = 0.5  # m: from bar to bar
 HAND = 0.18  # m: from the middle to each hand, along the bars; half the shoulders' width
 
@@ -13,8 +14,8 @@ HAND = 0.18  # m: from the middle to each hand, along the bars; half the shoulde
 def brachiation(**options) -> tuple[Chain, State]:
     """The 16-joint figure under three bars, hanging from the first by its right hand, swung back and at rest.
 
-    Bars along y, `SPACING` apart along x, `BAR_HEIGHT` above the ground. Virtual links "right_hand_bar1" (holds), "left_hand_bar2", "right_hand_bar3":
-    hinges about the bars. 23 joint freedoms with one hand on a bar, 24 with two, of which 17 and 12 are free. `options` go to `svkc.load`.
+    Bars along y under two rails, `SPACING` apart along x, `BAR_HEIGHT` above the ground. Virtual links "right_hand_bar1" (holds),
+    "left_hand_bar2", "right_hand_bar3": hinges about the bars. Mobility 17 with one hand on a bar, 12 with two. `options` go to `svkc.load`.
     """
     import mujoco
 
@@ -23,9 +24,10 @@ def brachiation(**options) -> tuple[Chain, State]:
     capsule = mujoco.mjtGeom.mjGEOM_CAPSULE
     for bar in range(3):
         x = bar * SPACING
-        spec.worldbody.add_geom(name=f"bar{bar + 1}", type=capsule, fromto=[x, -0.6, BAR_HEIGHT, x, 0.6, BAR_HEIGHT], size=[0.014, 0, 0], **steel)
+        spec.worldbody.add_geom(name=f"bar{bar + 1}", type=capsule, fromto=[x, -0.6, BAR_HEIGHT, x, 0.6, BAR_HEIGHT], size=[RADIUS, 0, 0], **steel)
+    rail = BAR_HEIGHT + 2 * RADIUS
     for y in (-0.6, 0.6):
-        spec.worldbody.add_geom(type=capsule, fromto=[-SPACING / 2, y, BAR_HEIGHT, 2.5 * SPACING, y, BAR_HEIGHT], size=[0.02, 0, 0], **steel)
+        spec.worldbody.add_geom(type=capsule, fromto=[-SPACING / 2, y, rail, 2.5 * SPACING, y, rail], size=[RADIUS, 0, 0], **steel)
     hands = [
         VirtualLink(
             f"{side}_hand_bar{bar + 1}", "world", f"{side}_hand", joint="hinge", axis=(0, 1, 0), pos=(bar * SPACING, y, BAR_HEIGHT), real_pos=(0, 0, -PALM),

@@ -7,7 +7,7 @@ from svkc.chain import Chain, State, VirtualLink
 from svkc.load import load
 from svkc.scenes import FOLDER
 
-STRIDE, HIP = 0.35, 0.903  # m: from foot to foot where both stand; the hips above the ground
+STRIDE, HIP = 0.33, 0.906  # m: from foot to foot where both stand; the hips above the ground
 HIPS = 0.085  # m: half the distance between the hips, and between the feet
 THIGH, SHANK, ANKLE, SOLE = 0.4222, 0.434, 0.075, 0.04  # m: the ankle above the ground; the sole's point that holds ahead of the ankle
 
@@ -31,9 +31,11 @@ def walking(**options) -> tuple[Chain, State]:
     chain = load(spec, virtual_links=feet, **options)
     hips = -0.55 * STRIDE - SOLE
     q = {"base": [hips, 0, HIP, 1, 0, 0, 0]}
-    for link in feet:
+    for link, arm in zip(feet, (-0.3, 0.3), strict=True):
+        side = link.name.removesuffix("_foot_ground")
+        q |= {f"{side}_shoulder_flexion": arm, f"{side}_elbow": 0.35}
         for joint, angle in leg(link.pos[0] - SOLE - hips, HIP - ANKLE).items():
-            q[link.name.replace("foot_ground", joint)] = float(angle)
+            q[f"{side}_{joint}"] = float(angle)
     return chain, chain.state(q)
 
 
