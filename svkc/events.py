@@ -86,9 +86,10 @@ def when(guard, connect=(), cut=(), direction=None, *, lock=(), unlock=(), here=
     """When guard(t, state, args) -> real crosses zero, located to round-off and differentiable in time; the actions are those of `at`.
 
     direction: True for upwards only, False for downwards only. A guard is watched while its action would change something, or always if it has
-    none, so name the links it is about where several act alike; one that is exactly zero at the start has not crossed, nor has one that rests at zero (to eps^(3/4)) after it fired. Crossings are
-    seen between the ends of steps of one phase: two within one step go unseen, so bound the step (`stepsize_controller`, `dt`) where that can happen.
-    A guard that jumps over zero happens where it jumps; only a smooth one has a time to differentiate.
+    none, so name the links it is about where several act alike; one that is exactly zero at the start has not crossed, nor has one that rests at zero
+    (to eps^(3/4)) after it fired. Crossings are seen between the ends of steps of one phase: two within one step go unseen, so bound the step
+    (`stepsize_controller`, `dt`) where that can happen. A guard that jumps over zero happens where it jumps; only a smooth one has a time to
+    differentiate.
     """
     if not callable(guard):
         raise ValueError(f"when: guard must be a function of (t, state, args), got {guard!r}")

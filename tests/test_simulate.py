@@ -250,3 +250,14 @@ def test_save_and_load(tmp_path, pendulum):
         with pytest.raises(ValueError, match="not a whole trajectory"):
             svkc.load_trajectory(tmp_path / name)
     assert [p.name for p in tmp_path.glob("*.part")] == []
+
+
+def test_guards_that_jump(pendulum):
+    """A guard that jumps in time happens where it jumps; one that a change of structure makes jump has not crossed."""
+    state = pendulum.state({"arm": 1.2})
+    traj = svkc.simulate(pendulum, state, 1.0, events=[svkc.when(lambda t, s, a: jnp.where(t > 0.5, 1.0 + t, -1.0))], rtol=1e-8)
+    assert traj.events.time[0] == pytest.approx(0.5, abs=1e-7)
+    assert int(traj.events.count) == 1
+    later = svkc.when(lambda t, s, a: jnp.where(s.structure.connected[0], s.q[0] - 2.0, 1.0))
+    traj = svkc.simulate(pendulum, state, 1.0, events=[svkc.at(0.3, connect="hook", here=True), later], rtol=1e-8)
+    assert traj.events.which[: int(traj.events.count)].tolist() == [0]
