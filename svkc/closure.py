@@ -211,7 +211,7 @@ def decide_rank(chain: Chain, structure: Structure, q: Float[Array, " q"]) -> St
     return eqx.tree_at(lambda s: s.rank, structure, jax.lax.stop_gradient(rank))
 
 
-def _least_change(selection: Selection, J, x: Float[Array, " rows"]) -> Float[Array, " dofs"]:
+def _least_change(selection: Selection, J, x: Float[Array, "rows *n"]) -> Float[Array, "dofs *n"]:
     """The smallest y with J_Cm y = Q x."""
     Jm, _ = square(selection, J)
     gram = Jm @ Jm.T + jnp.diag(jnp.where(selection.used, 0, 1).astype(J.dtype))
@@ -243,6 +243,26 @@ def close(chain: Chain, structure: Structure, q: Float[Array, " q"], iterations:
         return integrate(chain, q, -column * _least_change(selection, J, row * gap(structure, end).ravel()))
 
     return jax.lax.fori_loop(0, iterations, newton, normalize(chain, q))
+
+
+@functools.partial(jax.jit, static_argnames="iterations")
+def settle_loops(chain: Chain, structure: Structure, q, v, iterations: int) -> tuple[Float[Array, " q"], Float[Array, " dofs"]]:
+    """`close`, then `agree`: one body for both, the last turn of the loop being the velocities', so that it is compiled once."""
+    row, column = scales(chain)
+    active = active_dofs(chain, structure)
+
+    def turn(i, both):
+        q, v = both
+        kin = kinematics(chain, q)
+        end = ends(chain, structure, kin, q)
+        J = scaled_jacobian(chain, structure, kin, end)
+        selection = _solvable(select(J, structure.rank))
+        open_ = jnp.stack([row * gap(structure, end).ravel(), J @ jnp.where(active, v / column, 0)], 1)
+        step = -column[:, None] * _least_change(selection, J, open_)
+        last = i == iterations
+        return integrate(chain, q, jnp.where(last, 0, step[:, 0])), jnp.where(last, v + step[:, 1], v)
+
+    return jax.lax.fori_loop(0, iterations + 1, turn, (normalize(chain, q), v))
 
 
 @jax.jit

@@ -11,7 +11,8 @@ from jaxtyping import Array, Bool, Float
 
 from svkc.chain import Chain, Structure
 from svkc.kinematics import Kinematics
-from svkc.spatial import motion_cross, quat_about, quat_conjugate, quat_log, quat_matrix, quat_multiply, quat_normalize, quat_rotate, shift_motion
+from svkc.spatial import motion_cross, quat_about, quat_conjugate, quat_log, quat_matrix, quat_multiply, quat_normalize, quat_rotate, rotate, shift_motion
+from svkc.topology import Topology
 
 
 class Ends(eqx.Module):
@@ -48,41 +49,54 @@ def _coordinates(chain: Chain, q: Float[Array, " q"]):
     return padded[table.angle], padded[table.slide], quat_normalize(padded[table.quat])
 
 
+def _turns(top: Topology, angle: Float[Array, "links 3"], ball: Float[Array, "links 4"]):
+    """Rotation of each virtual joint and the axes of its three turns, all in the joint's frame; only what some joint of the scene has is computed.
+
+    Turns in sequence about x, then y, then z, each axis carried by the turns before it; a ball's axes are those of the virtual link.
+    """
+    eye = jnp.eye(3, dtype=angle.dtype)
+    freedoms = np.array(top.link_freedoms, bool).reshape(-1, 6)[:, :3]
+    is_ball = freedoms.all(1)
+    turn, axes = None, []
+    for k in range(3):
+        axis = jnp.broadcast_to(eye[k], (len(is_ball), 3))
+        axes.append(axis if turn is None else quat_rotate(turn, axis))
+        if np.any(freedoms[~is_ball, k]):
+            this = quat_about(eye[k : k + 1], angle[:, k])
+            turn = this if turn is None else quat_multiply(turn, this)
+    axes = jnp.stack(axes, 1)
+    if is_ball.any():
+        of_ball = jnp.swapaxes(quat_matrix(ball), -1, -2)
+        axes = jnp.where(is_ball[:, None, None], of_ball, axes)
+        # one that is not a ball holds the identity here
+        turn = ball if turn is None else quat_multiply(ball, turn)
+    return turn, axes
+
+
 def ends(chain: Chain, structure: Structure, kin: Kinematics, q: Float[Array, " q"]) -> Ends:
     """Frames of both ends of every virtual link, the joint's own turn and slide included.
 
     A joint slides along its parent's axes, then turns: about x, then y, then z (universal: x, y), or by a quaternion (ball).
     """
+    top = chain.topology
     angle, slide, ball = _coordinates(chain, q)
     p, r = structure.parent, structure.real
-    eye = jnp.eye(3, dtype=q.dtype)
-    base_quat = quat_normalize(quat_multiply(kin.quat[p], structure.quat))
+    of_parent, of_real = kin.quat[p], kin.quat[r]
+    base_quat = quat_normalize(quat_multiply(of_parent, structure.quat))
     base = quat_matrix(base_quat)
-    turn_x = quat_about(eye[:1], angle[:, 0])
-    turn_xy = quat_multiply(turn_x, quat_about(eye[1:2], angle[:, 1]))
-    turn = quat_multiply(quat_multiply(ball, turn_xy), quat_about(eye[2:], angle[:, 2]))
-    virtual_quat = quat_multiply(base_quat, turn)
-    # axes of the turns: one by one in sequence; a ball's are those of the virtual link
-    virtual_axes = jnp.swapaxes(quat_matrix(virtual_quat), -1, -2)
-    serial = jnp.stack(
-        [
-            base[..., 0],
-            quat_rotate(base_quat, quat_rotate(turn_x, eye[1:2])),
-            quat_rotate(base_quat, quat_rotate(turn_xy, eye[2:])),
-        ],
-        1,
-    )
-    is_ball = np.array([sum(f[:3]) == 3 for f in chain.topology.link_freedoms], bool)[:, None, None]
-    axes = jnp.concatenate([jnp.where(is_ball, virtual_axes, serial), jnp.swapaxes(base, -1, -2)], 1)
-    from_parent_root = kin.r[p] + quat_rotate(kin.quat[p], structure.pos) + quat_rotate(base_quat, slide)
+    turn, turning = _turns(top, angle, ball)
+    axes = jnp.sum(base[:, None] * turning[:, :, None], -1)
+    from_parent_root = kin.r[p] + quat_rotate(of_parent, structure.pos)
+    if np.any(np.array(top.link_freedoms, bool).reshape(-1, 6)[:, 3:]):
+        from_parent_root = from_parent_root + rotate(base, slide)
     return Ends(
         base_quat=base_quat,
-        virtual_quat=virtual_quat,
+        virtual_quat=base_quat if turn is None else quat_multiply(base_quat, turn),
         virtual=from_parent_root + (kin.root[p] - kin.root[r]),
-        real_quat=quat_normalize(quat_multiply(kin.quat[r], structure.real_quat)),
-        real=kin.r[r] + quat_rotate(kin.quat[r], structure.real_pos),
+        real_quat=quat_normalize(quat_multiply(of_real, structure.real_quat)),
+        real=kin.r[r] + quat_rotate(of_real, structure.real_pos),
         from_parent_root=from_parent_root,
-        axes=axes,
+        axes=jnp.concatenate([axes, jnp.swapaxes(base, -1, -2)], 1),
     )
 
 

@@ -114,11 +114,12 @@ def _locate(hit, t_end, end: Motion, term, solver, scene: Scene, made: Plan):
     if isinstance(solver.solver, diffrax.AbstractRungeKutta):
         solver = eqx.tree_at(lambda s: s.solver.scan_kind, solver, "bounded", is_leaf=lambda x: x is None)
 
-    def back(t, t_end, end, scene):
-        return solver.step(term, t_end, t, end, scene, solver.init(term, t_end, t, end, scene), False)[0]
+    def back(t, t_end, end, scene, begun):
+        return solver.step(term, t_end, t, end, scene, begun, False)[0]
 
     def found():
-        frozen = jax.lax.stop_gradient((t_end, end, scene))
+        begun = solver.init(term, t_end, t_end, end, scene)
+        frozen = jax.lax.stop_gradient((t_end, end, scene, begun))
 
         def passed(values):
             return jnp.where(crossed, side * values, -jnp.inf)
@@ -128,7 +129,7 @@ def _locate(hit, t_end, end: Motion, term, solver, scene: Scene, made: Plan):
 
         at_start, at_end = jnp.max(passed(end.watch.before)), jnp.max(passed(end.watch.after))
         root = jax.lax.stop_gradient(first_root(ahead, end.watch.start, at_start, frozen[0], at_end))
-        y = back(root, t_end, end, scene)
+        y = back(root, t_end, end, scene, begun)
         rate = jax.lax.stop_gradient(term.vf(root, y, scene))
         along = (jnp.ones_like(root), rate)
         values, slopes = jax.jvp(lambda t, y: solver.guards(t, y, scene), (root, y), along)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from svkc.chain import Chain, State, Structure
-from svkc.closure import agree, close
+from svkc.closure import settle_loops
 from svkc.forward_dynamics import acceleration, joint_torques
 from svkc.inverse_dynamics import limit_forces
 from svkc.kinematics import normalize, rates
@@ -99,8 +99,7 @@ def settle(stabilization, scene: Scene, y: Motion) -> Motion:
     chain, structure = scene.chain, scene.structure
     if not len(chain.topology.link_names) or not isinstance(stabilization, Projection):
         return eqx.tree_at(lambda y: y.q, y, normalize(chain, y.q))
-    q = close(chain, structure, y.q, stabilization.iterations)
-    return eqx.tree_at(lambda y: (y.q, y.v), y, (q, agree(chain, structure, q, y.v)))
+    return eqx.tree_at(lambda y: (y.q, y.v), y, settle_loops(chain, structure, y.q, y.v, stabilization.iterations))
 
 
 class _Interpolation(diffrax.AbstractLocalInterpolation):

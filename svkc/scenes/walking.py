@@ -19,7 +19,7 @@ def walking(**options) -> tuple[Chain, State]:
     none. A weld also carries moments and friction: the ground of this scene is one that feet do not slide or tilt on. `options` go to `svkc.load`.
     """
     spec = mujoco.MjSpec.from_file(str(FOLDER / "figure16.xml"))
-    floor = {"pos": [0.9, 0, -0.02], "size": [1.9, 0.6, 0.02], "rgba": [0.75, 0.75, 0.78, 1]}
+    floor = {"pos": [1.55, 0, -0.02], "size": [2.35, 0.6, 0.02], "rgba": [0.75, 0.75, 0.78, 1]}
     spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_BOX, contype=0, conaffinity=0, **floor)
     feet = [
         VirtualLink(
