@@ -17,7 +17,8 @@ thighs = ["right_thigh_plate", "left_thigh_plate"]
 
 
 def passes_the_edge(link):
-    along = svkc.touch(chain, link, 0.0, axes="z")  # where the thigh is on its slide
+    """A guard: how far beyond the plate's edge a thigh is on its slide."""
+    along = svkc.touch(chain, link, 0.0, axes="z")
     return lambda t, state, args: jnp.abs(along(t, state)) - EDGE
 
 

@@ -1,6 +1,4 @@
-"""Walking: left foot, both, right foot, both; feet are caught where they touch the ground and let go where it would have to pull (args: folder).
-
-A controller without memory reads from the structure which feet hold and where, and leads the load from one leg to the other."""
+"""Walking: a foot is held where it touches the ground, and let go when the ground would have to pull. Writes a picture to the folder given."""
 
 import pathlib
 import sys
@@ -42,49 +40,46 @@ def plan(t, structure):
         above = 0.6 * u**2 * (1 - u) * (1.15 - u)  # comes down with some speed, and would go below the ground
         angles = leg(jnp.where(stands, start, ahead) - SOLE - hips, HIP - ANKLE - jnp.where(stands, 0, above))
         angles["ankle"] -= jnp.where(stands, 0, 6 * part**2 * (1 - part) ** 2)  # toes down on the way
-        arm = {"shoulder_flexion": -swing if odd else swing, "elbow": 0.35}
-        joints |= {f"{side}_{name}": angle for name, angle in (angles | arm).items()}
+        angles |= {"shoulder_flexion": -swing if odd else swing, "elbow": 0.35}
+        joints |= {f"{side}_{name}": angle for name, angle in angles.items()}
     return jnp.stack([jnp.asarray(joints.get(name, 0.0), t.dtype) for name in chain.joint_names[1:]])
 
 
 def torques_on(foot, state, vdot):
-    """Torques for an acceleration with this foot alone on the ground: what moves, moves; the other foot carries nothing."""
-    alone = (jnp.arange(len(chain.link_names)) == foot, jnp.asarray(6, jnp.int32))
-    state = eqx.tree_at(lambda s: (s.structure.connected, s.structure.rank), state, alone)
-    return svkc.actuation(chain, state, vdot).tau
+    """Torques for an acceleration of all joints that leave the whole load to this foot."""
+    alone = jnp.arange(len(chain.link_names)) == foot, jnp.asarray(6, jnp.int32)
+    return svkc.actuation(chain, eqx.tree_at(lambda s: (s.structure.connected, s.structure.rank), state, alone), vdot).tau
 
 
 def control(t, state, args):
-    """Computed torque: the plan's accelerations as far as the feet allow them, the load led from the rear leg to the front one."""
-    at = lambda t: plan(t, state.structure)
-    rate = lambda t: jax.jvp(at, (t,), (jnp.ones_like(t),))
-    (q, v), (_, a) = jax.jvp(rate, (t,), (jnp.ones_like(t),))
-    wanted = a + 200 * (q - state.q[7:]) + 28 * (v - state.v[6:])
+    """Computed torque: the plan's accelerations as nearly as the feet allow, the load led from the rear leg to the front one."""
+    both = lambda t: jax.jvp(lambda t: plan(t, state.structure), (t,), (jnp.ones_like(t),))
+    (q, v), (_, a) = jax.jvp(both, (t,), (jnp.ones_like(t),))
     co = svkc.coordinates(chain, state)
-    W = co.W[6:]
-    gram = W.T @ W + jnp.diag(jnp.where(co.independent, 0.0, 1.0))
-    vdot = co.W @ jnp.linalg.solve(gram, W.T @ (wanted - co.bias[6:])) + co.bias
-    done, stands, place = progress(t), state.structure.connected, state.structure.pos[:, 0]
-    left, right = feet["left"], feet["right"]
-    part = jnp.clip((done - jnp.round(done)) / SHARED, 0, 1)
-    front = 0.02 + 1.03 * part**2 * (3 - 2 * part)
-    on_left = jnp.where(place[left] > place[right], front, 1 - front)
-    on_left = jnp.where(stands[left] & stands[right], on_left, jnp.where(stands[left], 1.0, 0.0))
+    W, wanted = co.W[6:], a + 200 * (q - state.q[7:]) + 28 * (v - state.v[6:]) - co.bias[6:]
+    vdot = co.bias + co.W @ jnp.linalg.solve(W.T @ W + jnp.diag(jnp.where(co.independent, 0.0, 1.0)), W.T @ wanted)
+    (left, right), stands, place = feet.values(), state.structure.connected, state.structure.pos[:, 0]
+    part = jnp.clip((progress(t) - jnp.round(progress(t))) / SHARED, 0, 1)
+    front = 0.02 + 1.03 * part**2 * (3 - 2 * part)  # passes one: then the ground would have to pull the rear foot
+    shared = jnp.where(place[left] > place[right], front, 1 - front)
+    on_left = jnp.where(stands[left] & stands[right], shared, jnp.where(stands[left], 1.0, 0.0))
     torques = jax.vmap(torques_on, (0, None, None))(jnp.asarray([left, right]), state, vdot)
     return on_left * torques[0] + (1 - on_left) * torques[1]
 
 
-events = []
+events, what = [], []
 for side in feet:
     link = f"{side}_foot_ground"
     events += [svkc.when(svkc.touch(chain, link, 0.0, axes="z"), connect=link, direction=False, here=True)]
     events += [svkc.when(svkc.leaves(chain, link), cut=link, direction=False)]
+    what += [f"{side} foot down", f"{side} foot up"]
 traj = svkc.simulate(chain, state, END, ts=jnp.linspace(0, END, 79), events=events, control=control, rtol=1e-6, atol=1e-8)
 
-p = traj.phases
-for phase in range(int(p.count)):
-    held = " and ".join(side for side in feet if p.connected[phase, feet[side]]) or "no foot"
-    print(f"{float(p.start[phase]):.3f} s to {float(p.stop[phase]):.3f} s: {held}, {int(p.joint_freedoms[phase])} joint freedoms, mobility {int(p.freedoms[phase])}")
-
+p, e = traj.phases, traj.events
+for i in range(int(p.count)):
+    held = " and ".join(side for side in feet if p.connected[i, feet[side]]) or "no foot"
+    print(f"from {float(p.start[i]):.4f} s: {held}, {int(p.joint_freedoms[i])} joint freedoms, mobility {int(p.freedoms[i])}")
+    if i < int(e.count):
+        print(f"  at {float(e.time[i]):.4f} s: {what[int(e.which[i])]}, {float(e.energy_lost[i]):.2f} J lost")
 folder = pathlib.Path(sys.argv[1] if len(sys.argv) > 1 else ".")
 print("wrote", svkc.render(chain, traj, folder / "04_walk.png", frames=9))

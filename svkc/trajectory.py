@@ -1,6 +1,7 @@
 """F2: what a run leaves behind."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -117,3 +118,12 @@ class Report(eqx.Module):
     accepted: Int[Array, ""]
     rejected: Int[Array, ""]
     result: RESULTS
+
+    def __str__(self) -> str:
+        if isinstance(self.gap, jax.core.Tracer) or self.gap.ndim:
+            return repr(self)
+        return (
+            f"largest loop gap {float(self.gap):.2e} m, {float(self.angular_gap):.2e} rad; energy drift {float(self.energy_drift):.2e} J, "
+            f"lost in impacts {float(self.energy_lost):.4g} J; {int(self.accepted)} steps, {int(self.rejected)} rejected; "
+            f"{RESULTS[self.result] or 'successful'}"
+        )

@@ -114,7 +114,7 @@ def five_bar() -> svkc.Chain:
 
 
 def dh_loop(theta, length, twist, axes_named="j") -> svkc.Chain:
-    """A single loop of hinges by Denavit and Hartenberg: joint i turns by theta[i] about z, then the next is `length[i]` along x, turned by `twist[i]` about x."""
+    """A loop of hinges by Denavit and Hartenberg: joint i turns by theta[i] about z, the next is `length[i]` along x, turned by `twist[i]` about x."""
     turn = lambda angle: np.array([np.cos(angle / 2), np.sin(angle / 2)])
     about_x = lambda angle: (turn(angle)[0], turn(angle)[1], 0, 0)
     xml = ""
@@ -131,6 +131,17 @@ def dh_loop(theta, length, twist, axes_named="j") -> svkc.Chain:
         real_pos=(-length[-1], 0, 0), real_quat=about_x(-twist[-1]), connected=True,
     )  # fmt: skip
     return svkc.load(MJCF.format(xml), virtual_links=[end])
+
+
+def figure40() -> svkc.Chain:
+    """The 40-freedom figure, a ball grip at each hand where it hangs: mobility 40."""
+    chain = svkc.load(str(svkc.scenes.FOLDER / "figure40.xml"))
+    place = np.asarray(svkc.poses(chain, chain.state())[0])
+    grips = [
+        svkc.VirtualLink(f"{s}_grip", "world", f"{s}_hand", "ball", pos=tuple(place[chain.body_names.index(f"{s}_hand")]), connected=True)
+        for s in ("right", "left")
+    ]
+    return svkc.load(str(svkc.scenes.FOLDER / "figure40.xml"), virtual_links=grips)
 
 
 def bennett(theta=0.9) -> svkc.Chain:

@@ -11,7 +11,8 @@ from kkt import acceleration
 import svkc
 
 CASES = {"four_bar": models.four_bar, "parallelogram": models.parallelogram, "rod_on_balls": models.rod_on_balls, "stewart": models.stewart}
-MOBILITY = {"four_bar": 1, "parallelogram": 1, "rod_on_balls": 2, "stewart": 6}
+CASES |= {"figure40": models.figure40}
+MOBILITY = {"four_bar": 1, "parallelogram": 1, "rod_on_balls": 2, "stewart": 6, "figure40": 40}
 
 
 @pytest.fixture(params=[*CASES, "two_hands"], scope="module")

@@ -81,13 +81,29 @@ def test_readme_example_runs():
     assert done.stdout.startswith("[0."), done.stdout
 
 
-def test_example_draws_its_picture(tmp_path):
-    assert len((ROOT / "examples" / "01_high_bar.py").read_text().splitlines()) < 60
-    done = run(ROOT / "examples" / "01_high_bar.py", tmp_path)
+EXAMPLES = {
+    "01_high_bar": ("24 joint freedoms", "22 joint freedoms"),
+    "02_swing": ("31 joint freedoms", "29 joint freedoms"),
+    "03_brachiation": ("right_hand_bar1; mobility 17", "right_hand_bar1, left_hand_bar2; mobility 12", "s: right_hand_bar3; mobility 17"),
+    "04_walk": ("left foot", "left and right"),
+}
+
+
+def test_examples_are_all_here():
+    assert {path.stem for path in (ROOT / "examples").glob("*.py")} == set(EXAMPLES)
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_example_draws_its_picture(name, tmp_path):
+    """From the command line, whole; under 80 lines; no library code: only public names."""
+    text = (ROOT / "examples" / f"{name}.py").read_text()
+    assert len(text.splitlines()) < 80
+    assert not re.search(r"from svkc\.(?!scenes)|import svkc\.(?!scenes)", text)
+    done = run(ROOT / "examples" / f"{name}.py", tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "24 joint freedoms" in done.stdout
-    assert "22 joint freedoms" in done.stdout
-    _looks_drawn(tmp_path / "01_high_bar.png")
+    for word in EXAMPLES[name]:
+        assert word in done.stdout, done.stdout
+    _looks_drawn(tmp_path / f"{name}.png")
 
 
 def test_main_job(tmp_path):
@@ -111,6 +127,18 @@ def test_main_job(tmp_path):
             assert len(image.convert("RGB").getcolors(1 << 20)) > 10
 
 
+def test_the_swing_from_the_command_line(tmp_path):
+    """python -m svkc swing: 30 joint freedoms and the swing's own, two fewer at the end."""
+    done = run("-m", "svkc", "swing", "--out", tmp_path)
+    assert done.returncode == 0, done.stderr
+    for word in ("31     21        10", "29     12        17", "largest loop gap", "wrote"):
+        assert word in done.stdout, done.stdout
+    _looks_drawn(tmp_path / "swing.png")
+    import svkc
+
+    assert svkc.load_trajectory(tmp_path / "swing.npz").phases.joint_freedoms[:2].tolist() == [31, 29]
+
+
 def _looks_drawn(path):
     from PIL import Image
 
@@ -125,6 +153,8 @@ def test_info(tmp_path):
     assert done.returncode == 0, done.stderr
     assert "friction" in done.stdout
     assert "1 joint freedoms in the tree" in done.stdout
+    assert "mobility (N_F = N_J - m)     1" in done.stdout
+    assert "independent coordinates: j" in done.stdout
     (tmp_path / "bad.xml").write_text("<mujoco")
     assert run("-m", "svkc", "info", tmp_path / "bad.xml").returncode == 1
 
@@ -148,5 +178,5 @@ def test_pictures_say_what_they_cannot_draw(high_bar, tmp_path, monkeypatch):
 
 
 def test_ruff_is_content():
-    done = run("-m", "ruff", "check", "svkc", "tests", "examples")
+    done = run("-m", "ruff", "check", "svkc", "tests", "examples", "benchmarks")
     assert done.returncode == 0, done.stdout

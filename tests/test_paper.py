@@ -1,9 +1,12 @@
 """The paper's own examples and formulas: section VII-A to the printed digit, attachment in flight, Rodrigues' integration."""
 
+import importlib.util
 import itertools
+import pathlib
 
 import jax
 import jax.numpy as jnp
+import models
 import numpy as np
 import pytest
 
@@ -139,3 +142,40 @@ def test_rodrigues_euler_keeps_quaternions_at_unit_length():
     turn = quat_exp(jnp.array([3e-3, 1e-4, 2e-3]))
     bare = jax.lax.fori_loop(0, 100000, lambda i, q: quat_multiply(q, turn), jnp.array([1.0, 0, 0, 0]))
     assert abs(float(jnp.linalg.norm(bare)) - 1) < 100000 * 2.3e-16
+
+
+@pytest.fixture(scope="module")
+def benchmark():
+    """benchmarks/joints.py, which builds both figures."""
+    spec = importlib.util.spec_from_file_location("joints", pathlib.Path(__file__).parent.parent / "benchmarks" / "joints.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_figure_of_40_freedoms(benchmark):
+    """Fig. 16: 17 links, 4 hinges, 12 balls; as 41 links of one freedom it moves the same."""
+    spec, balls = benchmark.hinges_for_balls()
+    chains = {"balls": svkc.load(str(benchmark.FIGURE)), "hinges": svkc.load(spec)}
+    links = {name: len(chain.topology.parent) - 1 for name, chain in chains.items()}
+    assert (links, len(balls), chains["balls"].nv) == ({"balls": 17, "hinges": 41}, 12, 46)
+    assert abs(float(chains["balls"].mass.sum()) - 73) < 0.01
+    states = benchmark.same_motion(chains, balls, np.random.default_rng(2))
+    ends = [svkc.simulate(chain, state, 0.2, rtol=1e-10, atol=1e-12).final for chain, state in zip(chains.values(), states, strict=True)]
+    places = [svkc.poses(chain, end)[0] for chain, end in zip(chains.values(), ends, strict=True)]
+    np.testing.assert_allclose(places[0], places[1], atol=1e-9)
+
+
+def test_rodrigues_euler_on_the_figure():
+    """Balls in a tree, two of them virtual: first order, loops closed, unit quaternions."""
+    chain = models.figure40()
+    rng = np.random.default_rng(1)
+    state = chain.state(v=rng.normal(size=chain.nv))
+    run = lambda dt: svkc.simulate(chain, state, 0.1, dt=dt, solver=svkc.RodriguesEuler())
+    fine, coarse = run(5e-4), run(1e-3)
+    exact = svkc.simulate(chain, state, 0.1, rtol=1e-9, atol=1e-11).final
+    error = [float(jnp.abs(svkc.difference(chain, exact.q, traj.final.q)).max()) for traj in (coarse, fine)]
+    assert 1.8 < error[0] / error[1] < 2.2
+    assert float(fine.gaps.max()) < 1e-9
+    at = chain.topology.quaternions[0][:, None] + np.arange(4)
+    np.testing.assert_allclose(jnp.linalg.norm(fine.final.q[at], axis=1), 1, atol=1e-15)
