@@ -20,6 +20,7 @@ class Actuation(eqx.Module):
     the acceleration is reached); `rank`: of S; `redundancy`: actuators more than that, `deficiency`: freedoms that nobody drives.
     `null_space` [dofs, dofs]: torques that change no motion (they only load the loops), one for each actuator that the others can stand in for;
     `null_force`, `null_torque`: what each of them does to the links' wrenches, on `real` from `parent`, world axes;
+    `stress_force`, `stress_torque`: self-stresses, wrenches of redundant loops together that need no torque, one for each redundant row;
     `undriven` [dofs, dofs]: joint velocities on which no actuator does work.
     """
 
@@ -28,6 +29,8 @@ class Actuation(eqx.Module):
     null_space: Float[Array, "dofs dofs"]
     null_force: Float[Array, "links 3 dofs"]
     null_torque: Float[Array, "links 3 dofs"]
+    stress_force: Float[Array, "links 3 rows"]
+    stress_torque: Float[Array, "links 3 rows"]
     undriven: Float[Array, "dofs dofs"]
     rank: Int[Array, ""]
     redundancy: Int[Array, ""]
@@ -85,10 +88,9 @@ def _open(W, free, chain: Chain) -> Coordinates:
     return Coordinates(W, jnp.zeros(n, W.dtype), free, jnp.zeros(n, bool), chain.actuated, selection, jnp.zeros((0, n), W.dtype))
 
 
-def _basis(B: Float[Array, "rows dofs"]) -> tuple[Selection, Int[Array, ""], Float[Array, "dofs dofs"]]:
-    """Pivots of B, its rank, and a basis of its null space: for each column that is no pivot a one there, balanced by the pivots."""
-    found = select(B)
-    rank = count_rank(found.size)
+def _basis(B: Float[Array, "rows dofs"], rank=None) -> tuple[Selection, Int[Array, ""], Float[Array, "dofs dofs"]]:
+    """Pivots of B, its rank (None: to be found), and a basis of its null space: for each column that is no pivot a one there, balanced by the pivots."""
+    rank = count_rank(select(B).size) if rank is None else rank
     chosen = select(B, rank)
     P = chosen.P
     Bm = chosen.Q @ B
@@ -128,12 +130,19 @@ def _solve(chain: Chain, state: State, vdot_G, weight, actuated: Bool[Array, " d
     undriven = co.W @ (column[:, None] * jnp.where(co.independent[None], undriven, 0))
     if len(chain.link_names):
         carried = jax.vmap(lambda tau: constraint_forces(chain, co, tau), in_axes=1, out_axes=-1)(null)
+        _, _, stress = _basis(co.J.T, state.structure.rank)
+        row, _ = scales(chain)
+        holds = jnp.repeat(state.structure.connected, 6)
+        stress = jnp.where(holds[None], row[:, None] * stress, 0).reshape(-1, 6, row.shape[0])
     else:
-        carried = jnp.zeros((0, 6, chain.dofs), y.dtype)
+        carried, stress = jnp.zeros((0, 6, chain.dofs), y.dtype), jnp.zeros((0, 6, 0), y.dtype)
     count = lambda mask: jnp.sum(mask, dtype=jnp.int32)
     tau = y / column
     residual = wanted - S.T @ tau
-    done = Actuation(tau, residual, null, carried[:, 3:], carried[:, :3], undriven, rank, count(reachable) - rank, count(co.independent) - rank)
+    done = Actuation(
+        tau, residual, null, carried[:, 3:], carried[:, :3], stress[:, 3:], stress[:, :3], undriven, rank, count(reachable) - rank,
+        count(co.independent) - rank,
+    )  # fmt: skip
     return done, (B, column * wanted, column)
 
 

@@ -109,6 +109,7 @@ def _compose(top: Topology, quat: Float[Array, "rows 4"]) -> Float[Array, "rows 
     return jnp.concatenate(levels)
 
 
+@jax.jit
 def kinematics(chain: Chain, q: Float[Array, " q"]) -> Kinematics:
     """Poses of every row and the joint axes at q (Featherstone section 4.4, world axes)."""
     top = chain.topology

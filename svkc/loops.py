@@ -5,6 +5,7 @@ of the joint.
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -73,6 +74,7 @@ def _turns(top: Topology, angle: Float[Array, "links 3"], ball: Float[Array, "li
     return turn, axes
 
 
+@jax.jit
 def ends(chain: Chain, structure: Structure, kin: Kinematics, q: Float[Array, " q"]) -> Ends:
     """Frames of both ends of every virtual link, the joint's own turn and slide included.
 

@@ -113,6 +113,13 @@ def test_over_constrained():
     assert (int(found.rank), int(found.redundancy), int(found.deficiency)) == (1, chain.nv - 1, 0)
     assert reached(chain, state, vdot, found) < 1e-10 * float(jnp.abs(vdot).max())
     assert not svkc.loop_forces(chain, state, found.tau).unique.any()
+    # seven self-stresses: wrenches of both pins that no joint feels
+    linear, angular = (np.asarray(x) for x in svkc.jacobian(chain, state))
+    force, torque = np.asarray(found.stress_force), np.asarray(found.stress_torque)
+    felt = np.einsum("lkd,lkr->dr", linear, force) + np.einsum("lkd,lkr->dr", angular, torque)
+    stresses = np.concatenate([force, torque], 1).reshape(12, -1)
+    assert np.linalg.matrix_rank(stresses) == int(np.any(stresses, 0).sum()) == 7
+    assert np.abs(felt).max() < 1e-12
     assert svkc.loop_forces(chain, chain.state(connected=["pin2"]), found.tau).unique.tolist() == [True, False]
 
 

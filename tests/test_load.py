@@ -97,7 +97,6 @@ def test_limits_and_springs_are_the_models():
         (lambda: svkc.VirtualLink("a", "world", "arm", "rubber"), "rubber"),
         (lambda: svkc.VirtualLink("a", "world", "arm", quat=(1, 1, 0, 0)), "unit quaternion"),
         (lambda: svkc.VirtualLink("a", "world", "arm", axis=(0, 0, 0)), "axis"),
-        (lambda: svkc.load(PENDULUM, cuttable=("arm",)), "cuttable"),
     ],
 )
 def test_wrong_models(call, message):
