@@ -54,7 +54,7 @@ def control(t, state, args):
     both = lambda t: jax.jvp(lambda t: plan(t, state.structure), (t,), (jnp.ones_like(t),))
     (q, v), (_, a) = jax.jvp(both, (t,), (jnp.ones_like(t),))
     co = svkc.coordinates(chain, state)
-    W, wanted = co.W[6:], a + 100 * (q - state.q[7:]) + 20 * (v - state.v[6:]) - co.bias[6:]
+    W, wanted = co.W[6:], a + 200 * (q - state.q[7:]) + 28 * (v - state.v[6:]) - co.bias[6:]
     vdot = co.bias + co.W @ jnp.linalg.solve(W.T @ W + jnp.diag(jnp.where(co.independent, 0.0, 1.0)), W.T @ wanted)
     (left, right), stands, place = feet.values(), state.structure.connected, state.structure.pos[:, 0]
     part = jnp.clip((progress(t) - jnp.round(progress(t))) / SHARED, 0, 1)
@@ -73,6 +73,7 @@ for i in range(int(p.count)):
     held = " and ".join(side for side in feet if p.connected[i, feet[side]]) or "no foot"
     print(f"from {float(p.start[i]):.4f} s: {held}, {int(p.joint_freedoms[i])} joint freedoms, mobility {int(p.freedoms[i])}")
     if i < int(e.count):
-        print(f"  at {float(e.time[i]):.4f} s: {('left', 'right')[e.which[i] // 2]} foot {('down', 'up')[e.which[i] % 2]}, {float(e.energy_lost[i]):.2f} J lost")
+        happened = f"{('left', 'right')[e.which[i] // 2]} foot {('down', 'up')[e.which[i] % 2]}"
+        print(f"  at {float(e.time[i]):.4f} s: {happened}, {float(e.energy_lost[i]):.2f} J lost")
 folder = pathlib.Path(sys.argv[1] if len(sys.argv) > 1 else ".")
 print("wrote", svkc.render(chain, traj, folder / "04_walk.png", frames=9))

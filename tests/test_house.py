@@ -87,7 +87,7 @@ EXAMPLES = {
     "01_high_bar": ("24 joint freedoms", "22 joint freedoms"),
     "02_swing": ("31 joint freedoms", "29 joint freedoms"),
     "03_brachiation": ("right_hand_bar1; mobility 17", "right_hand_bar1, left_hand_bar2; mobility 12", "s: right_hand_bar3; mobility 17"),
-    "04_walk": ("left foot", "left and right"),
+    "04_walk": ("left foot down", "right foot up", "left and right, 22 joint freedoms, mobility 11", "left, 22 joint freedoms, mobility 16"),
 }
 
 
@@ -105,6 +105,8 @@ def test_example_draws_its_picture(name, tmp_path):
     assert done.returncode == 0, done.stderr
     for word in EXAMPLES[name]:
         assert word in done.stdout, done.stdout
+    # at least four steps
+    assert name != "04_walk" or min(done.stdout.count("foot down"), done.stdout.count("foot up")) >= 4
     _looks_drawn(tmp_path / f"{name}.png")
 
 
