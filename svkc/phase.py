@@ -138,7 +138,8 @@ def _locate(hit, t_end, end: Motion, term, solver, scene: Scene, made: Plan):
         fired = crossed & (passed(values) + side * slopes * event_tolerance(root) >= 0)
         fired = fired | (jnp.arange(side.shape[0]) == first)
         correction = values[first] / jnp.where(slopes[first] == 0, 1, slopes[first])
-        correction = jnp.where(jnp.abs(correction) <= event_tolerance(root), correction, 0)
+        # time does not run back behind the step
+        correction = jnp.where(jnp.abs(correction) <= event_tolerance(root), jnp.minimum(correction, root - end.watch.start), 0)
         y = jax.tree.map(lambda y, r: y - r * correction, y, rate)
         # zero: not armed, until it has left zero
         after = jnp.where(fired, 0, jax.lax.stop_gradient(values))

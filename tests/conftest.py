@@ -1,5 +1,6 @@
 """float64, strict promotion, warnings as errors, every annotation checked."""
 
+import gc
 import os
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
@@ -31,3 +32,11 @@ def pytest_configure(config):
 def high_bar():
     """Chain and state of the main job, without joint ranges: nothing that takes or gives energy."""
     return svkc.scenes.high_bar(ignore=("limit",))
+
+
+@pytest.fixture(autouse=True, scope="module")
+def room_for_programs():
+    """Compiled programs are given up after each file: XLA maps memory for every one, and Linux allows a process 65530 maps."""
+    yield
+    jax.clear_caches()
+    gc.collect()
