@@ -24,7 +24,7 @@ def passes_the_edge(link):
 
 # two guards; the figure sits straight, so that both fire at one instant and make one change of structure
 events = [svkc.when(passes_the_edge(link), cut=link, direction=True) for link in thighs]
-traj = svkc.simulate(chain, state, 2.0, ts=jnp.linspace(0, 2.0, 81), events=events, rtol=1e-7, atol=1e-9)
+traj = svkc.simulate(chain, state, 2.0, ts=jnp.linspace(0, 2.0, 81), events=events, rtol=1e-8, atol=1e-10)
 
 p = traj.phases
 for i in range(int(p.count)):

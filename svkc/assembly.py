@@ -161,7 +161,8 @@ def assemble(chain: Chain, q, v, connected) -> State:
     _check_quaternions(chain, q)
     if not len(top.link_names):
         return State(normalize(chain, q), v, structure)
-    whole = given is not None and not isinstance(given, dict) and np.shape(given) != (len(top.model_q),)
+    # (where no joint can be cut it is all the same, and one program)
+    whole = max(top.link_child, default=-1) < 0 or (given is not None and not isinstance(given, dict) and np.shape(given) != (len(top.model_q),))
     state = _close_and_agree(chain, structure, q, v, jnp.asarray(_as_dofs(chain, held_q)), jnp.asarray(held_v), whole)
     return check_closed(chain, state)
 

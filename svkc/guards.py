@@ -22,6 +22,8 @@ class Sensor(eqx.Module):
     link: int = eqx.field(static=True)
     # it measures loads, for which it must be told the joint torques
     loaded: ClassVar[bool] = True
+    # what it says of a link that carries nothing
+    idle: ClassVar[float] = 0.0
 
     def measure(self, chain: Chain, state: State, tau: Float[Array, " dofs"]) -> Float[Array, ""]:
         raise NotImplementedError
@@ -52,6 +54,7 @@ class Touch(Sensor):
 class Leaves(Sensor):
     """See `leaves`."""
 
+    idle: ClassVar[float] = 1.0
     axis: Float[Array, "3"]
 
     def measure(self, chain, state, tau):
@@ -60,12 +63,13 @@ class Leaves(Sensor):
         normal = quat_rotate(ends(chain, s, kin, state.q).base_quat[i], self.axis)
         push = jnp.sum(loop_forces(chain, state, tau).force[i] * normal)
         # a link that is not connected counts as pressed, so that one that would have to pull from the first is seen to leave
-        return jnp.where(s.connected[i], push, 1)
+        return jnp.where(s.connected[i], push, self.idle)
 
 
 class Overload(Sensor):
     """See `overload`."""
 
+    idle: ClassVar[float] = -1.0
     force: Float[Array, ""]
     torque: Float[Array, ""]
 

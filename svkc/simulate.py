@@ -95,6 +95,10 @@ def _start(chain: Chain, state: State, t0, ts, made: Plan, options: Options, arg
     state = State(state.q, state.v, structure)
     scene = Scene(chain, structure, args)
     guards = guard_values(made, options.field, t0, Motion(state.q, state.v), scene) if made.guards else None
+    for i, guard in enumerate(made.guards):
+        if isinstance(guard, Sensor) and guard.loaded:
+            # a load that is too much from the start is seen to be
+            guards = guards.at[i].set(guard.idle)
     zero = jnp.asarray(0, jnp.int32)
     return Run(
         t=t0,

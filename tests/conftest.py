@@ -5,7 +5,7 @@ import os
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("MPLBACKEND", "Agg")
-# most of the suite's time is XLA's optimizer; examples and the command line run in processes of their own, with everything on
+# most of the suite's time is XLA's optimizer; the main job, its example and README's run in processes of their own, with everything on
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 
 import jax
