@@ -83,18 +83,18 @@ def put(structure: Structure, at: Bool[Array, " links"], rows, freedoms, quat, p
 def holding(chain: Chain, structure: Structure, parent: str, real: str) -> Bool[Array, " links"]:
     """Spare slots that are bound between these two bodies and connected."""
     p, r = rows_of(chain, parent, real)
-    return np.array(chain.topology.link_spare) & structure.connected & (structure.parent == p) & (structure.real == r)
+    return jnp.asarray(np.array(chain.topology.link_spare, bool)) & structure.connected & (structure.parent == p) & (structure.real == r)
 
 
 def grip(chain: Chain, structure: Structure, wish: Grip) -> tuple[Structure, Bool[Array, " links"], Bool[Array, ""]]:
     """The structure with a slot bound as wished, the slot to connect (none where the two bodies are held already), and whether none was free."""
-    spare = np.array(chain.topology.link_spare)
+    spare = jnp.asarray(np.array(chain.topology.link_spare, bool))
     rows = rows_of(chain, wish.parent, wish.real)
     if wish.slot is None:
         free = spare & ~structure.connected & (structure.parent == 0) & (structure.real == 0)
         slot = free & (jnp.cumsum(free, dtype=jnp.int32) == 1)
     else:
-        slot = (np.arange(len(spare)) == spare_slot(chain, wish.slot)) & ~structure.connected
+        slot = (jnp.arange(spare.shape[0]) == spare_slot(chain, wish.slot)) & ~structure.connected
     held = jnp.any(holding(chain, structure, wish.parent, wish.real))
     slot = slot & ~held
     bound = put(structure, slot, rows, checked_freedoms(wish.joint), to_axis(wish.axis), jnp.zeros(3, structure.pos.dtype), wish.real_pos)

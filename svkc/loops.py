@@ -57,7 +57,7 @@ def _turns(top: Topology, angle: Float[Array, "links 3"], ball: Float[Array, "li
     """
     eye = jnp.eye(3, dtype=angle.dtype)
     freedoms = np.array(top.link_freedoms, bool).reshape(-1, 6)[:, :3]
-    is_ball = freedoms.all(1)
+    is_ball = np.all(freedoms, axis=1)
     turn, axes = None, []
     for k in range(3):
         axis = jnp.broadcast_to(eye[k], (len(is_ball), 3))
