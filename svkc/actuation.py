@@ -14,7 +14,7 @@ from svkc.kinematics import kinematics, twists
 
 
 class Actuation(eqx.Module):
-    """Torques of the actuators for an acceleration, and what is left open or out of reach. Columns of the two bases that do not count are zero.
+    """Torques of the actuators for an acceleration, and what is left open or out of reach. Columns of the bases that do not count are zero.
 
     `tau` [dofs]: the particular solution (N m, N), of least weighted norm; `residual` [dofs]: generalized force on theta_G that no torque gives (zero:
     the acceleration is reached); `rank`: of S; `redundancy`: actuators more than that, `deficiency`: freedoms that nobody drives.

@@ -5,10 +5,9 @@ import dataclasses
 import numpy as np
 
 from svkc.chain import VirtualLink
-from svkc.reading import name_of
+from svkc.reading import KINDS, matrix, name_of
 from svkc.topology import BALL, FREE, HINGE, SLIDE, V_SIZE, Topology
 
-_KINDS = {0: FREE, 1: BALL, 2: SLIDE, 3: HINGE}  # mjtJoint
 # place of the coordinates of each kind among the six freedoms of a virtual joint
 _FREEDOMS = {"hinge": (2,), "slide": (5,), "ball": (0, 1, 2), "universal": (0, 1)}
 
@@ -40,10 +39,10 @@ def cuts_of(model, cuttable) -> list[Cut]:
 
 def _cut(model, name: str, body: int) -> Cut:
     joints = tuple(range(int(model.body_jntadr[body]), int(model.body_jntadr[body]) + int(model.body_jntnum[body])))
-    kinds = [_KINDS[int(model.jnt_type[j])] for j in joints]
+    kinds = [KINDS[int(model.jnt_type[j])] for j in joints]
     frame, axis = np.eye(3), model.jnt_axis[joints[0]]
     ref = [float(model.qpos0[model.jnt_qposadr[j]]) for j in joints]
-    pos, turned = np.array(model.body_pos[body]), _matrix(model.body_quat[body])
+    pos, turned = np.array(model.body_pos[body]), matrix(model.body_quat[body])
     anchor = np.array(model.jnt_pos[joints[0]])
     if kinds == [HINGE, HINGE] and abs(axis @ model.jnt_axis[joints[1]]) < 1e-9 and np.allclose(anchor, model.jnt_pos[joints[1]], atol=1e-12) and not any(ref):
         joint, second = "universal", model.jnt_axis[joints[1]]
@@ -78,7 +77,7 @@ def placed_in(model, topology: Topology, cuts: list[Cut], first: int) -> Topolog
     model_q, model_v, cut_joints, tree = [], [], [], iter(zip(topology.joint_names, topology.joint_row, strict=True))
     table, seen = topology.links, set()
     for j in range(model.njnt):
-        body, kind = int(model.jnt_bodyid[j]), _KINDS[int(model.jnt_type[j])]
+        body, kind = int(model.jnt_bodyid[j]), KINDS[int(model.jnt_type[j])]
         if body in slots:
             slot, cut = slots[body]
             if body not in seen:
@@ -97,14 +96,6 @@ def placed_in(model, topology: Topology, cuts: list[Cut], first: int) -> Topolog
     return dataclasses.replace(topology, link_child=as_ints(link_child), cut_joints=tuple(cut_joints), model_q=as_ints(model_q), model_v=as_ints(model_v))
 
 
-def _matrix(quat) -> np.ndarray:
-    import mujoco
-
-    R = np.zeros(9)
-    mujoco.mju_quat2Mat(R, np.asarray(quat, float))
-    return R.reshape(3, 3)
-
-
 def _quat(R) -> np.ndarray:
     import mujoco
 
@@ -118,4 +109,4 @@ def _about(axis, angle) -> np.ndarray:
 
     quat = np.zeros(4)
     mujoco.mju_axisAngle2Quat(quat, np.asarray(axis, float), angle)
-    return _matrix(quat)
+    return matrix(quat)

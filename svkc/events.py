@@ -29,11 +29,6 @@ class Action(eqx.Module):
     unbind: tuple = eqx.field(static=True, default=())
     bind: tuple[Grip, ...] = ()
 
-    @property
-    def idle(self) -> bool:
-        """Changes nothing: it only records, or stops."""
-        return self.stop or not (self.connect + self.cut + self.lock + self.unlock + self.unbind + self.bind)
-
 
 class At(eqx.Module):
     """An event at a time (s); the time is differentiable."""
@@ -160,7 +155,8 @@ class Plan(eqx.Module):
             held = lambda g: jnp.any(holding(chain, structure, g.parent, g.real))
             grips = [jnp.any(~jnp.stack([held(g) for g in self.grips[i]])) if self.grips[i] else jnp.zeros((), bool) for i in rows]
             change = change | empties | jnp.stack(grips)
-        return change | np.array([self.actions[i].idle and not self.grips[i] for i in rows], bool)
+        always = [(a := self.actions[i]).stop or not (a.connect + a.cut + a.lock + a.unlock + a.unbind + self.grips[i]) for i in rows]
+        return change | np.array(always, bool)
 
     def crossed(self, before: Float[Array, " guards"], after: Float[Array, " guards"]) -> Bool[Array, " guards"]:
         """Guards that went through zero; one that starts at zero has not."""

@@ -8,7 +8,7 @@ from svkc.topology import BALL, FIXED, FREE, HINGE, Q_SIZE, SLIDE, V_SIZE, Topol
 from svkc.unsupported import plain_motors
 
 _LIMIT_RATE = 50.0  # rad/s: a joint outside its range is an oscillator of this frequency, critically damped, at its load-pose inertia
-_KINDS = {0: FREE, 1: BALL, 2: SLIDE, 3: HINGE}  # mjtJoint
+KINDS = {0: FREE, 1: BALL, 2: SLIDE, 3: HINGE}  # mjtJoint
 
 
 def name_of(model, kind: str, index: int) -> str:
@@ -17,6 +17,15 @@ def name_of(model, kind: str, index: int) -> str:
 
     name = mujoco.mj_id2name(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), index)
     return name or (f"{kind}_{index}" if index or kind != "body" else "world")
+
+
+def matrix(quat) -> np.ndarray:
+    """The rotation matrix [3 3] of a quaternion, in numpy."""
+    import mujoco
+
+    R = np.zeros(9)
+    mujoco.mju_quat2Mat(R, np.asarray(quat, float))
+    return R.reshape(3, 3)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,7 +47,7 @@ def joints_of(model, cut_bodies) -> list[Joint]:
         body = int(model.jnt_bodyid[j])
         if body in seen:
             continue
-        kind, name, joint = _KINDS[int(model.jnt_type[j])], name_of(model, "joint", j), j
+        kind, name, joint = KINDS[int(model.jnt_type[j])], name_of(model, "joint", j), j
         if body in cut_bodies:
             seen.add(body)
             kind, name, joint = FREE, f"{cut_bodies[body]}_free", -1
@@ -99,11 +108,7 @@ def bodies_of(model, topology, rows) -> dict[str, np.ndarray]:
 
 def _inertia(model, body):
     """About the centre of mass, in body axes."""
-    import mujoco
-
-    R = np.zeros(9)
-    mujoco.mju_quat2Mat(R, model.body_iquat[body])
-    R = R.reshape(3, 3)
+    R = matrix(model.body_iquat[body])
     return R @ np.diag(model.body_inertia[body]) @ R.T
 
 
@@ -112,7 +117,7 @@ def joint_forces_of(model, ignored, topology) -> tuple[np.ndarray, np.ndarray, n
     n, place = topology.dofs, np.array(topology.model_v, int)
     stiffness, limit, spring = np.zeros(n), np.tile([[-np.inf], [np.inf]], (1, n)), np.zeros((2, n))
     for j in range(model.njnt):
-        own = slice(int(model.jnt_dofadr[j]), int(model.jnt_dofadr[j]) + V_SIZE[_KINDS[int(model.jnt_type[j])]])
+        own = slice(int(model.jnt_dofadr[j]), int(model.jnt_dofadr[j]) + V_SIZE[KINDS[int(model.jnt_type[j])]])
         dofs = place[own]
         if "spring" not in ignored:
             stiffness[dofs] = np.ravel(model.jnt_stiffness[j])[0]
@@ -137,7 +142,7 @@ def motors_of(model, ignored, topology):
     gear, control, force = np.zeros((count, topology.dofs)), np.tile([-np.inf, np.inf], (count, 1)), np.tile([-np.inf, np.inf], (count, 1))
     for i in range(count):
         joint = int(model.actuator_trnid[i, 0])
-        size, start = V_SIZE[_KINDS[int(model.jnt_type[joint])]], int(model.jnt_dofadr[joint])
+        size, start = V_SIZE[KINDS[int(model.jnt_type[joint])]], int(model.jnt_dofadr[joint])
         gear[i, place[start : start + size]] = model.actuator_gear[i, :size] * model.actuator_gainprm[i, 0]
         if model.actuator_ctrllimited[i]:
             control[i] = model.actuator_ctrlrange[i]

@@ -7,6 +7,7 @@ import numpy as np
 
 from svkc.chain import Chain, State
 from svkc.kinematics import poses
+from svkc.reading import matrix
 from svkc.trajectory import Trajectory
 
 GL_PACKAGES = "libegl1 libgl1"
@@ -33,7 +34,7 @@ def _segments(chain: Chain) -> list[tuple[int, np.ndarray, np.ndarray, float]]:
     model, out = chain.model.model, []
     for g in range(model.ngeom):
         kind, size = mujoco.mjtGeom(int(model.geom_type[g])), model.geom_size[g]
-        R = _matrix(model.geom_quat[g])
+        R = matrix(model.geom_quat[g])
         axis = R[:, 2]
         if kind in (mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER):
             half, radius = axis * size[1], size[0]
@@ -45,14 +46,6 @@ def _segments(chain: Chain) -> list[tuple[int, np.ndarray, np.ndarray, float]]:
             continue
         out.append((int(model.geom_bodyid[g]), model.geom_pos[g] - half, model.geom_pos[g] + half, float(radius)))
     return out
-
-
-def _matrix(quat) -> np.ndarray:
-    import mujoco
-
-    R = np.zeros(9)
-    mujoco.mju_quat2Mat(R, quat)
-    return R.reshape(3, 3)
 
 
 def _world_poses(chain: Chain, states: State) -> tuple[np.ndarray, np.ndarray]:
@@ -147,7 +140,7 @@ def _animation(chain: Chain, traj: Trajectory, path: pathlib.Path, fps, size, lo
     camera.distance = 1.0 * float(np.linalg.norm(high - low)) + 1 if distance is None else distance
     camera.azimuth, camera.elevation = azimuth, -8
     rows = {row: body for body, row in enumerate(chain.topology.body_row)}
-    shapes, images = [_matrix(quat) for quat in model.geom_quat], []
+    shapes, images = [matrix(quat) for quat in model.geom_quat], []
     mujoco.mj_forward(model, data)
     with mujoco.Renderer(model, height=size[1], width=size[0]) as renderer:
         for t in np.arange(ts[0], ts[-1] + 0.5 / fps, 1 / fps):

@@ -69,7 +69,7 @@ def test_the_table_names_things():
 
 def test_loop_forces_are_the_multipliers():
     """Against numpy's multipliers of the same rows: equal where unique, of least norm and said not to be unique where not."""
-    for make, unique in ((models.stewart, [True] * 5), (models.parallelogram, [False, False])):
+    for make, unique in ((models.rod_on_balls, [True]), (models.stewart, [True] * 5), (models.four_bar, [False]), (models.parallelogram, [False, False])):
         chain = make()
         rng = np.random.default_rng(4)
         state = chain.state(v=rng.normal(size=chain.nv))
