@@ -100,7 +100,8 @@ def _strobe(chain: Chain, traj: Trajectory, path: pathlib.Path, frames: int) -> 
     for phase, i in enumerate(phases):
         held = [n for n, on in zip(chain.link_names, np.asarray(p.connected[i]), strict=True) if on]
         axes.plot([], [], color=COLORS[phase % len(COLORS)], linewidth=5, label=f"from {starts[phase]:.2f} s: {', '.join(held) or 'free'}")
-    axes.legend(loc="best", fontsize=9, title="held by")
+    # below the picture: inside it would hide limbs
+    figure.legend(loc="outside lower center", ncols=2, fontsize=9, title="held by")
     axes.grid(alpha=0.2)
     axes.set_title(f"{len(pick)} poses, {ts[pick[0]]:.2f} s to {ts[pick[-1]]:.2f} s")
     figure.savefig(path, dpi=110)
