@@ -7,10 +7,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc.chain import Chain, State
-from svkc.closure import Coordinates, Selection, constrain, count_rank, scales, select
+from svkc.closure import Coordinates, constrained, scales
 from svkc.forward_dynamics import constraint_forces, with_links
 from svkc.inverse_dynamics import generalized_forces, passive_forces
 from svkc.kinematics import kinematics, twists
+from svkc.selection import Selection, count_rank, select
 
 
 class Actuation(eqx.Module):
@@ -78,7 +79,7 @@ def _coordinates(chain: Chain, state: State):
         free = jnp.ones(chain.dofs, bool) if state.structure.locked is None else ~state.structure.locked
         W = jnp.diag(jnp.where(free, 1, 0).astype(state.q.dtype))
         return _open(W, free, chain), kin, V
-    return constrain(chain, state.structure, state.q, state.v, kin, V), kin, V
+    return constrained(chain, state.structure, state.q, state.v, kin, V), kin, V
 
 
 def _open(W, free, chain: Chain) -> Coordinates:
@@ -101,8 +102,7 @@ def _basis(B: Float[Array, "rows dofs"], rank=None) -> tuple[Selection, Int[Arra
 
 def _reach(chosen: Selection, B, wanted, cost):
     """The y of least sum(cost y^2) that makes |B y - wanted| least, by an orthonormal basis Z of B's range."""
-    R = jax.lax.stop_gradient((chosen.Q @ B) @ chosen.P.T) + jnp.diag(jnp.where(chosen.used, 0, 1).astype(B.dtype))
-    Z = jnp.linalg.solve(R.T, chosen.P @ B.T).T
+    Z = chosen.Q.T
     ZB = Z.T @ B
     over_cost = ZB.T / cost[:, None]
     G = ZB @ over_cost + jnp.diag(jnp.where(chosen.used, 0, 1).astype(B.dtype))
@@ -129,7 +129,7 @@ def _solve(chain: Chain, state: State, vdot_G, weight, actuated: Bool[Array, " d
     _, _, undriven = _basis(B.T)
     undriven = co.W @ (column[:, None] * jnp.where(co.independent[None], undriven, 0))
     if len(chain.link_names):
-        carried = jax.vmap(lambda tau: constraint_forces(chain, co, tau), in_axes=1, out_axes=-1)(null)
+        carried = jax.vmap(lambda tau: constraint_forces(chain, co.selection, co.J, tau), in_axes=1, out_axes=-1)(null)
         _, _, stress = _basis(co.J.T, state.structure.rank)
         row, _ = scales(chain)
         holds = jnp.repeat(state.structure.connected, 6)

@@ -13,7 +13,9 @@ import numpy as np
 from svkc.chain import State, Structure
 from svkc.trajectory import RESULT_NAMES, RESULTS, Events, Phases, Trajectory
 
-SCHEMA = 1
+# 2: with `derivative` and the phases' `margin`
+SCHEMA = 2
+_CODES = ("result", "derivative")
 _PARTS = {"states": State, "final": State, "structure": Structure, "events": Events, "phases": Phases}
 
 
@@ -24,7 +26,7 @@ def _flatten(node, prefix: str = "") -> dict[str, np.ndarray]:
         value, name = getattr(node, field.name), prefix + field.name
         if field.name in _PARTS:
             out |= _flatten(value, name + ".")
-        elif field.name != "result" and value is not None:
+        elif field.name not in _CODES and value is not None:
             out[name] = np.asarray(value)
     return out
 
@@ -46,7 +48,8 @@ def save(traj: Trajectory, path, chain=None) -> None:
 
     import svkc
 
-    meta = {"schema": SCHEMA, "result": int(np.asarray(traj.result._value)), "svkc": svkc.__version__, "jax": jax.__version__, "units": "SI, rad, wxyz"}
+    meta = {"schema": SCHEMA, "svkc": svkc.__version__, "jax": jax.__version__, "units": "SI, rad, wxyz"}
+    meta |= {name: int(np.asarray(getattr(traj, name)._value)) for name in _CODES}
     if chain is not None:
         meta |= {"bodies": chain.body_names, "joints": chain.joint_names, "links": chain.link_names}
     path = pathlib.Path(path)
@@ -75,8 +78,5 @@ def load_trajectory(path) -> Trajectory:
     missing = {"ts", "states.q", "final.q", "events.time"} - set(arrays)
     if missing:
         raise ValueError(f"{path} lacks {', '.join(sorted(missing))}; it is not a trajectory written by svkc")
-    result = RESULTS.successful
-    for item in (getattr(RESULTS, name) for name in RESULT_NAMES):
-        if int(np.asarray(item._value)) == meta["result"]:
-            result = item
-    return _build(Trajectory, arrays, result=result)
+    codes = {int(np.asarray(item._value)): item for item in (getattr(RESULTS, name) for name in RESULT_NAMES)}
+    return _build(Trajectory, arrays, **{name: codes.get(meta.get(name, 0), RESULTS.successful) for name in _CODES})

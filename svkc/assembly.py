@@ -6,9 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from svkc.chain import Chain, State, Structure
-from svkc.closure import agree, close, decide_rank, loop_gaps
+from svkc.closure import loop_gaps
 from svkc.kinematics import kinematics, normalize
 from svkc.loops import active_dofs, joint_coordinates, with_coordinates
+from svkc.projection import agree, close, decide_rank
 from svkc.topology import Q_SIZE, V_SIZE
 
 _NEWTON = 30

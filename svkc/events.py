@@ -208,26 +208,28 @@ def _checked_grip(chain: Chain, wish: Grip, dtype) -> Grip:
     return dataclasses.replace(wish, real_pos=place)
 
 
-def first_root(f, a: Float[Array, ""], fa: Float[Array, ""], b: Float[Array, ""], fb: Float[Array, ""]) -> Float[Array, ""]:
-    """A zero of f in [a, b], fa = f(a), fb = f(b) >= 0, to round-off: false position with the Illinois weight, every third step a bisection.
+def first_root(f, a, fa: Float[Array, ""], b, fb: Float[Array, ""]):
+    """A zero of f in [a, b], to round-off: false position with the Illinois weight, every third step a bisection. Not differentiable.
 
-    Returns the side where f >= 0; a itself if fa is not negative. Not differentiable.
+    f(t) -> (value, anything); a, b: a time and what f gives beside its value there, fa, fb: the values, fb >= 0. Returns such a pair, on the side where
+    f >= 0; a itself if fa is not negative.
     """
-    eps = jnp.finfo(b.dtype).eps
-    fine = 2 * eps * jnp.maximum(jnp.abs(a), jnp.abs(b)) + eps * (b - a)
+    eps = jnp.finfo(fb.dtype).eps
+    choose = lambda which, x, y: jax.tree.map(lambda x, y: jnp.where(which, x, y), x, y)
+    fine = 2 * eps * jnp.maximum(jnp.abs(a[0]), jnp.abs(b[0])) + eps * (b[0] - a[0])
 
     def narrow(carry):
         i, a, fa, b, fb, last = carry
-        weight = fb - fa
-        secant = b - fb * (b - a) / jnp.where(weight == 0, 1, weight)
-        c = jnp.where((i % 3 == 2) | (weight == 0), a + (b - a) / 2, secant)
-        c = jnp.clip(c, a + fine / 4, b - fine / 4)
-        fc = f(c)
+        weight, end = fb - fa, b[0]
+        secant = end - fb * (end - a) / jnp.where(weight == 0, 1, weight)
+        c = jnp.where((i % 3 == 2) | (weight == 0), a + (end - a) / 2, secant)
+        c = jnp.clip(c, a + fine / 4, end - fine / 4)
+        fc, rest = f(c)
         right = fc >= 0
         fa, fb = jnp.where(right & (last == 1), fa / 2, fa), jnp.where(~right & (last == -1), fb / 2, fb)
         a, fa = jnp.where(right, a, c), jnp.where(right, fa, fc)
-        b, fb = jnp.where(right, c, b), jnp.where(right, fc, fb)
+        b, fb = choose(right, (c, rest), b), jnp.where(right, fc, fb)
         return i + 1, a, fa, b, fb, jnp.where(right, 1, -1)
 
-    start = (jnp.asarray(0), a, fa, jnp.where(fa >= 0, a, b), fb, jnp.asarray(0))
-    return jax.lax.while_loop(lambda c: (c[3] - c[1] > fine) & (c[0] < 200), narrow, start)[3]
+    start = (jnp.asarray(0), a[0], fa, choose(fa >= 0, a, b), fb, jnp.asarray(0))
+    return jax.lax.while_loop(lambda c: (c[3][0] - c[1] > fine) & (c[0] < 200), narrow, start)[3]

@@ -5,13 +5,15 @@ import functools
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import cho_factor, cho_solve
+from jax.scipy.linalg import cho_factor, cho_solve, solve_triangular
 from jaxtyping import Array, Bool, Float
 
 from svkc.chain import Chain, State, Structure
-from svkc.closure import Coordinates, constrain, rank_tolerance, scales, square
-from svkc.inverse_dynamics import generalized_forces, inertia_by_composites, inertia_by_unit_vectors, passive_forces
-from svkc.kinematics import kinematics, twists
+from svkc.closure import Coordinates, choose, constrain, loop_rows, scaled_jacobian, scales
+from svkc.inverse_dynamics import generalized_forces, inertia_by_composites, inertia_by_unit_vectors, inertia_times, passive_forces
+from svkc.kinematics import Kinematics, kinematics, twists
+from svkc.loops import active_dofs, ends
+from svkc.selection import Selection, rank_tolerance, square
 
 
 def joint_torques(chain: Chain, tau: Float[Array, " torques"]) -> Float[Array, " dofs"]:
@@ -40,30 +42,70 @@ def with_links(chain: Chain, tree: Float[Array, " nv"], own: Float[Array, " dofs
     return jnp.concatenate([tree, chain.link_armature * own[chain.nv :]])
 
 
+def solve_motion(
+    chain: Chain, structure: Structure, kin: Kinematics, selection: Selection, J: Float[Array, "rows dofs"], force: Float[Array, " dofs"],
+    bias: Float[Array, " rows"], inertia=inertia_by_composites,
+) -> Float[Array, " dofs"]:  # fmt: skip
+    """The x with M x = force + J_C^T lambda and J_C x + bias = 0, through W, A and b (paper, section III-B).
+
+    Its derivatives are those of these equations, M x by Newton-Euler: one more solve with the same W and A, nothing through recursions for M or pivots.
+    """
+    nv, (_, column) = chain.nv, scales(chain)
+    chosen, rows = jax.lax.stop_gradient((selection, J))
+    co = constrain(chain, structure, chosen, rows, jnp.zeros_like(bias))
+    tree = inertia(*jax.lax.stop_gradient((chain, kin)))
+    W, active = co.W, active_dofs(chain, structure)
+    A = cho_factor(reduced_inertia(jax.lax.stop_gradient(chain), co, tree))
+    _, JS = square(chosen, rows)
+
+    def solve(_, right):
+        force, rate = right
+        x = column * (chosen.P.T @ solve_triangular(JS, rate))
+        x = x + W @ cho_solve(A, W.T @ (force - with_links(chain, tree @ x[:nv], x)))
+        rest = column * (force - with_links(chain, tree @ x[:nv], x))
+        return x, jnp.where(chosen.used, solve_triangular(JS, chosen.P @ rest, trans=1), rate)
+
+    def equations(unknown):
+        x, mu = unknown
+        held = (chosen.Q @ J) / column[None]
+        moving = jnp.where(active, x, 0)
+        force = with_links(chain, inertia_times(chain, kin, moving[:nv]), moving) + held.T @ mu
+        return jnp.where(active, force, x), held @ x + jnp.where(chosen.used, 0, mu)
+
+    right = (jnp.where(active, force, 0), -chosen.Q @ bias)
+    return jax.lax.custom_linear_solve(equations, right, solve=solve, symmetric=True)[0]
+
+
+def solve_free_motion(
+    chain: Chain, structure: Structure, kin: Kinematics, force: Float[Array, " dofs"], inertia=inertia_by_composites
+) -> Float[Array, " dofs"]:
+    """The same on an open chain: M x = force, zero for locked joints."""
+    free = jnp.ones(chain.nv, bool) if structure.locked is None else ~structure.locked
+    M = inertia(*jax.lax.stop_gradient((chain, kin)))
+    if structure.locked is not None:
+        M = jnp.where(free[:, None] & free[None], M, jnp.eye(chain.nv, dtype=M.dtype))
+    factor = cho_factor(M)
+
+    def equations(x):
+        return jnp.where(free, inertia_times(chain, kin, jnp.where(free, x, 0)), x)
+
+    return jax.lax.custom_linear_solve(equations, jnp.where(free, force, 0), solve=lambda _, x: cho_solve(factor, x), symmetric=True)
+
+
 @functools.partial(jax.jit, static_argnames="inertia")
 def acceleration(chain: Chain, structure: Structure, q, v, tau: Float[Array, " dofs"], inertia=inertia_by_composites, baumgarte=None) -> Float[Array, " dofs"]:
     """Steps 1 to 5 of section III-B. On an open chain W is the identity and nothing of the closure is computed.
 
     baumgarte: rate (1/s) at which open loops are pulled back; None: not at all.
     """
-    nv = chain.nv
     kin = kinematics(chain, q)
     V = twists(chain, kin, v)
-    applied = tau + passive_forces(chain, q, v)
+    bias = generalized_forces(chain, kin, V, v, jnp.zeros(chain.nv, v.dtype))
+    force = tau + passive_forces(chain, q, v) - jnp.concatenate([bias, jnp.zeros(chain.dofs - chain.nv, v.dtype)])
     if not len(chain.topology.link_names):
-        M = inertia(chain, kin)
-        b = generalized_forces(chain, kin, V, v, jnp.zeros_like(v))
-        if structure.locked is None:
-            return cho_solve(cho_factor(M), applied - b)
-        free = ~structure.locked
-        M = jnp.where(free[:, None] & free[None], M, jnp.eye(nv, dtype=M.dtype))
-        return cho_solve(cho_factor(M), jnp.where(free, applied - b, 0))
-    co = constrain(chain, structure, q, v, kin, V, baumgarte)
-    W = co.W
-    b = W.T @ with_links(chain, generalized_forces(chain, kin, V, v, co.bias[:nv]), co.bias)
-    A = reduced_inertia(chain, co, inertia(chain, kin))
-    vdot_G = cho_solve(cho_factor(A), W.T @ applied - b)
-    return W @ vdot_G + co.bias
+        return solve_free_motion(chain, structure, kin, force, inertia)
+    J, rates = loop_rows(chain, structure, q, v, kin, V, baumgarte)
+    return solve_motion(chain, structure, kin, choose(structure, J), J, force, rates, inertia)
 
 
 @jax.jit
@@ -81,12 +123,12 @@ def forward_dynamics_by_unit_vectors(chain: Chain, state: State, tau: Float[Arra
     return acceleration(chain, state.structure, state.q, state.v, joint_torques(chain, tau), inertia_by_unit_vectors)
 
 
-def constraint_forces(chain: Chain, co: Coordinates, excess: Float[Array, " dofs"]) -> Float[Array, "links 6"]:
+def constraint_forces(chain: Chain, selection: Selection, J: Float[Array, "rows dofs"], excess: Float[Array, " dofs"]) -> Float[Array, "links 6"]:
     """Lambda with J_C^T lambda = excess, of least norm where loops are redundant: wrench (N m, N) on the virtual link, at the joint."""
     row, column = scales(chain)
-    _, JS = square(co.selection, co.J)
-    mu = jnp.linalg.solve(JS.T, co.selection.P @ (column * excess))
-    return (row * (co.selection.Q.T @ mu)).reshape(-1, 6)
+    _, JS = square(selection, J)
+    mu = jnp.linalg.solve(JS.T, selection.P @ (column * excess))
+    return (row * (selection.Q.T @ mu)).reshape(-1, 6)
 
 
 class LoopForces(eqx.Module):
@@ -108,18 +150,19 @@ def loop_forces(chain: Chain, state: State, tau: Float[Array, " torques"]) -> Lo
     """Force (N) and torque (N m) that each connected virtual link carries for the joint torques tau: on `real` from `parent`, at the joint, in
     world axes, and whether the motion alone decides it."""
     tau = joint_torques(chain, tau)
-    q, v, nv = state.q, state.v, chain.nv
+    q, v, s, nv = state.q, state.v, state.structure, chain.nv
     kin = kinematics(chain, q)
     V = twists(chain, kin, v)
-    vdot = acceleration(chain, state.structure, q, v, tau)
+    vdot = acceleration(chain, s, q, v, tau)
     needed = with_links(chain, generalized_forces(chain, kin, V, v, vdot[:nv]), vdot)
-    co = constrain(chain, state.structure, q, v, kin, V)
-    wrench = -constraint_forces(chain, co, needed - passive_forces(chain, q, v) - tau)
-    return LoopForces(wrench[:, 3:], wrench[:, :3], ~self_stressed(state.structure, co))
+    J = scaled_jacobian(chain, s, kin, ends(chain, s, kin, q))
+    selection = choose(s, J)
+    wrench = -constraint_forces(chain, selection, J, needed - passive_forces(chain, q, v) - tau)
+    return LoopForces(wrench[:, 3:], wrench[:, :3], ~self_stressed(s, selection))
 
 
-def self_stressed(structure: Structure, co: Coordinates) -> Bool[Array, " links"]:
+def self_stressed(structure: Structure, selection: Selection) -> Bool[Array, " links"]:
     """Links that take part in a self-stress: wrenches of all loops together, J_C^T lambda = 0, that no motion tells of."""
     # a row's length within the range of J_C: 1 where no vector orthogonal to that range has a part in it
-    inside = jnp.sum(co.selection.Q**2, 0).reshape(-1, 6)
+    inside = jnp.sum(selection.Q**2, 0).reshape(-1, 6)
     return structure.connected & jnp.any(inside < 1 - rank_tolerance(inside.dtype), 1)

@@ -40,15 +40,16 @@ def generalized_forces(chain: Chain, kin: Kinematics, V, v, vdot: Float[Array, "
     return tau if chain.armature is None else tau + chain.armature * vdot
 
 
+def inertia_times(chain: Chain, kin: Kinematics, x: Float[Array, " nv"]) -> Float[Array, " nv"]:
+    """M x: ID(q, 0, x) without gravity."""
+    A = down(chain.topology, to_rows(chain.topology, kin.S * x[:, None]))
+    tau = newton_euler(chain, kin, None, A)
+    return tau if chain.armature is None else tau + chain.armature * x
+
+
 def inertia_by_unit_vectors(chain: Chain, kin: Kinematics) -> Float[Array, "nv nv"]:
     """Column i is ID(q, 0, e_i) without gravity: the paper's way (section III-B, step 3)."""
-
-    def column(unit):
-        A = down(chain.topology, to_rows(chain.topology, kin.S * unit[:, None]))
-        return newton_euler(chain, kin, None, A)
-
-    M = jax.vmap(column, out_axes=1)(jnp.eye(chain.nv, dtype=kin.r.dtype))
-    return M if chain.armature is None else M + jnp.diag(chain.armature)
+    return jax.vmap(lambda unit: inertia_times(chain, kin, unit), out_axes=1)(jnp.eye(chain.nv, dtype=kin.r.dtype))
 
 
 def inertia_by_composites(chain: Chain, kin: Kinematics) -> Float[Array, "nv nv"]:

@@ -6,9 +6,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc.chain import Chain, State
-from svkc.closure import coordinates, count_rank, scaled_jacobian, select
+from svkc.closure import coordinates, scaled_jacobian
 from svkc.kinematics import kinematics
 from svkc.loops import active_dofs, ends
+from svkc.selection import count_rank, select, weakest
 
 
 class Mobility(eqx.Module):
@@ -57,9 +58,6 @@ def mobility(chain: Chain, state: State) -> Mobility:
     rows = jnp.where(state.structure.connected, 6, 0).astype(jnp.int32)
     redundant = rows - jnp.diff(ranks, prepend=jnp.zeros(1, jnp.int32))
     co = coordinates(chain, state)
-    size = co.selection.size
-    rank = state.structure.rank
-    last = jnp.where(jnp.arange(size.shape[0], dtype=jnp.int32) == rank - 1, size, 0).sum()
-    margin = jnp.where(rank > 0, last / jnp.where(size[0] > 0, size[0], 1), 1)
+    rank, margin = state.structure.rank, weakest(co.selection)
     on = state.structure.connected
     return Mobility(joint_freedoms - rank, joint_freedoms, rank, redundant, co.independent, margin, on, chain.link_names, chain.dof_names)

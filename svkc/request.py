@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from svkc.assembly import gap_tolerance
 from svkc.chain import Chain, State
 from svkc.events import At, Plan, plan
+from svkc.replay import Replay
 from svkc.stepping import Baumgarte, Drift, Field, FixedSteps, Projection, motion_norm
 
 
@@ -23,7 +24,7 @@ class Options(eqx.Module):
     solver: diffrax.AbstractSolver
     stabilization: Projection | Baumgarte | Drift
     controller: Any
-    adjoint: diffrax.AbstractAdjoint
+    adjoint: diffrax.AbstractAdjoint | Replay
     progress_meter: diffrax.AbstractProgressMeter
     dt: Float[Array, ""] | None
     first_step: Float[Array, ""]
@@ -82,7 +83,7 @@ def checked(
         solver=diffrax.Tsit5() if solver is None else solver,
         stabilization=Projection() if stabilization is None else stabilization,
         controller=controller,
-        adjoint=diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
+        adjoint=_adjoint(adjoint, controller if dt is None else None),
         progress_meter=diffrax.NoProgressMeter() if progress_meter is None else progress_meter,
         dt=None if dt is None else jnp.asarray(dt, dtype),
         first_step=jnp.maximum(span, jnp.finfo(dtype).tiny) * 1e-3,
@@ -93,6 +94,18 @@ def checked(
     )
     save_at = jnp.stack([jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)]) if ts is None else jnp.asarray(ts, dtype)
     return options, save_at, made
+
+
+def _adjoint(adjoint, controller) -> diffrax.AbstractAdjoint | Replay:
+    """Steps that do not meet the save times are not gone through again: what is saved is interpolated between them."""
+    meets = controller is None or isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
+    if adjoint is None:
+        return Replay() if meets else diffrax.RecursiveCheckpointAdjoint()
+    if not isinstance(adjoint, Replay | diffrax.AbstractAdjoint):
+        raise ValueError(f"adjoint: expected svkc.Replay or a diffrax adjoint, got {adjoint!r}")
+    if isinstance(adjoint, Replay) and not meets:
+        raise ValueError("adjoint: svkc.Replay needs dt or an adaptive stepsize_controller; give a diffrax adjoint with this one")
+    return adjoint
 
 
 def _capacity(max_events, made: Plan) -> int:

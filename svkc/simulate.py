@@ -5,6 +5,8 @@ solver back from there, so that its time and state have the solver's own order a
 that are done go on with phases of no length.
 """
 
+import dataclasses
+
 import equinox as eqx
 import equinox.internal as eqxi
 import jax
@@ -18,10 +20,13 @@ from svkc.closure import loop_gaps
 from svkc.energy import energy
 from svkc.events import Plan
 from svkc.guards import Sensor
+from svkc.location import Reading, event_tolerance
 from svkc.loops import active_dofs
-from svkc.phase import Run, Solved, event_tolerance, guard_values, solve
+from svkc.phase import Run, Solved, solve
+from svkc.projection import rank_margin
 from svkc.request import Options, checked
-from svkc.stepping import Motion, Scene
+from svkc.selection import rank_tolerance
+from svkc.stepping import Motion, Scene, frozen
 from svkc.trajectory import RESULTS, Events, Phases, Trajectory
 from svkc.transition import change, connect_tolerance
 
@@ -59,6 +64,7 @@ def simulate(
 
 @eqx.filter_jit
 def _run(chain: Chain, state: State, t0, t1, ts, made: Plan, options: Options, args) -> Trajectory:
+    made, options = _converted(chain, state, t0, made, options, args)
     run = _start(chain, state, t0, ts, made, options, args)
 
     def phase(run: Run, index):
@@ -73,7 +79,25 @@ def _run(chain: Chain, state: State, t0, t1, ts, made: Plan, options: Options, a
     saved = run.saved
     gaps = jax.vmap(lambda s: _largest_gaps(chain, s))(saved)
     result = RESULTS.where((result == RESULTS.successful) & (jnp.max(gaps) > options.gap), RESULTS.loop_open, result)
-    return Trajectory(ts, saved, gaps, run.events, run.phases, run.state, run.t, result)
+    return Trajectory(ts, saved, gaps, run.events, run.phases, run.state, run.t, result, run.derivative)
+
+
+def _converted(chain: Chain, state: State, t0, made: Plan, options: Options, args) -> tuple[Plan, Options]:
+    """Control and guards with all that they close over as their leaves, so that it can be differentiated."""
+    state = _lockable(chain, state, made)
+
+    def converted(fn):
+        return fn if fn is None or isinstance(fn, Sensor) else eqx.filter_closure_convert(fn, t0, state, args)
+
+    guards, control = tuple(converted(g) for g in made.guards), converted(options.control)
+    fresh = lambda node, name, value: dataclasses.replace(node, **{name: value})
+    return fresh(made, "guards", guards), fresh(options, "control", control)
+
+
+def _lockable(chain: Chain, state: State, made: Plan) -> State:
+    if not made.locks or state.structure.locked is not None:
+        return state
+    return eqx.tree_at(lambda s: s.structure.locked, state, jnp.zeros(chain.dofs, bool), is_leaf=lambda x: x is None)
 
 
 def _largest_gaps(chain: Chain, state: State) -> Float[Array, "2"]:
@@ -89,12 +113,9 @@ def _largest_gaps(chain: Chain, state: State) -> Float[Array, "2"]:
 def _start(chain: Chain, state: State, t0, ts, made: Plan, options: Options, args) -> Run:
     """Empty records, sized by capacity; unwritten entries show: inf, -1."""
     links, rows, dtype = len(chain.link_names), options.max_events, state.q.dtype
-    structure = state.structure
-    if made.locks and structure.locked is None:
-        structure = eqx.tree_at(lambda s: s.locked, structure, jnp.zeros(chain.dofs, bool), is_leaf=lambda x: x is None)
-    state = State(state.q, state.v, structure)
-    scene = Scene(chain, structure, args)
-    guards = guard_values(made, options.field, t0, Motion(state.q, state.v), scene) if made.guards else None
+    state = _lockable(chain, state, made)
+    scene = Scene(chain, state.structure, args)
+    guards = frozen(Reading(made, options.field))(*frozen((t0, Motion(state.q, state.v), scene))) if made.guards else None
     for i, guard in enumerate(made.guards):
         if isinstance(guard, Sensor) and guard.loaded:
             # a load that is too much from the start is seen to be
@@ -112,11 +133,12 @@ def _start(chain: Chain, state: State, t0, ts, made: Plan, options: Options, arg
         ),
         phases=Phases(
             jnp.full(rows + 1, jnp.inf, dtype), jnp.full(rows + 1, jnp.inf, dtype), jnp.zeros((rows + 1, links), bool), jnp.full(rows + 1, -1, jnp.int32),
-            jnp.full(rows + 1, -1, jnp.int32), jnp.zeros((rows + 1, 2), dtype), jnp.zeros(rows + 1, dtype), jnp.zeros(rows + 1, jnp.int32),
-            jnp.zeros(rows + 1, jnp.int32), zero,
+            jnp.full(rows + 1, -1, jnp.int32), jnp.zeros((rows + 1, 2), dtype), jnp.zeros(rows + 1, dtype), jnp.ones(rows + 1, dtype),
+            jnp.zeros(rows + 1, jnp.int32), jnp.zeros(rows + 1, jnp.int32), zero,
         ),
         saved=jax.tree.map(lambda x: jnp.broadcast_to(x[None], (ts.shape[0], *x.shape)), state),
         result=RESULTS.successful,
+        derivative=RESULTS.successful,
     )  # fmt: skip
 
 
@@ -126,19 +148,28 @@ def _phase(chain: Chain, run: Run, index, t1, ts, made: Plan, options: Options, 
     going = going & (run.result == RESULTS.successful)
     next_time = jnp.min(jnp.where(run.pending, made.times, jnp.inf), initial=jnp.inf)
     stop = jnp.where(going, jnp.maximum(jnp.minimum(t1, next_time), run.t), run.t)
-    solved = solve(chain, run, stop, ts, made, options, args)
+    solved = solve(run, stop, ts, made, options, Scene(chain, run.state.structure, args))
     reached = going & (solved.result == RESULTS.successful)
     timed = run.pending & (made.times <= solved.t + event_tolerance(solved.t)) & reached
     fired = jnp.zeros(len(made.actions), bool).at[np.array(made.timed + made.guarded, int)].set(jnp.concatenate([timed, solved.fired & reached]))
     ended = State(solved.motion.q, solved.motion.v, run.state.structure)
     saved = _save(run, ended, solved, ts)
-    phases = _record_phase(chain, run, index, going, solved, ended)
+    margin = rank_margin(chain, run.state, ended)
+    phases = _record_phase(chain, run, index, going, solved, ended, margin)
+    derivative = _derivative(run, solved, going, timed, margin)
     after, events, result = ended, run.events, solved.result
     if made.actions:
         after, events, result = _apply(chain, run, ended, solved, fired, made)
     result = RESULTS.where(run.result == RESULTS.successful, result, run.result)
     guards = _compared(chain, after, solved, jnp.any(fired), made, options, args)
-    return Run(solved.t, after, solved.motion.work, guards, run.pending & ~timed, events, phases, saved, result)
+    return Run(solved.t, after, solved.motion.work, guards, run.pending & ~timed, events, phases, saved, result, derivative)
+
+
+def _derivative(run: Run, solved: Solved, going, timed: Bool[Array, " timed"], margin) -> RESULTS:
+    """The first reason why the run has no derivative."""
+    code = RESULTS.where(jnp.any(solved.fired) & jnp.any(timed), RESULTS.together, solved.derivative)
+    code = RESULTS.where(margin < rank_tolerance(margin.dtype), RESULTS.rank_lost, code)
+    return RESULTS.where((run.derivative == RESULTS.successful) & going, code, run.derivative)
 
 
 def _compared(chain: Chain, after: State, solved: Solved, happened, made: Plan, options: Options, args):
@@ -149,7 +180,8 @@ def _compared(chain: Chain, after: State, solved: Solved, happened, made: Plan, 
     fresh = [i for i, g in enumerate(made.guards) if not (isinstance(g, Sensor) and g.loaded)]
     if not fresh:
         return solved.guards
-    now = guard_values(made, options.field, solved.t, Motion(after.q, after.v), Scene(chain, after.structure, args))
+    scene = Scene(chain, after.structure, args)
+    now = frozen(Reading(made, options.field))(*frozen((solved.t, Motion(after.q, after.v), scene)))
     take = np.isin(np.arange(len(made.guards)), fresh) & happened & (solved.guards != 0)
     return jnp.where(take, now, solved.guards)
 
@@ -166,7 +198,7 @@ def _save(run: Run, ended: State, solved: Solved, ts) -> State:
     return State(q, v, jax.tree.map(write, ended.structure, run.saved.structure))
 
 
-def _record_phase(chain: Chain, run: Run, index, going, solved: Solved, ended: State) -> Phases:
+def _record_phase(chain: Chain, run: Run, index, going, solved: Solved, ended: State, margin) -> Phases:
     s, row = run.state.structure, jnp.arange(run.phases.start.shape[0]) == index
     row = row & going
     work = jnp.zeros_like(run.t) if run.work is None else solved.motion.work - run.work
@@ -182,6 +214,7 @@ def _record_phase(chain: Chain, run: Run, index, going, solved: Solved, ended: S
         jnp.where(row, jnp.sum(active, dtype=jnp.int32), p.joint_freedoms),
         jnp.where(row[:, None], energies[None], p.energy),
         jnp.where(row, work, p.work),
+        jnp.where(row, margin, p.margin),
         jnp.where(row, jnp.asarray(solved.stats[0], jnp.int32), p.accepted),
         jnp.where(row, jnp.asarray(solved.stats[1], jnp.int32), p.rejected),
         p.count + jnp.where(going, 1, 0).astype(jnp.int32),

@@ -2,26 +2,38 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from svkc.chain import Chain, State, Structure
-from svkc.closure import settle_loops
 from svkc.forward_dynamics import acceleration, joint_torques
 from svkc.inverse_dynamics import limit_forces
 from svkc.kinematics import normalize, rates
 from svkc.loops import active_dofs
+from svkc.projection import settle_loops
+
+
+def frozen(tree):
+    """The tree with every array in it held fixed in derivatives."""
+    return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
+
+
+def filled(x, dx):
+    """The tangent of x: zeros where dx is None."""
+    return jax.tree.map(lambda x, d: jnp.zeros_like(x) if d is None and x is not None else d, x, dx, is_leaf=lambda x: x is None)
 
 
 class Watch(eqx.Module):
-    """Guards at both ends of the last step, which began at `start`."""
+    """Guards at both ends of the last step, which began at the time `start` with the motion `begin`."""
 
     start: Float[Array, ""]
+    begin: "Motion"
     before: Float[Array, " guards"]
     after: Float[Array, " guards"]
 
@@ -33,6 +45,11 @@ class Motion(eqx.Module):
     v: Float[Array, " dofs"]
     work: Float[Array, ""] | None = None
     watch: Watch | None = None
+
+    @property
+    def bare(self) -> "Motion":
+        """Without what is watched."""
+        return Motion(self.q, self.v, self.work)
 
 
 class Scene(eqx.Module):
@@ -75,7 +92,7 @@ class Field(eqx.Module):
         rate = self.stabilization.rate if isinstance(self.stabilization, Baumgarte) else None
         vdot = acceleration(chain, structure, y.q, y.v, tau, baumgarte=rate)
         moving = jnp.where(active_dofs(chain, structure), y.v, 0)
-        watch = None if y.watch is None else jax.tree.map(jnp.zeros_like, y.watch)
+        watch = jax.tree.map(jnp.zeros_like, y.watch)
         return Motion(rates(chain, y.q, moving), vdot, power, watch)
 
     def torques(self, t, y: Motion, scene: Scene):
@@ -127,6 +144,9 @@ def _interpolation(cls, *, t0, t1, inner, shift):
 class Settled(diffrax.AbstractWrappedSolver):
     """Any diffrax solver, its steps settled and its guards read at their ends."""
 
+    # diffrax takes a wrapper for what it wraps and asks for it; the inner solver has its own
+    scan_kind: ClassVar[str] = "inner"
+
     solver: diffrax.AbstractSolver
     stabilization: Projection | Baumgarte | Drift
     guards: Callable | None
@@ -163,9 +183,44 @@ class Settled(diffrax.AbstractWrappedSolver):
             # a guard at zero is not armed before it has left it by more than round-off
             resting = (y0.watch.after == 0) & (jnp.abs(after) < jnp.finfo(after.dtype).eps ** 0.75)
             after = jnp.where(resting, 0, after)
-            y1 = eqx.tree_at(lambda y: y.watch, y1, Watch(jax.lax.stop_gradient(t0), y0.watch.after, after))
+            y1 = eqx.tree_at(lambda y: y.watch, y1, Watch(t0, y0.bare, y0.watch.after, after))
         shift = jax.tree.map(lambda a, b: a - b, y1, raw)
         return y1, error, {"inner": dense, "shift": shift}, solver_state, result
+
+
+def step_alone(solver: diffrax.AbstractSolver, field: Field, t0, t1, y: Motion, scene: Scene) -> Motion:
+    """One settled step of a solver that remembers nothing of the step before, to be differentiated: of each evaluation of the field, and of what
+    settles the step, only the arguments are kept on the way back."""
+    rate = eqx.filter_checkpoint(field)
+    if isinstance(solver, diffrax.AbstractERK) and isinstance(solver.tableau, diffrax.ButcherTableau):
+        raw = _explicit_step(solver.tableau, rate, t0, t1, y, scene)
+    else:
+        if isinstance(solver, diffrax.AbstractRungeKutta):
+            solver = eqx.tree_at(lambda s: s.scan_kind, solver, "bounded", is_leaf=lambda x: x is None)
+        term = diffrax.ODETerm(rate)
+        raw = solver.step(term, t0, t1, y, scene, solver.init(term, t0, t1, y, scene), False)[0]
+    return eqx.filter_checkpoint(settle)(field.stabilization, scene, raw)
+
+
+def _explicit_step(tableau: diffrax.ButcherTableau, rate, t0, t1, y: Motion, scene: Scene) -> Motion:
+    """An explicit Runge-Kutta step as a loop over its stages, without those that only estimate the error."""
+    used = int(np.max(np.flatnonzero(tableau.b_sol))) + 1
+    A = np.zeros((used, used))
+    for i, row in enumerate(tableau.a_lower[: used - 1]):
+        A[i + 1, : i + 1] = row
+    c, dtype = np.append(0.0, tableau.c)[:used], t1.dtype
+    add = lambda weights, rates: jax.tree.map(lambda y, k: y + (t1 - t0) * jnp.tensordot(weights, k, 1), y, rates)
+
+    def stage(rates, x):
+        weights, part, here = x
+        k = rate(t0 + part * (t1 - t0), add(weights, rates), scene)
+        put = lambda ks, k: jnp.where(here.reshape(-1, *(1,) * k.ndim), k[None], ks)
+        return jax.tree.map(put, rates, k), None
+
+    none = jax.tree.map(lambda y: jnp.zeros((used, *y.shape), y.dtype), y)
+    stages = (jnp.asarray(A, dtype), jnp.asarray(c, dtype), np.eye(used, dtype=bool))
+    rates, _ = jax.lax.scan(stage, none, stages)
+    return add(jnp.asarray(tableau.b_sol[:used], dtype), rates)
 
 
 class FixedSteps(diffrax.AbstractStepSizeController):

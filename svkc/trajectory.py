@@ -19,6 +19,10 @@ class RESULTS(eqx.Enumeration):
     not_in_place = "A link was to be connected at its declared placement, but its bodies were elsewhere. Use here, or a guard that waits."
     loop_open = "A loop is open by more than the tolerance. Use smaller steps, or projection."
     non_finite = "A number that is not finite appeared."
+    grazing = "A guard touched zero rather than crossed it: the time of its event has no derivative, and those given are not numbers."
+    jump = "A guard jumped over zero: the time of its event counts as fixed in derivatives."
+    together = "Two guards, or a guard and a scheduled event, happened at one instant: derivatives are those of this order of events."
+    rank_lost = "The loops lost rank within a phase: derivatives across it are not to be relied on."
     no_slot = "A grip was to be made and every spare slot was taken: it was not made, everything else was. Load with more spare slots, or unbind."
 
 
@@ -44,7 +48,8 @@ class Events(eqx.Module):
 class Phases(eqx.Module):
     """The stretches between changes of structure; rows past `count` are unused.
 
-    `energy`: mechanical energy (J) at start and end; `work`: done in between by control, limits and dampers (J).
+    `energy`: mechanical energy (J) at start and end; `work`: done in between by control, limits and dampers (J); `margin`: the least |R_mm| / |R_11| at
+    start and end, how far the weakest row that counts is from being redundant.
     """
 
     start: Float[Array, " phases"]
@@ -54,6 +59,7 @@ class Phases(eqx.Module):
     joint_freedoms: Int[Array, " phases"]
     energy: Float[Array, "phases 2"]
     work: Float[Array, " phases"]
+    margin: Float[Array, " phases"]
     accepted: Int[Array, " phases"]
     rejected: Int[Array, " phases"]
     count: Int[Array, ""]
@@ -70,7 +76,10 @@ class Phases(eqx.Module):
 
 
 class Trajectory(eqx.Module):
-    """A run: `states` at `ts` (leading time axis), the loop gaps there, events, phases, the final state and how it ended."""
+    """A run: `states` at `ts` (leading time axis), the loop gaps there, events, phases, the final state and how it ended.
+
+    `derivative`: successful where the run has derivatives, else why not: a guard that grazed or jumped, events that could change order, rank lost.
+    """
 
     ts: Float[Array, " times"]
     states: State
@@ -80,6 +89,7 @@ class Trajectory(eqx.Module):
     final: State
     t_final: Float[Array, ""]
     result: RESULTS
+    derivative: RESULTS
 
     @property
     def connected(self) -> Bool[Array, "... times links"]:

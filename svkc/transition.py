@@ -12,11 +12,12 @@ from jaxtyping import Array, Bool, Float
 from svkc.assembly import check_closed, connection_mask, joint_slice, link_index
 from svkc.binding import emptied, spare_slot
 from svkc.chain import Chain, State, Structure
-from svkc.closure import close, constrain, decide_rank, scales
-from svkc.forward_dynamics import constraint_forces, reduced_inertia, with_links
-from svkc.inverse_dynamics import inertia_by_composites
+from svkc.closure import choose, constrained, scaled_jacobian, scales
+from svkc.forward_dynamics import constraint_forces, reduced_inertia, solve_free_motion, solve_motion, with_links
+from svkc.inverse_dynamics import inertia_by_composites, inertia_times
 from svkc.kinematics import kinematics, twists
 from svkc.loops import active_dofs, ends, gap, joint_coordinates, loop_jacobian, with_coordinates
+from svkc.projection import close, decide_rank
 from svkc.spatial import quat_conjugate, quat_multiply, quat_rotate
 from svkc.topology import V_SIZE
 
@@ -58,15 +59,15 @@ def _project(chain: Chain, structure: Structure, q, v):
     """
     nv = chain.nv
     kin = kinematics(chain, q)
-    co = constrain(chain, structure, q, v, kin, twists(chain, kin, v))
-    M = inertia_by_composites(chain, kin)
-    A = reduced_inertia(chain, co, M)
-    after = co.W @ cho_solve(cho_factor(A), co.W.T @ with_links(chain, M @ v[:nv], v))
+    momentum = lambda v: with_links(chain, inertia_times(chain, kin, v[:nv]), v)
+    J = scaled_jacobian(chain, structure, kin, ends(chain, structure, kin, q))
+    selection = choose(structure, J)
+    after = solve_motion(chain, structure, kin, selection, J, momentum(v), jnp.zeros(J.shape[0], v.dtype))
     jump = after - v
-    momentum = with_links(chain, M @ jump[:nv], jump)
+    impulse = momentum(jump)
     # v- and v+ differ by a vector orthogonal to v+, so that the loss is a square and cannot be negative
     jump = jnp.where(active_dofs(chain, structure), jump, 0)
-    return after, -constraint_forces(chain, co, momentum), jump @ momentum / 2
+    return after, -constraint_forces(chain, selection, J, impulse), jump @ impulse / 2
 
 
 def change(
@@ -109,12 +110,10 @@ def lock_projection(chain: Chain, structure: Structure, q, v):
     """The projection where only joints are locked and there are no virtual links; velocity after, energy lost."""
     if structure.locked is None:
         return v, jnp.zeros((), v.dtype)
-    M = inertia_by_composites(chain, kinematics(chain, q))
-    free = ~structure.locked
-    A = jnp.where(free[:, None] & free[None], M, jnp.eye(chain.nv, dtype=M.dtype))
-    after = cho_solve(cho_factor(A), jnp.where(free, M @ v, 0))
+    kin = kinematics(chain, q)
+    after = solve_free_motion(chain, structure, kin, inertia_times(chain, kin, v))
     jump = after - v
-    return after, jump @ (M @ jump) / 2
+    return after, jump @ inertia_times(chain, kin, jump) / 2
 
 
 _change = eqx.filter_jit(change)
@@ -192,7 +191,7 @@ def velocity_by_impulse(chain: Chain, state: State, name: str) -> tuple[Float[Ar
     """
     slot, nv = link_index(chain, name), chain.nv
     kin = kinematics(chain, state.q)
-    before = constrain(chain, state.structure, state.q, state.v, kin, twists(chain, kin, state.v))
+    before = constrained(chain, state.structure, state.q, state.v, kin, twists(chain, kin, state.v))
     after = eqx.tree_at(lambda s: s.connected, state.structure, state.structure.connected.at[slot].set(True))
     q = with_coordinates(chain, after.connected & ~state.structure.connected, joint_coordinates(chain, after, kin, state.q), state.q)
     J = loop_jacobian(chain, after, kin, ends(chain, after, kin, q))[6 * slot : 6 * slot + 6]

@@ -13,15 +13,18 @@ import pytest
 ROOT = pathlib.Path(__file__).parent.parent
 # the house floor by floor, the ground first
 HOUSE = [
-    "spatial topology unsupported",
+    "spatial topology unsupported selection",
     "chain reading",
     "kinematics trajectory cuttable",
     "inverse_dynamics loops archive load",
     "energy closure",
-    "forward_dynamics assembly mobility",
+    "forward_dynamics projection",
+    "assembly mobility",
     "binding actuation guards solvers",
     "transition events stepping",
-    "request scenes",
+    "location scenes",
+    "replay",
+    "request",
     "phase view",
     "simulate",
     "__main__",

@@ -1,0 +1,137 @@
+"""F6: where in its last step a phase ends: the first guard's zero, found without derivatives, and the derivatives of the time and motion there."""
+
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from svkc.chain import State
+from svkc.events import Plan, first_root
+from svkc.guards import Sensor
+from svkc.stepping import Field, Motion, Scene, filled, step_alone
+
+# a guard that at the rate it crosses zero with would change this little over a step, measured by its size, touches zero rather than crosses it
+FLAT = 1e-5
+
+
+class Reading(eqx.Module):
+    """What every guard says of a moment; those that measure the mechanism are told its torques."""
+
+    made: Plan
+    field: Field
+
+    def __call__(self, t, y: Motion, scene: Scene) -> Float[Array, " guards"]:
+        state = State(y.q, y.v, scene.structure)
+        guards = self.made.guards
+        tau = self.field.torques(t, y, scene)[0] if any(isinstance(g, Sensor) and g.loaded for g in guards) else jnp.zeros_like(y.v)
+        values = [g.measure(scene.chain, state, tau) if isinstance(g, Sensor) else g(t, state, scene.args) for g in guards]
+        return jnp.stack([jnp.asarray(x, y.q.dtype).reshape(()) for x in values])
+
+
+class Crossing(eqx.Module):
+    """Whether a watched guard went through zero in the last step."""
+
+    made: Plan
+
+    def __call__(self, t, y: Motion, args: Scene, **_):
+        return jnp.any(self.made.crossed(y.watch.before, y.watch.after) & args.watched)
+
+
+class Found(eqx.Module):
+    """The guards that fired, which guard values go on, the first guard, whether there was one, it jumped over zero, or it only touched it."""
+
+    fired: Bool[Array, " guards"]
+    values: Float[Array, " guards"]
+    first: Int[Array, ""]
+    hit: Bool[Array, ""]
+    jumps: Bool[Array, ""]
+    flat: Bool[Array, ""]
+
+
+def event_tolerance(t: Float[Array, ""]) -> Float[Array, ""]:
+    """Events this close (s) to the earliest happen together with it: sqrt(eps), 1.5e-8 in float64, relative from t = 1 s on."""
+    return jnp.finfo(t.dtype).eps ** 0.5 * jnp.maximum(1, jnp.abs(t))
+
+
+def locate(hit: Bool[Array, ""], t_end, end: Motion, solver, scene: Scene, guards: Reading) -> tuple[Float[Array, ""], Motion, Found]:
+    """Time and motion of the earliest crossing in the last step, by steps of the solver from its begin, so that they have the solver's own order.
+
+    A guard that fired is armed again once it has left zero. Nothing here is to be differentiated.
+    """
+    watch = end.watch
+    crossed = guards.made.crossed(watch.before, watch.after) & scene.watched & hit
+    side = jnp.where(crossed, jnp.where(watch.after >= watch.before, 1, -1), 0).astype(t_end.dtype)
+
+    def passed(values):
+        return jnp.where(crossed, side * values, -jnp.inf)
+
+    def found():
+        def ahead(t):
+            y = step_alone(solver, guards.field, watch.start, t, watch.begin, scene)
+            return jnp.max(passed(guards(t, y, scene))), y
+
+        root, y = first_root(ahead, (watch.start, watch.begin), jnp.max(passed(watch.before)), (t_end, end.bare), jnp.max(passed(watch.after)))
+        rate = guards.field(root, y, scene)
+        values, slopes = jax.jvp(lambda t, y: guards(t, y, scene), (root, y), (jnp.ones_like(root), rate))
+        first = jnp.argmax(passed(values))
+        fired = crossed & (passed(values) + side * slopes * event_tolerance(root) >= 0)
+        fired = fired | (jnp.arange(side.shape[0]) == first)
+        value, slope = jnp.abs(values[first]), jnp.abs(slopes[first])
+        jumps = value > slope * event_tolerance(root)
+        flat = ~jumps & (slope * (t_end - watch.start) < FLAT * jnp.maximum(jnp.abs(watch.before[first]), jnp.abs(watch.after[first])))
+        # zero: not armed, until it has left zero
+        return root, y, Found(fired, jnp.where(fired, 0, values), first, hit, jumps, flat)
+
+    def missed():
+        no = jnp.zeros((), bool)
+        return t_end, end.bare, Found(jnp.zeros_like(crossed), watch.after, jnp.asarray(0), no, no, no)
+
+    at = jax.lax.cond(eqxi.unvmap_any(hit), found, missed)
+    return jax.tree.map(lambda a, b: jnp.where(hit, a, b), at, missed())
+
+
+@eqx.filter_custom_jvp
+def arrived(
+    t: Float[Array, ""], y: Motion, late: Float[Array, ""], scene: Scene, guards: Reading | Field, *, found: Found | None
+) -> tuple[Float[Array, ""], Motion]:
+    """The end of a phase, where the motion y was found at the time t: a guard's zero, or, `late` by nothing, the time scheduled. To be differentiated."""
+    return t, y
+
+
+@arrived.def_jvp
+def _arrived_jvp(primals, tangents, *, found):
+    """What y changes by at its time, and its rate times the change of the end's time: that of `late`, or dt = -dg / (dg/dt), the implicit function's."""
+    t, y, late, scene, guards = primals
+    d_t, dy, d_late, d_scene, d_guards = tangents
+    end, at = arrived(t, y, late, scene, guards, found=found)
+    field, d_field = (guards, d_guards) if isinstance(guards, Field) else (guards.field, d_guards.field)
+    d_t = filled(t, d_t)
+    dy = _carried(filled(y, dy), end - t, end, at, (scene, field), (d_scene, d_field))
+    rate = field(end, at, scene)
+    dt = filled(late, d_late)
+    if found is not None:
+        guard = lambda t, y, scene, guards: guards(t, y, scene)[found.first]
+        slope = jax.jvp(lambda t, y: guard(t, y, scene, guards), (end, at), (jnp.ones_like(end), rate))[1]
+        change = eqx.filter_jvp(guard, (end, at, scene, guards), (d_t, dy, d_scene, d_guards))[1]
+        none = found.jumps | ~found.hit
+        # where a guard touches zero there is no derivative, and no number that looks like one
+        implicit = jnp.where(none, 0, -change) / jnp.where(none, 1, jnp.where(found.flat, jnp.nan, slope))
+        dt = jnp.where(found.hit, implicit, dt)
+    return (end, at), (d_t + dt, jax.tree.map(lambda d, r: d + r * dt, dy, rate))
+
+
+@eqx.filter_custom_jvp
+def _carried(dy: Motion, delay, t, at: Motion, world, d_world) -> Motion:
+    """A change of the motion, carried along for a time that is zero, but may itself change: second derivatives see it."""
+    return dy
+
+
+@_carried.def_jvp
+def _carried_jvp(primals, tangents):
+    dy, _, t, at, (scene, field), d_world = primals
+    ddy = filled(dy, tangents[0])
+    if tangents[1] is not None:
+        d_rate = eqx.filter_jvp(lambda y, scene, field: field(t, y, scene), (at, scene, field), (dy, *d_world))[1]
+        ddy = jax.tree.map(lambda d, r: d + tangents[1] * r, ddy, d_rate)
+    return _carried(*primals), ddy

@@ -1,0 +1,124 @@
+"""F3: the way back onto closed loops, by the least change, and the rank that a phase goes by."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from svkc.chain import Chain, State, Structure
+from svkc.closure import scaled_jacobian, scales
+from svkc.kinematics import integrate, kinematics, normalize
+from svkc.loops import active_dofs, ends, gap
+from svkc.selection import Selection, count_rank, rank_tolerance, select, solve_positive, square, weakest
+
+
+@jax.jit
+def decide_rank(chain: Chain, structure: Structure, q: Float[Array, " q"]) -> Structure:
+    """The structure with its rank m: the larger of those at q and at a closed configuration nearby, for q itself may be singular."""
+    if not len(chain.topology.link_names):
+        return structure
+    given = structure
+    chain, structure, q = jax.lax.stop_gradient((chain, structure, q))
+    row, column = scales(chain)
+
+    def sizes(q):
+        kin = kinematics(chain, q)
+        end = ends(chain, structure, kin, q)
+        return select(scaled_jacobian(chain, structure, kin, end)).size, jnp.max(jnp.abs(row * gap(structure, end).ravel()))
+
+    # a fixed direction without pattern, a few degrees away; left out where Newton's method does not come back onto the loops
+    direction = np.sin(1.0 + 2.3 * np.arange(chain.dofs))
+    near = jnp.where(active_dofs(chain, structure), 0.05 * direction * column, 0).astype(q.dtype)
+    full = eqx.tree_at(lambda s: s.rank, structure, jnp.asarray(min(row.shape[0], chain.dofs), jnp.int32))
+    moved = close(chain, full, integrate(chain, q, near), iterations=12)
+    size, open_ = jax.lax.map(sizes, jnp.stack([q, moved]))
+    closed = open_[1] < jnp.finfo(q.dtype).eps ** 0.75
+    rank = jnp.where(closed, jnp.maximum(count_rank(size[0]), count_rank(size[1])), count_rank(size[0]))
+    return eqx.tree_at(lambda s: s.rank, given, rank)
+
+
+def rank_margin(chain: Chain, *states: State) -> Float[Array, ""]:
+    """The least |R_mm| / |R_11| at some states of one phase: how far the weakest row that counts is from being redundant; 1 where none counts."""
+    if not len(chain.topology.link_names):
+        return jnp.ones((), states[0].q.dtype)
+    chain, states = jax.lax.stop_gradient((chain, states))
+    structure = states[0].structure
+
+    def margin(q):
+        kin = kinematics(chain, q)
+        return weakest(select(scaled_jacobian(chain, structure, kin, ends(chain, structure, kin, q)), structure.rank))
+
+    return jnp.min(jax.lax.map(margin, jnp.stack([s.q for s in states])))
+
+
+def _least_change(selection: Selection, J, x: Float[Array, "rows *n"]) -> Float[Array, "dofs *n"]:
+    """The smallest y with J_Cm y = Q x."""
+    Jm, _ = square(selection, J)
+    gram = Jm @ Jm.T + jnp.diag(jnp.where(selection.used, 0, 1).astype(J.dtype))
+    return Jm.T @ solve_positive(gram, selection.Q @ x)
+
+
+def _solvable(selection: Selection) -> Selection:
+    """Steps below the rank's tolerance dropped: a gap along them is of second order, and dividing by them would only amplify round-off."""
+    floor = rank_tolerance(selection.size.dtype) * selection.size[0]
+    keep = selection.used & (selection.size > floor)
+    return Selection(jnp.where(keep[:, None], selection.Q, 0), jnp.where(keep[:, None], selection.P, 0), selection.size, keep)
+
+
+@functools.partial(jax.jit, static_argnames="iterations")
+def close(chain: Chain, structure: Structure, q: Float[Array, " q"], iterations: int = 2, hold=None) -> Float[Array, " q"]:
+    """Q moved by the least change (scaled coordinates) that closes the loops: Newton's method on the gaps, `iterations` times.
+
+    `hold`: coordinates that must not move in the first half of the iterations.
+    """
+    row, column = scales(chain)
+
+    def newton(i, q):
+        kin = kinematics(chain, q)
+        end = ends(chain, structure, kin, q)
+        J = scaled_jacobian(chain, structure, kin, end)
+        if hold is not None:
+            J = jnp.where(hold[None] & (i < iterations // 2), 0, J)
+        selection = _solvable(select(J, structure.rank))
+        return integrate(chain, q, -column * _least_change(selection, J, row * gap(structure, end).ravel()))
+
+    return jax.lax.fori_loop(0, iterations, newton, normalize(chain, q))
+
+
+@functools.partial(jax.jit, static_argnames="iterations")
+def settle_loops(chain: Chain, structure: Structure, q, v, iterations: int) -> tuple[Float[Array, " q"], Float[Array, " dofs"]]:
+    """`close`, then `agree`: one body for both, the last turn of the loop being the velocities', so that it is compiled once."""
+    row, column = scales(chain)
+    active = active_dofs(chain, structure)
+
+    def turn(i, both):
+        q, v = both
+        kin = kinematics(chain, q)
+        end = ends(chain, structure, kin, q)
+        J = scaled_jacobian(chain, structure, kin, end)
+        selection = _solvable(select(J, structure.rank))
+        open_ = jnp.stack([row * gap(structure, end).ravel(), J @ jnp.where(active, v / column, 0)], 1)
+        step = -column[:, None] * _least_change(selection, J, open_)
+        last = i == iterations
+        return integrate(chain, q, jnp.where(last, 0, step[:, 0])), jnp.where(last, v + step[:, 1], v)
+
+    return jax.lax.fori_loop(0, iterations + 1, turn, (normalize(chain, q), v))
+
+
+@jax.jit
+def agree(chain: Chain, structure: Structure, q, v, hold=None) -> Float[Array, " dofs"]:
+    """V with the least change (scaled coordinates) that makes J_C v = 0; first without changing those in `hold`, then as far as needed."""
+    _, column = scales(chain)
+    kin = kinematics(chain, q)
+    J = scaled_jacobian(chain, structure, kin, ends(chain, structure, kin, q))
+    active = active_dofs(chain, structure)
+
+    def project(i, v):
+        free = J if hold is None else jnp.where(hold[None] & (i == 0), 0, J)
+        selection = _solvable(select(free, structure.rank))
+        return v - column * _least_change(selection, free, J @ jnp.where(active, v / column, 0))
+
+    return project(0, v) if hold is None else jax.lax.fori_loop(0, 2, project, v)

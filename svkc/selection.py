@@ -1,0 +1,109 @@
+"""F0: which columns of a matrix are independent: pivots, rank, and solves with that choice held fixed.
+
+Pivots are integers chosen on stop_gradient(J). What follows from them is exact to differentiate wherever the rank does not change.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.linalg import cho_factor, cho_solve, solve_triangular
+from jaxtyping import Array, Bool, Float, Int
+
+
+class Selection(eqx.Module):
+    """Pivoted Gram-Schmidt of a matrix: Q [steps, rows], one-hot pivots P [steps, dofs], |R_kk|, and which steps count.
+
+    P is frozen; Q and |R_kk| follow the matrix when it is differentiated, so that Q's rows go on spanning the range of the pivot columns.
+    """
+
+    Q: Float[Array, "steps rows"]
+    P: Float[Array, "steps dofs"]
+    size: Float[Array, " steps"]
+    used: Bool[Array, " steps"]
+
+
+def rank_tolerance(dtype) -> float:
+    """|R_kk| / |R_11| below which a row of the scaled J_C counts as redundant: sqrt(eps), 1.5e-8 in float64, 3.5e-4 in float32."""
+    return float(np.sqrt(np.finfo(dtype).eps))
+
+
+def select(J: Float[Array, "rows dofs"], rank: Int[Array, ""] | None = None, wanted: Bool[Array, " dofs"] | None = None) -> Selection:
+    """min(rows, dofs) steps of column-pivoted Gram-Schmidt, orthogonalised twice; steps from `rank` on are inert (None: all are taken).
+
+    `wanted`: columns to leave independent, taken as pivots only where nothing else is left.
+    """
+    frozen = jax.lax.stop_gradient(J)
+    rows, dofs = J.shape
+    steps = min(rows, dofs)
+    weight = None if wanted is None else jnp.where(wanted, rank_tolerance(J.dtype) ** 2, 1).astype(J.dtype)
+
+    def step(k, carry):
+        A, Q, P, size = carry
+        norms = jnp.sum(A * A, 0)
+        pivot = jnp.arange(dofs) == jnp.argmax(norms if weight is None else norms * weight)
+        column = jnp.sum(jnp.where(pivot[None], A, 0), 1)
+        column = column - (Q @ column) @ Q
+        r = jnp.sqrt(jnp.sum(column * column))
+        taken = r > 0 if rank is None else (r > 0) & (k < rank)
+        q = jnp.where(taken, column / jnp.where(taken, r, 1), 0)
+        A = jnp.where(pivot[None], 0, A - q[:, None] * (q @ A)[None])
+        here = jnp.arange(steps) == k
+        Q = jnp.where(here[:, None], q[None], Q)
+        P = jnp.where(here[:, None] & pivot[None] & taken, 1, P)
+        return A, Q, P, jnp.where(here, r, size)
+
+    start = (frozen, jnp.zeros((steps, rows), J.dtype), jnp.zeros((steps, dofs), J.dtype), jnp.zeros(steps, J.dtype))
+    _, Q, P, size = jax.lax.fori_loop(0, steps, step, start)
+    Q, size = _following(J, Q, P, size)
+    return Selection(Q, P, size, jnp.any(P > 0, 1))
+
+
+@jax.custom_jvp
+def _following(J, Q, P, size):
+    """Q and size, whose derivatives are those of R^-T (J P^T)^T, with R frozen, and of the diagonal of R."""
+    return Q, size
+
+
+@_following.defjvp
+def _following_jvp(primals, tangents):
+    J, Q, P, size = primals
+    moved = tangents[0] @ P.T
+    R = jax.lax.stop_gradient(Q @ J @ P.T) + jnp.diag(jnp.where(jnp.any(P > 0, 1), 0, 1).astype(J.dtype))
+    dQ = solve_triangular(R, moved.T, trans=1)
+    # d|R_kk| / |R_kk| is the diagonal of Q dJ P^T R^-1
+    return (Q, size), (dQ, size * jnp.sum(dQ * Q, 1))
+
+
+def count_rank(size: Float[Array, " steps"]) -> Int[Array, ""]:
+    """Steps whose |R_kk| is above the tolerance."""
+    return jnp.sum(size > rank_tolerance(size.dtype) * jnp.maximum(size[0], jnp.finfo(size.dtype).tiny)).astype(jnp.int32)
+
+
+def weakest(selection: Selection) -> Float[Array, ""]:
+    """|R_mm| / |R_11|, 1 where no row counts."""
+    size, used = selection.size, selection.used
+    return jnp.min(jnp.where(used, size, jnp.inf), initial=1, where=used) / jnp.where(jnp.any(used), size[0], 1)
+
+
+def solve_frozen(B: Float[Array, "steps steps"], x: Float[Array, "steps *n"]) -> Float[Array, "steps *n"]:
+    """B^-1 x for a B that the frozen choice leaves upper triangular in value but not in derivative."""
+    triangle = jax.lax.stop_gradient(B)
+    return jax.lax.custom_linear_solve(
+        lambda y: B @ y,
+        x,
+        solve=lambda _, y: solve_triangular(triangle, y),
+        transpose_solve=lambda _, y: solve_triangular(triangle, y, trans=1),
+    )
+
+
+def solve_positive(A: Float[Array, "n n"], x: Float[Array, "n *m"]) -> Float[Array, "n *m"]:
+    """A^-1 x by Cholesky for a symmetric positive A; the derivative is one more solve with the same factor."""
+    factor = cho_factor(jax.lax.stop_gradient(A))
+    return jax.lax.custom_linear_solve(lambda y: A @ y, x, solve=lambda _, y: cho_solve(factor, y), symmetric=True)
+
+
+def square(selection: Selection, J: Float[Array, "rows dofs"]) -> tuple[Float[Array, "steps dofs"], Float[Array, "steps steps"]]:
+    """J_Cm = Q J_C, m independent rows (12), and J_S, its pivot columns in order (14), with ones on the unused diagonal."""
+    Jm = selection.Q @ J
+    return Jm, Jm @ selection.P.T + jnp.diag(jnp.where(selection.used, 0, 1).astype(J.dtype))
