@@ -36,6 +36,9 @@ from svkc.replay import Replay as Replay
 from svkc.stepping import Baumgarte as Baumgarte, Drift as Drift, Projection as Projection
 from svkc.solvers import RodriguesEuler as RodriguesEuler
 
+# derivatives
+from svkc.derivative import Check as Check, check_grad as check_grad, tangent as tangent
+
 try:
     __version__ = _version("svkc")
 except _Missing:  # a source tree that is not installed

@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 
 from svkc.chain import Chain, State
 from svkc.kinematics import Kinematics, difference, down, kinematics, to_rows, twists, up, velocity_products
-from svkc.spatial import cross, rotate
+from svkc.spatial import cross, halves, rotate
 
 
 def newton_euler(chain: Chain, kin: Kinematics, V: Float[Array, "rows 6"] | None, A: Float[Array, "rows 6"]) -> Float[Array, " nv"]:
@@ -15,8 +15,8 @@ def newton_euler(chain: Chain, kin: Kinematics, V: Float[Array, "rows 6"] | None
     Each body's force is taken at its centre of mass, where gyroscopic terms need no parallel axes, and moved to the root's origin.
     """
     c = kin.r + rotate(kin.R, chain.com)
-    alpha = A[:, :3]
-    acceleration = A[:, 3:] + cross(alpha, c)
+    alpha, acceleration = halves(A)
+    acceleration = acceleration + cross(alpha, c)
     R = kin.R
 
     def spin(w):
@@ -24,8 +24,8 @@ def newton_euler(chain: Chain, kin: Kinematics, V: Float[Array, "rows 6"] | None
 
     moment = spin(alpha)
     if V is not None:
-        w = V[:, :3]
-        acceleration = acceleration + cross(w, V[:, 3:] + cross(w, c))
+        w, u = halves(V)
+        acceleration = acceleration + cross(w, u + cross(w, c))
         moment = moment + cross(w, spin(w))
     force = chain.mass[:, None] * acceleration
     F = up(chain.topology, jnp.concatenate([moment + cross(c, force), force], -1))
@@ -63,7 +63,7 @@ def inertia_by_composites(chain: Chain, kin: Kinematics) -> Float[Array, "nv nv"
     I = central + m[:, :, None] * square
     total = up(top, jnp.concatenate([m, m * c, I.reshape(-1, 9)], -1))[top.dof_row]
     m, h, I = total[:, :1], total[:, 1:4], total[:, 4:].reshape(-1, 3, 3)
-    w, u = kin.S[:, :3], kin.S[:, 3:]
+    w, u = halves(kin.S)
     # momentum of everything a joint carries, for a unit of its velocity
     F = jnp.concatenate([rotate(I, w) + cross(h, u), m * u + cross(w, h)], -1)
     related = top.ancestor[top.dof_row][:, top.dof_row]

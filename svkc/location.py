@@ -54,6 +54,7 @@ def event_tolerance(t: Float[Array, ""]) -> Float[Array, ""]:
     return jnp.finfo(t.dtype).eps ** 0.5 * jnp.maximum(1, jnp.abs(t))
 
 
+@eqx.filter_jit
 def locate(hit: Bool[Array, ""], t_end, end: Motion, solver, scene: Scene, guards: Reading) -> tuple[Float[Array, ""], Motion, Found]:
     """Time and motion of the earliest crossing in the last step, by steps of the solver from its begin, so that they have the solver's own order.
 

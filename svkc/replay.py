@@ -106,14 +106,14 @@ def _grid(t0, at, path: Path):
     return times.at[0].set(t0), place
 
 
-def _block(y: Motion, times: Float[Array, " grid"], world: World, solver) -> tuple[Motion, Motion]:
-    """The steps of one block: the state after it, and after each step."""
+def _block(y: Motion, times, world: World, solver) -> tuple[Motion, Motion]:
+    """The steps of one block, from times[0] to times[1]: the state after it, and after each step."""
 
     def step(y, ends):
         y = step_alone(solver, world.field, *ends, y, world.scene)
         return y, y
 
-    return jax.lax.scan(step, y, (times[:-1], times[1:]))
+    return jax.lax.scan(step, y, times)
 
 
 @integrated.def_jvp
@@ -140,13 +140,18 @@ def _zeros(x):
     return jax.tree.map(jnp.zeros_like, x)
 
 
+@eqx.filter_jit
 def _through(start: Motion, d_start: Motion, grid, d_grid, place, world: World, d_world, path: Path, how: How):
     """The tangents at the end, at the save times and at the kept states: block after block of steps, each from its kept state."""
     every, count = how.every, path.kept.q.shape[0] + 1
     groups = -(-count // GROUP)
     pad = groups * GROUP - count
     index = jnp.arange(groups * GROUP)
-    windows = jnp.minimum(index[:, None] * every + jnp.arange(every + 1)[None], grid.shape[0] - 1)
+
+    def ends(x):
+        x = jnp.concatenate([x, jnp.broadcast_to(x[-1:], (groups * GROUP * every + 1 - x.shape[0],))])
+        return x[:-1].reshape(-1, every), x[1:].reshape(-1, every)
+
     going = index * every < path.accepted
     kept = jax.tree.map(lambda s, k: jnp.concatenate([s[None], k, jnp.broadcast_to(s[None], (pad, *s.shape))]), start, path.kept)
     # blocks that were not begun get numbers that are finite
@@ -171,6 +176,7 @@ def _through(start: Motion, d_start: Motion, grid, d_grid, place, world: World, 
         carry = jax.lax.cond(eqxi.unvmap_any(going), taken, lambda: (d_y, d_saved))
         return carry, carry[0]
 
+    @jax.checkpoint
     def group(carry, x):
         def some(carry):
             return jax.lax.scan(one, carry, x)
@@ -181,7 +187,7 @@ def _through(start: Motion, d_start: Motion, grid, d_grid, place, world: World, 
         return jax.lax.cond(eqxi.unvmap_any(jnp.any(x[1])), some, none, carry)
 
     d_saved = jax.tree.map(lambda d: jnp.where((place == 0).reshape(-1, *(1,) * d.ndim), d[None], 0), d_start)
-    xs = jax.tree.map(lambda x: x.reshape(groups, GROUP, *x.shape[1:]), (index, going, kept, grid[windows], d_grid[windows]))
+    xs = jax.tree.map(lambda x: x.reshape(groups, GROUP, *x.shape[1:]), (index, going, kept, ends(grid), ends(d_grid)))
     (d_end, d_saved), after = jax.lax.scan(group, (d_start, d_saved), xs)
     written = (index[: count - 1] + 1) * every <= path.accepted
     flat = jax.tree.map(lambda d: d.reshape(-1, *d.shape[2:])[: count - 1], after)

@@ -8,10 +8,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
+def halves(x: Float[Array, "*n 6"]) -> tuple[Float[Array, "*n 3"], Float[Array, "*n 3"]]:
+    """The angular and the linear part of a 6-vector."""
+    # a split, whose transpose is one concatenation; that of two slices would be two paddings and a sum
+    angular, linear = jnp.split(x, 2, -1)
+    return angular, linear
+
+
 def cross(a: Float[Array, "*#n 3"], b: Float[Array, "*#n 3"]) -> Float[Array, "*n 3"]:
     """Vector product a x b."""
-    a0, a1, a2 = a[..., 0], a[..., 1], a[..., 2]
-    b0, b1, b2 = b[..., 0], b[..., 1], b[..., 2]
+    (a0, a1, a2), (b0, b1, b2) = jnp.unstack(a, axis=-1), jnp.unstack(b, axis=-1)
     return jnp.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], -1)
 
 
@@ -22,21 +28,19 @@ def rotate(R: Float[Array, "*#n 3 3"], x: Float[Array, "*#n 3"]) -> Float[Array,
 
 def motion_cross(a: Float[Array, "*#n 6"], b: Float[Array, "*#n 6"]) -> Float[Array, "*n 6"]:
     """A x b of two motion vectors (Featherstone 2.9, eq. 2.31)."""
-    w, v = a[..., :3], a[..., 3:]
-    m, n = b[..., :3], b[..., 3:]
+    (w, v), (m, n) = halves(a), halves(b)
     return jnp.concatenate([cross(w, m), cross(v, m) + cross(w, n)], -1)
 
 
 def shift_motion(S: Float[Array, "*#n 6"], r: Float[Array, "*#n 3"]) -> Float[Array, "*n 6"]:
     """The motion vector S given about the origin, given about the point r instead (Featherstone 2.8)."""
-    w = S[..., :3]
-    return jnp.concatenate([jnp.broadcast_to(w, jnp.broadcast_shapes(w.shape, r.shape)), S[..., 3:] + cross(w, r)], -1)
+    w, v = halves(S)
+    return jnp.concatenate([jnp.broadcast_to(w, jnp.broadcast_shapes(w.shape, r.shape)), v + cross(w, r)], -1)
 
 
 def quat_multiply(a: Float[Array, "*#n 4"], b: Float[Array, "*#n 4"]) -> Float[Array, "*n 4"]:
     """Hamilton product."""
-    aw, ax, ay, az = a[..., 0], a[..., 1], a[..., 2], a[..., 3]
-    bw, bx, by, bz = b[..., 0], b[..., 1], b[..., 2], b[..., 3]
+    (aw, ax, ay, az), (bw, bx, by, bz) = jnp.unstack(a, axis=-1), jnp.unstack(b, axis=-1)
     return jnp.stack(
         [
             aw * bw - ax * bx - ay * by - az * bz,
@@ -50,7 +54,8 @@ def quat_multiply(a: Float[Array, "*#n 4"], b: Float[Array, "*#n 4"]) -> Float[A
 
 def quat_conjugate(q: Float[Array, "*n 4"]) -> Float[Array, "*n 4"]:
     """The inverse rotation of a unit quaternion."""
-    return jnp.concatenate([q[..., :1], -q[..., 1:]], -1)
+    w, u = jnp.split(q, [1], -1)
+    return jnp.concatenate([w, -u], -1)
 
 
 def quat_normalize(q: Float[Array, "*n 4"]) -> Float[Array, "*n 4"]:
@@ -63,20 +68,20 @@ def quat_normalize(q: Float[Array, "*n 4"]) -> Float[Array, "*n 4"]:
 
 def quat_matrix(q: Float[Array, "*n 4"]) -> Float[Array, "*n 3 3"]:
     """Rotation matrix of a unit quaternion, body to world."""
-    w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return jnp.stack([jnp.stack(row, -1) for row in rows], -2)
+    w, x, y, z = jnp.unstack(q, axis=-1)
+    entries = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return jnp.stack(entries, -1).reshape(*q.shape[:-1], 3, 3)
 
 
 def quat_rotate(q: Float[Array, "*#n 4"], x: Float[Array, "*#n 3"]) -> Float[Array, "*n 3"]:
     """The vector x turned by the unit quaternion q."""
-    u = q[..., 1:]
+    w, u = jnp.split(q, [1], -1)
     t = 2 * cross(u, x)
-    return x + q[..., :1] * t + cross(u, t)
+    return x + w * t + cross(u, t)
 
 
 def quat_about(axis: Float[Array, "*#n 3"], angle: Float[Array, "*#n"]) -> Float[Array, "*n 4"]:

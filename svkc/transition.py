@@ -70,6 +70,7 @@ def _project(chain: Chain, structure: Structure, q, v):
     return after, -constraint_forces(chain, selection, J, impulse), jump @ impulse / 2
 
 
+@eqx.filter_jit
 def change(
     chain: Chain, state: State, connected: Bool[Array, " links"], locked: Bool[Array, " dofs"] | None = None, here: Bool[Array, " links"] | None = None
 ) -> Change:
@@ -116,13 +117,13 @@ def lock_projection(chain: Chain, structure: Structure, q, v):
     return after, jump @ inertia_times(chain, kin, jump) / 2
 
 
-_change = eqx.filter_jit(change)
+
 
 
 def transition(chain: Chain, state: State, connected) -> State:
     """The state with exactly these virtual links connected (mask, or names): new ones with their impact, the others cut."""
     mask = jnp.asarray(connection_mask(chain, connected))
-    return _checked(chain, _change(chain, state, mask))
+    return _checked(chain, change(chain, state, mask))
 
 
 def connect(chain: Chain, state: State, *names: str, here: bool = False) -> State:
@@ -133,7 +134,7 @@ def connect(chain: Chain, state: State, *names: str, here: bool = False) -> Stat
     """
     chosen = np.isin(np.arange(len(chain.link_names)), [link_index(chain, n) for n in names])
     mask = state.structure.connected | jnp.asarray(chosen)
-    return _checked(chain, _change(chain, state, mask, here=jnp.asarray(chosen) if here else None))
+    return _checked(chain, change(chain, state, mask, here=jnp.asarray(chosen) if here else None))
 
 
 def _checked(chain: Chain, done: Change) -> State:
@@ -156,14 +157,14 @@ connect_tolerance = 1e-2
 def cut(chain: Chain, state: State, *names: str) -> State:
     """Cuts virtual links: q and v stay as they are, bit for bit (paper, section V-C)."""
     chosen = np.isin(np.arange(len(chain.link_names)), [link_index(chain, n) for n in names])
-    return _change(chain, state, state.structure.connected & ~jnp.asarray(chosen)).state
+    return change(chain, state, state.structure.connected & ~jnp.asarray(chosen)).state
 
 
 def _locked(chain: Chain, state: State, joints, value: bool) -> State:
     locked = jnp.zeros(chain.dofs, bool) if state.structure.locked is None else state.structure.locked
     for name in joints:
         locked = locked.at[joint_slice(chain, name, V_SIZE, chain.topology.v_start)].set(value)
-    return _change(chain, state, state.structure.connected, locked).state
+    return change(chain, state, state.structure.connected, locked).state
 
 
 def lock(chain: Chain, state: State, *joints: str) -> State:
@@ -179,7 +180,7 @@ def unlock(chain: Chain, state: State, *joints: str) -> State:
 def unbind(chain: Chain, state: State, *names: str) -> State:
     """Cuts spare virtual links and empties their slots for other bodies; q and v stay as they are."""
     slots = np.isin(np.arange(len(chain.link_names)), [spare_slot(chain, n) for n in names])
-    after = _change(chain, state, state.structure.connected & ~jnp.asarray(slots)).state
+    after = change(chain, state, state.structure.connected & ~jnp.asarray(slots)).state
     return State(after.q, after.v, emptied(after.structure, jnp.asarray(slots)))
 
 

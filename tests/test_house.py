@@ -25,7 +25,7 @@ HOUSE = [
     "location scenes",
     "replay",
     "request",
-    "phase view",
+    "phase view derivative",
     "simulate",
     "__main__",
 ]
