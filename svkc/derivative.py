@@ -29,8 +29,8 @@ class Check(eqx.Module):
 
     def __str__(self) -> str:
         return (
-            f"worst relative error {self.error:.2e} (the difference is good to {self.uncertainty:.0e}): d{self.output} / d{self.input} is {self.derivative:.12g} "
-            f"by differentiation, {self.difference:.12g} by differences; forward and reverse differ by {self.modes:.1e}"
+            f"worst relative error {self.error:.2e} (the difference is good to {self.uncertainty:.0e}): d {self.output} / d {self.input} is "
+            f"{self.derivative:.12g} by differentiation, {self.difference:.12g} by differences; forward and reverse differ by {self.modes:.1e}"
         )
 
 
@@ -58,83 +58,72 @@ def check_grad(f: Callable, x, mode: str = "both", directions: int = 2, step: fl
     for name, leaf in base.items():
         if not np.isfinite(leaf).all():
             raise ValueError(f"check_grad: f(x){name} is not finite: {leaf}")
-    tangents = _by_mode(outputs, free, mode)
-    rng, worst = np.random.default_rng(seed), None
-    for place, (path, leaf) in enumerate(named):
-        for _ in range(directions):
-            along = rng.normal(size=leaf.shape)
-            along = jnp.asarray(along / np.linalg.norm(along) * (np.linalg.norm(leaf) or 1.0), leaf.dtype) if leaf.size else leaf
-            direction = [along if i == place else jnp.zeros_like(other) for i, (_, other) in enumerate(named)]
-            direction = jax.tree.unflatten(jax.tree.structure(free), direction)
-            difference, doubt = _differences(value, free, direction, step)
-            derivative, modes = tangents(direction)
-            for name in base:
-                found = _compare(derivative[name], difference[name], doubt[name], modes[name], name, f"x{jax.tree_util.keystr(path)}")
-                if worst is None or not found.error <= worst.error:
-                    worst = eqx.tree_at(lambda c: c.modes, found, max(found.modes, worst.modes if worst else 0.0))
-                else:
-                    worst = eqx.tree_at(lambda c: c.modes, worst, max(found.modes, worst.modes))
-    return worst
-
-
-def _by_mode(outputs, free, mode):
-    """Direction -> the derivative of every output along it, and how much the two modes differ (zeros where one alone is asked)."""
+    rng, found = np.random.default_rng(seed), []
+    weights = {name: rng.normal(size=leaf.shape) for name, leaf in base.items()}
     forward = jax.jit(lambda d: jax.jvp(outputs, (free,), (d,))[1])
-    backward = jax.jit(lambda: jax.jacrev(outputs)(free))
-    rows = None if mode == "forward" else backward()
+    gradients = {} if mode == "forward" else _gradients(outputs, free, weights)
+    for place, (path, leaf) in enumerate(named):
+        for _ in range(directions if leaf.size else 0):
+            along = rng.normal(size=leaf.shape)
+            along = jnp.asarray(along / np.linalg.norm(along) * (np.linalg.norm(leaf) or 1.0), leaf.dtype)
+            direction = jax.tree.unflatten(jax.tree.structure(free), [along if i == place else jnp.zeros_like(x) for i, (_, x) in enumerate(named)])
+            difference, doubt = _differences(value, free, direction, step)
+            ahead = None if mode == "reverse" else forward(direction)
+            for name, weight in weights.items():
+                pair = f"f(x){name}", f"x{jax.tree_util.keystr(path)}"
+                back = None if mode == "forward" else sum(float(jnp.vdot(g, d)) for g, d in zip(gradients[name], jax.tree.leaves(direction), strict=True))
+                if ahead is None:
+                    # one number for the whole leaf: reverse mode has no more for one pass
+                    weighed = [np.asarray(np.sum(weight * x)) for x in (difference[name], doubt[name])]
+                    found.append(_compare(np.asarray(back), *weighed, 0.0, *pair))
+                    continue
+                size = np.linalg.norm(weight) * np.linalg.norm(ahead[name])
+                apart = 0.0 if back is None else abs(back - np.sum(weight * np.asarray(ahead[name]))) / (size if size > 1e-9 else 1.0)
+                found.append(_compare(np.asarray(ahead[name]), difference[name], doubt[name], float(apart), *pair))
+    worst = max(found, key=lambda c: c.error)
+    return eqx.tree_at(lambda c: c.modes, worst, max(c.modes for c in found))
 
-    def reverse(direction):
-        def along(jacobian, size):
-            terms = zip(jax.tree.leaves(jacobian), jax.tree.leaves(direction), strict=True)
-            return sum(np.asarray(j).reshape(size, -1) @ np.asarray(d).reshape(-1) for j, d in terms)
 
-        shapes = jax.eval_shape(outputs, free)
-        return {name: along(rows[name], s.size).reshape(s.shape) for name, s in shapes.items()}
-
-    def tangents(direction):
-        if mode == "reverse":
-            back = reverse(direction)
-            return back, {name: np.zeros_like(x) for name, x in back.items()}
-        ahead = {name: np.asarray(x) for name, x in forward(direction).items()}
-        back = reverse(direction) if mode == "both" else ahead
-        return ahead, {name: back[name] - x for name, x in ahead.items()}
-
-    return tangents
+def _gradients(outputs, free, weights):
+    """For each output leaf, the gradient of its entries summed with random weights."""
+    backward = jax.jit(lambda w: jax.tree.leaves(jax.vjp(outputs, free)[1](w)[0]))
+    dtypes = {name: s.dtype for name, s in jax.eval_shape(outputs, free).items()}
+    only = lambda chosen: {name: jnp.asarray(w if name == chosen else np.zeros_like(w), dtypes[name]) for name, w in weights.items()}
+    return {name: backward(only(name)) for name in weights}
 
 
 def _differences(value, free, direction, step):
     """Central differences at eight halved steps, extrapolated to zero; for every entry the estimate that changed least, and by how much."""
-    table, best = [], None
-    for i in range(8):
-        h = step / 2**i
-        moved = [value(jax.tree.map(lambda x, d: x + jnp.asarray(s * h, x.dtype) * d, free, direction)) for s in (1, -1)]
-        row = [{name: (np.asarray(moved[0][name]) - np.asarray(moved[1][name])) / (2 * h) for name in moved[0]}]
+    at = lambda h: value(jax.tree.map(lambda x, d: x + jnp.asarray(h, x.dtype) * d, free, direction))
+    table, best, change = [], {}, {}
+    for h in step / 2.0 ** np.arange(8):
+        ahead, behind = at(h), at(-h)
+        row = [{name: (np.asarray(ahead[name]) - np.asarray(behind[name])) / (2 * h) for name in ahead}]
         for k, before in enumerate(table[-1] if table else [], start=1):
             row.append({name: row[-1][name] + (row[-1][name] - before[name]) / (4**k - 1) for name in before})
-        if table:
-            for better, worse in zip(row[1:], row[:-1], strict=True):
-                change = {name: np.maximum(np.abs(better[name] - worse[name]), np.abs(better[name] - table[-1][-1][name])) for name in better}
-                if best is None:
-                    best = better, change
-                closer = {name: change[name] < best[1][name] for name in better}
-                pick = lambda new, old: {name: np.where(closer[name], new[name], old[name]) for name in old}
-                best = pick(better, best[0]), pick(change, best[1])
+        for k in range(1, len(row)):
+            for name, new in row[k].items():
+                moved = np.maximum(np.abs(new - row[k - 1][name]), np.abs(new - table[-1][k - 1][name]))
+                closer = moved < change.get(name, np.inf)
+                best[name] = np.where(closer, new, best.get(name, new))
+                change[name] = np.where(closer, moved, change.get(name, moved))
         table.append(row)
-    return best
+    return best, change
 
 
-def _compare(derivative, difference, doubt, modes, output, input) -> Check:
+def _compare(derivative, difference, doubt, modes: float, output: str, input: str) -> Check:
+    """The worst entry of one leaf."""
     size = max(np.abs(derivative).max(initial=0), np.abs(difference).max(initial=0))
-    # both nothing: an error within the round-off of differences is none
-    size = size if size > 1e-9 or not np.isfinite(size) else 1.0
+    # both nothing: what is within the round-off of differences is no error
+    size = size if not size <= 1e-9 else 1.0
     off = np.abs(derivative - difference)
     off = np.where(np.isfinite(off), off, np.inf).ravel()
     if not off.size:
-        return Check(0.0, output, input, 0.0, 0.0, 0.0, 0.0)
+        return Check(0.0, output, input, 0.0, 0.0, 0.0, modes)
     at = int(np.argmax(off))
     entry = f"{output}[{at}]" if off.size > 1 else output
-    pick = lambda x: float(np.asarray(x).ravel()[at])
-    return Check(float(off[at] / size), entry, input, pick(derivative), pick(difference), pick(doubt) / size, float(np.abs(modes).max() / size))
+    pick = lambda x: float(np.ravel(x)[at])
+    return Check(float(off[at] / size), entry, input, pick(derivative), pick(difference), pick(doubt) / float(size), modes)
 
 
 def tangent(chain: Chain, q: Float[Array, " q"], gradient: Float[Array, " q"]) -> Float[Array, " dofs"]:
