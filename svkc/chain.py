@@ -140,6 +140,11 @@ class Chain(eqx.Module):
         return self.topology.dofs
 
     @property
+    def rotational(self) -> Float[Array, "rows 3 3"]:
+        """`inertia` made symmetric, so that its entries may be moved one by one."""
+        return (self.inertia + jnp.swapaxes(self.inertia, -1, -2)) / 2
+
+    @property
     def parent(self) -> np.ndarray:
         """Pointer of the paper's section IV, for each body, then each virtual link, as an index into both; -1: none."""
         return _pointers(self)[0]

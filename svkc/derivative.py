@@ -34,7 +34,7 @@ class Check(eqx.Module):
         )
 
 
-def check_grad(f: Callable, x, mode: str = "both", directions: int = 2, step: float = 1e-2, seed: int = 0) -> Check:
+def check_grad(f: Callable, x, mode: str = "both", directions: int = 2, step: float = 0.05, seed: int = 0) -> Check:
     """The derivative of f at x against central differences, Richardson-extrapolated (Ridders), along random directions; says which entry is worst.
 
     f: of one argument; x and f(x): any pytrees, of which floats count. For every float leaf of x by itself, `directions` random directions, as long as

@@ -15,7 +15,7 @@ def _bodies(chain: Chain, kin: Kinematics, v):
     V = twists(chain, kin, v)
     c = kin.r + rotate(kin.R, chain.com)
     w = V[:, :3]
-    spin = rotate(kin.R, rotate(chain.inertia, rotate(jnp.swapaxes(kin.R, -1, -2), w)))
+    spin = rotate(kin.R, rotate(chain.rotational, rotate(jnp.swapaxes(kin.R, -1, -2), w)))
     return c, V[:, 3:] + cross(w, c), w, spin
 
 

@@ -20,7 +20,7 @@ def newton_euler(chain: Chain, kin: Kinematics, V: Float[Array, "rows 6"] | None
     R = kin.R
 
     def spin(w):
-        return rotate(R, rotate(chain.inertia, rotate(jnp.swapaxes(R, -1, -2), w)))
+        return rotate(R, rotate(chain.rotational, rotate(jnp.swapaxes(R, -1, -2), w)))
 
     moment = spin(alpha)
     if V is not None:
@@ -56,7 +56,7 @@ def inertia_by_composites(chain: Chain, kin: Kinematics) -> Float[Array, "nv nv"
     """Composite rigid bodies (Featherstone section 6.2): mass, first moment and rotational inertia simply add up towards the root."""
     top = chain.topology
     c = kin.r + rotate(kin.R, chain.com)
-    RI = jnp.sum(kin.R[:, :, :, None] * chain.inertia[:, None, :, :], 2)
+    RI = jnp.sum(kin.R[:, :, :, None] * chain.rotational[:, None, :, :], 2)
     central = jnp.sum(RI[:, :, None, :] * kin.R[:, None, :, :], -1)
     m = chain.mass[:, None]
     square = jnp.sum(c * c, -1)[:, None, None] * jnp.eye(3, dtype=c.dtype)[None] - c[:, :, None] * c[:, None, :]

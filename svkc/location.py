@@ -75,9 +75,9 @@ def locate(hit: Bool[Array, ""], t_end, end: Motion, solver, scene: Scene, guard
         root, y = first_root(ahead, (watch.start, watch.begin), jnp.max(passed(watch.before)), (t_end, end.bare), jnp.max(passed(watch.after)))
         rate = guards.field(root, y, scene)
         values, slopes = jax.jvp(lambda t, y: guards(t, y, scene), (root, y), (jnp.ones_like(root), rate))
-        first = jnp.argmax(passed(values))
+        first = jnp.argmax(passed(values)).astype(jnp.int32)
         fired = crossed & (passed(values) + side * slopes * event_tolerance(root) >= 0)
-        fired = fired | (jnp.arange(side.shape[0]) == first)
+        fired = fired | (jnp.arange(side.shape[0], dtype=jnp.int32) == first)
         value, slope = jnp.abs(values[first]), jnp.abs(slopes[first])
         jumps = value > slope * event_tolerance(root)
         flat = ~jumps & (slope * (t_end - watch.start) < FLAT * jnp.maximum(jnp.abs(watch.before[first]), jnp.abs(watch.after[first])))
@@ -86,7 +86,7 @@ def locate(hit: Bool[Array, ""], t_end, end: Motion, solver, scene: Scene, guard
 
     def missed():
         no = jnp.zeros((), bool)
-        return t_end, end.bare, Found(jnp.zeros_like(crossed), watch.after, jnp.asarray(0), no, no, no)
+        return t_end, end.bare, Found(jnp.zeros_like(crossed), watch.after, jnp.asarray(0, jnp.int32), no, no, no)
 
     at = jax.lax.cond(eqxi.unvmap_any(hit), found, missed)
     return jax.tree.map(lambda a, b: jnp.where(hit, a, b), at, missed())

@@ -96,13 +96,13 @@ def _grid(t0, at, path: Path):
     """[steps + 1] times of the start and of every step, those that met a save time being that time; after the last step, its end; and for each save
     time the place in the grid of the state saved there."""
     recorded = jnp.concatenate([jax.lax.stop_gradient(t0)[None], path.times])
-    place = jnp.searchsorted(recorded, jax.lax.stop_gradient(at))
+    place = jnp.searchsorted(recorded, jax.lax.stop_gradient(at)).astype(jnp.int32)
     met = recorded[jnp.minimum(place, recorded.shape[0] - 1)] == at
     last = recorded[path.accepted]
     recorded = jnp.where(jnp.isfinite(recorded), recorded, last)
     times = recorded.at[jnp.where(met & (place > 0), place, recorded.shape[0])].set(at, mode="drop")
     # past the last step time stands still
-    times = jnp.where(jnp.arange(times.shape[0]) > path.accepted, times[path.accepted], times)
+    times = jnp.where(jnp.arange(times.shape[0], dtype=jnp.int32) > path.accepted, times[path.accepted], times)
     return times.at[0].set(t0), place
 
 
@@ -146,7 +146,7 @@ def _through(start: Motion, d_start: Motion, grid, d_grid, place, world: World, 
     every, count = how.every, path.kept.q.shape[0] + 1
     groups = -(-count // GROUP)
     pad = groups * GROUP - count
-    index = jnp.arange(groups * GROUP)
+    index = jnp.arange(groups * GROUP, dtype=jnp.int32)
 
     def ends(x):
         x = jnp.concatenate([x, jnp.broadcast_to(x[-1:], (groups * GROUP * every + 1 - x.shape[0],))])

@@ -1,0 +1,242 @@
+"""What derivatives are checked on: a function of parameters for each case, its parameters, and the relative error it is held to."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import models
+import numpy as np
+
+import svkc
+
+TIGHT = {"rtol": 1e-11, "atol": 1e-13}
+ALGEBRA, RUN = 1e-8, 1e-6
+
+
+def model(chain, *names):
+    """Floats of the model by name, "grip": where its virtual links take hold of their real links."""
+    return {name: chain.structure.real_pos if name == "grip" else getattr(chain, name) for name in names}
+
+
+def changed(chain, x):
+    """The chain with the floats in x that are its own."""
+    for name in ("mass", "com", "inertia", "pos", "gravity", "armature", "damping"):
+        if name in x:
+            chain = eqx.tree_at(lambda c, name=name: getattr(c, name), chain, x[name])
+    return chain
+
+
+def start(state, x):
+    s = state.structure
+    if "grip" in x:
+        s = eqx.tree_at(lambda s: s.real_pos, s, x["grip"])
+    return svkc.State(x.get("q", state.q), x.get("v", state.v), s)
+
+
+def motion(traj):
+    """What is looked at of a run; rows that no event has filled hold no numbers."""
+    filled = jnp.isfinite(traj.events.time)
+    event = jnp.where(filled, traj.events.time, 0)
+    end = traj.final
+    return {"q": end.q, "v": end.v, "event": event, "lost": traj.events.energy_lost, "impulse": traj.events.impulse, "saved": traj.states.q}
+
+
+def algebra(chain, state):
+    """Everything that is not a run, on one state."""
+    rng = np.random.default_rng(3)
+    moving = jnp.asarray(rng.normal(size=chain.dofs))
+
+    def f(x):
+        c = changed(chain, x)
+        s = start(state, x)
+        out = {"forward": svkc.forward_dynamics(c, s, x["tau"]), "inverse": svkc.inverse_dynamics(c, s, moving), "energy": svkc.energy(c, s)}
+        driven = svkc.actuation(c, s, moving)
+        out |= {"actuation": driven.tau, "residual": driven.residual}
+        if len(chain.link_names):
+            carried = svkc.loop_forces(c, s, x["tau"])
+            out |= {"loop_force": carried.force, "loop_torque": carried.torque, "W": svkc.coordinates(c, s).W, "margin": svkc.mobility(c, s).margin}
+        return out
+
+    x = {"q": state.q, "v": state.v, "tau": jnp.asarray(rng.normal(size=chain.dofs))} | model(chain, "mass", "com", "inertia", "pos", "gravity")
+    return f, x | ({"grip": state.structure.real_pos} if len(chain.link_names) else {}), ALGEBRA
+
+
+def four_bar():
+    chain = models.four_bar()
+    return algebra(chain, chain.state(v={"crank": 4.0}))
+
+
+def spatial_loop():
+    chain = models.rod_on_balls()
+    return algebra(chain, chain.state(v={"crank": 2.0}))
+
+
+def over_constrained():
+    """Three parallel bars: the third loop is redundant as a whole."""
+    chain = models.parallelogram()
+    f, x, _ = algebra(chain, chain.state({"leg0": 0.3}, {"leg0": 1.0}))
+    # what keeps the redundant rows redundant: no single place may move
+    return f, {k: v for k, v in x.items() if k not in ("q", "v", "pos", "grip")}, ALGEBRA
+
+
+def at_rest():
+    """Identity rotations, no velocity, no load: a free body with a ball and a hinge."""
+    ball = models.bar("arm", 'type="ball"', "0.2 0 0.5", "0 0 0.1", models.bar("fore", models.Y, "0 0 0.4", "0.2 0 0.5"))
+    base = f'<body name="base"><freejoint name="base"/>{models.BAR.format("0.3 0 0")}{ball}</body>'
+    chain = svkc.load(models.MJCF.format(base))
+    state = chain.state()
+    f, x, _ = algebra(chain, state)
+    return f, x | {"v": jnp.zeros(chain.dofs)}, ALGEBRA
+
+
+def assembly():
+    """Newton's method onto the loops, from a configuration that is off them; lengths and grips of the model too."""
+    chain = models.rod_on_balls()
+    near = chain.state({"crank": 0.3})
+    # as the user gives it: a little off, and a velocity that does not agree
+    q = near.q[: chain.nq] + 0.02 * jnp.sin(jnp.arange(chain.nq, dtype=float))
+
+    def f(x):
+        c = changed(chain, x)
+        c = eqx.tree_at(lambda c: c.structure.real_pos, c, x["grip"])
+        state = c.state(x["q"], x["v"])
+        return {"q": state.q, "v": state.v}
+
+    start = at_unit(chain, q)
+    return f, {"q": start, "v": jnp.ones(chain.nv), "pos": chain.pos, "grip": chain.structure.real_pos}, ALGEBRA
+
+
+def at_unit(chain, q):
+    """With quaternions of unit length, as the loader asks for."""
+    full = jnp.concatenate([q, chain.q_load[chain.nq :]])
+    return svkc.integrate(chain, full, jnp.zeros(chain.dofs))[: chain.nq]
+
+
+def impact():
+    """The velocity after a connect, declared and where it is."""
+    box = '<body name="{}" pos="{}"><freejoint name="{}"/><geom type="box" size="0.1 0.2 0.3" contype="0"/></body>'
+    links = [svkc.VirtualLink("hold", "a", "b", "ball", real_pos=(-0.6, 0.1, 0))]
+    chain = svkc.load(models.MJCF.format(box.format("a", "0 0 0", "a") + box.format("b", "1 0 0", "b")), virtual_links=links)
+    rng = np.random.default_rng(5)
+    state = chain.state(v=rng.normal(size=12), connected=())
+
+    def f(x):
+        after = svkc.connect(changed(chain, x), start(state, x), "hold", here=True)
+        return {"q": after.q, "v": after.v, "energy": svkc.kinetic_energy(changed(chain, x), after)}
+
+    return f, {"q": state.q, "v": state.v, "grip": state.structure.real_pos} | model(chain, "mass", "com", "inertia"), ALGEBRA
+
+
+def pendulum_cut():
+    """Two rods, the second comes off at an angle of the first: a cuttable joint, cut by a guard; the angle, both times and lengths count."""
+    chain = svkc.load(models.MJCF.format(models.bar("upper", models.Y, "0 0 -1", inside=models.bar("lower", models.Y, "0 0 -0.8", "0 0 -1"))), cuttable="lower")
+    state = chain.state({"upper": 1.2, "lower": 0.3})
+
+    def f(x):
+        events = [svkc.when(lambda t, s, args: s.q[0] - args, cut="lower"), svkc.at(x["again"], connect="lower", here=True)]
+        ts = jnp.stack([x["seen"], x["t1"]])
+        return motion(svkc.simulate(changed(chain, x), start(state, x), x["t1"], ts=ts, events=events, args=x["angle"], **TIGHT))
+
+    one = jnp.asarray
+    x = {"angle": one(0.4), "again": one(0.55), "t1": one(0.7), "seen": one(0.5), "q": state.q[:1], "v": state.v}
+    full = lambda x: x | {"q": jnp.concatenate([x["q"], state.q[1:]])}
+    return lambda x: f(full(x)), x | model(chain, "mass", "inertia", "com", "gravity"), RUN
+
+
+def breaking():
+    """A joint that breaks under its load, and a grip made with a spare slot."""
+    rods = models.bar("upper", models.Y, "0 0 -1", inside=models.bar("lower", models.Y, "0 0 -0.8", "0 0 -1"))
+    rods += models.bar("other", models.Y, "0 0 -1", "1 0 0")
+    chain = svkc.load(models.MJCF.format(rods), cuttable="lower", spare=1)
+    state = chain.state({"upper": 1.2, "lower": 0.3})
+
+    def f(x):
+        grip = svkc.Grip("upper", "other", "ball", real_pos=x["place"])
+        events = [svkc.when(svkc.overload(chain, "lower", force=x["limit"]), cut="lower", direction=True), svkc.at(x["time"], bind=grip)]
+        control = lambda t, s, args: args * jnp.sin(3 * t) * jnp.ones(chain.nv)
+        traj = svkc.simulate(changed(chain, x), start(state, x), 0.6, events=events, control=control, args=x["torque"], **TIGHT)
+        return motion(traj)
+
+    x = {"limit": jnp.asarray(60.0), "time": jnp.asarray(0.45), "torque": jnp.asarray(0.5), "place": jnp.array([0.1, 0.0, -0.7])}
+    return f, x | model(chain, "mass", "gravity"), RUN
+
+
+def four_bar_turning():
+    """A four-bar driven through whole turns: the independent coordinates change on the way."""
+    chain = models.four_bar()
+    state = chain.state(v={"crank": 6.0})
+
+    def f(x):
+        control = lambda t, s, args: jnp.zeros(chain.dofs).at[0].set(args[0] * jnp.cos(args[1] * t))
+        traj = svkc.simulate(changed(chain, x), start(state, x), 1.0, ts=jnp.linspace(0, 1, 5), control=control, args=x["torque"], **TIGHT)
+        return motion(traj)
+
+    x = {"torque": jnp.array([2.0, 3.0]), "v": state.v, "grip": state.structure.real_pos}
+    return f, x | model(chain, "mass", "pos", "gravity"), RUN
+
+
+def over_constrained_run():
+    """Three parallel bars swing and the middle one lets go."""
+    chain = models.parallelogram()
+    state = chain.state({"leg0": 0.3}, {"leg0": 1.0})
+
+    def f(x):
+        events = [svkc.at(x["time"], cut="pin1"), svkc.at(x["time"] + 0.1, connect="pin1", here=True)]
+        return motion(svkc.simulate(changed(chain, x), start(state, x), 0.5, events=events, **TIGHT))
+
+    return f, {"time": jnp.asarray(0.2), "v": state.v} | model(chain, "mass", "inertia", "gravity"), RUN
+
+
+def high_bar():
+    """Two hands, one, none, one again: 24, 23, 22, 23 joint freedoms, every release time and the re-catch."""
+    chain, state = svkc.scenes.high_bar(ignore="limit")
+
+    def f(x):
+        r, l, again = x["times"]
+        events = [svkc.at(r, cut="right_hand_grip"), svkc.at(l, cut="left_hand_grip"), svkc.at(again, connect="left_hand_grip", here=True)]
+        control = lambda t, s, args: jnp.concatenate([jnp.zeros(6), args * jnp.sin(4 * t), jnp.zeros(chain.dofs - 22)])
+        traj = svkc.simulate(changed(chain, x), start(state, x), 0.5, ts=jnp.linspace(0, 0.5, 3), events=events, control=control, args=x["torque"], **TIGHT)
+        return motion(traj)
+
+    rng = np.random.default_rng(1)
+    x = {"times": jnp.array([0.2, 0.3, 0.4]), "torque": jnp.asarray(20 * rng.normal(size=16)), "v": jnp.asarray(0.3 * rng.normal(size=chain.dofs))}
+    return f, x | model(chain, "mass"), RUN
+
+
+def swing():
+    """The seat gives way as each thigh passes its edge: two guards."""
+    from svkc.scenes.swing import leaving, swing
+
+    chain, state = swing(ignore="limit")
+    # turned a little, so that the thighs leave one after the other
+    state = chain.state(state.q[: chain.nq], {"base": [2.2, 0.1, 0, 0, 0, 0.3]})
+
+    def f(x):
+        control = lambda t, s, args: jnp.concatenate([jnp.zeros(7), args, jnp.zeros(chain.dofs - 23)])
+        return motion(svkc.simulate(chain, start(state, x), x["t1"], events=leaving(chain), control=control, args=x["torque"], **TIGHT))
+
+    return f, {"t1": jnp.asarray(0.6), "torque": 3 * jnp.ones(16), "v": state.v}, RUN
+
+
+def brachiation():
+    """Hanging by one hand, the other takes hold of the next bar where it comes near, and the first lets go."""
+    from svkc.scenes.brachiation import brachiation
+
+    chain, state = brachiation(ignore="limit")
+
+    def f(x):
+        near = svkc.touch(chain, "left_hand_bar2", x["reach"], axes="xy")
+        events = [svkc.when(near, connect="left_hand_bar2", here=True, direction=False), svkc.at(x["release"], cut="right_hand_bar1")]
+        control = lambda t, s, args: jnp.concatenate([jnp.zeros(6), args, jnp.zeros(chain.dofs - 22)])
+        return motion(svkc.simulate(chain, start(state, x), 0.9, events=events, control=control, args=x["torque"], **TIGHT))
+
+    names = chain.joint_names[1:]
+    torque = jnp.array([{"left_shoulder_flexion": 9.0, "left_elbow": -2.0}.get(n, 0.0) for n in names])
+    return f, {"reach": jnp.asarray(0.25), "release": jnp.asarray(0.8), "torque": torque}, RUN
+
+
+CASES = {
+    case.__name__: case
+    for case in (
+        four_bar, spatial_loop, over_constrained, at_rest, assembly, impact, pendulum_cut, breaking, four_bar_turning, over_constrained_run, high_bar, swing,
+        brachiation,
+    )
+}  # fmt: skip
