@@ -48,8 +48,6 @@ def loss(p):
     return found[0] + 1e4 * jnp.sum(off**2) + 2e-3 * jnp.sum(p["bend"] ** 2), found
 
 
-import time
-t0=time.time()
 # rad/s^2, for four joints of an arm and four of a leg, at the start and at the time meant for the catch; hundredths of a second
 p = first = {"bend": jnp.zeros((2, 8)), "late": jnp.zeros(())}
 step, adam = jax.jit(jax.value_and_grad(loss, has_aux=True)), optax.adam(0.4)
@@ -57,20 +55,21 @@ memory = adam.init(p)
 for i in range(41):
     (value, (lost, impulse, off)), gradient = step(p)
     if i % 10 == 0:
-        print(f"{i}: loss {value:.3f}; catch after {CATCH + float(p['late']) / 100:.3f} s costs {lost:.2f} J, {impulse:.2f} N s a hand, {off:.1f} cm off the bar", time.time()-t0)
+        after = CATCH + float(p["late"]) / 100
+        print(f"{i}: loss {value:.3f}; a catch after {after:.3f} s costs {lost:.2f} J, {impulse:.2f} N s a hand, {off:.1f} cm off the bar")
     if i < 40:
         change, memory = adam.update(gradient, memory)
         p = optax.apply_updates(p, change)
-print(p, jax.tree.map(lambda x: x, gradient))
-fly_ = jax.jit(lambda p: fly(p, 0.8, jnp.linspace(0,0.8,65)))
+shown = jax.jit(lambda p: fly(p, 0.8, jnp.linspace(0, 0.8, 65)))
 folder = pathlib.Path(sys.argv[1] if len(sys.argv) > 1 else ".")
-figure, panels = plt.subplots(1, 2, figsize=(20, 7.6), layout="constrained")
+figure, panels = plt.subplots(1, 2, figsize=(11, 7.6), layout="constrained")
 with tempfile.TemporaryDirectory() as scratch:
     for panel, what, x in zip(panels, ("before", "after"), (first, p)):
-        panel.imshow(plt.imread(svkc.render(chain, fly_(x), pathlib.Path(scratch) / f"{what}.png", frames=6)))
+        picture = plt.imread(svkc.render(chain, shown(x), pathlib.Path(scratch) / "strobe.png", frames=6))
+        panel.imshow(picture[:, 270:830])  # without the empty sides
         panel.set_title(what, fontsize=16)
         panel.axis("off")
-figure.savefig(folder / "06_soft_catch.png", dpi=80)
-print("wrote", folder / "06_soft_catch.png", time.time()-t0)
+figure.savefig(folder / "06_soft_catch.png", dpi=110, bbox_inches="tight")
+print("wrote", folder / "06_soft_catch.png")
 both = jax.tree.map(lambda *x: jnp.stack(x), first, p)
-print("derivatives before and after:", svkc.check_grad(jax.vmap(lambda p: loss(p)[0]), both, directions=1), time.time()-t0)
+print("derivatives before and after:", svkc.check_grad(jax.vmap(lambda p: loss(p)[0]), both, directions=1))

@@ -11,7 +11,7 @@ jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
-import optimistix as optx
+from jax.flatten_util import ravel_pytree
 
 import svkc
 
@@ -37,41 +37,43 @@ def control(t, state, args):
 
 @jax.jit
 def run(p):
-    """The run with masses and limit times these factors: the tool comes off when the wrist carries too much."""
+    """With masses and limit times these factors: where the ends of the links are (m; times, links, x and z), and when the overloaded wrist breaks (s)."""
     scale = jnp.ones_like(chain.mass).at[rows].set(p["mass"])
     arm = eqx.tree_at(lambda c: (c.mass, c.inertia), chain, (chain.mass * scale, chain.inertia * scale[:, None, None]))
     events = [svkc.when(svkc.overload(arm, "wrist", force=limit * p["limit"]), cut="wrist", direction=True)]
-    return svkc.simulate(arm, start, ts[-1], ts=ts, events=events, control=control, rtol=1e-9, atol=1e-11, max_events=1)
-
-
-def markers(traj):
-    """[times, markers, x and z]: where the ends of the three links are (m)."""
-    return jax.vmap(lambda s: svkc.poses(chain, s)[0])(traj.states)[:, seen][:, :, ::2]
-
-
-def misses(p, observed):
-    """How far the run's markers are from those observed (m)."""
-    return markers(run(p)) - observed
-
-
-def show(what, p):
-    m, rms = np.asarray(masses * p["mass"]), 1e3 * float(jnp.sqrt(jnp.mean(misses(p, observed) ** 2)))
-    print(f"{what}: masses {m.round(4)} kg, limit {limit * float(p['limit']):.3f} N, breaks at {float(run(p).events.time[0]):.4f} s; misses {rms:.2f} mm rms")
+    traj = svkc.simulate(arm, start, ts[-1], ts=ts, events=events, control=control, rtol=1e-9, atol=1e-11, max_events=1)
+    return jax.vmap(lambda s: svkc.poses(chain, s)[0])(traj.states)[:, seen][:, :, ::2], traj.events.time[0]
 
 
 true = {"mass": jnp.array([2.4, 1.7, 1.3]) / masses, "limit": jnp.asarray(35.0 / limit)}
 guess = {"mass": jnp.ones(3), "limit": jnp.ones(())}
-exact = markers(run(true))
-observed = exact + 2e-3 * np.random.default_rng(0).normal(size=exact.shape)
-import time
-t0 = time.time()
-show("true", true)
-show("guess", guess)
-print(time.time()-t0)
-fit = optx.least_squares(misses, optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6), guess, args=observed, max_steps=50)
-print(time.time()-t0, fit.stats)
-show("found", fit.value)
+noise = 2e-3  # m
+observed = run(true)[0] + noise * np.random.default_rng(0).normal(size=(len(ts), 3, 2))
+# Levenberg and Marquardt's method: few parameters, so forward mode, and one program gives the misses too
+misses = lambda p: (run(p)[0] - observed).ravel()
+x, tree = ravel_pytree(guess)
+derivatives = jax.jit(jax.jacfwd(lambda x: 2 * (misses(tree(x)),), has_aux=True))
+(J, r), damping = derivatives(x), 1e-2
+for _ in range(12):
+    trial = x - jnp.linalg.solve(J.T @ J + damping * jnp.diag(jnp.sum(J * J, 0)), J.T @ r)
+    new = derivatives(trial)
+    better = bool(jnp.sum(new[1] ** 2) < jnp.sum(r**2))
+    x, (J, r), damping = (trial, new, damping / 10) if better else (x, (J, r), damping * 10)
+found = tree(x)
+error = tree(noise * jnp.sqrt(jnp.diag(jnp.linalg.inv(J.T @ J))))
+for what, p in (("true", true), ("guess", guess), ("found", found), ("expected error", error)):
+    print(f"{what}: masses {np.asarray(masses * p['mass']).round(4)} kg, limit {limit * p['limit']:.3f} N")
+    if what != "expected error":
+        print(f"  breaks at {run(p)[1]:.4f} s; misses {1e3 * jnp.sqrt(jnp.mean(misses(p) ** 2)):.2f} mm rms")
+folder = pathlib.Path(sys.argv[1] if len(sys.argv) > 1 else ".")
+figure, axes = plt.subplots(figsize=(9, 7), layout="constrained")
+for i, (name, color) in enumerate((("elbow", "C0"), ("end of forearm", "C1"), ("end of tool", "C2"))):
+    for what, path, style in (("guess", run(guess)[0], "--"), ("found", run(found)[0], "-"), ("observed", observed, "o")):
+        axes.plot(*path[:, i].T, style, color=color, markersize=4, label=f"{name}, {what}")
+axes.set(aspect="equal", xlabel="x (m)", ylabel="z (m)", title=f"an arm whose wrist breaks, every {float(ts[1]):.2f} s")
+axes.grid(alpha=0.2)
+figure.legend(loc="outside lower center", ncols=3)
+figure.savefig(folder / "07_identify.png", dpi=110)
+print("wrote", folder / "07_identify.png")
 # of the misses, not of the sum of their squares, which is flat where it is least
-for what, p in (("guess", guess), ("found", fit.value)):
-    print(f"derivatives at the {what}:", svkc.check_grad(lambda p: misses(p, observed), p, directions=1))
-    print(time.time()-t0)
+print("derivatives at what was found:", svkc.check_grad(misses, found, directions=1, mode="forward"))

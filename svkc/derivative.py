@@ -1,5 +1,6 @@
 """F7: derivatives as users meet them: checked against differences, and in the tangent of the configuration."""
 
+import dataclasses
 from collections.abc import Callable
 
 import equinox as eqx
@@ -26,11 +27,13 @@ class Check(eqx.Module):
     difference: float
     uncertainty: float
     modes: float
+    mode: str = eqx.field(static=True, default="both")
 
     def __str__(self) -> str:
         return (
             f"worst relative error {self.error:.2e} (the difference is good to {self.uncertainty:.0e}): d {self.output} / d {self.input} is "
-            f"{self.derivative:.12g} by differentiation, {self.difference:.12g} by differences; forward and reverse differ by {self.modes:.1e}"
+            f"{self.derivative:.12g} by differentiation, {self.difference:.12g} by differences"
+            + (f"; forward and reverse differ by {self.modes:.1e}" if self.mode == "both" else "")
         )
 
 
@@ -60,7 +63,7 @@ def check_grad(f: Callable, x, mode: str = "both", directions: int = 2, step: fl
             raise ValueError(f"check_grad: f(x){name} is not finite: {leaf}")
     rng, found = np.random.default_rng(seed), []
     weights = {name: rng.normal(size=leaf.shape) for name, leaf in base.items()}
-    forward = jax.jit(lambda d: jax.jvp(outputs, (free,), (d,))[1])
+    forward = jax.jit(lambda x, d: jax.jvp(outputs, (x,), (d,))[1])
     gradients = {} if mode == "forward" else _gradients(outputs, free, weights)
     for place, (path, leaf) in enumerate(named):
         for _ in range(directions if leaf.size else 0):
@@ -68,7 +71,7 @@ def check_grad(f: Callable, x, mode: str = "both", directions: int = 2, step: fl
             along = jnp.asarray(along / np.linalg.norm(along) * (np.linalg.norm(leaf) or 1.0), leaf.dtype)
             direction = jax.tree.unflatten(jax.tree.structure(free), [along if i == place else jnp.zeros_like(x) for i, (_, x) in enumerate(named)])
             difference, doubt = _differences(value, free, direction, step)
-            ahead = None if mode == "reverse" else forward(direction)
+            ahead = None if mode == "reverse" else forward(free, direction)
             for name, weight in weights.items():
                 pair = f"f(x){name}", f"x{jax.tree_util.keystr(path)}"
                 back = None if mode == "forward" else sum(float(jnp.vdot(g, d)) for g, d in zip(gradients[name], jax.tree.leaves(direction), strict=True))
@@ -81,15 +84,15 @@ def check_grad(f: Callable, x, mode: str = "both", directions: int = 2, step: fl
                 apart = 0.0 if back is None else abs(back - np.sum(weight * np.asarray(ahead[name]))) / (size if size > 1e-9 else 1.0)
                 found.append(_compare(np.asarray(ahead[name]), difference[name], doubt[name], float(apart), *pair))
     worst = max(found, key=lambda c: c.error)
-    return eqx.tree_at(lambda c: c.modes, worst, max(c.modes for c in found))
+    return dataclasses.replace(worst, modes=max(c.modes for c in found), mode=mode)
 
 
 def _gradients(outputs, free, weights):
     """For each output leaf, the gradient of its entries summed with random weights."""
-    backward = jax.jit(lambda w: jax.tree.leaves(jax.vjp(outputs, free)[1](w)[0]))
+    backward = jax.jit(lambda x, w: jax.tree.leaves(jax.vjp(outputs, x)[1](w)[0]))
     dtypes = {name: s.dtype for name, s in jax.eval_shape(outputs, free).items()}
     only = lambda chosen: {name: jnp.asarray(w if name == chosen else np.zeros_like(w), dtypes[name]) for name, w in weights.items()}
-    return {name: backward(only(name)) for name in weights}
+    return {name: backward(free, only(name)) for name in weights}
 
 
 def _differences(value, free, direction, step):

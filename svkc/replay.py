@@ -62,8 +62,12 @@ class Path(eqx.Module):
     found: Found | None = None
 
 
-@eqx.filter_custom_jvp
 def integrated(start: Motion, times, world: World, how: How) -> Path:
+    """`_integrated` as an operation of its own: jax.custom_jvp would lose its rule where a scan is linearized and then differentiated again."""
+    return eqxi.filter_primitive_bind(_integrated_p, start, times, world, how)
+
+
+def _integrated(start: Motion, times, world: World, how: How) -> Path:
     """Diffrax from times = (t0, stop, save times) to `stop`, or to where in its last step a guard was zero. In derivatives the end's time is fixed."""
     t0, stop, at = times
     inner = how.solver
@@ -116,7 +120,7 @@ def _block(y: Motion, times, world: World, solver) -> tuple[Motion, Motion]:
     return jax.lax.scan(step, y, times)
 
 
-@integrated.def_jvp
+@eqxi.filter_primitive_jvp
 def _integrated_jvp(primals, tangents):
     start, times, world, how = primals
     d_start, d_times, d_world, _ = tangents
@@ -193,3 +197,17 @@ def _through(start: Motion, d_start: Motion, grid, d_grid, place, world: World, 
     flat = jax.tree.map(lambda d: d.reshape(-1, *d.shape[2:])[: count - 1], after)
     d_kept = jax.tree.map(lambda d: jnp.where(written.reshape(-1, *(1,) * (d.ndim - 1)), d, 0), flat)
     return d_end, d_saved, d_kept
+
+
+@eqxi.filter_primitive_def
+def _abstract(*args):
+    shaped = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype) if isinstance(x, jax.core.ShapedArray) else x
+    out = eqx.filter_eval_shape(_integrated, *jax.tree.map(shaped, args))
+    return jax.tree.map(lambda x: jax.core.ShapedArray(x.shape, x.dtype) if isinstance(x, jax.ShapeDtypeStruct) else x, out)
+
+
+def _no_transpose(*_, **__):
+    raise NotImplementedError("the run itself is not linear")
+
+
+_integrated_p = eqxi.create_vprim("integrated", eqxi.filter_primitive_def(_integrated), _abstract, _integrated_jvp, _no_transpose)

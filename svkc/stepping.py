@@ -111,10 +111,14 @@ class Field(eqx.Module):
         return tau, tau @ v if chain.damping is None else tau @ v - jnp.sum(chain.damping * v * v)
 
 
+def _projects(stabilization, scene: Scene) -> bool:
+    return bool(scene.chain.topology.link_names) and isinstance(stabilization, Projection)
+
+
 def settle(stabilization, scene: Scene, y: Motion) -> Motion:
     """The motion put back: quaternions to unit length, loops closed, velocities in agreement."""
     chain, structure = scene.chain, scene.structure
-    if not len(chain.topology.link_names) or not isinstance(stabilization, Projection):
+    if not _projects(stabilization, scene):
         return eqx.tree_at(lambda y: y.q, y, normalize(chain, y.q))
     return eqx.tree_at(lambda y: (y.q, y.v), y, settle_loops(chain, structure, y.q, y.v, stabilization.iterations))
 
@@ -175,7 +179,9 @@ class Settled(diffrax.AbstractWrappedSolver):
         return self.solver.func(terms, t0, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        raw, error, dense, solver_state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
+        # a step begins with the rate where the one before was settled to, not with one remembered from where it was before that
+        fresh = made_jump or _projects(self.stabilization, args)
+        raw, error, dense, solver_state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, fresh)
         y1 = settle(self.stabilization, args, raw)
         if self.guards is not None:
             # what only says where to look for an event is not differentiated; the event's time is, where it is located
