@@ -101,6 +101,10 @@ def _differences(value, free, direction, step):
     table, best, change = [], {}, {}
     for h in step / 2.0 ** np.arange(8):
         ahead, behind = at(h), at(-h)
+        if not all(np.isfinite(x).all() for x in (*ahead.values(), *behind.values())):
+            # so far away f is not defined: begin again, nearer
+            table, best, change = [], {}, {}
+            continue
         row = [{name: (np.asarray(ahead[name]) - np.asarray(behind[name])) / (2 * h) for name in ahead}]
         for k, before in enumerate(table[-1] if table else [], start=1):
             row.append({name: row[-1][name] + (row[-1][name] - before[name]) / (4**k - 1) for name in before})
@@ -111,7 +115,8 @@ def _differences(value, free, direction, step):
                 best[name] = np.where(closer, new, best.get(name, new))
                 change[name] = np.where(closer, moved, change.get(name, moved))
         table.append(row)
-    return best, change
+    nothing = {name: np.full(np.shape(leaf), np.nan) for name, leaf in at(0.0).items()} if not best else {}
+    return best or nothing, change or nothing
 
 
 def _compare(derivative, difference, doubt, modes: float, output: str, input: str) -> Check:

@@ -1,4 +1,4 @@
-"""F6: the motion of one phase as a function that is differentiated both ways, to any order, whatever solver and step control found it.
+"""F6: the motion of one phase as a function that is differentiated both ways, whatever solver and step control found it.
 
 The run itself is never differentiated. Its steps are then gone through again, with their times held fixed, for what a change of start, times and
 parameters does to each: forwards for a tangent, backwards for a cotangent. Kept of a run are the times of its steps and one state in `every`.
@@ -19,7 +19,7 @@ GROUP = 64
 
 
 class Replay(eqx.Module):
-    """The default `adjoint` of `svkc.simulate`: both modes, any order, any mixture with vmap and jit.
+    """The default `adjoint` of `svkc.simulate`: both modes, in any mixture with vmap and jit.
 
     every: one state in so many steps is kept, and the steps between are taken once more on the way back. Memory for a phase, in numbers:
     max_steps (1 + size / every), with size that of q and v together, and what one block of `every` steps needs.
