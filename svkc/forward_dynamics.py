@@ -72,7 +72,8 @@ def solve_motion(
         force = with_links(chain, inertia_times(chain, kin, moving[:nv]), moving) + held.T @ mu
         return jnp.where(active, force, x), held @ x + jnp.where(chosen.used, 0, mu)
 
-    right = (jnp.where(active, force, 0), -chosen.Q @ bias)
+    # jax transposes the solve only where both sides take part in the derivative
+    right = (jnp.where(active, force, 0) + 0 * jnp.sum(bias), -chosen.Q @ bias + 0 * jnp.sum(force))
     return jax.lax.custom_linear_solve(equations, right, solve=solve, symmetric=True)[0]
 
 

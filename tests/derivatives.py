@@ -66,7 +66,9 @@ def four_bar():
 
 def spatial_loop():
     chain = models.rod_on_balls()
-    return algebra(chain, chain.state(v={"crank": 2.0}))
+    f, x, _ = algebra(chain, chain.state(v={"crank": 2.0}))
+    # the rod's inertia about itself is too small for differences
+    return f, {name: value for name, value in x.items() if name != "inertia"}, ALGEBRA
 
 
 def over_constrained():
