@@ -115,8 +115,9 @@ def _differences(value, free, direction, step):
                 best[name] = np.where(closer, new, best.get(name, new))
                 change[name] = np.where(closer, moved, change.get(name, moved))
         table.append(row)
-    nothing = {name: np.full(np.shape(leaf), np.nan) for name, leaf in at(0.0).items()} if not best else {}
-    return best or nothing, change or nothing
+    # (not finite at every step tried, and so worth nothing)
+    nothing = {name: np.full(np.shape(leaf), np.nan) for name, leaf in ahead.items()}
+    return nothing | best, nothing | change
 
 
 def _compare(derivative, difference, doubt, modes: float, output: str, input: str) -> Check:

@@ -180,7 +180,7 @@ class Settled(diffrax.AbstractWrappedSolver):
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         # a step begins with the rate where the one before was settled to, not with one remembered from where it was before that
-        fresh = made_jump or _projects(self.stabilization, args)
+        fresh = True if _projects(self.stabilization, args) else made_jump
         raw, error, dense, solver_state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, fresh)
         y1 = settle(self.stabilization, args, raw)
         if self.guards is not None:
