@@ -4,11 +4,13 @@ import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
+from jax.interpreters import ad
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc.chain import State
 from svkc.events import Plan, first_root
 from svkc.guards import Sensor
+from svkc.operation import operation
 from svkc.stepping import Field, Motion, Scene, filled, step_alone
 
 # a guard that at the rate it crosses zero with would change this little over a step, measured by its size, touches zero rather than crosses it
@@ -92,23 +94,14 @@ def locate(hit: Bool[Array, ""], t_end, end: Motion, solver, scene: Scene, guard
     return jax.tree.map(lambda a, b: jnp.where(hit, a, b), at, missed())
 
 
-@eqx.filter_custom_jvp
-def arrived(
-    t: Float[Array, ""], y: Motion, late: Float[Array, ""], scene: Scene, guards: Reading | Field, *, found: Found | None
-) -> tuple[Float[Array, ""], Motion]:
-    """The end of a phase, where the motion y was found at the time t: a guard's zero, or, `late` by nothing, the time scheduled. To be differentiated."""
-    return t, y
-
-
-@arrived.def_jvp
-def _arrived_jvp(primals, tangents, *, found):
+def _arrived_jvp(primals, tangents):
     """What y changes by at its time, and its rate times the change of the end's time: that of `late`, or dt = -dg / (dg/dt), the implicit function's."""
-    t, y, late, scene, guards = primals
-    d_t, dy, d_late, d_scene, d_guards = tangents
-    end, at = arrived(t, y, late, scene, guards, found=found)
+    t, y, late, scene, guards, found = primals
+    d_t, dy, d_late, d_scene, d_guards, _ = tangents
+    end, at = arrived(*primals)
     field, d_field = (guards, d_guards) if isinstance(guards, Field) else (guards.field, d_guards.field)
     d_t = filled(t, d_t)
-    dy = _carried(filled(y, dy), end - t, end, at, (scene, field), (d_scene, d_field))
+    dy = _carried((filled(y, dy), d_scene, d_field), end - t, end, at, scene, field)
     rate = field(end, at, scene)
     dt = filled(late, d_late)
     if found is not None:
@@ -122,17 +115,52 @@ def _arrived_jvp(primals, tangents, *, found):
     return (end, at), (d_t + dt, jax.tree.map(lambda d, r: d + r * dt, dy, rate))
 
 
-@eqx.filter_custom_jvp
-def _carried(dy: Motion, delay, t, at: Motion, world, d_world) -> Motion:
-    """A change of the motion, carried along for a time that is zero, but may itself change: second derivatives see it."""
-    return dy
+# arrived(t, y, late, scene, guards or field, found or None) -> t, y: the end of a phase, where the motion y was found at the time t, a guard's zero, or,
+# `late` by nothing, the time scheduled
+arrived = operation("arrived", lambda t, y, *_: (t, y), _arrived_jvp)
 
 
-@_carried.def_jvp
+def _rate_of(changes, t, at: Motion, scene: Scene, field: Field) -> Motion:
+    """How fast changes of the motion, the scene and the field make the motion's change grow."""
+    return eqx.filter_jvp(lambda y, scene, field: field(t, y, scene), (at, scene, field), changes)[1]
+
+
 def _carried_jvp(primals, tangents):
-    dy, _, t, at, (scene, field), d_world = primals
-    ddy = filled(dy, tangents[0])
-    if tangents[1] is not None:
-        d_rate = eqx.filter_jvp(lambda y, scene, field: field(t, y, scene), (at, scene, field), (dy, *d_world))[1]
-        ddy = jax.tree.map(lambda d, r: d + tangents[1] * r, ddy, d_rate)
+    changes, _, *where = primals
+    (further, _, _), delay, *_ = tangents
+    ddy = filled(changes[0], further)
+    if delay is not None:
+        ddy = jax.tree.map(lambda d, r: d + delay * r, ddy, _rate_of(changes, *where))
     return _carried(*primals), ddy
+
+
+def _carried_transpose(inputs, cotangent: Motion):
+    changes, *where = inputs
+    linear = lambda x: isinstance(x, ad.UndefinedPrimal)
+    asked = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) if linear(x) else None, changes, is_leaf=linear)
+    return _brought_back(cotangent, asked, *where), *jax.tree.map(lambda _: None, tuple(where))
+
+
+# _carried((dy, d_scene, d_field), delay, t, at, scene, field) -> dy: a change of the motion carried along for a time that is zero but may itself
+# change, which second derivatives see
+_carried = operation("carried", lambda changes, *_: changes[0], _carried_jvp, _carried_transpose)
+
+
+def _back(cotangent: Motion, asked, *_):
+    """The cotangent of dy, and zeros for those of the scene and the field, as far as they are asked for."""
+    moving, *rest = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), asked)
+    return jax.tree.map(lambda d, z: None if z is None else d, cotangent, moving), *rest
+
+
+def _back_jvp(primals, tangents):
+    cotangent, asked, _, t, at, scene, field = primals
+    further, _, delay, *_ = tangents
+    change = _back(filled(cotangent, further), asked)
+    if delay is not None:
+        pulled = eqx.filter_vjp(lambda y, scene, field: field(t, y, scene), at, scene, field)[1](cotangent)
+        change = jax.tree.map(lambda c, p: c + delay * p, change, jax.tree.map(lambda a, p: None if a is None else p, asked, pulled, is_leaf=lambda a: a is None))
+    return _brought_back(*primals), change
+
+
+# _brought_back(cotangent of dy, shapes, delay, t, at, scene, field) -> cotangents of (dy, d_scene, d_field): the transpose of `_carried`
+_brought_back = operation("brought_back", _back, _back_jvp)

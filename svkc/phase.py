@@ -56,7 +56,7 @@ def solve(run: Run, stop, ts, made: Plan, options: Options, scene: Scene) -> Sol
     # of a scheduled end the time goes on to move; a diffrax adjoint has seen to that
     scheduled = path.result == diffrax.RESULTS.successful._value
     late = jnp.where(scheduled, stop - path.t, 0) if isinstance(options.adjoint, Replay) else jnp.zeros_like(stop)
-    t, motion = arrived(path.t, path.end, late, scene, options.field if guards is None else guards, found=found)
+    t, motion = arrived(path.t, path.end, late, scene, options.field if guards is None else guards, found)
     if found is None:
         return Solved(t, motion, jnp.zeros(0, bool), None, path.saved, stats, result, RESULTS.successful)
     code = RESULTS.where(found.jumps, RESULTS.jump, RESULTS.successful)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from svkc.location import Found, locate
+from svkc.operation import operation
 from svkc.stepping import Field, Motion, Scene, Settled, filled, step_alone
 
 # blocks are passed over in groups where the run has no more steps
@@ -60,11 +61,6 @@ class Path(eqx.Module):
     rejected: Int[Array, ""]
     result: Int[Array, ""]
     found: Found | None = None
-
-
-def integrated(start: Motion, times, world: World, how: How) -> Path:
-    """`_integrated` as an operation of its own: jax.custom_jvp would lose its rule where a scan is linearized and then differentiated again."""
-    return eqxi.filter_primitive_bind(_integrated_p, start, times, world, how)
 
 
 def _integrated(start: Motion, times, world: World, how: How) -> Path:
@@ -120,7 +116,6 @@ def _block(y: Motion, times, world: World, solver) -> tuple[Motion, Motion]:
     return jax.lax.scan(step, y, times)
 
 
-@eqxi.filter_primitive_jvp
 def _integrated_jvp(primals, tangents):
     start, times, world, how = primals
     d_start, d_times, d_world, _ = tangents
@@ -199,15 +194,5 @@ def _through(start: Motion, d_start: Motion, grid, d_grid, place, world: World, 
     return d_end, d_saved, d_kept
 
 
-@eqxi.filter_primitive_def
-def _abstract(*args):
-    shaped = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype) if isinstance(x, jax.core.ShapedArray) else x
-    out = eqx.filter_eval_shape(_integrated, *jax.tree.map(shaped, args))
-    return jax.tree.map(lambda x: jax.core.ShapedArray(x.shape, x.dtype) if isinstance(x, jax.ShapeDtypeStruct) else x, out)
-
-
-def _no_transpose(*_, **__):
-    raise NotImplementedError("the run itself is not linear")
-
-
-_integrated_p = eqxi.create_vprim("integrated", eqxi.filter_primitive_def(_integrated), _abstract, _integrated_jvp, _no_transpose)
+# integrated(start, times, world, how) -> Path
+integrated = operation("integrated", _integrated, _integrated_jvp)

@@ -10,6 +10,8 @@ import numpy as np
 from jax.scipy.linalg import cho_factor, cho_solve, solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
+from svkc.operation import operation
+
 
 class Selection(eqx.Module):
     """Pivoted Gram-Schmidt of a matrix: Q [steps, rows], one-hot pivots P [steps, dofs], |R_kk|, and which steps count.
@@ -59,20 +61,19 @@ def select(J: Float[Array, "rows dofs"], rank: Int[Array, ""] | None = None, wan
     return Selection(Q, P, size, jnp.any(P > 0, 1))
 
 
-@jax.custom_jvp
-def _following(J, Q, P, size):
-    """Q and size, whose derivatives are those of R^-T (J P^T)^T, with R frozen, and of the diagonal of R."""
-    return Q, size
-
-
-@_following.defjvp
 def _following_jvp(primals, tangents):
-    J, Q, P, size = primals
-    moved = tangents[0] @ P.T
-    R = jax.lax.stop_gradient(Q @ J @ P.T) + jnp.diag(jnp.where(jnp.any(P > 0, 1), 0, 1).astype(J.dtype))
-    dQ = solve_triangular(R, moved.T, trans=1)
-    # d|R_kk| / |R_kk| is the diagonal of Q dJ P^T R^-1
-    return (Q, size), (dQ, size * jnp.sum(dQ * Q, 1))
+    """Derivatives of Q = R^-T (J P^T)^T with R frozen, and of the diagonal of the R that J has, which is that of Cholesky's factor of Q Q^T times R's."""
+    J, _, P, _ = primals
+    Q, size = _following(*primals)
+    unused = jnp.diag(jnp.where(jnp.any(P > 0, 1), 0, 1).astype(J.dtype))
+    dQ = solve_triangular(jax.lax.stop_gradient(Q @ J @ P.T) + unused, (tangents[0] @ P.T).T, trans=1)
+    L = jnp.linalg.cholesky(Q @ Q.T + unused)
+    along = jnp.sum(solve_triangular(L, dQ, lower=True) * solve_triangular(L, Q, lower=True), 1)
+    return (Q, size), (dQ, size * along)
+
+
+# Q and size of J with the pivots P, as they were found
+_following = operation("following", lambda J, Q, P, size: (Q, size), _following_jvp)
 
 
 def count_rank(size: Float[Array, " steps"]) -> Int[Array, ""]:

@@ -1,5 +1,6 @@
 """What derivatives are checked on: a function of parameters for each case, its parameters, and the relative error it is held to."""
 
+import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import models
@@ -7,8 +8,8 @@ import numpy as np
 
 import svkc
 
-TIGHT = {"rtol": 1e-11, "atol": 1e-13}
-ALGEBRA = 1e-8
+TIGHT = {"rtol": 1e-11, "atol": 1e-13, "solver": diffrax.Dopri8()}
+ALGEBRA, RUN = 1e-8, 1e-6
 
 
 def model(chain, *names):
@@ -29,6 +30,13 @@ def start(state, x):
     if "grip" in x:
         s = eqx.tree_at(lambda s: s.real_pos, s, x["grip"])
     return svkc.State(x.get("q", state.q), x.get("v", state.v), s)
+
+
+def motion(traj):
+    """What is looked at of a run; rows that no event has filled hold no numbers."""
+    event = jnp.where(jnp.isfinite(traj.events.time), traj.events.time, 0)
+    end = traj.final
+    return {"q": end.q, "v": end.v, "event": event, "lost": traj.events.energy_lost, "impulse": traj.events.impulse, "saved": traj.states.q}
 
 
 def algebra(chain, state):
@@ -119,4 +127,118 @@ def impact():
     return f, {"q": state.q, "v": state.v, "grip": state.structure.real_pos} | model(chain, "mass", "com", "inertia"), ALGEBRA
 
 
-CASES = {case.__name__: case for case in (four_bar, spatial_loop, over_constrained, at_rest, assembly, impact)}
+def pendulum_cut():
+    """Two rods, the second comes off at an angle of the first, and is taken hold of again where it is: both times, the angle and the model count."""
+    rods = models.bar("upper", models.Y, "0 0 -1", inside=models.bar("lower", models.Y, "0 0 -0.8", "0 0 -1"))
+    chain = svkc.load(models.MJCF.format(rods), cuttable="lower")
+
+    def f(x):
+        c = changed(chain, x)
+        events = [svkc.when(lambda t, s, args: s.q[0] - args, cut="lower"), svkc.at(x["again"], connect="lower", here=True)]
+        start = c.state(x["q"], x["v"])
+        return motion(svkc.simulate(c, start, x["t1"], ts=jnp.stack([x["seen"], x["t1"]]), events=events, args=x["angle"], **TIGHT))
+
+    x = {name: jnp.asarray(value) for name, value in {"angle": 0.4, "again": 0.55, "t1": 0.7, "seen": 0.5, "q": [1.2, 0.3], "v": [0.1, 0.2]}.items()}
+    return f, x | model(chain, "mass", "inertia", "com", "gravity"), RUN
+
+
+def breaking():
+    """A joint that breaks under its load, and a grip made with a spare slot."""
+    rods = models.bar("upper", models.Y, "0 0 -1", inside=models.bar("lower", models.Y, "0 0 -0.8", "0 0 -1"))
+    rods += models.bar("other", models.Y, "0 0 -1", "1 0 0")
+    chain = svkc.load(models.MJCF.format(rods), cuttable="lower", spare=1)
+    state = chain.state({"upper": 1.2, "lower": 0.3})
+
+    def f(x):
+        grip = svkc.Grip("upper", "other", "ball", real_pos=x["place"])
+        events = [svkc.when(svkc.overload(chain, "lower", force=x["limit"]), cut="lower", direction=True), svkc.at(x["time"], bind=grip)]
+        control = lambda t, s, args: args * jnp.sin(3 * t) * jnp.ones(chain.nv)
+        return motion(svkc.simulate(changed(chain, x), state, 0.6, events=events, control=control, args=x["torque"], **TIGHT))
+
+    x = {"limit": jnp.asarray(32.0), "time": jnp.asarray(0.45), "torque": jnp.asarray(0.5), "place": jnp.array([0.1, 0.0, -0.7])}
+    return f, x | model(chain, "mass", "gravity"), RUN
+
+
+def four_bar_turning():
+    """A four-bar driven through more than a turn: the independent coordinates change on the way."""
+    chain = models.four_bar()
+    control = lambda t, s, args: jnp.zeros(chain.dofs).at[0].set(args[0] * jnp.cos(args[1] * t))
+
+    def run(x):
+        c = changed(chain, x)
+        # the pin may be elsewhere in the plane; out of it the loop would not close
+        pin = chain.structure.real_pos.at[:, ::2].add(x["pin"])
+        c = eqx.tree_at(lambda c: c.structure.real_pos, c, pin)
+        return c, svkc.simulate(c, c.state({"crank": x["angle"]}, {"crank": x["speed"]}), 1.0, ts=jnp.linspace(0, 1, 9), control=control, args=x["torque"], **TIGHT)
+
+    x = {"torque": jnp.array([2.0, 3.0]), "speed": jnp.asarray(6.0), "angle": jnp.asarray(0.1), "pin": jnp.zeros((1, 2))} | model(chain, "mass", "gravity")
+    choices = {tuple(np.asarray(svkc.coordinates(c, traj.states[i]).dependent)) for c, traj in [run(x)] for i in range(9)}
+    assert len(choices) > 1, "no coordinate was swapped"
+    return lambda x: motion(run(x)[1]), x, RUN
+
+
+def over_constrained_run():
+    """Three parallel bars swing and the middle one lets go, for a while."""
+    chain = models.parallelogram()
+
+    def f(x):
+        c = changed(chain, x)
+        events = [svkc.at(x["time"], cut="pin1"), svkc.at(x["time"] + 0.1, connect="pin1", here=True)]
+        return motion(svkc.simulate(c, c.state({"leg0": x["angle"]}, {"leg0": x["speed"]}), 0.5, events=events, **TIGHT))
+
+    x = {"time": jnp.asarray(0.2), "angle": jnp.asarray(0.3), "speed": jnp.asarray(1.0)}
+    return f, x | model(chain, "mass", "inertia", "gravity"), RUN
+
+
+def high_bar():
+    """From rest, two hands, one, none, one again: 24, 23, 22, 23 joint freedoms, every release time and the re-catch."""
+    chain, hanging = svkc.scenes.high_bar(ignore="limit")
+
+    def f(x):
+        c = changed(chain, x)
+        right, left, again = x["times"]
+        events = [svkc.at(right, cut="right_hand_grip"), svkc.at(left, cut="left_hand_grip"), svkc.at(again, connect="left_hand_grip", here=True)]
+        control = lambda t, s, args: jnp.concatenate([jnp.zeros(6), args * jnp.sin(4 * t), jnp.zeros(chain.dofs - 22)])
+        return motion(svkc.simulate(c, c.state(hanging.q[: c.nq], x["v"]), 0.5, events=events, control=control, args=x["torque"], **TIGHT))
+
+    rng = np.random.default_rng(1)
+    x = {"times": jnp.array([0.2, 0.3, 0.4]), "torque": jnp.asarray(5 * rng.normal(size=16)), "v": jnp.zeros(chain.nv)}
+    return f, x | model(chain, "mass"), RUN
+
+
+def swing():
+    """The seat gives way as each thigh passes its edge: two guards."""
+    from svkc.scenes.swing import leaving, swing
+
+    chain, state = swing(ignore="limit")
+    # turned a little, so that the thighs leave one after the other
+    speed = chain.state(state.q[: chain.nq], {"base": [2.2, 0.1, 0, 0, 0, 0.3]}).v[: chain.nv]
+
+    def f(x):
+        control = lambda t, s, args: jnp.concatenate([jnp.zeros(7), args, jnp.zeros(chain.dofs - 23)])
+        start = chain.state(state.q[: chain.nq], x["v"])
+        return motion(svkc.simulate(chain, start, x["t1"], events=leaving(chain), control=control, args=x["torque"], **TIGHT))
+
+    return f, {"t1": jnp.asarray(0.6), "torque": 3 * jnp.ones(16), "v": speed}, RUN
+
+
+def brachiation():
+    """Hanging by one hand, the other takes hold of the next bar where it comes near, and the first lets go."""
+    from svkc.scenes.brachiation import brachiation
+
+    chain, state = brachiation(ignore="limit")
+
+    def f(x):
+        near = svkc.touch(chain, "left_hand_bar2", x["reach"], axes="xy")
+        events = [svkc.when(near, connect="left_hand_bar2", here=True, direction=False), svkc.at(x["release"], cut="right_hand_bar1")]
+        control = lambda t, s, args: jnp.concatenate([jnp.zeros(6), args, jnp.zeros(chain.dofs - 22)])
+        return motion(svkc.simulate(chain, start(state, x), 0.9, events=events, control=control, args=x["torque"], **TIGHT))
+
+    names = chain.joint_names[1:]
+    torque = jnp.array([{"left_shoulder_flexion": 9.0, "left_elbow": -2.0}.get(n, 0.0) for n in names])
+    return f, {"reach": jnp.asarray(0.25), "release": jnp.asarray(0.8), "torque": torque}, RUN
+
+
+ALGEBRAIC = {case.__name__: case for case in (four_bar, spatial_loop, over_constrained, at_rest, assembly, impact)}
+RUNS = {case.__name__: case for case in (pendulum_cut, breaking, four_bar_turning, over_constrained_run, high_bar, swing, brachiation)}
+CASES = ALGEBRAIC | RUNS

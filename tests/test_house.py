@@ -13,8 +13,8 @@ import pytest
 ROOT = pathlib.Path(__file__).parent.parent
 # the house floor by floor, the ground first
 HOUSE = [
-    "spatial topology unsupported selection",
-    "chain reading",
+    "spatial topology unsupported operation",
+    "chain reading selection",
     "kinematics trajectory cuttable",
     "inverse_dynamics loops archive load",
     "energy closure",

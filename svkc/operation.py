@@ -1,0 +1,27 @@
+"""F0: functions that have derivatives of their own, at every order and in every transformation."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+
+
+def operation(name: str, function: Callable, jvp: Callable, transpose: Callable | None = None) -> Callable:
+    """The function as an operation of its own; jax.custom_jvp would lose its rule where a scan is linearized and then differentiated again.
+
+    jvp(primals, tangents) and transpose(inputs, cotangents) are over trees, None where nothing changes; jvp calls the operation again for its value.
+    """
+
+    def shapes(*args):
+        shaped = lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype) if isinstance(x, jax.core.ShapedArray) else x
+        abstract = lambda x: jax.core.ShapedArray(x.shape, x.dtype) if isinstance(x, jax.ShapeDtypeStruct) else x
+        return jax.tree.map(abstract, eqx.filter_eval_shape(function, *jax.tree.map(shaped, args)))
+
+    def not_linear(*_, **__):
+        raise NotImplementedError(f"{name} is not linear")
+
+    defined = [eqxi.filter_primitive_def(f) for f in (function, shapes)]
+    backwards = not_linear if transpose is None else eqxi.filter_primitive_transpose(transpose, materialise_zeros=True)
+    primitive = eqxi.create_vprim(name, *defined, eqxi.filter_primitive_jvp(jvp), backwards)
+    return lambda *args: eqxi.filter_primitive_bind(primitive, *args)
