@@ -205,7 +205,7 @@ def _record_phase(chain: Chain, run: Run, index, going, solved: Solved, ended: S
     active = active_dofs(chain, s)
     p = run.phases
     both = jax.tree.map(lambda *x: jnp.stack(x), (run.state.q, run.state.v), (ended.q, ended.v))
-    energies = jax.vmap(lambda q, v: energy(chain, State(q, v, s)))(*both)
+    energies = jax.checkpoint(jax.vmap(lambda q, v: energy(chain, State(q, v, s))))(*both)
     return Phases(
         jnp.where(row, run.t, p.start),
         jnp.where(row, solved.t, p.stop),
@@ -234,7 +234,7 @@ def _apply(chain: Chain, run: Run, ended: State, solved: Solved, fired: Bool[Arr
         connected, here = (connected | gripped) & ~emptying, here | gripped
 
     def changed():
-        done = change(chain, ended, connected, locked, here)
+        done = eqx.filter_checkpoint(change)(chain, ended, connected, locked, here)
         return done if emptying is None else eqx.tree_at(lambda d: d.state.structure, done, emptied(done.state.structure, emptying))
 
     def same():

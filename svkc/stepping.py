@@ -205,7 +205,7 @@ def step_alone(solver: diffrax.AbstractSolver, field: Field, t0, t1, y: Motion, 
             solver = eqx.tree_at(lambda s: s.scan_kind, solver, "bounded", is_leaf=lambda x: x is None)
         term = diffrax.ODETerm(rate)
         raw = solver.step(term, t0, t1, y, scene, solver.init(term, t0, t1, y, scene), False)[0]
-    return eqx.filter_checkpoint(settle)(field.stabilization, scene, raw)
+    return settle(field.stabilization, scene, raw)
 
 
 def _explicit_step(tableau: diffrax.ButcherTableau, rate, t0, t1, y: Motion, scene: Scene) -> Motion:

@@ -1,0 +1,203 @@
+"""What derivatives cost: time and memory of a whole run, its gradient and its directional derivative, and the compilation of each.
+
+High bar: 1.8 s with both releases, 246 parameters (masses, centres of mass, velocity, release times, torques). Open chain: the same figure in free
+fall, 200 steps of the classical Runge-Kutta method of 2 ms, 198 parameters (velocity, torques), beside MJX's gradient of the same steps and central
+differences with MuJoCo; all three gradients are compared. `python benchmarks/gradients.py` prints and writes results/gradients.csv; needs the extra
+`bench`. float64. Medians; runs that are compared take turns."""
+
+import csv
+import os
+import pathlib
+import platform
+import statistics
+import time
+
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+import svkc
+from svkc.scenes import FOLDER, high_bar
+
+RESULTS = pathlib.Path(__file__).parent / "results" / "gradients.csv"
+RUNS, STEPS, DT = 7, 200, 2e-3
+KUTTA = diffrax.ButcherTableau(
+    c=np.array([0.5, 0.5, 1.0]), b_sol=np.array([1, 2, 2, 1]) / 6, b_error=np.zeros(4),
+    a_lower=(np.array([0.5]), np.array([0.0, 0.5]), np.array([0.0, 0.0, 1.0])),
+)  # fmt: skip
+
+
+class ClassicalRungeKutta(diffrax.AbstractERK):
+    """MuJoCo's RK4."""
+
+    tableau = KUTTA
+    interpolation_cls = diffrax.ThirdOrderHermitePolynomialInterpolation.from_k
+
+    def order(self, terms):
+        return 4
+
+
+def whole_run():
+    """The high bar, both hands let go."""
+    chain, state = high_bar()
+    ts = jnp.linspace(0, 1.8, 73)
+
+    def loss(p):
+        floats = (chain.mass * p["mass"], chain.inertia * p["mass"][:, None, None], chain.com * p["com"])
+        c = eqx.tree_at(lambda c: (c.mass, c.inertia, c.com), chain, floats)
+        start = svkc.State(state.q, state.v + p["v"], state.structure)
+        events = (svkc.at(p["times"][0], cut="right_hand_grip"), svkc.at(p["times"][1], cut="left_hand_grip"))
+        control = lambda t, s, a: jnp.pad(a @ jnp.sin(jnp.arange(1, 7) * t), (6, chain.dofs - 22))
+        traj = svkc.simulate(c, start, 1.8, ts=ts, events=events, rtol=1e-8, atol=1e-10, control=control, args=p["torque"], throw=False)
+        return jnp.sum(traj.final.q[:3]) + 0.1 * jnp.sum(traj.states.q[40])
+
+    bodies = chain.mass.shape[0]
+    p = {"mass": jnp.ones(bodies), "com": jnp.ones((bodies, 3)), "v": jnp.zeros(chain.dofs), "times": jnp.array([0.9, 1.15])}
+    return loss, p | {"torque": jnp.full((16, 6), 5.0)}
+
+
+def torques(coefficients, t, pad):
+    return pad(coefficients @ np.sin(np.arange(1, 12) * t) if isinstance(t, float) else coefficients @ jnp.sin(jnp.arange(1, 12) * t), (6, 0))
+
+
+def falling_spec():
+    spec = mujoco.MjSpec.from_file(str(FOLDER / "figure16.xml"))
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
+    spec.option.timestep = DT
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT
+    return spec
+
+
+def falling():
+    """Open chain, by svkc."""
+    chain = svkc.load(falling_spec(), ignore=("limit", "contact"))
+    state = chain.state()
+
+    def loss(p):
+        # MuJoCo holds the torque over a step
+        control = lambda t, s, a: torques(a, jnp.floor(t / DT + 1e-6) * DT, jnp.pad)
+        start = svkc.State(state.q, p["v"], state.structure)
+        traj = svkc.simulate(
+            chain, start, STEPS * DT, dt=DT, control=control, args=p["torque"], solver=ClassicalRungeKutta(), max_steps=STEPS + 2, throw=False
+        )
+        return jnp.sum(traj.final.q[:7])
+
+    return loss, {"v": jnp.zeros(22), "torque": jnp.ones((16, 11))}
+
+
+def falling_by_mjx():
+    from mujoco import mjx
+
+    model = mjx.put_model(falling_spec().compile())
+    data = mjx.make_data(model)
+
+    def loss(p):
+        def step(data, i):
+            return mjx.step(model, data.replace(qfrc_applied=torques(p["torque"], i * DT, jnp.pad))), None
+
+        return jnp.sum(jax.lax.scan(step, data.replace(qvel=p["v"]), jnp.arange(STEPS))[0].qpos[:7])
+
+    return loss
+
+
+def falling_by_mujoco():
+    """The loss, and its gradient by central differences."""
+    model = falling_spec().compile()
+    data = mujoco.MjData(model)
+
+    def loss(v, u):
+        mujoco.mj_resetData(model, data)
+        data.qvel[:] = v
+        for i in range(STEPS):
+            data.qfrc_applied[:] = torques(u, i * DT, np.pad)
+            mujoco.mj_step(model, data)
+        return data.qpos[:7].sum()
+
+    def gradient(p, h=1e-6):
+        x = np.concatenate([np.ravel(p["v"]), np.ravel(p["torque"])])
+        at = lambda x: loss(x[:22], x[22:].reshape(16, 11))
+        return np.array([(at(x + h * e) - at(x - h * e)) / (2 * h) for e in np.eye(len(x))])
+
+    return lambda p: loss(np.asarray(p["v"]), np.asarray(p["torque"])), gradient
+
+
+def compiled(function, p):
+    """The program, and seconds of tracing with lowering and of compilation, and its temporary memory (MB)."""
+    begun = time.perf_counter()
+    lowered = jax.jit(function).lower(p)
+    middle = time.perf_counter()
+    program = lowered.compile()
+    return program, middle - begun, time.perf_counter() - middle, program.memory_analysis().temp_size_in_bytes / 1e6
+
+
+def timed(programs, p, runs=RUNS):
+    """Median seconds of each; they take turns."""
+    times = {name: [] for name in programs}
+    for _ in range(runs + 1):
+        for name, program in programs.items():
+            begun = time.perf_counter()
+            jax.block_until_ready(program(p))
+            times[name].append(time.perf_counter() - begun)
+    return {name: statistics.median(seconds[1:]) for name, seconds in times.items()}
+
+
+def measured(case, loss, p, peers=()):
+    """Rows of one case: forward, reverse, forward mode; then those of its peers."""
+    along = jax.tree.map(jnp.ones_like, p)
+    kinds = {"run": loss, "gradient": jax.value_and_grad(loss), "directional": lambda p: jax.jvp(loss, (p,), (along,))}
+    made = {("svkc", kind): compiled(f, p) for kind, f in kinds.items()}
+    for peer, its in peers:
+        made |= {(peer, kind): compiled(f, p) for kind, f in (("run", its), ("gradient", jax.value_and_grad(its)))}
+    seconds = timed({name: program for name, (program, *_) in made.items()}, p)
+    rows = []
+    for (who, kind), (_, traced, compile_time, memory) in made.items():
+        ratio = seconds[who, kind] / seconds[who, "run"]
+        rows.append([case, who, kind, f"{1e3 * seconds[who, kind]:.1f}", f"{ratio:.2f}", f"{traced:.1f}", f"{compile_time:.1f}", f"{memory:.1f}"])
+    return rows, {who: program(p)[1] for (who, kind), (program, *_) in made.items() if kind == "gradient"}
+
+
+def flat(gradient):
+    return np.concatenate([np.ravel(gradient["v"]), np.ravel(gradient["torque"])])
+
+
+def main():
+    loss, p = whole_run()
+    count = sum(x.size for x in jax.tree.leaves(p))
+    rows, _ = measured(f"high bar, {count} parameters", loss, p)
+    loss, p = falling()
+    count = sum(x.size for x in jax.tree.leaves(p))
+    try:
+        peers = [("MJX", falling_by_mjx())]
+    except ImportError as missing:
+        peers = []
+        print(f"no MJX: {missing}; pip install 'svkc[bench]'")
+    more, gradients = measured(f"open chain, {count} parameters", loss, p, peers)
+    value, by_differences = falling_by_mujoco()
+    once = timed({"run": lambda p: value(p)}, p)["run"]
+    whole = timed({"gradient": lambda p: by_differences(p)}, p, runs=1)["gradient"]
+    gradients = {who: flat(g) for who, g in gradients.items()} | {"MuJoCo": by_differences(p)}
+    for kind, seconds in (("run", once), ("gradient", whole)):
+        more.append([f"open chain, {count} parameters", "MuJoCo, differences", kind, f"{1e3 * seconds:.1f}", f"{seconds / once:.2f}", "", "", ""])
+    head = ["case", "by", "what", "ms", "times its run", "trace and lower s", "compile s", "temporary MB"]
+    for row in (head, *rows, *more):
+        print("  ".join(cell.ljust(width) for cell, width in zip(row, (28, 20, 12, 10, 14, 18, 10, 12))))
+    for who, g in gradients.items():
+        if who != "svkc":
+            print(f"gradient of the open chain: {who} differs from svkc by {np.abs(g - gradients['svkc']).max() / np.abs(g).max():.1e} of the largest entry")
+    versions = f"jax {jax.__version__}, mujoco {mujoco.__version__}, Python {platform.python_version()}, {os.cpu_count()} cores {platform.machine()}"
+    print(versions)
+    RESULTS.parent.mkdir(exist_ok=True)
+    with RESULTS.open("w", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows([head, *rows, *more, [versions]])
+
+
+if __name__ == "__main__":
+    main()
