@@ -65,10 +65,12 @@ def whole_run():
 
 
 def torques(coefficients, t, pad):
+    """Of the joints, at a time: sines of eleven frequencies."""
     return pad(coefficients @ np.sin(np.arange(1, 12) * t) if isinstance(t, float) else coefficients @ jnp.sin(jnp.arange(1, 12) * t), (6, 0))
 
 
 def falling_spec():
+    """The figure for MuJoCo, without contacts and limits."""
     spec = mujoco.MjSpec.from_file(str(FOLDER / "figure16.xml"))
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
     spec.option.timestep = DT
@@ -85,15 +87,14 @@ def falling():
         # MuJoCo holds the torque over a step
         control = lambda t, s, a: torques(a, jnp.floor(t / DT + 1e-6) * DT, jnp.pad)
         start = svkc.State(state.q, p["v"], state.structure)
-        traj = svkc.simulate(
-            chain, start, STEPS * DT, dt=DT, control=control, args=p["torque"], solver=ClassicalRungeKutta(), max_steps=STEPS + 2, throw=False
-        )
+        traj = svkc.simulate(chain, start, STEPS * DT, dt=DT, control=control, args=p["torque"], solver=ClassicalRungeKutta(), max_steps=STEPS + 2, throw=False)
         return jnp.sum(traj.final.q[:7])
 
     return loss, {"v": jnp.zeros(22), "torque": jnp.ones((16, 11))}
 
 
 def falling_by_mjx():
+    """The same steps, by MJX."""
     from mujoco import mjx
 
     model = mjx.put_model(falling_spec().compile())
@@ -165,10 +166,12 @@ def measured(case, loss, p, peers=()):
 
 
 def flat(gradient):
+    """As one vector."""
     return np.concatenate([np.ravel(gradient["v"]), np.ravel(gradient["torque"])])
 
 
 def main():
+    """Measures, prints, writes."""
     loss, p = whole_run()
     count = sum(x.size for x in jax.tree.leaves(p))
     rows, _ = measured(f"high bar, {count} parameters", loss, p)

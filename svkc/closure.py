@@ -67,9 +67,7 @@ def scaled_jacobian(chain: Chain, structure: Structure, kin, end) -> Float[Array
     return row[:, None] * loop_jacobian(chain, structure, kin, end) * column[None]
 
 
-def loop_rows(
-    chain: Chain, structure: Structure, q, v, kin: Kinematics, V, baumgarte=None
-) -> tuple[Float[Array, "rows dofs"], Float[Array, " rows"]]:
+def loop_rows(chain: Chain, structure: Structure, q, v, kin: Kinematics, V, baumgarte=None) -> tuple[Float[Array, "rows dofs"], Float[Array, " rows"]]:
     """J_C and Jdot_C v without units. baumgarte: rate (1/s) at which gaps are pulled back."""
     row, column = scales(chain)
     end = ends(chain, structure, kin, q)

@@ -52,26 +52,21 @@ def check_grad(f: Callable, x, mode: str = "both", directions: int = 2, step: fl
     if not named:
         raise ValueError("check_grad: x has no floating-point arrays to differentiate by")
 
-    def outputs(free):
-        floats = jax.tree_util.tree_flatten_with_path(eqx.filter(f(eqx.combine(free, rest)), eqx.is_inexact_array))[0]
-        return {jax.tree_util.keystr(path): leaf for path, leaf in floats}
-
-    value = jax.jit(outputs)
+    value = lambda free: _outputs(f, free, rest)
     base = {name: np.asarray(leaf) for name, leaf in value(free).items()}
     for name, leaf in base.items():
         if not np.isfinite(leaf).all():
             raise ValueError(f"check_grad: f(x){name} is not finite: {leaf}")
     rng, found = np.random.default_rng(seed), []
     weights = {name: rng.normal(size=leaf.shape) for name, leaf in base.items()}
-    forward = jax.jit(lambda x, d: jax.jvp(outputs, (x,), (d,))[1])
-    gradients = {} if mode == "forward" else _gradients(outputs, free, weights)
+    gradients = {} if mode == "forward" else _gradients(f, free, rest, weights)
     for place, (path, leaf) in enumerate(named):
         for _ in range(directions if leaf.size else 0):
             along = rng.normal(size=leaf.shape)
             along = jnp.asarray(along / np.linalg.norm(along) * (np.linalg.norm(leaf) or 1.0), leaf.dtype)
             direction = jax.tree.unflatten(jax.tree.structure(free), [along if i == place else jnp.zeros_like(x) for i, (_, x) in enumerate(named)])
             difference, doubt = _differences(value, free, direction, step)
-            ahead = None if mode == "reverse" else forward(free, direction)
+            ahead = None if mode == "reverse" else _along(f, free, rest, direction)
             for name, weight in weights.items():
                 pair = f"f(x){name}", f"x{jax.tree_util.keystr(path)}"
                 back = None if mode == "forward" else sum(float(jnp.vdot(g, d)) for g, d in zip(gradients[name], jax.tree.leaves(direction), strict=True))
@@ -87,12 +82,29 @@ def check_grad(f: Callable, x, mode: str = "both", directions: int = 2, step: fl
     return dataclasses.replace(worst, modes=max(c.modes for c in found), mode=mode)
 
 
-def _gradients(outputs, free, weights):
+# (compiled once for a function, however many points it is checked at)
+@eqx.filter_jit
+def _outputs(f, free, rest):
+    """The floats of f(x) by their paths."""
+    floats = jax.tree_util.tree_flatten_with_path(eqx.filter(f(eqx.combine(free, rest)), eqx.is_inexact_array))[0]
+    return {jax.tree_util.keystr(path): leaf for path, leaf in floats}
+
+
+@eqx.filter_jit
+def _along(f, free, rest, direction):
+    return jax.jvp(lambda free: _outputs(f, free, rest), (free,), (direction,))[1]
+
+
+@eqx.filter_jit
+def _weighed(f, free, rest, weights):
+    return jax.tree.leaves(jax.vjp(lambda free: _outputs(f, free, rest), free)[1](weights)[0])
+
+
+def _gradients(f, free, rest, weights):
     """For each output leaf, the gradient of its entries summed with random weights."""
-    backward = jax.jit(lambda x, w: jax.tree.leaves(jax.vjp(outputs, x)[1](w)[0]))
-    dtypes = {name: s.dtype for name, s in jax.eval_shape(outputs, free).items()}
-    only = lambda chosen: {name: jnp.asarray(w if name == chosen else np.zeros_like(w), dtypes[name]) for name, w in weights.items()}
-    return {name: backward(free, only(name)) for name in weights}
+    shapes = eqx.filter_eval_shape(_outputs, f, free, rest)
+    only = lambda chosen: {name: jnp.asarray(w if name == chosen else np.zeros_like(w), shapes[name].dtype) for name, w in weights.items()}
+    return {name: _weighed(f, free, rest, only(name)) for name in weights}
 
 
 def _differences(value, free, direction, step):
@@ -122,11 +134,12 @@ def _differences(value, free, direction, step):
 
 def _compare(derivative, difference, doubt, modes: float, output: str, input: str) -> Check:
     """The worst entry of one leaf."""
-    size = max(np.abs(derivative).max(initial=0), np.abs(difference).max(initial=0))
+    size = max(np.abs(x[np.isfinite(x)]).max(initial=0) for x in map(np.asarray, (derivative, difference)))
     # both nothing: what is within the round-off of differences is no error
-    size = size if not size <= 1e-9 else 1.0
+    size = size if size > 1e-9 else 1.0
     off = np.abs(derivative - difference)
     off = np.where(np.isfinite(off), off, np.inf).ravel()
+    modes = modes if np.isfinite(modes) else np.inf
     if not off.size:
         return Check(0.0, output, input, 0.0, 0.0, 0.0, modes)
     at = int(np.argmax(off))

@@ -81,8 +81,9 @@ def locate(hit: Bool[Array, ""], t_end, end: Motion, solver, scene: Scene, guard
         fired = crossed & (passed(values) + side * slopes * event_tolerance(root) >= 0)
         fired = fired | (jnp.arange(side.shape[0], dtype=jnp.int32) == first)
         value, slope = jnp.abs(values[first]), jnp.abs(slopes[first])
-        jumps = value > slope * event_tolerance(root)
-        flat = ~jumps & (slope * (t_end - watch.start) < FLAT * jnp.maximum(jnp.abs(watch.before[first]), jnp.abs(watch.after[first])))
+        large = FLAT * jnp.maximum(jnp.abs(watch.before[first]), jnp.abs(watch.after[first]))
+        jumps = (value > slope * event_tolerance(root)) & (value > large)
+        flat = ~jumps & (slope * (t_end - watch.start) < large)
         # zero: not armed, until it has left zero
         return root, y, Found(fired, jnp.where(fired, 0, values), first, hit, jumps, flat)
 
@@ -101,8 +102,8 @@ def _arrived_jvp(primals, tangents):
     end, at = arrived(*primals)
     field, d_field = (guards, d_guards) if isinstance(guards, Field) else (guards.field, d_guards.field)
     d_t = filled(t, d_t)
-    dy = _carried((filled(y, dy), d_scene, d_field), end - t, end, at, scene, field)
     rate = field(end, at, scene)
+    dy = carried((filled(y, dy), d_scene, d_field), rate, end - t, end, at, scene, field)
     dt = filled(late, d_late)
     if found is not None:
         guard = lambda t, y, scene, guards: guards(t, y, scene)[found.first]
@@ -138,18 +139,23 @@ def _carried_transpose(inputs, cotangent: Motion):
     changes, *where = inputs
     linear = lambda x: isinstance(x, ad.UndefinedPrimal)
     asked = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) if linear(x) else None, changes, is_leaf=linear)
-    return _brought_back(cotangent, asked, *where), *jax.tree.map(lambda _: None, tuple(where))
+    return _brought_back(filled(where[2], cotangent), asked, *where), *jax.tree.map(lambda _: None, tuple(where))
 
 
-# _carried((dy, d_scene, d_field), delay, t, at, scene, field) -> dy: a change of the motion carried along for a time that is zero but may itself
-# change, which second derivatives see
 _carried = operation("carried", lambda changes, *_: changes[0], _carried_jvp, _carried_transpose)
+
+
+def carried(changes, rate: Motion, none, t, at: Motion, scene: Scene, field: Field) -> Motion:
+    """Of changes = (dy, d_scene, d_field), dy carried along for a time that is zero but may itself change, which second derivatives see."""
+    # a number for each lane of its own, as the operation's transpose would not sum over lanes
+    one = 1 + 0 * jnp.sum(rate.v)
+    return _carried(jax.tree.map(lambda d: d * one, changes), none, t, at, scene, field)
 
 
 def _back(cotangent: Motion, asked, *_):
     """The cotangent of dy, and zeros for those of the scene and the field, as far as they are asked for."""
     moving, *rest = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), asked)
-    return jax.tree.map(lambda d, z: None if z is None else d, cotangent, moving), *rest
+    return jax.tree.map(lambda z, c: None if z is None else c, moving, cotangent, is_leaf=lambda z: z is None), *rest
 
 
 def _back_jvp(primals, tangents):
@@ -158,7 +164,8 @@ def _back_jvp(primals, tangents):
     change = _back(filled(cotangent, further), asked)
     if delay is not None:
         pulled = eqx.filter_vjp(lambda y, scene, field: field(t, y, scene), at, scene, field)[1](cotangent)
-        change = jax.tree.map(lambda c, p: c + delay * p, change, jax.tree.map(lambda a, p: None if a is None else p, asked, pulled, is_leaf=lambda a: a is None))
+        grown = lambda c, p: None if c is None else c + delay * p
+        change = jax.tree.map(grown, change, pulled, is_leaf=lambda c: c is None)
     return _brought_back(*primals), change
 
 

@@ -188,8 +188,13 @@ def _angles(turn: Float[Array, "links 4"], freedoms: Bool[Array, "links 6"]) -> 
     """Turns about x, y, z in sequence; those not free are taken as zero, the others solved from the rotation."""
     R = quat_matrix(turn)
     fx, fy, fz = freedoms[:, 0], freedoms[:, 1], freedoms[:, 2]
+
+    def angle(s, c):
+        # where there is none, no derivative that is not a number either
+        return jnp.arctan2(s, jnp.where((s == 0) & (c == 0), 1, c))
+
     # each from the entries of Rx Ry, Rx Rz or Ry Rz that hold it alone
-    x = jnp.where(fx, jnp.where(fz, jnp.arctan2(-R[:, 1, 2], R[:, 2, 2]), jnp.arctan2(R[:, 2, 1], R[:, 1, 1])), 0)
-    y = jnp.where(fy, jnp.arctan2(R[:, 0, 2], jnp.where(fz, R[:, 2, 2], R[:, 0, 0])), 0)
-    z = jnp.where(fz, jnp.where(fx, jnp.arctan2(-R[:, 0, 1], R[:, 0, 0]), jnp.arctan2(R[:, 1, 0], R[:, 1, 1])), 0)
+    x = jnp.where(fx, jnp.where(fz, angle(-R[:, 1, 2], R[:, 2, 2]), angle(R[:, 2, 1], R[:, 1, 1])), 0)
+    y = jnp.where(fy, angle(R[:, 0, 2], jnp.where(fz, R[:, 2, 2], R[:, 0, 0])), 0)
+    z = jnp.where(fz, jnp.where(fx, angle(-R[:, 0, 1], R[:, 0, 0]), angle(R[:, 1, 0], R[:, 1, 1])), 0)
     return jnp.stack([x, y, z], -1)

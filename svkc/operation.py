@@ -1,4 +1,4 @@
-"""F0: functions that have derivatives of their own, at every order and in every transformation."""
+"""F0: functions that have derivatives of their own, in every transformation and where they are differentiated twice."""
 
 from collections.abc import Callable
 

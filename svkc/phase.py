@@ -50,12 +50,13 @@ def solve(run: Run, stop, ts, made: Plan, options: Options, scene: Scene) -> Sol
     still = Motion(run.state.q, run.state.v, run.work)
     watch = None if guards is None else frozen(Watch(run.t, still, run.guards, run.guards))
     start = eqx.tree_at(lambda y: y.watch, still, watch, is_leaf=lambda x: x is None)
-    at = jnp.clip(ts, run.t, jnp.maximum(stop, run.t))
+    # a save time within the phase, its ends included, moves by itself; what is saved of the others counts in another phase
+    begun, ended = frozen((run.t, jnp.maximum(stop, run.t)))
+    at = jnp.where(ts < begun, begun, jnp.where(ts > ended, ended, ts))
     path, found = _path(start, (run.t, stop, at), World(scene, options.field), guards, options)
     stats, result = (path.accepted, path.rejected), _translate(path.result, path.end)
-    # of a scheduled end the time goes on to move; a diffrax adjoint has seen to that
-    scheduled = path.result == diffrax.RESULTS.successful._value
-    late = jnp.where(scheduled, stop - path.t, 0) if isinstance(options.adjoint, Replay) else jnp.zeros_like(stop)
+    # a scheduled end goes on to move with its time, where a diffrax adjoint has not seen to that
+    late = jnp.where(path.result == diffrax.RESULTS.successful._value, stop - path.t, 0)
     t, motion = arrived(path.t, path.end, late, scene, options.field if guards is None else guards, found)
     if found is None:
         return Solved(t, motion, jnp.zeros(0, bool), None, path.saved, stats, result, RESULTS.successful)

@@ -1,7 +1,8 @@
 """F6: the motion of one phase as a function that is differentiated both ways, whatever solver and step control found it.
 
-The run itself is never differentiated. Its steps are then gone through again, with their times held fixed, for what a change of start, times and
-parameters does to each: forwards for a tangent, backwards for a cotangent. Kept of a run are the times of its steps and one state in `every`.
+The run itself is never differentiated. Its steps are gone through again, their times held fixed, for what a change of start and parameters does to
+each: forwards for a tangent, backwards for a cotangent. Kept of a run are the times of its steps and one state in `every`. What a change of the start's
+time or of a save time does is the rate of the motion there.
 """
 
 import diffrax
@@ -11,9 +12,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from svkc.location import Found, locate
+from svkc.location import Found, carried, locate
 from svkc.operation import operation
-from svkc.stepping import Field, Motion, Scene, Settled, filled, step_alone
+from svkc.stepping import Field, Motion, Scene, Settled, filled, frozen, step_alone
 
 # blocks are passed over in groups where the run has no more steps
 GROUP = 64
@@ -93,17 +94,11 @@ def _integrated(start: Motion, times, world: World, how: How) -> Path:
 
 
 def _grid(t0, at, path: Path):
-    """[steps + 1] times of the start and of every step, those that met a save time being that time; after the last step, its end; and for each save
-    time the place in the grid of the state saved there."""
-    recorded = jnp.concatenate([jax.lax.stop_gradient(t0)[None], path.times])
-    place = jnp.searchsorted(recorded, jax.lax.stop_gradient(at)).astype(jnp.int32)
-    met = recorded[jnp.minimum(place, recorded.shape[0] - 1)] == at
-    last = recorded[path.accepted]
-    recorded = jnp.where(jnp.isfinite(recorded), recorded, last)
-    times = recorded.at[jnp.where(met & (place > 0), place, recorded.shape[0])].set(at, mode="drop")
+    """[steps + 1] times of the start and of every step, after the last its end again; and for each save time the place of its state among them."""
+    times = jnp.concatenate([t0[None], path.times])
+    place = jnp.searchsorted(times, at).astype(jnp.int32)
     # past the last step time stands still
-    times = jnp.where(jnp.arange(times.shape[0], dtype=jnp.int32) > path.accepted, times[path.accepted], times)
-    return times.at[0].set(t0), place
+    return jnp.where(jnp.arange(times.shape[0], dtype=jnp.int32) > path.accepted, times[path.accepted], times), place
 
 
 def _block(y: Motion, times, world: World, solver) -> tuple[Motion, Motion]:
@@ -117,30 +112,35 @@ def _block(y: Motion, times, world: World, solver) -> tuple[Motion, Motion]:
 
 
 def _integrated_jvp(primals, tangents):
+    """Tangents at the times that the run has found, which stay; a start that comes later has less time to move, a state saved later has moved on."""
     start, times, world, how = primals
     d_start, d_times, d_world, _ = tangents
     path = integrated(start, times, world, how)
     (t0, _, at), (d_t0, _, d_at) = times, d_times
-    grid, place = _grid(t0, at, path)
-    d_grid = _zeros(grid) if d_t0 is None and d_at is None else eqx.filter_jvp(lambda t0, at: _grid(t0, at, path)[0], (t0, at), (d_t0, d_at))[1]
-    d_start = filled(start.bare, d_start.bare)
-    d_end, d_saved, d_kept = _through(start.bare, d_start, grid, d_grid, place, world, d_world, path, how)
+    grid, place = _grid(*frozen((t0, at, path)))
+    start, d_start = _moved(start.bare, filled(start.bare, d_start.bare), t0, d_t0, -1, world, d_world)
+    d_end, d_saved, d_kept = _through(start, d_start, grid, place, world, d_world, path, how)
     if d_at is not None:
-        # a state saved at the start moves with its own time, at the rate of the motion there
-        rate = world.field(t0, start.bare, world.scene)
-        delay = jnp.where(place == 0, d_at - filled(t0, d_t0), 0)
-        d_saved = jax.tree.map(lambda d, r: d + delay.reshape(-1, *(1,) * r.ndim) * r[None], d_saved, rate)
+        later = lambda y, dy, t, dt: _moved(y, dy, t, dt, 1, world, d_world)[1]
+        d_saved = jax.vmap(later)(path.saved, d_saved, at, d_at)
     none = jax.tree.map(lambda x: None, path)
-    moving = lambda p: (p.t, p.end, p.saved, p.kept)
-    return path, eqx.tree_at(moving, none, (d_grid[path.accepted], d_end, d_saved, d_kept), is_leaf=lambda x: x is None or isinstance(x, Motion))
+    moving = lambda p: (p.end, p.saved, p.kept)
+    return path, eqx.tree_at(moving, none, (d_end, d_saved, d_kept), is_leaf=lambda x: x is None or isinstance(x, Motion))
 
 
-def _zeros(x):
-    return jax.tree.map(jnp.zeros_like, x)
+def _moved(y: Motion, dy: Motion, t, dt, sign: int, world: World, d_world) -> tuple[Motion, Motion]:
+    """The motion and its tangent, taken along by the change of a time: towards it (1), or from it back to where it was (-1)."""
+    if dt is None:
+        return y, dy
+    none = sign * (t - jax.lax.stop_gradient(t))
+    rate = world.field(t, y, world.scene)
+    dy = carried((dy, d_world.scene, d_world.field), rate, none, t, y, world.scene, world.field)
+    along = lambda x, factor: jax.tree.map(lambda x, r: x + factor * r, x, rate)
+    return along(y, none), along(dy, sign * dt)
 
 
 @eqx.filter_jit
-def _through(start: Motion, d_start: Motion, grid, d_grid, place, world: World, d_world, path: Path, how: How):
+def _through(start: Motion, d_start: Motion, grid, place, world: World, d_world, path: Path, how: How):
     """The tangents at the end, at the save times and at the kept states: block after block of steps, each from its kept state."""
     every, count = how.every, path.kept.q.shape[0] + 1
     groups = -(-count // GROUP)
@@ -157,16 +157,16 @@ def _through(start: Motion, d_start: Motion, grid, d_grid, place, world: World, 
     kept = jax.tree.map(lambda s, k: jnp.where(going.reshape(-1, *(1,) * s.ndim), k, s[None]), start, kept)
 
     @eqx.filter_checkpoint
-    def block(d_y, y, times, d_times):
-        _, (d_y, d_every) = eqx.filter_jvp(lambda y, times, world: _block(y, times, world, how.solver), (y, times, world), (d_y, d_times, d_world))
+    def block(d_y, y, times):
+        _, (d_y, d_every) = eqx.filter_jvp(lambda y, world: _block(y, times, world, how.solver), (y, world), (d_y, d_world))
         return d_y, d_every
 
     def one(carry, x):
         d_y, d_saved = carry
-        i, going, y, times, d_times = x
+        i, going, y, times = x
 
         def taken():
-            after, d_every = block(d_y, y, times, d_times)
+            after, d_every = block(d_y, y, times)
             here = (place > i * every) & (place <= jnp.minimum((i + 1) * every, path.accepted))
             local = jnp.clip(place - i * every - 1, 0, every - 1)
             spread = lambda old, new: jnp.where(here.reshape(-1, *(1,) * (old.ndim - 1)) & going, new[local], old)
@@ -186,7 +186,7 @@ def _through(start: Motion, d_start: Motion, grid, d_grid, place, world: World, 
         return jax.lax.cond(eqxi.unvmap_any(jnp.any(x[1])), some, none, carry)
 
     d_saved = jax.tree.map(lambda d: jnp.where((place == 0).reshape(-1, *(1,) * d.ndim), d[None], 0), d_start)
-    xs = jax.tree.map(lambda x: x.reshape(groups, GROUP, *x.shape[1:]), (index, going, kept, ends(grid), ends(d_grid)))
+    xs = jax.tree.map(lambda x: x.reshape(groups, GROUP, *x.shape[1:]), (index, going, kept, ends(grid)))
     (d_end, d_saved), after = jax.lax.scan(group, (d_start, d_saved), xs)
     written = (index[: count - 1] + 1) * every <= path.accepted
     flat = jax.tree.map(lambda d: d.reshape(-1, *d.shape[2:])[: count - 1], after)

@@ -147,7 +147,9 @@ def _phase(chain: Chain, run: Run, index, t1, ts, made: Plan, options: Options, 
     going = (run.t < t1) | jnp.any(run.pending & (made.times <= t1))
     going = going & (run.result == RESULTS.successful)
     next_time = jnp.min(jnp.where(run.pending, made.times, jnp.inf), initial=jnp.inf)
-    stop = jnp.where(going, jnp.maximum(jnp.minimum(t1, next_time), run.t), run.t)
+    # (the event's own time where it is that of the end, and the end's own where the run is there already: each is to be differentiated by)
+    ahead = jnp.where(next_time <= t1, next_time, t1)
+    stop = jnp.where((ahead < run.t) | (run.result != RESULTS.successful), run.t, ahead)
     solved = solve(run, stop, ts, made, options, Scene(chain, run.state.structure, args))
     reached = going & (solved.result == RESULTS.successful)
     timed = run.pending & (made.times <= solved.t + event_tolerance(solved.t)) & reached
@@ -167,7 +169,7 @@ def _phase(chain: Chain, run: Run, index, t1, ts, made: Plan, options: Options, 
 
 def _derivative(run: Run, solved: Solved, going, timed: Bool[Array, " timed"], margin) -> RESULTS:
     """The first reason why the run has no derivative."""
-    code = RESULTS.where(jnp.any(solved.fired) & jnp.any(timed), RESULTS.together, solved.derivative)
+    code = RESULTS.where(jnp.sum(solved.fired) + jnp.sum(timed) > 1, RESULTS.together, solved.derivative)
     code = RESULTS.where(margin < rank_tolerance(margin.dtype), RESULTS.rank_lost, code)
     return RESULTS.where((run.derivative == RESULTS.successful) & going, code, run.derivative)
 

@@ -49,7 +49,8 @@ class Motion(eqx.Module):
     @property
     def bare(self) -> "Motion":
         """Without what is watched."""
-        return Motion(self.q, self.v, self.work)
+        # (of tangents too, whose parts may be None)
+        return eqx.tree_at(lambda y: y.watch, self, None, is_leaf=lambda x: x is None)
 
 
 class Scene(eqx.Module):

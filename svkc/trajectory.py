@@ -21,8 +21,8 @@ class RESULTS(eqx.Enumeration):
     non_finite = "A number that is not finite appeared."
     grazing = "A guard touched zero rather than crossed it: the time of its event has no derivative, and those given are not numbers."
     jump = "A guard jumped over zero: the time of its event counts as fixed in derivatives."
-    together = "Two guards, or a guard and a scheduled event, happened at one instant: derivatives are those of this order of events."
-    rank_lost = "The loops lost rank within a phase: derivatives across it are not to be relied on."
+    together = "Events happened at one instant: derivatives are those of this order, and none where their times can change apart."
+    rank_lost = "The loops lose rank at an end of a phase: derivatives across it are not to be relied on."
     no_slot = "A grip was to be made and every spare slot was taken: it was not made, everything else was. Load with more spare slots, or unbind."
 
 

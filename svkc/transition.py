@@ -117,9 +117,6 @@ def lock_projection(chain: Chain, structure: Structure, q, v):
     return after, jump @ inertia_times(chain, kin, jump) / 2
 
 
-
-
-
 def transition(chain: Chain, state: State, connected) -> State:
     """The state with exactly these virtual links connected (mask, or names): new ones with their impact, the others cut."""
     mask = jnp.asarray(connection_mask(chain, connected))

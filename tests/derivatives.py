@@ -1,4 +1,8 @@
-"""What derivatives are checked on: a function of parameters for each case, its parameters, and the relative error it is held to."""
+"""What derivatives are checked on: a function of parameters for each case, its parameters, and the relative error it is held to.
+
+`python tests/derivatives.py` prints the README's table, or the rows of the cases named."""
+
+import sys
 
 import diffrax
 import equinox as eqx
@@ -11,6 +15,7 @@ import svkc
 
 TIGHT = {"rtol": 1e-11, "atol": 1e-13, "solver": diffrax.Dopri8()}
 ALGEBRA, RUN = 1e-8, 1e-6
+FLOATS = "mass com inertia pos quat axis anchor gravity armature damping stiffness q_spring".split()
 
 
 def model(chain, *names):
@@ -20,7 +25,7 @@ def model(chain, *names):
 
 def changed(chain, x):
     """The chain with the floats in x that are its own."""
-    for name in ("mass", "com", "inertia", "pos", "gravity", "armature", "damping"):
+    for name in FLOATS:
         if name in x:
             chain = eqx.tree_at(lambda c, name=name: getattr(c, name), chain, x[name])
     if "heavier" in x:
@@ -28,6 +33,11 @@ def changed(chain, x):
         grown = (chain.mass * x["heavier"], chain.inertia * x["heavier"][:, None, None])
         chain = eqx.tree_at(lambda c: (c.mass, c.inertia), chain, grown)
     return chain
+
+
+def heavier(chain):
+    """Factors of mass and inertia, body by body."""
+    return {"heavier": jnp.ones(len(chain.mass))}
 
 
 def start(state, x):
@@ -39,9 +49,16 @@ def start(state, x):
 
 def motion(traj):
     """What is looked at of a run; rows that no event has filled hold no numbers."""
-    event = jnp.where(jnp.isfinite(traj.events.time), traj.events.time, 0)
-    end = traj.final
-    return {"q": end.q, "v": end.v, "event": event, "lost": traj.events.energy_lost, "impulse": traj.events.impulse, "saved": traj.states.q}
+    e, p = traj.events, traj.phases
+    flat = lambda *parts: jnp.concatenate([jnp.ravel(part) for part in parts])
+    times = flat(e.time, p.start, p.stop, traj.t_final)
+    return {
+        "end": flat(traj.final.q, traj.final.v),
+        "saved": flat(traj.states.q, traj.states.v),
+        "times": jnp.where(jnp.isfinite(times), times, 0),
+        "impacts": flat(e.impulse, e.angular_impulse, e.energy_lost),
+        "energy": flat(p.energy, p.work),
+    }
 
 
 def algebra(chain, state):
@@ -82,6 +99,17 @@ def over_constrained():
     f, x, _ = algebra(chain, chain.state({"leg0": 0.3}, {"leg0": 1.0}))
     # what keeps the redundant rows redundant: no single place may move
     return f, {k: v for k, v in x.items() if k not in ("q", "v", "pos", "grip")}, ALGEBRA
+
+
+def every_float():
+    """A tree with hinges, slides, balls, springs, dampers, rotors and offset axes, by all that its model holds."""
+    chain = svkc.load(models.random_tree(6, seed=4))
+    rng = np.random.default_rng(4)
+    q = svkc.integrate(chain, chain.q_load, jnp.asarray(rng.normal(size=chain.dofs)))
+    f, x, _ = algebra(chain, svkc.State(q, jnp.asarray(rng.normal(size=chain.dofs)), chain.structure))
+    floats = model(chain, *FLOATS)
+    assert all(leaf is not None for leaf in floats.values())
+    return f, x | floats, ALGEBRA
 
 
 def at_rest():
@@ -136,15 +164,15 @@ def pendulum_cut():
     """Two rods, the second comes off at an angle of the first, and is taken hold of again where it is: both times, the angle and the model count."""
     rods = models.bar("upper", models.Y, "0 0 -1", inside=models.bar("lower", models.Y, "0 0 -0.8", "0 0 -1"))
     chain = svkc.load(models.MJCF.format(rods), cuttable="lower")
+    state = chain.state({"upper": 1.2, "lower": 0.3}, {"upper": 0.1, "lower": 0.2})
 
     def f(x):
-        c = changed(chain, x)
         events = [svkc.when(lambda t, s, args: s.q[0] - args, cut="lower"), svkc.at(x["again"], connect="lower", here=True)]
-        start = c.state(x["q"], x["v"])
-        return motion(svkc.simulate(c, start, x["t1"], ts=jnp.stack([x["seen"], x["t1"]]), events=events, args=x["angle"], **TIGHT))
+        ts = jnp.stack([x["seen"], x["t1"]])
+        return motion(svkc.simulate(changed(chain, x), state, x["t1"], ts=ts, events=events, args=x["angle"], **TIGHT))
 
-    x = {name: jnp.asarray(value) for name, value in {"angle": 0.4, "again": 0.55, "t1": 0.7, "seen": 0.5, "q": [1.2, 0.3], "v": [0.1, 0.2]}.items()}
-    return f, x | model(chain, "com", "gravity") | {"heavier": jnp.ones(len(chain.mass))}, RUN
+    x = {name: jnp.asarray(value) for name, value in {"angle": 0.4, "again": 0.55, "t1": 0.7, "seen": 0.5}.items()}
+    return f, x | model(chain, "com", "gravity") | heavier(chain), RUN
 
 
 def breaking():
@@ -161,7 +189,7 @@ def breaking():
         return motion(svkc.simulate(changed(chain, x), state, 0.6, events=events, control=control, args=x["torque"], **TIGHT))
 
     x = {"limit": jnp.asarray(32.0), "time": jnp.asarray(0.45), "torque": jnp.asarray(0.5), "place": jnp.array([0.1, 0.0, -0.7])}
-    return f, x | model(chain, "gravity") | {"heavier": jnp.ones(len(chain.mass))}, RUN
+    return f, x | model(chain, "gravity") | heavier(chain), RUN
 
 
 def four_bar_turning():
@@ -174,9 +202,11 @@ def four_bar_turning():
         # the pin may be elsewhere in the plane; out of it the loop would not close
         pin = chain.structure.real_pos.at[:, ::2].add(x["pin"])
         c = eqx.tree_at(lambda c: c.structure.real_pos, c, pin)
-        return c, svkc.simulate(c, c.state({"crank": x["angle"]}, {"crank": x["speed"]}), 1.0, ts=jnp.linspace(0, 1, 9), control=control, args=x["torque"], **TIGHT)
+        start = c.state({"crank": x["angle"]}, {"crank": x["speed"]})
+        return c, svkc.simulate(c, start, 1.0, ts=jnp.linspace(0, 1, 9), control=control, args=x["torque"], **TIGHT)
 
-    x = {"torque": jnp.array([2.0, 3.0]), "speed": jnp.asarray(6.0), "angle": jnp.asarray(0.1), "pin": jnp.zeros((1, 2))} | model(chain, "gravity") | {"heavier": jnp.ones(len(chain.mass))}
+    x = {"torque": jnp.array([2.0, 3.0]), "speed": jnp.asarray(6.0), "angle": jnp.asarray(0.1), "pin": jnp.zeros((1, 2))}
+    x |= model(chain, "gravity") | heavier(chain)
     c, traj = run(x)
     dependent = jax.vmap(lambda s: svkc.coordinates(c, s).dependent)(traj.states)
     assert jnp.any(dependent != dependent[0]), "no coordinate was swapped"
@@ -186,14 +216,13 @@ def four_bar_turning():
 def over_constrained_run():
     """Three parallel bars swing and the middle one lets go, for a while."""
     chain = models.parallelogram()
+    state = chain.state({"leg0": 0.3}, {"leg0": 1.0})
 
     def f(x):
-        c = changed(chain, x)
         events = [svkc.at(x["time"], cut="pin1"), svkc.at(x["time"] + 0.1, connect="pin1", here=True)]
-        return motion(svkc.simulate(c, c.state({"leg0": x["angle"]}, {"leg0": x["speed"]}), 0.5, events=events, **TIGHT))
+        return motion(svkc.simulate(changed(chain, x), state, 0.5, events=events, **TIGHT))
 
-    x = {"time": jnp.asarray(0.2), "angle": jnp.asarray(0.3), "speed": jnp.asarray(1.0)}
-    return f, x | model(chain, "gravity") | {"heavier": jnp.ones(len(chain.mass))}, RUN
+    return f, {"time": jnp.asarray(0.2)} | model(chain, "gravity") | heavier(chain), RUN
 
 
 def high_bar():
@@ -209,7 +238,7 @@ def high_bar():
 
     rng = np.random.default_rng(1)
     x = {"times": jnp.array([0.2, 0.3, 0.4]), "torque": jnp.asarray(5 * rng.normal(size=16)), "v": jnp.zeros(chain.nv)}
-    return f, x | {"heavier": jnp.ones(len(chain.mass))}, RUN
+    return f, x | heavier(chain), RUN
 
 
 def swing():
@@ -218,14 +247,13 @@ def swing():
 
     chain, state = swing(ignore="limit")
     # turned a little, so that the thighs leave one after the other
-    speed = chain.state(state.q[: chain.nq], {"base": [2.2, 0.1, 0, 0, 0, 0.3]}).v[: chain.nv]
+    state = chain.state(state.q[: chain.nq], {"base": [2.2, 0.1, 0, 0, 0, 0.3]})
 
     def f(x):
         control = lambda t, s, args: jnp.concatenate([jnp.zeros(7), args, jnp.zeros(chain.dofs - 23)])
-        start = chain.state(state.q[: chain.nq], x["v"])
-        return motion(svkc.simulate(chain, start, x["t1"], events=leaving(chain), control=control, args=x["torque"], **TIGHT))
+        return motion(svkc.simulate(changed(chain, x), state, x["t1"], events=leaving(chain), control=control, args=x["torque"], **TIGHT))
 
-    return f, {"t1": jnp.asarray(0.6), "torque": 3 * jnp.ones(16), "v": speed}, RUN
+    return f, {"t1": jnp.asarray(0.2), "torque": 3 * jnp.ones(16)} | heavier(chain), RUN
 
 
 def brachiation():
@@ -233,7 +261,8 @@ def brachiation():
     from svkc.scenes.brachiation import brachiation
 
     chain, state = brachiation(ignore="limit")
-    held = {"right_shoulder_flexion": 3.0, "right_elbow": 0.85, "left_shoulder_flexion": 2.4, "left_elbow": 0.1, "left_hip_flexion": 0.8, "right_hip_flexion": 0.8}
+    held = {"right_shoulder_flexion": 3.0, "right_elbow": 0.85, "left_shoulder_flexion": 2.4, "left_elbow": 0.1}
+    held |= {"left_hip_flexion": 0.8, "right_hip_flexion": 0.8}
     pose = jnp.array([held.get(name, 0.0) for name in chain.joint_names[1:]])
     strong = jnp.array([60.0 if any(part in name for part in ("shoulder", "elbow", "hip")) else 5.0 for name in chain.joint_names[1:]])
 
@@ -248,6 +277,21 @@ def brachiation():
     return f, {"reach": jnp.asarray(0.45), "release": jnp.asarray(0.72), "pose": pose}, RUN
 
 
-ALGEBRAIC = {case.__name__: case for case in (four_bar, spatial_loop, over_constrained, at_rest, assembly, impact)}
+ALGEBRAIC = {case.__name__: case for case in (four_bar, spatial_loop, over_constrained, every_float, at_rest, assembly, impact)}
 RUNS = {case.__name__: case for case in (pendulum_cut, breaking, four_bar_turning, over_constrained_run, high_bar, swing, brachiation)}
 CASES = ALGEBRAIC | RUNS
+
+
+def main(names):
+    """A row for each case: the worst entry in both modes, along a random direction of each parameter."""
+    print("| case | parameters | worst relative error | of | difference good to | forward against reverse |\n|---|---|---|---|---|---|")
+    for name in names or CASES:
+        f, x, _ = CASES[name]()
+        found = svkc.check_grad(f, x, directions=1)
+        worst = f"{found.output[5:]} by {found.input[1:]}".replace("'", "")
+        print(f"| {name} | {', '.join(x)} | {found.error:.1e} | {worst} | {found.uncertainty:.0e} | {found.modes:.0e} |", flush=True)
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_enable_x64", True)
+    main(sys.argv[1:])
