@@ -11,7 +11,7 @@ from svkc.events import Plan
 from svkc.location import Crossing, Found, Reading, arrived, locate
 from svkc.replay import How, Path, Replay, World, integrated
 from svkc.request import Options
-from svkc.stepping import Motion, Scene, Settled, Watch, frozen, step_alone
+from svkc.stepping import Motion, Scene, Settled, Watch, frozen, staged, step_alone
 from svkc.trajectory import RESULTS, Events, Phases
 
 
@@ -76,7 +76,9 @@ def _path(start: Motion, times, world: World, guards: Reading | None, options: O
         how = How(*frozen((options.solver, guards, controller, first)), event, options.progress_meter, options.max_steps, every)
         path = integrated(start, times, world, how)
         return path, frozen(path.found)
-    solver = Settled(options.solver, options.stabilization, guards)
+    # as diffrax would set it, did it see through the wrapper
+    kind = {diffrax.ForwardMode: "lax", diffrax.DirectAdjoint: "bounded"}.get(type(options.adjoint))
+    solver = Settled(staged(options.solver, kind), options.stabilization, guards)
     saveat = diffrax.SaveAt(subs=[diffrax.SubSaveAt(t1=True), diffrax.SubSaveAt(ts=at)])
     sol = diffrax.diffeqsolve(
         diffrax.ODETerm(world.field), solver, t0, stop, first, start, world.scene, saveat=saveat, stepsize_controller=controller,

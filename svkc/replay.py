@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from svkc.location import Found, carried, locate
 from svkc.operation import operation
-from svkc.stepping import Field, Motion, Scene, Settled, filled, frozen, step_alone
+from svkc.stepping import Field, Motion, Scene, Settled, filled, frozen, staged, step_alone
 
 # blocks are passed over in groups where the run has no more steps
 GROUP = 64
@@ -67,9 +67,7 @@ class Path(eqx.Module):
 def _integrated(start: Motion, times, world: World, how: How) -> Path:
     """Diffrax from times = (t0, stop, save times) to `stop`, or to where in its last step a guard was zero. In derivatives the end's time is fixed."""
     t0, stop, at = times
-    inner = how.solver
-    if isinstance(inner, diffrax.AbstractRungeKutta):
-        inner = eqx.tree_at(lambda s: s.scan_kind, inner, "lax", is_leaf=lambda x: x is None)
+    inner = staged(how.solver, "lax")
     solver = Settled(inner, world.field.stabilization, how.guards)
     subs = [
         diffrax.SubSaveAt(t1=True),
@@ -112,31 +110,36 @@ def _block(y: Motion, times, world: World, solver) -> tuple[Motion, Motion]:
 
 
 def _integrated_jvp(primals, tangents):
-    """Tangents at the times that the run has found, which stay; a start that comes later has less time to move, a state saved later has moved on."""
+    """Tangents at the times that the run has found, which stay, and what the changes of its start's time and of the save times add."""
     start, times, world, how = primals
     d_start, d_times, d_world, _ = tangents
     path = integrated(start, times, world, how)
     (t0, _, at), (d_t0, _, d_at) = times, d_times
     grid, place = _grid(*frozen((t0, at, path)))
-    start, d_start = _moved(start.bare, filled(start.bare, d_start.bare), t0, d_t0, -1, world, d_world)
+    start, d_start = _from_fixed(start.bare, filled(start.bare, d_start.bare), t0, d_t0, world, d_world)
     d_end, d_saved, d_kept = _through(start, d_start, grid, place, world, d_world, path, how)
     if d_at is not None:
-        later = lambda y, dy, t, dt: _moved(y, dy, t, dt, 1, world, d_world)[1]
-        d_saved = jax.vmap(later)(path.saved, d_saved, at, d_at)
+        d_saved = jax.vmap(lambda y, dy, t, dt: _moved_on(y, dy, t, dt, world, d_world))(path.saved, d_saved, at, d_at)
     none = jax.tree.map(lambda x: None, path)
     moving = lambda p: (p.end, p.saved, p.kept)
     return path, eqx.tree_at(moving, none, (d_end, d_saved, d_kept), is_leaf=lambda x: x is None or isinstance(x, Motion))
 
 
-def _moved(y: Motion, dy: Motion, t, dt, sign: int, world: World, d_world) -> tuple[Motion, Motion]:
-    """The motion and its tangent, taken along by the change of a time: towards it (1), or from it back to where it was (-1)."""
-    if dt is None:
+def _from_fixed(y: Motion, dy: Motion, t0, d_t0, world: World, d_world) -> tuple[Motion, Motion]:
+    """The start of a run and its tangent, as of a start at a time that stays: one that comes later has less time to move."""
+    if d_t0 is None:
         return y, dy
-    none = sign * (t - jax.lax.stop_gradient(t))
-    rate = world.field(t, y, world.scene)
+    none, rate = jax.lax.stop_gradient(t0) - t0, world.field(t0, y, world.scene)
+    dy = jax.tree.map(lambda d, r: d - r * d_t0, dy, rate)
+    dy = carried((dy, d_world.scene, d_world.field), rate, none, t0, y, world.scene, world.field)
+    return jax.tree.map(lambda y, r: y + none * r, y, rate), dy
+
+
+def _moved_on(y: Motion, dy: Motion, t, dt, world: World, d_world) -> Motion:
+    """The tangent of a state saved at a time that changes, from that at a time that stays."""
+    none, rate = t - jax.lax.stop_gradient(t), world.field(t, y, world.scene)
     dy = carried((dy, d_world.scene, d_world.field), rate, none, t, y, world.scene, world.field)
-    along = lambda x, factor: jax.tree.map(lambda x, r: x + factor * r, x, rate)
-    return along(y, none), along(dy, sign * dt)
+    return jax.tree.map(lambda d, r: d + r * dt, dy, rate)
 
 
 @eqx.filter_jit

@@ -195,6 +195,13 @@ class Settled(diffrax.AbstractWrappedSolver):
         return y1, error, {"inner": dense, "shift": shift}, solver_state, result
 
 
+def staged(solver: diffrax.AbstractSolver, kind: str | None) -> diffrax.AbstractSolver:
+    """The solver with its loop over stages made for what is to be differentiated: "lax" forwards, "bounded" both ways, None diffrax's own choice."""
+    if not isinstance(solver, diffrax.AbstractRungeKutta):
+        return solver
+    return eqx.tree_at(lambda s: s.scan_kind, solver, kind, is_leaf=lambda x: x is None)
+
+
 def step_alone(solver: diffrax.AbstractSolver, field: Field, t0, t1, y: Motion, scene: Scene) -> Motion:
     """One settled step of a solver that remembers nothing of the step before, to be differentiated: of each evaluation of the field, and of what
     settles the step, only the arguments are kept on the way back."""
@@ -202,8 +209,7 @@ def step_alone(solver: diffrax.AbstractSolver, field: Field, t0, t1, y: Motion, 
     if isinstance(solver, diffrax.AbstractERK) and isinstance(solver.tableau, diffrax.ButcherTableau):
         raw = _explicit_step(solver.tableau, rate, t0, t1, y, scene)
     else:
-        if isinstance(solver, diffrax.AbstractRungeKutta):
-            solver = eqx.tree_at(lambda s: s.scan_kind, solver, "bounded", is_leaf=lambda x: x is None)
+        solver = staged(solver, "bounded")
         term = diffrax.ODETerm(rate)
         raw = solver.step(term, t0, t1, y, scene, solver.init(term, t0, t1, y, scene), False)[0]
     return settle(field.stabilization, scene, raw)

@@ -186,18 +186,19 @@ def test_second_derivatives(pendulum):
 
 def test_where_there_is_no_derivative(pendulum):
     """A guard that grazes, one that jumps, two at one instant, a rank that is lost: a code says so; a grazing guard gives no number."""
-    angle = lambda t, s, args: s.q[0] - args
 
-    def reached(at, start=1.2):
+    def grazed(size):
+        """A guard that is above zero for a moment only, at a time where the run stops to save."""
+        above = lambda t, s, args: args - (t - 0.5) ** 2
         state = pendulum.state({"arm": 1.2})
-        state = svkc.State(state.q.at[0].set(start), state.v, state.structure)
-        return svkc.simulate(pendulum, state, 2.0, events=[svkc.when(angle, stop=True)], args=jnp.asarray(at), **TIGHT)
+        return svkc.simulate(pendulum, state, 1.0, ts=jnp.array([0.5]), events=[svkc.when(above, stop=True)], args=size, **TIGHT)
 
-    assert reached(0.3).derivative == svkc.RESULTS.successful
-    # the far turning point, less a hair: the angle goes through it at almost no rate
-    hair = 1e-14 - 1.2
-    assert reached(hair).derivative == svkc.RESULTS.grazing
-    assert np.isnan(jax.grad(lambda q: reached(hair, q).events.time[0])(1.2))
+    # at 0.4 it goes through zero at a rate; 3e-8 s before 0.5 s at almost none
+    assert grazed(jnp.asarray(0.01)).derivative == svkc.RESULTS.successful
+    assert grazed(jnp.asarray(1e-15)).derivative == svkc.RESULTS.grazing
+    slopes = jax.vmap(jax.grad(lambda size: grazed(size).events.time[0]))(jnp.array([0.01, 1e-15]))
+    np.testing.assert_allclose(slopes[0], -5.0, rtol=1e-9)
+    assert np.isnan(slopes[1])
 
     def code(*events):
         return svkc.simulate(pendulum, pendulum.state({"arm": 1.2}), 2.0, events=events, **TIGHT).derivative
@@ -208,7 +209,7 @@ def test_where_there_is_no_derivative(pendulum):
     assert code(svkc.when(lambda t, s, a: t - 0.5), svkc.at(0.5, connect="hook", here=True)) == svkc.RESULTS.together
     # a parallelogram laid flat: its bars in one line
     flat = models.parallelogram(middle=False)
-    lost = svkc.simulate(flat, flat.state({"leg0": np.pi / 2}, {"leg0": 1.0}), 0.0)
+    lost = svkc.simulate(flat, flat.state({"leg0": np.pi / 2}, {"leg0": 1.0}), 1e-3, throw=False)
     assert lost.derivative == svkc.RESULTS.rank_lost
     assert float(lost.phases.margin[0]) < 1e-8
 
@@ -226,7 +227,7 @@ def test_nothing_is_not_a_number():
         return derivatives.motion(traj) | {"forces": svkc.loop_forces(c, traj.final, jnp.zeros(chain.dofs)).force, "gap": traj.gaps}
 
     x = {"q": state.q, "v": state.v, "time": jnp.asarray(0.05)} | derivatives.model(chain, "mass", "inertia", "com", "pos", "gravity")
-    total = lambda x: sum(jnp.sum(leaf) for leaf in everything(x).values())
+    total = lambda x: sum(jnp.sum(leaf) for leaf in jax.tree.leaves(everything(x)))
     backwards = jax.grad(total)(x)
     forwards = jax.jvp(total, (x,), (jax.tree.map(jnp.ones_like, x),))[1]
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(backwards))
@@ -239,13 +240,12 @@ def test_adjoints_pass_through(pendulum):
 
     x = jnp.array([1.2, 0.3, 0.8, 1.3])
 
-    def loss(x, adjoint=None):
+    def loss(x, adjoint):
         traj = held(pendulum, x, ts=jnp.array([0.5, 0.9]), dt=0.01, adjoint=adjoint, max_steps=300)
         return traj.final.q[0] + jnp.sum(traj.states.q)
 
-    expected = jax.grad(loss)(x)
-    for adjoint in (svkc.Replay(every=5), diffrax.RecursiveCheckpointAdjoint()):
-        np.testing.assert_allclose(jax.grad(loss)(x, adjoint), expected, atol=1e-7)
+    expected = jax.grad(loss)(x, svkc.Replay(every=5))
+    np.testing.assert_allclose(jax.grad(loss)(x, diffrax.RecursiveCheckpointAdjoint()), expected, atol=1e-7)
     forward = jax.jvp(lambda x: loss(x, diffrax.ForwardMode()), (x,), (jnp.ones(4),))[1]
     np.testing.assert_allclose(forward, jnp.sum(expected), atol=1e-7)
     with pytest.raises(ValueError, match="adjoint"):
@@ -290,6 +290,6 @@ def test_the_check_finds_what_is_wrong():
         with pytest.raises(ValueError, match=r"check_grad|mode"):
             svkc.check_grad(f, x, **kw)
     assert svkc.check_grad(jnp.sin, 1.0).error < 1e-9
-    # a derivative that is no number is the worst there is
-    found = svkc.check_grad(lambda x: {"a": x, "root": jnp.where(x > 0, jnp.sqrt(x), x)}, {"x": jnp.asarray(0.0)}["x"])
-    assert found.error == np.inf
+    # a derivative that is no number is as wrong as can be
+    found = svkc.check_grad(lambda x: {"a": x, "root": jnp.where(x > 0, jnp.sqrt(x), x)}, jnp.zeros(()))
+    assert found.modes == np.inf
