@@ -83,4 +83,4 @@ figure.savefig(path, dpi=110)
 print("wrote", path)
 alone = lambda x: loss(x)[0]
 for when, at in (("start", first), ("end", x)):
-    print(f"gradient at the {when}: {svkc.check_grad(alone, at, directions=1)}")
+    print(f"gradient at the {when}: {svkc.check_grad(alone, at, mode='reverse', directions=1)}")

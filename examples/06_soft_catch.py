@@ -75,4 +75,4 @@ figure.savefig(folder / "06_soft_catch.png", dpi=110, bbox_inches="tight")
 print("wrote", folder / "06_soft_catch.png")
 alone = lambda p: loss(p)[0]
 for when, at in (("start", first), ("end", p)):
-    print(f"gradient at the {when}: {svkc.check_grad(alone, at, directions=1)}")
+    print(f"gradient at the {when}: {svkc.check_grad(alone, at, mode='reverse', directions=1)}")
