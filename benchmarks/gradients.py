@@ -1,9 +1,9 @@
 """What derivatives cost: time and memory of a whole run, its gradient and its directional derivative, and the compilation of each.
 
-High bar: 1.8 s with both releases, 246 parameters (masses, centres of mass, velocity, release times, torques). Open chain: the same figure in free
+High bar: 1.8 s with both releases, 198 parameters (masses, centres of mass, velocity, release times, torques). Open chain: the same figure in free
 fall, 200 steps of the classical Runge-Kutta method of 2 ms, 198 parameters (velocity, torques), beside MJX's gradient of the same steps and central
-differences with MuJoCo; all three gradients are compared. `python benchmarks/gradients.py` prints and writes results/gradients.csv; needs the extra
-`bench`. float64. Medians; runs that are compared take turns."""
+differences with MuJoCo, both of which hold the torque of a step's middle; all three gradients are compared. `python benchmarks/gradients.py` prints and
+writes results/gradients.csv; needs the extra `bench`. float64. Medians; runs that are compared take turns."""
 
 import csv
 import os
@@ -84,8 +84,7 @@ def falling():
     state = chain.state()
 
     def loss(p):
-        # MuJoCo holds the torque over a step
-        control = lambda t, s, a: torques(a, jnp.floor(t / DT + 1e-6) * DT, jnp.pad)
+        control = lambda t, s, a: torques(a, t, jnp.pad)
         start = svkc.State(state.q, p["v"], state.structure)
         traj = svkc.simulate(chain, start, STEPS * DT, dt=DT, control=control, args=p["torque"], solver=ClassicalRungeKutta(), max_steps=STEPS + 2, throw=False)
         return jnp.sum(traj.final.q[:7])
@@ -102,7 +101,7 @@ def falling_by_mjx():
 
     def loss(p):
         def step(data, i):
-            return mjx.step(model, data.replace(qfrc_applied=torques(p["torque"], i * DT, jnp.pad))), None
+            return mjx.step(model, data.replace(qfrc_applied=torques(p["torque"], (i + 0.5) * DT, jnp.pad))), None
 
         return jnp.sum(jax.lax.scan(step, data.replace(qvel=p["v"]), jnp.arange(STEPS))[0].qpos[:7])
 
@@ -118,7 +117,7 @@ def falling_by_mujoco():
         mujoco.mj_resetData(model, data)
         data.qvel[:] = v
         for i in range(STEPS):
-            data.qfrc_applied[:] = torques(u, i * DT, np.pad)
+            data.qfrc_applied[:] = torques(u, (i + 0.5) * DT, np.pad)
             mujoco.mj_step(model, data)
         return data.qpos[:7].sum()
 

@@ -76,7 +76,7 @@ def close(chain: Chain, structure: Structure, q: Float[Array, " q"], iterations:
     """
     row, column = scales(chain)
 
-    @jax.checkpoint
+    @functools.partial(jax.checkpoint, prevent_cse=False)
     def newton(i, q):
         kin = kinematics(chain, q)
         end = ends(chain, structure, kin, q)
@@ -95,7 +95,7 @@ def settle_loops(chain: Chain, structure: Structure, q, v, iterations: int) -> t
     row, column = scales(chain)
     active = active_dofs(chain, structure)
 
-    @jax.checkpoint
+    @functools.partial(jax.checkpoint, prevent_cse=False)
     def turn(i, both):
         q, v = both
         kin = kinematics(chain, q)
