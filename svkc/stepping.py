@@ -203,8 +203,8 @@ def staged(solver: diffrax.AbstractSolver, kind: str | None) -> diffrax.Abstract
 
 
 def step_alone(solver: diffrax.AbstractSolver, field: Field, t0, t1, y: Motion, scene: Scene) -> Motion:
-    """One settled step of a solver that remembers nothing of the step before, to be differentiated: of each evaluation of the field, and of what
-    settles the step, only the arguments are kept on the way back."""
+    """One settled step of a solver that remembers nothing of the step before, to be differentiated: of each evaluation of the field, and
+    of each turn of the loop that settles the step, only the arguments are kept on the way back."""
     rate = eqx.filter_checkpoint(field)
     if isinstance(solver, diffrax.AbstractERK) and isinstance(solver.tableau, diffrax.ButcherTableau):
         raw = _explicit_step(solver.tableau, rate, t0, t1, y, scene)
