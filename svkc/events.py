@@ -5,10 +5,9 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from svkc.assembly import joint_slice, link_index
 from svkc.binding import Grip, checked_freedoms, holding, rows_of, spare_slot, to_axis
@@ -208,28 +207,42 @@ def _checked_grip(chain: Chain, wish: Grip, dtype) -> Grip:
     return dataclasses.replace(wish, real_pos=place)
 
 
-def first_root(f, a, fa: Float[Array, ""], b, fb: Float[Array, ""]):
-    """A zero of f in [a, b], to round-off: false position with the Illinois weight, every third step a bisection. Not differentiable.
+# how often a bracket may be narrowed
+NARROWINGS = 200
 
-    f(t) -> (value, anything); a, b: a time and what f gives beside its value there, fa, fb: the values, fb >= 0. Returns such a pair, on the side where
-    f >= 0; a itself if fa is not negative.
-    """
-    eps = jnp.finfo(fb.dtype).eps
-    choose = lambda which, x, y: jax.tree.map(lambda x, y: jnp.where(which, x, y), x, y)
-    fine = 2 * eps * jnp.maximum(jnp.abs(a[0]), jnp.abs(b[0])) + eps * (b[0] - a[0])
 
-    def narrow(carry):
-        i, a, fa, b, fb, last = carry
-        weight, end = fb - fa, b[0]
-        secant = end - fb * (end - a) / jnp.where(weight == 0, 1, weight)
-        c = jnp.where((i % 3 == 2) | (weight == 0), a + (end - a) / 2, secant)
-        c = jnp.clip(c, a + fine / 4, end - fine / 4)
-        fc, rest = f(c)
+class Bracket(eqx.Module):
+    """Two times, at the first a function is below zero, at the second not: narrowed to round-off by false position with the Illinois weight, every third
+    time by bisection. `fine`: how narrow; `last`: which end has moved (1: b, -1: a)."""
+
+    a: Float[Array, ""]
+    b: Float[Array, ""]
+    fa: Float[Array, ""]
+    fb: Float[Array, ""]
+    fine: Float[Array, ""]
+    last: Int[Array, ""]
+    count: Int[Array, ""]
+
+    @staticmethod
+    def around(a, b, fa, fb) -> "Bracket":
+        eps = jnp.finfo(fb.dtype).eps
+        fine = 2 * eps * jnp.maximum(jnp.abs(a), jnp.abs(b)) + eps * (b - a)
+        return Bracket(a, b, fa, fb, fine, *(jnp.zeros((), jnp.int32) for _ in range(2)))
+
+    def wide(self) -> Bool[Array, ""]:
+        """Whether to go on."""
+        return (self.b - self.a > self.fine) & (self.count < NARROWINGS)
+
+    def inside(self) -> Float[Array, ""]:
+        """The time to look at next."""
+        weight = self.fb - self.fa
+        secant = self.b - self.fb * (self.b - self.a) / jnp.where(weight == 0, 1, weight)
+        c = jnp.where((self.count % 3 == 2) | (weight == 0), self.a + (self.b - self.a) / 2, secant)
+        return jnp.clip(c, self.a + self.fine / 4, self.b - self.fine / 4)
+
+    def narrowed(self, c, fc) -> "Bracket":
+        """With what the function is at c."""
         right = fc >= 0
-        fa, fb = jnp.where(right & (last == 1), fa / 2, fa), jnp.where(~right & (last == -1), fb / 2, fb)
-        a, fa = jnp.where(right, a, c), jnp.where(right, fa, fc)
-        b, fb = choose(right, (c, rest), b), jnp.where(right, fc, fb)
-        return i + 1, a, fa, b, fb, jnp.where(right, 1, -1)
-
-    start = (jnp.asarray(0), a[0], fa, choose(fa >= 0, a, b), fb, jnp.asarray(0))
-    return jax.lax.while_loop(lambda c: (c[3][0] - c[1] > fine) & (c[0] < 200), narrow, start)[3]
+        fa, fb = jnp.where(right & (self.last == 1), self.fa / 2, self.fa), jnp.where(~right & (self.last == -1), self.fb / 2, self.fb)
+        a, fa, b, fb = jnp.where(right, self.a, c), jnp.where(right, fa, fc), jnp.where(right, c, self.b), jnp.where(right, fc, fb)
+        return Bracket(a, b, fa, fb, self.fine, jnp.where(right, 1, -1).astype(jnp.int32), self.count + 1)

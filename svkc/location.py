@@ -1,17 +1,16 @@
-"""F6: where in its last step a phase ends: the first guard's zero, found without derivatives, and the derivatives of the time and motion there."""
+"""F6: what guards say, what is found out about the one that ends a phase, and the derivatives of the time and motion there."""
 
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 from jax.interpreters import ad
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc.chain import State
-from svkc.events import Plan, first_root
+from svkc.events import Plan
 from svkc.guards import Sensor
 from svkc.operation import operation
-from svkc.stepping import Field, Motion, Scene, filled, step_alone
+from svkc.stepping import Field, Motion, Scene, filled
 
 # a guard that at the rate it crosses zero with would change this little over a step, measured by its size, touches zero rather than crosses it
 FLAT = 1e-5
@@ -31,15 +30,6 @@ class Reading(eqx.Module):
         return jnp.stack([jnp.asarray(x, y.q.dtype).reshape(()) for x in values])
 
 
-class Crossing(eqx.Module):
-    """Whether a watched guard went through zero in the last step."""
-
-    made: Plan
-
-    def __call__(self, t, y: Motion, args: Scene, **_):
-        return jnp.any(self.made.crossed(y.watch.before, y.watch.after) & args.watched)
-
-
 class Found(eqx.Module):
     """The guards that fired, which guard values go on, the first guard, whether there was one, it jumped over zero, or it only touched it."""
 
@@ -54,45 +44,6 @@ class Found(eqx.Module):
 def event_tolerance(t: Float[Array, ""]) -> Float[Array, ""]:
     """Events this close (s) to the earliest happen together with it: sqrt(eps), 1.5e-8 in float64, relative from t = 1 s on."""
     return jnp.finfo(t.dtype).eps ** 0.5 * jnp.maximum(1, jnp.abs(t))
-
-
-@eqx.filter_jit
-def locate(hit: Bool[Array, ""], t_end, end: Motion, solver, scene: Scene, guards: Reading) -> tuple[Float[Array, ""], Motion, Found]:
-    """Time and motion of the earliest crossing in the last step, by steps of the solver from its begin, so that they have the solver's own order.
-
-    A guard that fired is armed again once it has left zero. Nothing here is to be differentiated.
-    """
-    watch = end.watch
-    crossed = guards.made.crossed(watch.before, watch.after) & scene.watched & hit
-    side = jnp.where(crossed, jnp.where(watch.after >= watch.before, 1, -1), 0).astype(t_end.dtype)
-
-    def passed(values):
-        return jnp.where(crossed, side * values, -jnp.inf)
-
-    def found():
-        def ahead(t):
-            y = step_alone(solver, guards.field, watch.start, t, watch.begin, scene)
-            return jnp.max(passed(guards(t, y, scene))), y
-
-        root, y = first_root(ahead, (watch.start, watch.begin), jnp.max(passed(watch.before)), (t_end, end.bare), jnp.max(passed(watch.after)))
-        rate = guards.field(root, y, scene)
-        values, slopes = jax.jvp(lambda t, y: guards(t, y, scene), (root, y), (jnp.ones_like(root), rate))
-        first = jnp.argmax(passed(values)).astype(jnp.int32)
-        fired = crossed & (passed(values) + side * slopes * event_tolerance(root) >= 0)
-        fired = fired | (jnp.arange(side.shape[0], dtype=jnp.int32) == first)
-        value, slope = jnp.abs(values[first]), jnp.abs(slopes[first])
-        large = FLAT * jnp.maximum(jnp.abs(watch.before[first]), jnp.abs(watch.after[first]))
-        jumps = (value > slope * event_tolerance(root)) & (value > large)
-        flat = ~jumps & (slope * (t_end - watch.start) < large)
-        # zero: not armed, until it has left zero
-        return root, y, Found(fired, jnp.where(fired, 0, values), first, hit, jumps, flat)
-
-    def missed():
-        no = jnp.zeros((), bool)
-        return t_end, end.bare, Found(jnp.zeros_like(crossed), watch.after, jnp.asarray(0, jnp.int32), no, no, no)
-
-    at = jax.lax.cond(eqxi.unvmap_any(hit), found, missed)
-    return jax.tree.map(lambda a, b: jnp.where(hit, a, b), at, missed())
 
 
 def _arrived_jvp(primals, tangents):

@@ -8,10 +8,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from svkc.chain import State
 from svkc.events import Plan
-from svkc.location import Crossing, Found, Reading, arrived, locate
-from svkc.replay import How, Path, Replay, World, integrated
+from svkc.location import Found, Reading, arrived
+from svkc.marching import EVENT, MAX_STEPS, SUCCESSFUL, How, Path, Watched, World, march
+from svkc.replay import Replay, integrated
 from svkc.request import Options
-from svkc.stepping import Motion, Scene, Settled, Watch, frozen, staged, step_alone
+from svkc.stepping import Motion, Scene, Settled, frozen, staged
 from svkc.trajectory import RESULTS, Events, Phases
 
 
@@ -44,19 +45,17 @@ class Solved(eqx.Module):
 
 
 def solve(run: Run, stop, ts, made: Plan, options: Options, scene: Scene) -> Solved:
-    """Diffrax from run.t to `stop`, or to the first guard that crosses zero."""
-    scene = eqx.tree_at(lambda s: s.watched, scene, made.watched(scene.chain, scene.structure) if made.guards else None, is_leaf=lambda x: x is None)
+    """From run.t to `stop`, or to the first guard that crosses zero."""
     guards = Reading(made, options.field) if made.guards else None
-    still = Motion(run.state.q, run.state.v, run.work)
-    watch = None if guards is None else frozen(Watch(run.t, still, run.guards, run.guards))
-    start = eqx.tree_at(lambda y: y.watch, still, watch, is_leaf=lambda x: x is None)
+    watched = None if guards is None else frozen(Watched(guards, run.guards, made.watched(scene.chain, scene.structure)))
+    start = Motion(run.state.q, run.state.v, run.work)
     # a save time within the phase, its ends included, moves by itself; what is saved of the others counts in another phase
     begun, ended = frozen((run.t, jnp.maximum(stop, run.t)))
     at = jnp.where(ts < begun, begun, jnp.where(ts > ended, ended, ts))
-    path, found = _path(start, (run.t, stop, at), World(scene, options.field), guards, options)
+    path, found = _path(start, (run.t, stop, at), World(scene, options.field), watched, options)
     stats, result = (path.accepted, path.rejected), _translate(path.result, path.end)
     # a scheduled end goes on to move with its time, where a diffrax adjoint has not seen to that
-    late = jnp.where(path.result == diffrax.RESULTS.successful._value, stop - path.t, 0)
+    late = jnp.where(path.result == SUCCESSFUL, stop - path.t, 0)
     t, motion = arrived(path.t, path.end, late, scene, options.field if guards is None else guards, found)
     if found is None:
         return Solved(t, motion, jnp.zeros(0, bool), None, path.saved, stats, result, RESULTS.successful)
@@ -66,39 +65,42 @@ def solve(run: Run, stop, ts, made: Plan, options: Options, scene: Scene) -> Sol
     return Solved(t, motion, found.fired, found.values, path.saved, stats, result, code)
 
 
-def _path(start: Motion, times, world: World, guards: Reading | None, options: Options) -> tuple[Path, Found | None]:
+def _path(start: Motion, times, world: World, watched: Watched | None, options: Options) -> tuple[Path, Found | None]:
     """The solve up to where it ends, differentiated at fixed times by replay, or by the diffrax adjoint that the user asked for."""
-    t0, stop, at = times
-    event = None if guards is None else diffrax.Event(Crossing(frozen(guards.made)))
-    controller, first = options.steps(t0, t1=stop, ts=at)
-    if isinstance(options.adjoint, Replay):
-        every = min(options.adjoint.every, options.max_steps)
-        how = How(*frozen((options.solver, guards, controller, first)), event, options.progress_meter, options.max_steps, every)
+    ours, adjoint = isinstance(options.adjoint, Replay), options.adjoint
+    every = min(adjoint.every, options.max_steps) if isinstance(adjoint, Replay) else options.max_steps
+    meter = options.progress_meter if ours else diffrax.NoProgressMeter()
+    how = How(*frozen((options.solver, watched, *options.steps())), meter, options.max_steps, every)
+    if ours:
         path = integrated(start, times, world, how)
         return path, frozen(path.found)
+    t0, stop, at = times
+    first, found = None, None
+    if watched is not None:
+        # where a guard is zero first, found once before
+        first = march(*frozen((start, times, world)), how)
+        found = first.found
+        stop = jnp.where(found.hit, first.t, stop)
+        at = jnp.where(at > stop, stop, at)
+    controller, first_step = options.steps(at)
     # as diffrax would set it, did it see through the wrapper
-    kind = {diffrax.ForwardMode: "lax", diffrax.DirectAdjoint: "bounded"}.get(type(options.adjoint))
-    solver = Settled(staged(options.solver, kind), options.stabilization, guards)
+    kind = {diffrax.ForwardMode: "lax", diffrax.DirectAdjoint: "bounded"}.get(type(adjoint))
+    solver = Settled(staged(options.solver, kind), options.stabilization)
     saveat = diffrax.SaveAt(subs=[diffrax.SubSaveAt(t1=True), diffrax.SubSaveAt(ts=at)])
     sol = diffrax.diffeqsolve(
-        diffrax.ODETerm(world.field), solver, t0, stop, first, start, world.scene, saveat=saveat, stepsize_controller=controller,
-        adjoint=options.adjoint, event=event, max_steps=options.max_steps, throw=False, progress_meter=options.progress_meter,
+        diffrax.ODETerm(world.field), solver, t0, stop, first_step, start, world.scene, saveat=saveat, stepsize_controller=controller,
+        adjoint=adjoint, max_steps=options.max_steps, throw=False, progress_meter=options.progress_meter,
     )  # fmt: skip
-    (end, saved), t, found = sol.ys, sol.ts[0][0], None
-    end = jax.tree.map(lambda x: x[0], end)
-    if guards is not None:
-        hit = sol.result == diffrax.RESULTS.event_occurred
-        root, _, found = frozen(locate(*frozen((hit, t, end, options.solver, world.scene, guards))))
-        at_root = step_alone(options.solver, world.field, end.watch.start, root, end.watch.begin, world.scene)
-        t, end = jax.tree.map(lambda a, b: jnp.where(hit, a, b), (root, at_root), (t, end.bare))
+    (end, saved), t, result = sol.ys, sol.ts[0][0], sol.result._value
+    if found is not None:
+        result = jnp.where((result == SUCCESSFUL) & found.hit, EVENT, result)
     counts = (jnp.asarray(sol.stats[name], jnp.int32) for name in ("num_accepted_steps", "num_rejected_steps"))
-    return Path(t, end, saved, jnp.zeros(0, t0.dtype), saved, *counts, sol.result._value, found), found
+    return Path(t, jax.tree.map(lambda x: x[0], end), saved, jnp.zeros(0, t0.dtype), saved, *counts, result, found), found
 
 
 def _translate(result: Int[Array, ""], motion: Motion) -> RESULTS:
     """Diffrax's word for how a solve ended, as ours."""
-    said = lambda word: result == word._value
-    out = RESULTS.where(said(diffrax.RESULTS.successful) | said(diffrax.RESULTS.event_occurred), RESULTS.successful, RESULTS.step_too_small)
-    out = RESULTS.where(said(diffrax.RESULTS.max_steps_reached), RESULTS.max_steps, out)
+    out = RESULTS.where((result == SUCCESSFUL) | (result == EVENT), RESULTS.successful, RESULTS.step_too_small)
+    out = RESULTS.where(result == MAX_STEPS, RESULTS.max_steps, out)
     finite = jnp.all(jnp.isfinite(motion.q)) & jnp.all(jnp.isfinite(motion.v))
     return RESULTS.where(finite, out, RESULTS.non_finite)

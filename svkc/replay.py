@@ -5,16 +5,15 @@ each: forwards for a tangent, backwards for a cotangent. Kept of a run are the t
 time or of a save time does is the rate of the motion there.
 """
 
-import diffrax
 import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
 
-from svkc.location import Found, carried, locate
+from svkc.location import carried
+from svkc.marching import How, Path, World, march
 from svkc.operation import operation
-from svkc.stepping import Field, Motion, Scene, Settled, filled, frozen, staged, step_alone
+from svkc.stepping import Motion, filled, frozen, step_alone
 
 # blocks are passed over in groups where the run has no more steps
 GROUP = 64
@@ -28,67 +27,6 @@ class Replay(eqx.Module):
     """
 
     every: int = eqx.field(static=True, default=16)
-
-
-class World(eqx.Module):
-    """What the motion depends on besides its start: the scene, and the vector field with all that it closes over."""
-
-    scene: Scene
-    field: Field
-
-
-class How(eqx.Module):
-    """What finds the steps: nothing of it is differentiated."""
-
-    solver: diffrax.AbstractSolver
-    guards: object
-    controller: object
-    first_step: object
-    event: diffrax.Event | None
-    progress_meter: diffrax.AbstractProgressMeter
-    max_steps: int = eqx.field(static=True)
-    every: int = eqx.field(static=True)
-
-
-class Path(eqx.Module):
-    """Where a solve ended, the states at the times asked for, the times of its steps (inf: not taken), and one state in `every`."""
-
-    t: Float[Array, ""]
-    end: Motion
-    saved: Motion
-    times: Float[Array, " steps"]
-    kept: Motion
-    accepted: Int[Array, ""]
-    rejected: Int[Array, ""]
-    result: Int[Array, ""]
-    found: Found | None = None
-
-
-def _integrated(start: Motion, times, world: World, how: How) -> Path:
-    """Diffrax from times = (t0, stop, save times) to `stop`, or to where in its last step a guard was zero. In derivatives the end's time is fixed."""
-    t0, stop, at = times
-    inner = staged(how.solver, "lax")
-    solver = Settled(inner, world.field.stabilization, how.guards)
-    subs = [
-        diffrax.SubSaveAt(t1=True),
-        diffrax.SubSaveAt(ts=at, fn=lambda t, y, args: y.bare),
-        diffrax.SubSaveAt(steps=1, fn=lambda t, y, args: None),
-        diffrax.SubSaveAt(steps=how.every, fn=lambda t, y, args: y.bare),
-    ]
-    sol = diffrax.diffeqsolve(
-        diffrax.ODETerm(world.field), solver, t0, stop, how.first_step, start, world.scene, saveat=diffrax.SaveAt(subs=subs),
-        stepsize_controller=how.controller, adjoint=diffrax.ForwardMode(), event=how.event, max_steps=how.max_steps, throw=False,
-        progress_meter=how.progress_meter,
-    )  # fmt: skip
-    end, saved, _, kept = sol.ys
-    t, end, times, found = sol.ts[0][0], jax.tree.map(lambda x: x[0], end), sol.ts[2], None
-    counts = [jnp.asarray(sol.stats[name], jnp.int32) for name in ("num_accepted_steps", "num_rejected_steps")]
-    if how.guards is not None:
-        hit = sol.result == diffrax.RESULTS.event_occurred
-        t, end, found = locate(hit, t, end, inner, world.scene, how.guards)
-        # the last step is gone through again only up to there
-        times = times.at[counts[0] - 1].set(jnp.where(hit, t, times[counts[0] - 1]))
-    return Path(t, end.bare, saved, times, kept, *counts, sol.result._value, found)
 
 
 def _grid(t0, at, path: Path):
@@ -116,7 +54,7 @@ def _integrated_jvp(primals, tangents):
     path = integrated(start, times, world, how)
     (t0, _, at), (d_t0, _, d_at) = times, d_times
     grid, place = _grid(*frozen((t0, at, path)))
-    start, d_start = _from_fixed(start.bare, filled(start.bare, d_start.bare), t0, d_t0, world, d_world)
+    start, d_start = _from_fixed(start, filled(start, d_start), t0, d_t0, world, d_world)
     d_end, d_saved, d_kept = _through(start, d_start, grid, place, world, d_world, path, how)
     if d_at is not None:
         d_saved = jax.vmap(lambda y, dy, t, dt: _moved_on(y, dy, t, dt, world, d_world))(path.saved, d_saved, at, d_at)
@@ -197,5 +135,5 @@ def _through(start: Motion, d_start: Motion, grid, place, world: World, d_world,
     return d_end, d_saved, d_kept
 
 
-# integrated(start, times, world, how) -> Path
-integrated = operation("integrated", _integrated, _integrated_jvp)
+# integrated(start, times, world, how) -> Path: where the run went; in derivatives the time of its end is fixed
+integrated = operation("integrated", march, _integrated_jvp)

@@ -38,11 +38,11 @@ class Options(eqx.Module):
         """The vector field of a phase."""
         return Field(self.control, self.stabilization)
 
-    def steps(self, t0, t1, ts):
-        """The step-size controller of one phase, that stops at every save time, and the first step."""
+    def steps(self, ts=None):
+        """The step-size controller and the first step; for a loop that does not look to the save times itself, made to stop at each of `ts`."""
         if self.dt is not None:
-            return FixedSteps(self.dt, ts), None
-        if isinstance(self.controller, diffrax.AbstractAdaptiveStepSizeController):
+            return FixedSteps(self.dt, jnp.zeros(0, self.dt.dtype) if ts is None else ts), None
+        if ts is not None and isinstance(self.controller, diffrax.AbstractAdaptiveStepSizeController):
             return diffrax.ClipStepSizeController(self.controller, step_ts=ts), self.first_step
         return self.controller, None if isinstance(self.controller, diffrax.StepTo) else self.first_step
 

@@ -1,4 +1,4 @@
-"""F5: what is integrated, and the solver around the user's solver that keeps loops closed and watches guards after every step."""
+"""F5: what is integrated, one step of it, and how steps are kept on the loops."""
 
 import functools
 from collections.abc import Callable
@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from svkc.chain import Chain, State, Structure
 from svkc.forward_dynamics import acceleration, joint_torques
@@ -17,6 +17,9 @@ from svkc.inverse_dynamics import limit_forces
 from svkc.kinematics import normalize, rates
 from svkc.loops import active_dofs
 from svkc.projection import settle_loops
+
+# a step that would leave less than this part of itself before a time to be met goes all the way
+REST = 1e-6
 
 
 def frozen(tree):
@@ -29,28 +32,12 @@ def filled(x, dx):
     return jax.tree.map(lambda x, d: jnp.zeros_like(x) if d is None and x is not None else d, x, dx, is_leaf=lambda x: x is None)
 
 
-class Watch(eqx.Module):
-    """Guards at both ends of the last step, which began at the time `start` with the motion `begin`."""
-
-    start: Float[Array, ""]
-    begin: "Motion"
-    before: Float[Array, " guards"]
-    after: Float[Array, " guards"]
-
-
 class Motion(eqx.Module):
     """What is integrated: q, v, and the work (J) done by control, limits and dampers; None where the scene has none of them."""
 
     q: Float[Array, " q"]
     v: Float[Array, " dofs"]
     work: Float[Array, ""] | None = None
-    watch: Watch | None = None
-
-    @property
-    def bare(self) -> "Motion":
-        """Without what is watched."""
-        # (of tangents too, whose parts may be None)
-        return eqx.tree_at(lambda y: y.watch, self, None, is_leaf=lambda x: x is None)
 
 
 class Scene(eqx.Module):
@@ -59,7 +46,6 @@ class Scene(eqx.Module):
     chain: Chain
     structure: Structure
     args: Any
-    watched: Bool[Array, " guards"] | None = None
 
 
 class Projection(eqx.Module):
@@ -93,8 +79,7 @@ class Field(eqx.Module):
         rate = self.stabilization.rate if isinstance(self.stabilization, Baumgarte) else None
         vdot = acceleration(chain, structure, y.q, y.v, tau, baumgarte=rate)
         moving = jnp.where(active_dofs(chain, structure), y.v, 0)
-        watch = jax.tree.map(jnp.zeros_like, y.watch)
-        return Motion(rates(chain, y.q, moving), vdot, power, watch)
+        return Motion(rates(chain, y.q, moving), vdot, power)
 
     def torques(self, t, y: Motion, scene: Scene):
         """Joint torques of the control and the limits, and the power of all that is not conservative (None: there is none)."""
@@ -112,14 +97,15 @@ class Field(eqx.Module):
         return tau, tau @ v if chain.damping is None else tau @ v - jnp.sum(chain.damping * v * v)
 
 
-def _projects(stabilization, scene: Scene) -> bool:
+def projects(stabilization, scene: Scene) -> bool:
+    """Whether steps are put back onto the loops."""
     return bool(scene.chain.topology.link_names) and isinstance(stabilization, Projection)
 
 
 def settle(stabilization, scene: Scene, y: Motion) -> Motion:
     """The motion put back: quaternions to unit length, loops closed, velocities in agreement."""
     chain, structure = scene.chain, scene.structure
-    if not _projects(stabilization, scene):
+    if not projects(stabilization, scene):
         return eqx.tree_at(lambda y: y.q, y, normalize(chain, y.q))
     return eqx.tree_at(lambda y: (y.q, y.v), y, settle_loops(chain, structure, y.q, y.v, stabilization.iterations))
 
@@ -147,14 +133,13 @@ def _interpolation(cls, *, t0, t1, inner, shift):
 
 
 class Settled(diffrax.AbstractWrappedSolver):
-    """Any diffrax solver, its steps settled and its guards read at their ends."""
+    """Any diffrax solver, its steps settled, for diffrax's own adjoints."""
 
     # diffrax takes a wrapper for what it wraps and asks for it; the inner solver has its own
     scan_kind: ClassVar[str] = "inner"
 
     solver: diffrax.AbstractSolver
     stabilization: Projection | Baumgarte | Drift
-    guards: Callable | None
 
     @property
     def term_structure(self):  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -180,17 +165,9 @@ class Settled(diffrax.AbstractWrappedSolver):
         return self.solver.func(terms, t0, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        # a step begins with the rate where the one before was settled to, not with one remembered from where it was before that
-        fresh = True if _projects(self.stabilization, args) else made_jump
+        fresh = True if projects(self.stabilization, args) else made_jump
         raw, error, dense, solver_state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, fresh)
         y1 = settle(self.stabilization, args, raw)
-        if self.guards is not None:
-            # what only says where to look for an event is not differentiated; the event's time is, where it is located
-            after = jax.lax.stop_gradient(self.guards(t1, y1, args))
-            # a guard at zero is not armed before it has left it by more than round-off
-            resting = (y0.watch.after == 0) & (jnp.abs(after) < jnp.finfo(after.dtype).eps ** 0.75)
-            after = jnp.where(resting, 0, after)
-            y1 = eqx.tree_at(lambda y: y.watch, y1, Watch(t0, y0.bare, y0.watch.after, after))
         shift = jax.tree.map(lambda a, b: a - b, y1, raw)
         return y1, error, {"inner": dense, "shift": shift}, solver_state, result
 
@@ -237,7 +214,7 @@ def _explicit_step(tableau: diffrax.ButcherTableau, rate, t0, t1, y: Motion, sce
 
 
 class FixedSteps(diffrax.AbstractStepSizeController):
-    """Steps of dt, shortened to meet every time in `ts`."""
+    """Steps of dt; diffrax is told the times `ts` to shorten them for."""
 
     dt: Float[Array, ""]
     ts: Float[Array, " times"]
@@ -248,8 +225,7 @@ class FixedSteps(diffrax.AbstractStepSizeController):
     def _next(self, t):
         times = jnp.where(self.ts > t, self.ts, jnp.inf)
         stop = jnp.min(times, initial=jnp.inf)
-        # a step that would leave less than a millionth of itself goes all the way
-        return jnp.where(t + self.dt * (1 + 1e-6) >= stop, stop, t + self.dt)
+        return jnp.where(t + self.dt * (1 + REST) >= stop, stop, t + self.dt)
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         return self._next(t0), None

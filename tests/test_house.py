@@ -23,6 +23,7 @@ HOUSE = [
     "binding actuation guards solvers",
     "transition events stepping",
     "location scenes",
+    "marching",
     "replay",
     "request",
     "phase view derivative",
