@@ -28,7 +28,7 @@ links, seen = (np.array([chain.body_names.index(name) for name in names]) for na
 rows = np.array(chain.topology.body_row)[links]
 masses, limit = chain.mass[rows], 50.0  # kg, N: as drawn, and the first guess
 start = chain.state({"shoulder": -1.6, "elbow": 0.3, "wrist": 0.2})
-ts = jnp.linspace(0, 0.9, 31)
+ts, noise = jnp.linspace(0, 0.9, 31), 2e-3  # s, m
 EXACT = {"solver": diffrax.Dopri8(), "rtol": 1e-9, "atol": 1e-11}
 
 
@@ -49,7 +49,6 @@ def run(p):
 
 true = {"mass": jnp.array([2.4, 1.7, 1.3]) / masses, "limit": jnp.asarray(35.0 / limit)}
 guess = {"mass": jnp.ones(3), "limit": jnp.ones(())}
-noise = 2e-3  # m
 observed = run(true)[0] + noise * np.random.default_rng(0).normal(size=(len(ts), 3, 2))
 # Levenberg and Marquardt's method: few parameters, so forward mode, and one program gives the misses too
 misses = lambda p: (run(p)[0] - observed).ravel()
@@ -73,10 +72,8 @@ for i, (name, color) in enumerate((("elbow", "C0"), ("end of forearm", "C1"), ("
     for what, path, style in (("guess", run(guess)[0], "--"), ("found", run(found)[0], "-"), ("observed", observed, "o")):
         axes.plot(*path[:, i].T, style, color=color, markersize=4, label=f"{name}, {what}")
 axes.set(aspect="equal", xlabel="x (m)", ylabel="z (m)", title=f"an arm whose wrist breaks, every {float(ts[1]):.2f} s")
-axes.grid(alpha=0.2)
 figure.legend(loc="outside lower center", ncols=3)
 figure.savefig(folder / "07_identify.png", dpi=110)
 print("wrote", folder / "07_identify.png")
-# of the misses, not of the sum of their squares, which is flat where it is least
 for when, at in (("start", guess), ("end", found)):
     print(f"derivatives at the {when}: {svkc.check_grad(misses, at, directions=1, mode='forward')}")

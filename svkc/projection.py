@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
 from svkc.chain import Chain, State, Structure
@@ -37,7 +38,7 @@ def decide_rank(chain: Chain, structure: Structure, q: Float[Array, " q"]) -> St
     size, open_ = jax.lax.map(sizes, jnp.stack([q, moved]))
     closed = open_[1] < jnp.finfo(q.dtype).eps ** 0.75
     rank = jnp.where(closed, jnp.maximum(count_rank(size[0]), count_rank(size[1])), count_rank(size[0]))
-    return eqx.tree_at(lambda s: s.rank, given, rank)
+    return eqx.tree_at(lambda s: s.rank, given, checkpoint_name(rank, "rank"))
 
 
 def rank_margin(chain: Chain, *states: State) -> Float[Array, ""]:

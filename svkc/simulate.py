@@ -236,7 +236,7 @@ def _apply(chain: Chain, run: Run, ended: State, solved: Solved, fired: Bool[Arr
         connected, here = (connected | gripped) & ~emptying, here | gripped
 
     def changed():
-        done = eqx.filter_checkpoint(change)(chain, ended, connected, locked, here)
+        done = eqx.filter_checkpoint(change, policy=jax.checkpoint_policies.save_only_these_names("rank"))(chain, ended, connected, locked, here)
         return done if emptying is None else eqx.tree_at(lambda d: d.state.structure, done, emptied(done.state.structure, emptying))
 
     def same():

@@ -99,6 +99,7 @@ EXAMPLES = {
     "02_swing": ("31 joint freedoms", "29 joint freedoms"),
     "03_brachiation": ("right_hand_bar1; mobility 17", "right_hand_bar1, left_hand_bar2; mobility 12", "s: right_hand_bar3; mobility 17"),
     "04_walk": ("left foot down", "right foot up", "left and right, 22 joint freedoms, mobility 11", "left, 22 joint freedoms, mobility 16"),
+    "05_optimise_release": ("after 0 steps", "after 25 steps", "gradient at the start", "gradient at the end"),
     "06_soft_catch": ("gradient at the start", "gradient at the end"),
     "07_identify": ("derivatives at the start", "derivatives at the end"),
 }
