@@ -190,8 +190,9 @@ def _try(s: Step, t1, world: World, how: How) -> Tried:
     keep, t, ahead, jumped, controller, said = how.controller.adapt_step_size(s.t, t1, s.y, y, world.scene, error, order, s.controller)
     keep, length = jnp.asarray(keep), ahead - t
     if isinstance(how.controller, diffrax.PIDController):
-        # a step that was shortened says less of the next one's length than what was asked for before
-        length = jnp.where(keep & (t1 - s.t < s.length), jnp.maximum(length, s.length), length)
+        # the length asked for before a step was much shortened, where that step says no more than that it may grow as far as it ever may
+        grown = keep & (length >= 0.99 * how.controller.factormax * (t1 - s.t))
+        length = jnp.where(grown, jnp.maximum(length, s.length), length)
     failed = keep & (solved._value != SUCCESSFUL)
     result = jnp.where(failed, solved._value, said._value).astype(jnp.int32)
     return Tried(t, y, keep, length, jnp.asarray(jumped), solver, controller, result)
