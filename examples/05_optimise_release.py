@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 import svkc
 from svkc.scenes import high_bar
 
-chain, start = high_bar()
+chain, start = high_bar(ignore="limit")  # the ranges of joints act like walls: differences, to which the gradient is compared, would be rough
 joints, mass, rest = chain.joint_names[1:], chain.mass.sum(), start.q[7:23]  # all but the free base: q[7:23], v[6:22]
 limb = jnp.diag(svkc.mass_matrix(chain, start))[6:22]  # kg m^2
 driven = jnp.array([joints.index(f"{side}_{name}") for side in ("right", "left") for name in ("shoulder_flexion", "hip_flexion", "knee")])

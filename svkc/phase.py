@@ -70,18 +70,17 @@ def _path(start: Motion, times, world: World, watched: Watched | None, options: 
     ours, adjoint = isinstance(options.adjoint, Replay), options.adjoint
     every = min(adjoint.every, options.max_steps) if isinstance(adjoint, Replay) else options.max_steps
     meter = options.progress_meter if ours else diffrax.NoProgressMeter()
-    how = How(*frozen((options.solver, watched, *options.steps())), meter, options.max_steps, every)
+    how = How(*frozen((staged(options.solver, "lax"), watched, *options.steps())), meter, options.max_steps, every)
     if ours:
         path = integrated(start, times, world, how)
         return path, frozen(path.found)
     t0, stop, at = times
-    first, found = None, None
+    found = None
     if watched is not None:
         # where a guard is zero first, found once before
         first = march(*frozen((start, times, world)), how)
-        found = first.found
-        stop = jnp.where(found.hit, first.t, stop)
-        at = jnp.where(at > stop, stop, at)
+        stop = jnp.where(first.found.hit, first.t, stop)
+        at, found = jnp.where(at > stop, stop, at), first.found
     controller, first_step = options.steps(at)
     # as diffrax would set it, did it see through the wrapper
     kind = {diffrax.ForwardMode: "lax", diffrax.DirectAdjoint: "bounded"}.get(type(adjoint))
