@@ -223,6 +223,11 @@ def _record_phase(chain: Chain, run: Run, index, going, solved: Solved, ended: S
     )
 
 
+def _keep_rank(primitive, /, *_, **params) -> bool:
+    """Of a change, only the rank is kept for the way back; jax's own policy of this kind fails on operations that have a parameter `prim`."""
+    return primitive.name == "name" and params["name"] == "rank"
+
+
 def _apply(chain: Chain, run: Run, ended: State, solved: Solved, fired: Bool[Array, " events"], made: Plan):
     """The change of structure that all events of this instant make together; one record row for each of them."""
     any_of = lambda what: jnp.any(fired[:, None] & made.table(chain, what), 0)
@@ -236,7 +241,7 @@ def _apply(chain: Chain, run: Run, ended: State, solved: Solved, fired: Bool[Arr
         connected, here = (connected | gripped) & ~emptying, here | gripped
 
     def changed():
-        done = eqx.filter_checkpoint(change, policy=jax.checkpoint_policies.save_only_these_names("rank"))(chain, ended, connected, locked, here)
+        done = eqx.filter_checkpoint(change, policy=_keep_rank)(chain, ended, connected, locked, here)
         return done if emptying is None else eqx.tree_at(lambda d: d.state.structure, done, emptied(done.state.structure, emptying))
 
     def same():
