@@ -225,6 +225,7 @@ class Bracket(eqx.Module):
 
     @staticmethod
     def around(a, b, fa, fb) -> "Bracket":
+        """From the two times and the function there."""
         eps = jnp.finfo(fb.dtype).eps
         fine = 2 * eps * jnp.maximum(jnp.abs(a), jnp.abs(b)) + eps * (b - a)
         return Bracket(a, b, fa, fb, fine, *(jnp.zeros((), jnp.int32) for _ in range(2)))

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 # Products as sums over a table, out_k = table[i, k, j] a_i b_j: a few operations on whole arrays, where entry by entry would be dozens, and everything
-# that is compiled is made of these products. Measured on the high bar: a third less to compile, at the same speed.
+# that is compiled is made of these products (a run of the four-bar and its gradient: a fifth fewer operations).
 SKEW = np.zeros((3, 3, 3))
 HAMILTON = np.zeros((4, 4, 4))
 for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
