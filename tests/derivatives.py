@@ -14,8 +14,6 @@ import numpy as np
 import svkc
 
 TIGHT = {"rtol": 1e-11, "atol": 1e-13, "solver": diffrax.Dopri8()}
-# differences of stiff runs are clean where the steps stay as they are
-STEPS = {"dt": 5e-4, "solver": diffrax.Dopri8()}
 ALGEBRA, RUN = 1e-8, 1e-6
 FLOATS = "mass com inertia pos quat axis anchor gravity armature damping stiffness q_spring".split()
 
@@ -244,18 +242,32 @@ def high_bar():
 
 
 def swing():
-    """The seat gives way as each thigh passes its edge: two guards."""
-    from svkc.scenes.swing import leaving, swing
+    """The seat gives way as each thigh slides over an edge of its own: two guards.
 
-    chain, state = swing(ignore="limit")
-    # turned a little, so that the thighs leave one after the other
-    state = chain.state(state.q[: chain.nq], {"base": [2.2, 0.1, 0, 0, 0, 0.3]})
+    Both sides of the body stay alike up to the first: turned on the plate, the pelvis would open the two slides' loops to the second order only.
+    """
+    from svkc.scenes.swing import EDGE, swing
+
+    chain, seated = swing(ignore="limit")
+    back = -jnp.array([jnp.cos(0.6), 0, -jnp.sin(0.6), 0, 0, 0])
+    state = chain.state(seated.q[: chain.nq], {"base": back, "pivot": 0.0})
+    sides = ("right", "left")
+    parts = [name.removeprefix("right_").removeprefix("left_") for name in (*chain.body_names, *chain.link_names)]
+    index = np.array([sorted(set(parts)).index(part) for part in parts])
+
+    def slid(side, number):
+        along = svkc.touch(chain, f"{side}_thigh_plate", 0.0, axes="z")
+        return svkc.when(lambda t, s, args: jnp.abs(along(t, s)) - args[1] - 0.002 * number, cut=f"{side}_thigh_plate", direction=True)
 
     def f(x):
-        control = lambda t, s, args: jnp.concatenate([jnp.zeros(7), args, jnp.zeros(chain.dofs - 23)])
-        return motion(svkc.simulate(changed(chain, x), state, x["t1"], events=leaving(chain), control=control, args=x["torque"], **STEPS))
+        arm, leg = jnp.split(x["torque"], 2)
+        torque = jnp.concatenate([jnp.zeros(6), arm, arm, leg, leg, jnp.zeros(chain.dofs - 22)])
+        c = changed(chain, {"heavier": x["heavier"][index]})
+        events = [slid(side, number) for number, side in enumerate(sides)]
+        return motion(svkc.simulate(c, state, x["t1"], events=events, control=lambda t, s, args: args[0], args=(torque, x["edge"]), **TIGHT))
 
-    return f, {"t1": jnp.asarray(0.2), "torque": 3 * jnp.ones(16)} | heavier(chain), RUN
+    x = {"t1": jnp.asarray(0.15), "torque": jnp.ones(8), "edge": jnp.asarray(EDGE)}
+    return f, x | {"heavier": jnp.ones(index.max() + 1)}, RUN
 
 
 def brachiation():
