@@ -13,8 +13,8 @@ import numpy as np
 from svkc.chain import State, Structure
 from svkc.trajectory import RESULT_NAMES, RESULTS, Events, Phases, Trajectory
 
-# 2: with `derivative` and the phases' `margin`
-SCHEMA = 2
+# 2: with `derivative` and the phases' `margin`; 3: with the structures' `margin`
+SCHEMA = 3
 _CODES = ("result", "derivative")
 _PARTS = {"states": State, "final": State, "structure": Structure, "events": Events, "phases": Phases}
 
@@ -78,5 +78,8 @@ def load_trajectory(path) -> Trajectory:
     missing = {"ts", "states.q", "final.q", "events.time"} - set(arrays)
     if missing:
         raise ValueError(f"{path} lacks {', '.join(sorted(missing))}; it is not a trajectory written by svkc")
+    for part in ("states", "final"):
+        # not known before schema 3: no row is let go
+        arrays.setdefault(f"{part}.structure.margin", np.zeros_like(arrays[f"{part}.structure.rank"], arrays["ts"].dtype))
     codes = {int(np.asarray(item._value)): item for item in (getattr(RESULTS, name) for name in RESULT_NAMES)}
     return _build(Trajectory, arrays, **{name: codes.get(meta.get(name, 0), RESULTS.successful) for name in _CODES})

@@ -52,7 +52,8 @@ class Structure(eqx.Module):
     """How the bodies are joined for the length of a phase. Placements are the joint's frame in its two bodies (m, wxyz), its axis along z.
 
     `connected` [links]; `parent`, `real`: rows of the two bodies; `freedoms`: of each virtual joint; `locked`: joint coordinates held still, None
-    where nothing can be locked; `independent`: coordinates asked to be independent where they can be; `rank`: m, decided once for the phase.
+    where nothing can be locked; `independent`: coordinates asked to be independent where they can be; `rank`: m, decided once for the phase,
+    with `margin`: |R_mm| / |R_11| where that was, in a generic configuration.
     """
 
     connected: Bool[Array, "... links"]
@@ -64,6 +65,7 @@ class Structure(eqx.Module):
     real_quat: Float[Array, "... links 4"]
     freedoms: Bool[Array, "... links 6"]
     rank: Int[Array, "..."]
+    margin: Float[Array, "..."]
     locked: Bool[Array, "... dofs"] | None = None
     independent: Bool[Array, "... dofs"] | None = None
 

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from svkc.chain import Chain, State, Structure
 from svkc.kinematics import Kinematics, bias_accelerations, kinematics, twists
 from svkc.loops import active_dofs, ends, gap, loop_bias, loop_jacobian
-from svkc.selection import Selection, select, solve_frozen, square
+from svkc.selection import Selection, held_part, select, solve_frozen, square, without_weak
 from svkc.topology import FREE, SLIDE
 
 
@@ -67,21 +67,26 @@ def scaled_jacobian(chain: Chain, structure: Structure, kin, end) -> Float[Array
     return row[:, None] * loop_jacobian(chain, structure, kin, end) * column[None]
 
 
-def loop_rows(chain: Chain, structure: Structure, q, v, kin: Kinematics, V, baumgarte=None) -> tuple[Float[Array, "rows dofs"], Float[Array, " rows"]]:
-    """J_C and Jdot_C v without units. baumgarte: rate (1/s) at which gaps are pulled back."""
+def loop_rates(chain: Chain, structure: Structure, v, kin: Kinematics, V, end, J, baumgarte=None) -> Float[Array, " rows"]:
+    """Jdot_C v without units. baumgarte: rate (1/s) at which gaps are pulled back."""
     row, column = scales(chain)
-    end = ends(chain, structure, kin, q)
-    J = scaled_jacobian(chain, structure, kin, end)
     moving = jnp.where(active_dofs(chain, structure), v, 0)
     bias = row * loop_bias(chain, structure, kin, end, V, bias_accelerations(chain, kin, V, v), moving)
     if baumgarte is not None:
-        bias = bias + 2 * baumgarte * (J @ (v / column)) + baumgarte**2 * row * gap(structure, end).ravel()
-    return J, bias
+        bias = bias + 2 * baumgarte * (J @ (moving / column)) + baumgarte**2 * row * gap(structure, end).ravel()
+    return bias
+
+
+def agreeing(chain: Chain, selection: Selection, J: Float[Array, "rows dofs"], v: Float[Array, " dofs"]) -> Float[Array, " dofs"]:
+    """W v_G (16): the dependent velocities as the independent ones ask for."""
+    _, column = scales(chain)
+    Jm, JS = square(selection, J)
+    return v - column * (selection.P.T @ solve_frozen(JS, Jm @ (v / column)))
 
 
 def choose(structure: Structure, J: Float[Array, "rows dofs"]) -> Selection:
-    """The pivots of J_C, with the rank of the phase and the coordinates that are asked to be independent."""
-    return select(J, structure.rank, structure.independent)
+    """The pivots of J_C, with the rank of the phase and the coordinates that are asked to be independent; without rows that are too weak just now."""
+    return without_weak(select(J, structure.rank, structure.independent), held_part(J.dtype) * structure.margin)
 
 
 def constrain(chain: Chain, structure: Structure, selection: Selection, J: Float[Array, "rows dofs"], bias: Float[Array, " rows"]) -> Coordinates:
@@ -99,7 +104,9 @@ def constrain(chain: Chain, structure: Structure, selection: Selection, J: Float
 
 def constrained(chain: Chain, structure: Structure, q, v, kin: Kinematics, V) -> Coordinates:
     """`constrain` at one state, from its kinematics."""
-    J, bias = loop_rows(chain, structure, q, v, kin, V)
+    end = ends(chain, structure, kin, q)
+    J = scaled_jacobian(chain, structure, kin, end)
+    bias = loop_rates(chain, structure, v, kin, V, end, J)
     return constrain(chain, structure, choose(structure, J), J, bias)
 
 

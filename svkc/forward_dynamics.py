@@ -9,7 +9,7 @@ from jax.scipy.linalg import cho_factor, cho_solve, solve_triangular
 from jaxtyping import Array, Bool, Float
 
 from svkc.chain import Chain, State, Structure
-from svkc.closure import Coordinates, choose, constrain, loop_rows, scaled_jacobian, scales
+from svkc.closure import Coordinates, agreeing, choose, constrain, loop_rates, scaled_jacobian, scales
 from svkc.inverse_dynamics import generalized_forces, inertia_by_composites, inertia_by_unit_vectors, inertia_times, passive_forces
 from svkc.kinematics import Kinematics, kinematics, twists
 from svkc.loops import active_dofs, ends
@@ -93,20 +93,34 @@ def solve_free_motion(
     return jax.lax.custom_linear_solve(equations, jnp.where(free, force, 0), solve=lambda _, x: cho_solve(factor, x), symmetric=True)
 
 
-@functools.partial(jax.jit, static_argnames="inertia")
-def acceleration(chain: Chain, structure: Structure, q, v, tau: Float[Array, " dofs"], inertia=inertia_by_composites, baumgarte=None) -> Float[Array, " dofs"]:
-    """Steps 1 to 5 of section III-B. On an open chain W is the identity and nothing of the closure is computed.
+@functools.partial(jax.jit, static_argnames=("inertia", "agree"))
+def moving(
+    chain: Chain, structure: Structure, q, v, tau: Float[Array, " dofs"], inertia=inertia_by_composites, baumgarte=None, agree: bool = False
+) -> tuple[Float[Array, " dofs"], Float[Array, " dofs"]]:
+    """Velocity and acceleration: steps 1 to 5 of section III-B. On an open chain W is the identity and nothing of the closure is computed.
 
-    baumgarte: rate (1/s) at which open loops are pulled back; None: not at all.
+    baumgarte: rate (1/s) at which open loops are pulled back; None: not at all. agree: dependent velocities are those of the independent ones.
     """
     kin = kinematics(chain, q)
+    loops = len(chain.topology.link_names)
+    if loops:
+        end = ends(chain, structure, kin, q)
+        J = scaled_jacobian(chain, structure, kin, end)
+        selection = choose(structure, J)
+        if agree:
+            v = agreeing(chain, selection, J, jnp.where(active_dofs(chain, structure), v, 0))
     V = twists(chain, kin, v)
     bias = generalized_forces(chain, kin, V, v, jnp.zeros(chain.nv, v.dtype))
     force = tau + passive_forces(chain, q, v) - jnp.concatenate([bias, jnp.zeros(chain.dofs - chain.nv, v.dtype)])
-    if not len(chain.topology.link_names):
-        return solve_free_motion(chain, structure, kin, force, inertia)
-    J, rates = loop_rows(chain, structure, q, v, kin, V, baumgarte)
-    return solve_motion(chain, structure, kin, choose(structure, J), J, force, rates, inertia)
+    if not loops:
+        return v, solve_free_motion(chain, structure, kin, force, inertia)
+    rates = loop_rates(chain, structure, v, kin, V, end, J, baumgarte)
+    return v, solve_motion(chain, structure, kin, selection, J, force, rates, inertia)
+
+
+def acceleration(chain: Chain, structure: Structure, q, v, tau: Float[Array, " dofs"], inertia=inertia_by_composites) -> Float[Array, " dofs"]:
+    """The acceleration alone, for the velocity as it is."""
+    return moving(chain, structure, q, v, tau, inertia)[1]
 
 
 @jax.jit

@@ -178,6 +178,7 @@ def _structure(model, topology: Topology, links: list[VirtualLink], spare: int) 
         **{name: _floats(np.array(value).reshape(count, 4 if "quat" in name else 3)) for name, value in frames.items()},
         freedoms=jnp.asarray(np.array([joint_freedoms(link.joint) for link in links], bool).reshape(count, 6)),
         rank=jnp.asarray(np.int32(0)),
+        margin=jnp.zeros((), jnp.result_type(float)),
     )
 
 

@@ -58,6 +58,6 @@ def mobility(chain: Chain, state: State) -> Mobility:
     rows = jnp.where(state.structure.connected, 6, 0).astype(jnp.int32)
     redundant = rows - jnp.diff(ranks, prepend=jnp.zeros(1, jnp.int32))
     co = coordinates(chain, state)
-    rank, margin = state.structure.rank, weakest(co.selection)
+    rank, margin = state.structure.rank, weakest(select(J, state.structure.rank))
     on = state.structure.connected
     return Mobility(joint_freedoms - rank, joint_freedoms, rank, redundant, co.independent, margin, on, chain.link_names, chain.dof_names)

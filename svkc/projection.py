@@ -1,6 +1,7 @@
-"""F3: the way back onto closed loops, by the least change, and the rank that a phase goes by."""
+"""F5: the way back onto closed loops, by the least change, and the rank that a phase goes by."""
 
 import functools
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -11,9 +12,10 @@ from jaxtyping import Array, Float
 
 from svkc.chain import Chain, State, Structure
 from svkc.closure import scaled_jacobian, scales
-from svkc.kinematics import integrate, kinematics, normalize
+from svkc.forward_dynamics import solve_motion
+from svkc.kinematics import Kinematics, integrate, kinematics, normalize
 from svkc.loops import active_dofs, ends, gap
-from svkc.selection import Selection, count_rank, rank_tolerance, select, solve_positive, square, weakest
+from svkc.selection import Selection, count_rank, held_part, rank_tolerance, select, solve_frozen, solve_positive, square, weakest, without_weak
 
 
 @jax.jit
@@ -33,12 +35,15 @@ def decide_rank(chain: Chain, structure: Structure, q: Float[Array, " q"]) -> St
     # a fixed direction without pattern, a few degrees away; left out where Newton's method does not come back onto the loops
     direction = np.sin(1.0 + 2.3 * np.arange(chain.dofs))
     near = jnp.where(active_dofs(chain, structure), 0.05 * direction * column, 0).astype(q.dtype)
-    full = eqx.tree_at(lambda s: s.rank, structure, jnp.asarray(min(row.shape[0], chain.dofs), jnp.int32))
+    full = eqx.tree_at(lambda s: (s.rank, s.margin), structure, (jnp.asarray(min(row.shape[0], chain.dofs), jnp.int32), jnp.zeros_like(structure.margin)))
     moved = close(chain, full, integrate(chain, q, near), iterations=12)
     size, open_ = jax.lax.map(sizes, jnp.stack([q, moved]))
     closed = open_[1] < jnp.finfo(q.dtype).eps ** 0.75
     rank = jnp.where(closed, jnp.maximum(count_rank(size[0]), count_rank(size[1])), count_rank(size[0]))
-    return eqx.tree_at(lambda s: s.rank, given, checkpoint_name(rank, "rank"))
+    last = jnp.arange(size.shape[1], dtype=jnp.int32) == rank - 1
+    margin = jnp.sum(jnp.where(last, size, 0), 1) / jnp.maximum(size[:, 0], jnp.finfo(size.dtype).tiny)
+    margin = jnp.where(closed, jnp.max(margin), margin[0])
+    return eqx.tree_at(lambda s: (s.rank, s.margin), given, (checkpoint_name(rank, "rank"), checkpoint_name(margin, "rank")))
 
 
 def rank_margin(chain: Chain, *states: State) -> Float[Array, ""]:
@@ -55,18 +60,29 @@ def rank_margin(chain: Chain, *states: State) -> Float[Array, ""]:
     return jnp.min(jax.lax.map(margin, jnp.stack([s.q for s in states])))
 
 
-def _least_change(selection: Selection, J, x: Float[Array, "rows *n"]) -> Float[Array, "dofs *n"]:
-    """The smallest y with J_Cm y = Q x."""
+def least_change(chain: Chain, structure: Structure, kin: Kinematics, selection: Selection, J, x: Float[Array, "rows n"]) -> Float[Array, "dofs n"]:
+    """The y with J y = x whose sum of squares, in coordinates without units, is least."""
     Jm, _ = square(selection, J)
     gram = Jm @ Jm.T + jnp.diag(jnp.where(selection.used, 0, 1).astype(J.dtype))
-    return Jm.T @ solve_positive(gram, selection.Q @ x)
+    return scales(chain)[1][:, None] * (Jm.T @ solve_positive(gram, selection.Q @ x))
 
 
-def _solvable(selection: Selection) -> Selection:
-    """Steps below the rank's tolerance dropped: a gap along them is of second order, and dividing by them would only amplify round-off."""
-    floor = rank_tolerance(selection.size.dtype) * selection.size[0]
-    keep = selection.used & (selection.size > floor)
-    return Selection(jnp.where(keep[:, None], selection.Q, 0), jnp.where(keep[:, None], selection.P, 0), selection.size, keep)
+def dependent_change(chain: Chain, structure: Structure, kin: Kinematics, selection: Selection, J, x: Float[Array, "rows n"]) -> Float[Array, "dofs n"]:
+    """The y with J y = x that moves dependent coordinates only."""
+    _, JS = square(selection, J)
+    return scales(chain)[1][:, None] * (selection.P.T @ solve_frozen(JS, selection.Q @ x))
+
+
+def inertia_change(chain: Chain, structure: Structure, kin: Kinematics, selection: Selection, J, x: Float[Array, "rows n"]) -> Float[Array, "dofs n"]:
+    """The y with J y = x whose y^T M y is least."""
+    none = jnp.zeros(chain.dofs, J.dtype)
+    return jax.vmap(lambda x: solve_motion(chain, structure, kin, selection, J, none, -x), 1, 1)(x)
+
+
+def _solvable(structure: Structure, selection: Selection) -> Selection:
+    """Steps below the rank's tolerance dropped, for a gap along them is of second order and dividing by them would only amplify round-off; and rows
+    that are let go just now."""
+    return without_weak(selection, jnp.maximum(rank_tolerance(selection.size.dtype), held_part(selection.size.dtype) * structure.margin))
 
 
 @functools.partial(jax.jit, static_argnames="iterations")
@@ -75,7 +91,7 @@ def close(chain: Chain, structure: Structure, q: Float[Array, " q"], iterations:
 
     `hold`: coordinates that must not move in the first half of the iterations.
     """
-    row, column = scales(chain)
+    row, _ = scales(chain)
 
     @functools.partial(jax.checkpoint, prevent_cse=False)
     def newton(i, q):
@@ -84,14 +100,17 @@ def close(chain: Chain, structure: Structure, q: Float[Array, " q"], iterations:
         J = scaled_jacobian(chain, structure, kin, end)
         if hold is not None:
             J = jnp.where(hold[None] & (i < iterations // 2), 0, J)
-        selection = _solvable(select(J, structure.rank))
-        return integrate(chain, q, -column * _least_change(selection, J, row * gap(structure, end).ravel()))
+        selection = _solvable(structure, select(J, structure.rank))
+        open_ = row * gap(structure, end).ravel()
+        return integrate(chain, q, -least_change(chain, structure, kin, selection, J, open_[:, None])[:, 0])
 
     return jax.lax.fori_loop(0, iterations, newton, normalize(chain, q))
 
 
-@functools.partial(jax.jit, static_argnames="iterations")
-def settle_loops(chain: Chain, structure: Structure, q, v, iterations: int) -> tuple[Float[Array, " q"], Float[Array, " dofs"]]:
+@functools.partial(jax.jit, static_argnames=("iterations", "change"))
+def settle_loops(
+    chain: Chain, structure: Structure, q, v, iterations: int, change: Callable = inertia_change
+) -> tuple[Float[Array, " q"], Float[Array, " dofs"]]:
     """`close`, then `agree`: one body for both, the last turn of the loop being the velocities', so that it is compiled once."""
     row, column = scales(chain)
     active = active_dofs(chain, structure)
@@ -102,9 +121,9 @@ def settle_loops(chain: Chain, structure: Structure, q, v, iterations: int) -> t
         kin = kinematics(chain, q)
         end = ends(chain, structure, kin, q)
         J = scaled_jacobian(chain, structure, kin, end)
-        selection = _solvable(select(J, structure.rank))
+        selection = _solvable(structure, select(J, structure.rank, structure.independent))
         open_ = jnp.stack([row * gap(structure, end).ravel(), J @ jnp.where(active, v / column, 0)], 1)
-        step = -column[:, None] * _least_change(selection, J, open_)
+        step = -change(chain, structure, kin, selection, J, open_)
         last = i == iterations
         return integrate(chain, q, jnp.where(last, 0, step[:, 0])), jnp.where(last, v + step[:, 1], v)
 
@@ -121,7 +140,8 @@ def agree(chain: Chain, structure: Structure, q, v, hold=None) -> Float[Array, "
 
     def project(i, v):
         free = J if hold is None else jnp.where(hold[None] & (i == 0), 0, J)
-        selection = _solvable(select(free, structure.rank))
-        return v - column * _least_change(selection, free, J @ jnp.where(active, v / column, 0))
+        selection = _solvable(structure, select(free, structure.rank))
+        apart = J @ jnp.where(active, v / column, 0)
+        return v - least_change(chain, structure, kin, selection, free, apart[:, None])[:, 0]
 
     return project(0, v) if hold is None else jax.lax.fori_loop(0, 2, project, v)

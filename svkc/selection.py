@@ -30,6 +30,18 @@ def rank_tolerance(dtype) -> float:
     return float(np.sqrt(np.finfo(dtype).eps))
 
 
+def held_part(dtype) -> float:
+    """The part of the phase's own margin below which a row of the scaled J_C is let go for as long as the mechanism passes a singular configuration:
+    eps^(1/4), 1.2e-4 in float64, 1.9e-2 in float32. Nearer to it round-off would steer the motion; what moves goes on as it moves."""
+    return float(np.finfo(dtype).eps ** 0.25)
+
+
+def without_weak(selection: Selection, floor: Float[Array, ""]) -> Selection:
+    """Steps whose |R_kk| / |R_11| is not above the floor left out: their pivots are independent."""
+    keep = selection.used & (selection.size > floor * selection.size[0])
+    return Selection(jnp.where(keep[:, None], selection.Q, 0), jnp.where(keep[:, None], selection.P, 0), selection.size, keep)
+
+
 def select(J: Float[Array, "rows dofs"], rank: Int[Array, ""] | None = None, wanted: Bool[Array, " dofs"] | None = None) -> Selection:
     """min(rows, dofs) steps of column-pivoted Gram-Schmidt, orthogonalised twice; steps from `rank` on are inert (None: all are taken).
 

@@ -12,11 +12,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from svkc.chain import Chain, State, Structure
-from svkc.forward_dynamics import acceleration, joint_torques
+from svkc.forward_dynamics import joint_torques, moving
 from svkc.inverse_dynamics import limit_forces
 from svkc.kinematics import normalize, rates
 from svkc.loops import active_dofs
-from svkc.projection import settle_loops
+from svkc.projection import inertia_change, settle_loops
 
 # a step that would leave less than this part of itself before a time to be met goes all the way
 REST = 1e-6
@@ -49,12 +49,15 @@ class Scene(eqx.Module):
 
 
 class Projection(eqx.Module):
-    """Loop drift is taken away after every step by the least change of q and v (scaled coordinates) that closes the loops.
+    """Loop drift is taken away after every step by the smallest change of q and v that closes the loops.
 
-    iterations: Newton steps on the position; one leaves a gap of the second order in the drift of a step.
+    iterations: Newton steps on the position; one leaves a gap of the second order in the drift of a step. change: what is smallest:
+    `svkc.inertia_change` (kinetic energy: a velocity that is projected loses energy of second order only), `svkc.least_change` (scaled coordinates)
+    or `svkc.dependent_change` (no independent coordinate moves).
     """
 
     iterations: int = eqx.field(static=True, default=2)
+    change: Callable = eqx.field(static=True, default=inertia_change)
 
 
 class Baumgarte(eqx.Module):
@@ -77,9 +80,9 @@ class Field(eqx.Module):
         chain, structure = scene.chain, scene.structure
         tau, power = self.torques(t, y, scene)
         rate = self.stabilization.rate if isinstance(self.stabilization, Baumgarte) else None
-        vdot = acceleration(chain, structure, y.q, y.v, tau, baumgarte=rate)
-        moving = jnp.where(active_dofs(chain, structure), y.v, 0)
-        return Motion(rates(chain, y.q, moving), vdot, power)
+        # near a singular configuration the stages of a step would make errors of the dependent velocities grow
+        v, vdot = moving(chain, structure, y.q, y.v, tau, baumgarte=rate, agree=isinstance(self.stabilization, Projection))
+        return Motion(rates(chain, y.q, jnp.where(active_dofs(chain, structure), v, 0)), vdot, power)
 
     def torques(self, t, y: Motion, scene: Scene):
         """Joint torques of the control and the limits, and the power of all that is not conservative (None: there is none)."""
@@ -107,7 +110,7 @@ def settle(stabilization, scene: Scene, y: Motion) -> Motion:
     chain, structure = scene.chain, scene.structure
     if not projects(stabilization, scene):
         return eqx.tree_at(lambda y: y.q, y, normalize(chain, y.q))
-    return eqx.tree_at(lambda y: (y.q, y.v), y, settle_loops(chain, structure, y.q, y.v, stabilization.iterations))
+    return eqx.tree_at(lambda y: (y.q, y.v), y, settle_loops(chain, structure, y.q, y.v, stabilization.iterations, stabilization.change))
 
 
 class _Interpolation(diffrax.AbstractLocalInterpolation):
