@@ -1,0 +1,267 @@
+"""Independent solutions of other people's problems (tests/reference: where each comes from), and what they hold this library to."""
+
+import json
+import pathlib
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import maximal
+import numpy as np
+import pytest
+
+import svkc
+
+FOLDER = pathlib.Path(__file__).parent / "reference"
+ROTATION = '<mujoco><compiler balanceinertia="false"/><option gravity="{}"/><worldbody><body name="top"><joint name="top" type="ball"/>'
+ROTATION += '<inertial pos="{}" mass="{}" diaginertia="{}"/></body></worldbody></mujoco>'
+
+
+def given(name):
+    return json.loads((FOLDER / f"{name}.json").read_text())
+
+
+def tight(tolerance):
+    return {"rtol": tolerance, "atol": tolerance / 100, "solver": diffrax.Dopri8()}
+
+
+def numbers(x):
+    return " ".join(repr(float(value)) for value in x)
+
+
+def places(chain, traj, body):
+    """[times 3] of the body's frame."""
+    return np.asarray(jax.vmap(lambda s: svkc.poses(chain, s)[0])(traj.states))[:, chain.body_names.index(body)]
+
+
+def turned_alike(q, expected):
+    """Quaternions, the sign of each as expected."""
+    q, expected = np.asarray(q), np.asarray(expected)
+    return q * np.sign(np.sum(q * expected, 1))[:, None], expected
+
+
+@pytest.mark.parametrize("case", given("free_top")["cases"], ids=lambda case: case["name"])
+def test_free_top(case):
+    """1e-9; where the motion itself amplifies round-off, three times what a plain integration in double precision loses."""
+    chain = svkc.load(ROTATION.format("0 0 0", "0 0 0", 1, numbers(case["inertia"])))
+    traj = svkc.simulate(chain, chain.state(v={"top": case["omega0_body"]}), case["t_end"], ts=jnp.array(case["t"]), **tight(1e-13))
+    bound = max(1e-9, 3 * case["plain"])
+    np.testing.assert_allclose(*turned_alike(traj.states.q, case["quat_wxyz_body_to_world"]), atol=bound)
+    np.testing.assert_allclose(traj.states.v, case["omega_body"], atol=3 * bound * np.max(np.abs(case["omega_body"])))
+
+
+@pytest.mark.parametrize("case", given("heavy_top")["cases"], ids=lambda case: case["name"])
+def test_heavy_top(case):
+    model = given("heavy_top")["model"]
+    chain = svkc.load(ROTATION.format(numbers(model["gravity"]), numbers(model["com_body"]), model["mass"], numbers(model["inertia_com_body"])))
+    traj = svkc.simulate(chain, chain.state(v={"top": case["omega0_body"]}), case["t_end"], ts=jnp.array(case["t"]), **tight(1e-13))
+    np.testing.assert_allclose(*turned_alike(traj.states.q, case["quat_wxyz_body_to_world"]), atol=1e-9)
+
+
+def n_four_bar(windows):
+    """The problem of two windows with as many as asked for."""
+    problem = given("n_four_bar")["problem"]
+    upright, level = problem["bodies"][0], problem["bodies"][-1]
+    hinge = {"type": "revolute", "axis_world0": [0, 0, 1]}
+    bodies = [upright | {"name": f"vert{i}", "com_world0": [i, 0.5, 0]} for i in range(windows + 1)]
+    bodies += [level | {"name": f"horiz{i}", "com_world0": [i + 0.5, 1, 0]} for i in range(windows)]
+    joints = [hinge | {"parent": "ground", "child": f"vert{i}", "point_world0": [i, 0, 0]} for i in range(windows + 1)]
+    for i in range(windows):
+        joints.append(hinge | {"parent": f"vert{i}", "child": f"horiz{i}", "point_world0": [i, 1, 0]})
+        joints.append(hinge | {"parent": f"horiz{i}", "child": f"vert{i + 1}", "point_world0": [i + 1, 1, 0]})
+    return problem | {"bodies": bodies, "joints": joints}
+
+
+def test_n_four_bar_through_its_singular_configurations():
+    """20 s, some forty times through configurations where the rank drops: the angle where it is known, the energy, the loops; coordinates are swapped."""
+    case = next(case for case in given("n_four_bar")["cases"] if case["N"] == 2)
+    chain, state = maximal.load(n_four_bar(2))
+    ts = jnp.array([*case["t"], 20.0])
+    run = jax.jit(lambda state, tolerance: svkc.simulate(chain, state, 20.0, ts=ts, **tight(tolerance)))
+    for tolerance, error in ((1e-9, 1e-5), (1e-12, 1e-8)):
+        traj = run(state, tolerance)
+        found = 2 * places(chain, traj, "vert0")[:-1, :2]
+        np.testing.assert_allclose(found, case["B0"], atol=error)
+        energy = jax.vmap(lambda s: svkc.energy(chain, s))(traj.states)
+        assert np.max(np.abs(energy - energy[0])) <= 1e-6 * case["energy"]
+        assert np.max(traj.gaps) < 1e-12
+        dependent = np.asarray(jax.vmap(lambda s: svkc.coordinates(chain, s).dependent)(traj.states))
+        assert len(np.unique(dependent, axis=0)) > 1
+
+
+def springs(chain, problem):
+    """control: two-point springs and constant torques of a problem, as joint torques."""
+
+    def end(q, structure, body, point, name):
+        place, quat = svkc.poses(chain, svkc.State(q, jnp.zeros(chain.dofs), structure))
+        row = chain.body_names.index("world" if name == "ground" else name)
+        local = body.turn.T @ (np.asarray(point) - body.place)
+        w, u = quat[row, 0], quat[row, 1:]
+        return place[row] + local + 2 * jnp.cross(u, jnp.cross(u, local) + w * local)
+
+    bodies = {body["name"]: maximal.Body(body) for body in problem["bodies"]} | {"ground": maximal.Body()}
+
+    def potential(q, structure):
+        total = 0.0
+        for spring in (force for force in problem["forces"] if force["type"] == "spring_damper"):
+            one, other = (end(q, structure, bodies[spring[e]], spring[f"point_{e}_world0"], spring[e]) for e in ("parent", "child"))
+            total = total + spring["stiffness"] / 2 * (jnp.linalg.norm(other - one) - spring["rest_length"]) ** 2
+        return total
+
+    def control(t, state, args):
+        torque = -svkc.tangent(chain, state.q, jax.grad(potential)(state.q, state.structure))
+        for force in (force for force in problem["forces"] if force["type"] == "torque"):
+            torque = torque.at[chain.dof_names.index(force["body"])].add(force["world"][2])
+        return torque
+
+    return control
+
+
+def test_andrews_mechanism():
+    """Every angle and rate over 0.05 s; at 0.03 s the digits that are published, to 1e-8."""
+    reference = given("andrews")
+    chain, state = maximal.load(reference["problem"])
+    traj = svkc.simulate(chain, state, 0.05, ts=jnp.array(reference["t"]), control=springs(chain, reference["problem"]), **tight(1e-12))
+    # K1 turns by beta, K2 on it by Theta, K3 by gamma, K5 and K7 by delta and epsilon, K4 and K6 on them by Phi and Omega
+    turned = {"beta": ("K1",), "gamma": ("K1", "K2", "K3"), "delta": ("K1", "K2", "K4", "K5"), "epsilon": ("K1", "K2", "K6", "K7"), "Theta": ("K2",)}
+    turned |= {"Phi": ("K5",), "Omega": ("K7",)}
+    signs = {"Phi": -1, "Omega": -1}
+    index = {name: [chain.dof_names.index(body) for body in bodies] for name, bodies in turned.items()}
+    for i, name in enumerate(reference["angles"]):
+        sign = signs.get(name, 1)
+        angle = reference["q0"][i] + sign * np.sum(np.asarray(traj.states.q)[:, index[name]], 1)
+        rate = sign * np.sum(np.asarray(traj.states.v)[:, index[name]], 1)
+        np.testing.assert_allclose(angle, np.array(reference["q"])[:, i], atol=1e-10)
+        np.testing.assert_allclose(rate, np.array(reference["v"])[:, i], atol=1e-8 * np.max(np.abs(reference["v"])))
+        there = int(np.argmin(np.abs(np.array(reference["t"]) - 0.03)))
+        assert angle[there] == pytest.approx(float(reference["at_0p03"]["q"][i]), rel=1e-8)
+        assert rate[there] == pytest.approx(float(reference["at_0p03"]["v"][i]), rel=1e-8)
+
+
+@pytest.mark.parametrize("variant", given("slider_crank_3d")["variants"], ids=lambda variant: variant["name"])
+def test_slider_crank_3d(variant):
+    chain, state = maximal.load(variant["problem"])
+    traj = svkc.simulate(chain, state, 5.0, ts=jnp.array(variant["t"]), **tight(1e-12))
+    np.testing.assert_allclose(places(chain, traj, "slider")[:, 0], variant["slider_x"], atol=1e-10)
+    np.testing.assert_allclose(traj.states.v[:, chain.dof_names.index("slider")], variant["slider_v"], atol=1e-9)
+
+
+def test_rssr_does_not_notice_its_idle_spin():
+    """A coupler that spins at 200 rad/s about itself: crank and rocker as with one at rest."""
+    found = []
+    for variant in given("rssr")["variants"]:
+        chain, state = maximal.load(variant["problem"])
+        traj = svkc.simulate(chain, state, 4.0, ts=jnp.array(variant["t"]), **tight(1e-12))
+        np.testing.assert_allclose(places(chain, traj, "coupler"), variant["coupler_com"], atol=1e-9)
+        np.testing.assert_allclose(traj.states.v[:, chain.dof_names.index("crank")], variant["crank_rate"], atol=1e-8)
+        found.append(np.asarray(traj.states.v[:, 0]))
+    np.testing.assert_allclose(*found, atol=1e-8)
+
+
+CART = (
+    '<mujoco><compiler balanceinertia="false"/><option gravity="0 0 -9.81"/><worldbody><body name="cart"><joint name="x" type="slide" axis="1 0 0"/>'
+    '<inertial pos="0 0 0" mass="{}" diaginertia="1e-12 1e-12 1e-12"/><body name="pole"><joint name="theta" type="hinge" axis="0 -1 0"/>'
+    '<inertial pos="0 0 -1" mass="1" diaginertia="1e-15 1e-15 1e-15"/></body></body></worldbody></mujoco>'
+)
+
+
+@pytest.mark.parametrize(("number", "tolerance", "error"), [(0, 1e-11, 1e-8), (1, 1e-13, 1e-10), (2, 1e-9, 1e-5)])
+def test_light_cartpole(number, tolerance, error):
+    """A cart of 1e-6, 1e-3, 1e-9 of its pole: rates of 4e3, 1e2, 1e5 rad/s in each swing."""
+    case = given("light_cartpole")["cases"][number]
+    chain = svkc.load(CART.format(case["M"]))
+    traj = svkc.simulate(chain, chain.state({"theta": np.pi / 2}), 10.0, ts=jnp.array(case["t"]), **tight(tolerance))
+    np.testing.assert_allclose(traj.states.q[:, 0], case["x"], atol=error)
+    np.testing.assert_allclose(traj.states.q[:, 1], case["theta"], atol=error)
+
+
+def test_slider_crank_with_gradients():
+    """SUNDIALS' own example: the path, the integral of the kinetic energy, and its derivatives by the spring and the damper."""
+    reference = given("sundials_slider_crank")
+    crank = '<body name="crank"><joint name="crank" axis="0 0 1"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body>'
+    rod = '<body name="rod"><joint name="x" type="slide" axis="1 0 0"/><joint name="rod" axis="0 0 1"/>'
+    rod += '<inertial pos="0 0 0" mass="1" diaginertia="2 2 2"/></body>'
+    pin = svkc.VirtualLink("pin", "crank", "rod", "hinge", pos=(0.5, 0, 0), real_pos=(-1, 0, 0), connected=True)
+    chain = svkc.load(f'<mujoco><option gravity="0 0 0"/><worldbody>{crank}{rod}</worldbody></mujoco>', virtual_links=[pin])
+    state = chain.state({"crank": np.pi / 2, "x": np.sqrt(0.75), "rod": -np.pi / 6})
+
+    def along(q):
+        """The spring's two ends, and the end of the rod that is pushed."""
+        crank, x, rod = q[0], q[1], q[2]
+        tip, slider = 0.5 * jnp.stack([jnp.cos(crank), jnp.sin(crank)]), jnp.stack([x, 0 * x])
+        beyond = jnp.stack([jnp.cos(rod), jnp.sin(rod)])
+        return tip / 2, slider - beyond / 2, slider + beyond
+
+    def control(t, state, args):
+        (one, other, _), back = jax.vjp(along, state.q)
+        rates = jax.jvp(along, (state.q,), (state.v,))[1]
+        apart, opening = other - one, rates[1] - rates[0]
+        length = jnp.linalg.norm(apart)
+        pull = (args[0] * (length - 1) + args[1] * (apart @ opening) / length) * apart / length
+        return back((pull, -pull, jnp.array([1.0, 0.0])))[0]
+
+    # Gauss' nodes of 40 parts
+    node, weight = np.polynomial.legendre.leggauss(8)
+    nodes = (np.arange(40)[:, None] + (node + 1) / 2).ravel() / 4
+
+    args, wanted = jnp.ones(2), reference["functional"]
+    ts = np.concatenate([nodes, reference["t"]])
+    order = np.argsort(ts, kind="stable")
+
+    def functional(args):
+        traj = svkc.simulate(chain, state, 10.0, ts=jnp.array(ts[order]), control=control, args=args, **tight(1e-12))
+        states = jax.tree.map(lambda x: x[np.argsort(order)], (traj.states.q, traj.states.v))
+        energy = jax.vmap(lambda q, v: svkc.kinetic_energy(chain, svkc.State(q, v, state.structure)))(*states)
+        return jnp.tile(weight, 40) @ energy[:320] / 8, states[0][320:]
+
+    (value, path), slope = jax.jit(jax.value_and_grad(functional, has_aux=True))(args)
+    for column, name in enumerate(("q", "x", "p")):
+        np.testing.assert_allclose(path[:, column], reference[name], atol=1e-10)
+    assert float(value) == pytest.approx(wanted["value"], rel=1e-11)
+    np.testing.assert_allclose(slope, [wanted["dG_dk"], wanted["dG_dc"]], rtol=1e-9)
+
+
+def test_two_rods_latched():
+    """Velocities after a hinge and after a weld, momenta and kinetic energy: the closed form."""
+    case = given("events")["latch_two_rods"]
+    rod = '<body name="{0}" pos="{1} 0 0"><joint name="{0}.x" type="slide" axis="1 0 0"/><joint name="{0}.y" type="slide" axis="0 1 0"/>'
+    rod += '<joint name="{0}.turn" axis="0 0 1"/><inertial pos="0 0 0" mass="{2}" diaginertia="{3} {3} {3}"/></body>'
+    text = rod.format("one", 0, 1, 1 / 12) + rod.format("two", 1, 2, 2 / 12)
+    links = [svkc.VirtualLink(kind, "one", "two", kind, pos=(0.5, 0, 0), real_pos=(-0.5, 0, 0)) for kind in ("hinge", "weld")]
+    chain = svkc.load(f'<mujoco><option gravity="0 0 0"/><worldbody>{text}</worldbody></mujoco>', virtual_links=links)
+    before = chain.state(v=jnp.array(case["v_before"]), connected=())
+    for kind, key, energy in (("hinge", "v_after_revolute", 1), ("weld", "v_after_weld", 2)):
+        after = svkc.connect(chain, before, kind)
+        np.testing.assert_allclose(after.v[:6], case[key], atol=1e-14)
+        assert float(svkc.kinetic_energy(chain, after)) == pytest.approx(case["kinetic"][energy], rel=1e-14)
+        linear, angular = svkc.momentum(chain, after)
+        np.testing.assert_allclose([*linear[:2], angular[2]], case["momenta_before"], atol=1e-14)
+
+
+def test_pendulum_released():
+    """A rod comes off its pin at an angle and flies: the time, the rate, and the path of both parts."""
+    case = given("events")["pendulum_release"]
+    rod = '<body name="rod"><joint name="pin" axis="0 0 1"/><inertial pos="0 -0.5 0" mass="1" '
+    rod += f'diaginertia="{1 / 12!r} 0.01 {1 / 12!r}"/></body>'
+    chain = svkc.load(f'<mujoco><option gravity="0 -9.81 0"/><worldbody>{rod}</worldbody></mujoco>', cuttable="pin")
+    # half the angle's sine: its angle is -0.5
+    event = svkc.when(lambda t, s, args: svkc.poses(chain, s)[1][1, 3] + jnp.sin(0.25), cut="pin", direction=False)
+    traj = svkc.simulate(chain, chain.state({"pin": np.pi / 2}), 2.0, ts=jnp.array(case["t"]), events=[event], **tight(1e-13))
+    assert float(traj.events.time[0]) == pytest.approx(case["t_event"], abs=1e-12)
+    place, quat = (np.asarray(x)[:, 1] for x in jax.vmap(lambda s: svkc.poses(chain, s))(traj.states))
+    expected = np.array(case["theta_comx_comy"])
+    com = place[:, :2] + 0.5 * np.stack([np.sin(expected[:, 0]), -np.cos(expected[:, 0])], 1)
+    np.testing.assert_allclose(com, expected[:, 1:], atol=1e-11)
+    half = np.stack([np.cos(expected[:, 0] / 2), np.sin(expected[:, 0] / 2)], 1)
+    np.testing.assert_allclose(*turned_alike(quat[:, [0, 3]], half), atol=1e-11)
+
+
+def test_simple_pendulum_for_a_long_time():
+    """IFToMM A01: a point mass on a rod without mass, from the level, 42 periods and more."""
+    case = given("events")["a01_simple_pendulum"]
+    rod = '<body name="rod"><joint name="pin" axis="0 0 1"/><inertial pos="1 0 0" mass="1" diaginertia="1e-15 1e-15 1e-15"/></body>'
+    chain = svkc.load(f'<mujoco><compiler balanceinertia="false"/><option gravity="0 -9.81 0"/><worldbody>{rod}</worldbody></mujoco>')
+    ts = [t for t in case["t"] if t <= 100]
+    traj = svkc.simulate(chain, chain.state(), 100.0, ts=jnp.array(ts), **tight(1e-13))
+    found = np.stack([np.cos(traj.states.q[:, 0]), np.sin(traj.states.q[:, 0])], 1)
+    np.testing.assert_allclose(found, case["xy"][: len(ts)], atol=1e-9)
