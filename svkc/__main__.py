@@ -110,7 +110,7 @@ def _print_phases(chain, traj):
         )
     times = ", ".join(f"{float(t):.6f} s" for t in traj.events.time[: int(traj.events.count)])
     print(f"events at {times}; energy at the start {float(p.energy[0, 0]):.3f} J")
-    print(f"largest loop gap {float(report.gap):.2e} m, {float(report.angular_gap):.2e} rad; {int(report.accepted)} steps, {int(report.rejected)} rejected")
+    print(report)
 
 
 def main(argv=None) -> int:

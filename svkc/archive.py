@@ -13,7 +13,7 @@ import numpy as np
 from svkc.chain import State, Structure
 from svkc.trajectory import RESULT_NAMES, RESULTS, Events, Phases, Trajectory
 
-# 2: with `derivative` and the phases' `margin`; 3: with the structures' `margin`
+# 2: with `derivative` and the phases' `margin`; 3: with the structures' `margin` and the whole certificate
 SCHEMA = 3
 _CODES = ("result", "derivative")
 _PARTS = {"states": State, "final": State, "structure": Structure, "events": Events, "phases": Phases}
@@ -63,6 +63,16 @@ def save(traj: Trajectory, path, chain=None) -> None:
         raise
 
 
+def _complete(arrays: dict[str, np.ndarray]) -> None:
+    """What was not kept before schema 3, as not known: inf, -1, or nothing let go."""
+    rows, dtype = arrays["phases.start"].shape[-1:], arrays["ts"].dtype
+    unknown = {"evaluations": np.full(rows, -1, np.int32), "swaps": np.full(rows, -1, np.int32), "error": np.full(rows, np.inf, dtype)}
+    unknown |= {"free": np.zeros(rows, bool), "momentum_drift": np.zeros((*rows, 2), dtype)}
+    arrays |= {f"phases.{name}": value for name, value in unknown.items()} | {"gap_rates": np.full_like(arrays["gaps"], np.inf)}
+    for part in ("states", "final"):
+        arrays[f"{part}.structure.margin"] = np.zeros_like(arrays[f"{part}.structure.rank"], dtype)
+
+
 def load_trajectory(path) -> Trajectory:
     """The trajectory that `Trajectory.save` wrote. ValueError: not such a file, cut short, or of a newer schema."""
     try:
@@ -78,8 +88,7 @@ def load_trajectory(path) -> Trajectory:
     missing = {"ts", "states.q", "final.q", "events.time"} - set(arrays)
     if missing:
         raise ValueError(f"{path} lacks {', '.join(sorted(missing))}; it is not a trajectory written by svkc")
-    for part in ("states", "final"):
-        # not known before schema 3: no row is let go
-        arrays.setdefault(f"{part}.structure.margin", np.zeros_like(arrays[f"{part}.structure.rank"], arrays["ts"].dtype))
+    if meta["schema"] < 3:
+        _complete(arrays)
     codes = {int(np.asarray(item._value)): item for item in (getattr(RESULTS, name) for name in RESULT_NAMES)}
     return _build(Trajectory, arrays, **{name: codes.get(meta.get(name, 0), RESULTS.successful) for name in _CODES})

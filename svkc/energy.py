@@ -53,6 +53,15 @@ def energy(chain: Chain, state: State) -> Float[Array, ""]:
     return sum(_energies(chain, state), jnp.zeros((), state.q.dtype))
 
 
+def momentum_about_centre(chain: Chain, state: State) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    """Linear momentum (N s) and angular momentum about the centre of mass of all bodies (N m s), in world axes."""
+    kin = kinematics(chain, state.q)
+    c, u, _, spin = _bodies(chain, kin, state.v)
+    p, place = chain.mass[:, None] * u, kin.root + c
+    centre = jnp.sum(chain.mass[:, None] * place, 0) / jnp.sum(chain.mass)
+    return jnp.sum(p, 0), jnp.sum(spin + cross(place - centre, p), 0)
+
+
 @jax.jit
 def momentum(chain: Chain, state: State) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
     """Linear momentum (N s) and angular momentum about the world's origin (N m s), in world axes."""

@@ -13,9 +13,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc.events import Bracket
-from svkc.location import FLAT, Found, Reading, event_tolerance
-from svkc.stepping import REST, Field, Motion, Scene, projects, settle
+from svkc.location import Found
+from svkc.searching import Search, Watched, found, watch
+from svkc.stepping import REST, Field, Motion, Scene, Seen, chosen, finite, motion_norm, projects, settle
 
+NON_FINITE = -1
 SUCCESSFUL, EVENT, MAX_STEPS = diffrax.RESULTS.successful._value, diffrax.RESULTS.event_occurred._value, diffrax.RESULTS.max_steps_reached._value
 
 
@@ -24,14 +26,6 @@ class World(eqx.Module):
 
     scene: Scene
     field: Field
-
-
-class Watched(eqx.Module):
-    """Guards, their values at the start of a phase, and which of them may end it."""
-
-    guards: Reading
-    values: Float[Array, " guards"]
-    which: Bool[Array, " guards"]
 
 
 class How(eqx.Module):
@@ -46,6 +40,22 @@ class How(eqx.Module):
     every: int = eqx.field(static=True)
 
 
+class Tally(eqx.Module):
+    """What a run has cost and shown: tries, and of the steps that were kept the sum of their estimated errors (root mean square over q and v; inf: the
+    solver gives none), the least |R_mm| / |R_11| of the loops, and how often the dependent coordinates changed (-1: not looked at)."""
+
+    tries: Int[Array, ""]
+    error: Float[Array, ""]
+    margin: Float[Array, ""]
+    swaps: Int[Array, ""]
+
+    @classmethod
+    def none(cls, dtype, looked: bool) -> "Tally":
+        """Before the first step."""
+        zero = jnp.zeros((), jnp.int32)
+        return cls(zero, jnp.zeros((), dtype), jnp.ones((), dtype), zero if looked else zero - 1)
+
+
 class Path(eqx.Module):
     """Where a solve ended, the states at the times asked for, the times of its steps (inf: not taken), one state in `every`, diffrax's result code."""
 
@@ -57,28 +67,8 @@ class Path(eqx.Module):
     accepted: Int[Array, ""]
     rejected: Int[Array, ""]
     result: Int[Array, ""]
+    tally: Tally
     found: Found | None = None
-
-
-class Search(eqx.Module):
-    """For the first zero in the step from the loop's t, over a span of time: guards that crossed it, by the side they are on then, and their sizes; the
-    bracket and, at its right end, the motion and the guards; the guards just after that. on: begun; narrow: the bracket is to be made smaller yet."""
-
-    span: Float[Array, ""]
-    side: Float[Array, " guards"]
-    size: Float[Array, " guards"]
-    bracket: Bracket
-    motion: Motion
-    values: Float[Array, " guards"]
-    ahead: Float[Array, " guards"]
-    on: Bool[Array, ""]
-    narrow: Bool[Array, ""]
-    done: Bool[Array, ""]
-
-    def asked(self) -> Float[Array, ""]:
-        """The time to be looked at next."""
-        b = self.bracket.b
-        return jnp.where(self.narrow, self.bracket.inside(), b + event_tolerance(b))
 
 
 class Step(eqx.Module):
@@ -101,6 +91,8 @@ class Step(eqx.Module):
     accepted: Int[Array, ""]
     rejected: Int[Array, ""]
     result: Int[Array, ""]
+    tally: Tally
+    seen: Seen | None
 
 
 class Tried(eqx.Module):
@@ -114,10 +106,8 @@ class Tried(eqx.Module):
     solver: Any
     controller: Any
     result: Int[Array, ""]
-
-
-def _choose(which, new, old):
-    return jax.tree.map(lambda a, b: jnp.where(which, a, b), new, old)
+    error: Float[Array, ""]
+    seen: Seen | None
 
 
 def march(start: Motion, times, world: World, how: How) -> Path:
@@ -136,11 +126,11 @@ def march(start: Motion, times, world: World, how: How) -> Path:
     # of times that are equal the first one's row is written
     saved = jax.tree.map(lambda x: x[jnp.searchsorted(at, at)], end.saved) if at.shape[0] else end.saved
     short = jnp.where(end.t < stop, MAX_STEPS, SUCCESSFUL)
-    found = None if how.watched is None else _found(end)
-    if found is not None:
-        short = jnp.where(found.hit, EVENT, short)
+    fired = None if how.watched is None else found(end.search, end.guards, end.t)
+    if fired is not None:
+        short = jnp.where(fired.hit, EVENT, short)
     result = jnp.where(end.result == SUCCESSFUL, short, end.result)
-    return Path(end.t, end.y, saved, end.times, end.kept, end.accepted, end.rejected, result.astype(jnp.int32), found)
+    return Path(end.t, end.y, saved, end.times, end.kept, end.accepted, end.rejected, result.astype(jnp.int32), end.tally, fired)
 
 
 def _begin(start: Motion, times, world: World, how: How) -> Step:
@@ -169,6 +159,8 @@ def _begin(start: Motion, times, world: World, how: How) -> Step:
         accepted=zero,
         rejected=zero,
         result=jnp.asarray(SUCCESSFUL, jnp.int32),
+        tally=Tally.none(t0.dtype, projects(world.field.stabilization, world.scene)),
+        seen=Seen.nothing(world.scene.chain) if projects(world.field.stabilization, world.scene) else None,
     )
 
 
@@ -185,8 +177,9 @@ def _try(s: Step, t1, world: World, how: How) -> Tried:
     # a step begins with the rate where the one before was settled to, not with one remembered from where it was before that
     fresh = True if projects(stabilization, world.scene) else s.jumped
     y, error, _, solver, solved = how.solver.step(term, s.t, t1, s.y, world.scene, s.solver, fresh)
-    y = settle(stabilization, world.scene, y)
-    error, order = jax.tree.map(lambda x: jnp.where(jnp.isnan(x), jnp.inf, x), error), how.solver.error_order(term)
+    y, seen = settle(stabilization, world.scene, y)
+    whole, order = finite(y), how.solver.error_order(term)
+    error = jax.tree.map(lambda x: jnp.where(whole & jnp.isfinite(x), x, jnp.inf), error)
     keep, t, ahead, jumped, controller, said = how.controller.adapt_step_size(s.t, t1, s.y, y, world.scene, error, order, s.controller)
     keep, length = jnp.asarray(keep), ahead - t
     if isinstance(how.controller, diffrax.PIDController):
@@ -194,8 +187,11 @@ def _try(s: Step, t1, world: World, how: How) -> Tried:
         grown = keep & (length >= 0.99 * how.controller.factormax * (t1 - s.t))
         length = jnp.where(grown, jnp.maximum(length, s.length), length)
     failed = keep & (solved._value != SUCCESSFUL)
-    result = jnp.where(failed, solved._value, said._value).astype(jnp.int32)
-    return Tried(t, y, keep, length, jnp.asarray(jumped), solver, controller, result)
+    result = jnp.where(failed, solved._value, said._value)
+    # what is not finite is never kept: a step of that length ends the run, one that can be shortened until there is no shorter one
+    result = jnp.where(~whole & (keep | (result != SUCCESSFUL)), NON_FINITE, result).astype(jnp.int32)
+    estimate = jnp.asarray(jnp.inf, t.dtype) if error is None else motion_norm(error)
+    return Tried(t, y, keep & whole, length, jnp.asarray(jumped), solver, controller, result, estimate, seen)
 
 
 def _step(s: Step, times, world: World, how: How) -> Step:
@@ -207,13 +203,15 @@ def _step(s: Step, times, world: World, how: How) -> Step:
     else:
         t1 = jnp.where(s.search.on, s.search.asked(), s.next)
         tried = _try(s, t1, world, how)
-        guards, search = _watch(s, t1, tried, world.scene, how.watched)
+        guards, search = watch(s.search, s.guards, s.t, t1, tried.y, tried.keep, world.scene, how.watched)
         still = s.search.on | search.on
-        landed = _choose(search.done, (search.bracket.b, search.motion), (tried.t, tried.y))
+        blind = tried.keep & jnp.any(jnp.isnan(guards))
+        tried = eqx.tree_at(lambda x: (x.keep, x.result), tried, (tried.keep & ~blind, jnp.where(blind, NON_FINITE, tried.result)))
+        landed = chosen(search.done, (search.bracket.b, search.motion), (tried.t, tried.y))
         tried = eqx.tree_at(lambda x: (x.t, x.y, x.keep), tried, (*landed, (tried.keep & ~still) | search.done))
-    moved = lambda new, old: _choose(tried.keep, new, old)
+    moved = lambda new, old: chosen(tried.keep, new, old)
     # while a zero is looked for, nothing else goes on
-    next_ = lambda new, old: _choose(still, old, new)
+    next_ = lambda new, old: chosen(still, old, new)
     t, accepted = moved(tried.t, s.t), s.accepted + tried.keep.astype(jnp.int32)
     saved, kept = s.saved, s.kept
     if at.shape[0]:
@@ -238,7 +236,19 @@ def _step(s: Step, times, world: World, how: How) -> Step:
         accepted=accepted,
         rejected=s.rejected + (~tried.keep & ~still).astype(jnp.int32),
         result=next_(tried.result, s.result),
+        tally=_counted(s, tried),
+        seen=moved(tried.seen, s.seen),
     )
+
+
+def _counted(s: Step, tried: Tried) -> Tally:
+    """With one more try."""
+    old, kept = s.tally, tried.keep
+    margin, swaps = old.margin, old.swaps
+    if tried.seen is not None:
+        margin = jnp.where(kept, jnp.minimum(margin, tried.seen.margin), margin)
+        swaps = swaps + (kept & jnp.any(s.seen.dependent) & jnp.any(s.seen.dependent != tried.seen.dependent)).astype(jnp.int32)
+    return Tally(old.tries + 1, old.error + jnp.where(kept, tried.error, 0), margin, swaps)
 
 
 def _written(rows, i, new, pred):
@@ -246,48 +256,3 @@ def _written(rows, i, new, pred):
     # the index of a row that is not to be written may be anything
     i = jnp.where(pred, i, 0)
     return jax.tree.map(lambda x, b: eqxi.buffer_at_set(b, i, x, pred=pred), new, rows)
-
-
-def _watch(s: Step, t1, tried: Tried, scene: Scene, watched: Watched) -> tuple[Float[Array, " guards"], Search]:
-    """The guards after a try, and the search for their first zero: begun, narrowed, or done once they are known just after it."""
-    old = s.search
-    values = watched.guards(t1, tried.y, scene)
-    # a guard at zero is not armed before it has left it by more than round-off
-    values = jnp.where((s.guards == 0) & (jnp.abs(values) < jnp.finfo(values.dtype).eps ** 0.75), 0, values)
-    crossed = watched.guards.made.crossed(s.guards, values) & watched.which & tried.keep & ~old.on
-    begun = jnp.any(crossed)
-    side = jnp.where(begun, jnp.where(crossed, jnp.where(values >= s.guards, 1, -1), 0).astype(values.dtype), old.side)
-    # the largest of the guards that crossed: positive where one has
-    passed = lambda values: jnp.max(jnp.where(side != 0, side * values, -jnp.inf))
-    bracket = _choose(old.narrow, old.bracket.narrowed(t1, passed(values)), old.bracket)
-    bracket = _choose(begun, Bracket.around(s.t, t1, passed(s.guards), passed(values)), bracket)
-    at_right = begun | (old.narrow & (passed(values) >= 0))
-    done = old.on & ~old.narrow
-    on = begun | (old.on & ~done)
-    search = Search(
-        span=jnp.where(begun, t1 - s.t, old.span),
-        side=side,
-        size=jnp.where(begun, jnp.maximum(jnp.abs(s.guards), jnp.abs(values)), old.size),
-        bracket=bracket,
-        motion=_choose(at_right, tried.y, old.motion),
-        values=jnp.where(at_right, values, old.values),
-        ahead=jnp.where(done, values, old.ahead),
-        on=on,
-        narrow=on & bracket.wide(),
-        done=done,
-    )
-    return jnp.where(done, search.values, values), search
-
-
-def _found(end: Step) -> Found:
-    """Which guards fired, where the loop has looked for that."""
-    search = end.search
-    crossed, passed = search.side != 0, search.side * search.values
-    first = jnp.argmax(jnp.where(crossed, passed, -jnp.inf)).astype(jnp.int32)
-    fired = (crossed & (search.side * search.ahead >= 0)) | (jnp.arange(crossed.shape[0], dtype=jnp.int32) == first)
-    value, grown, large = jnp.abs(passed[first]), jnp.abs(search.ahead - search.values)[first], FLAT * search.size[first]
-    jumps = search.done & (value > grown) & (value > large)
-    flat = search.done & ~jumps & (grown / event_tolerance(end.t) * search.span < large)
-    fired = fired & search.done
-    # zero: not armed, until it has left zero
-    return Found(fired, jnp.where(fired, 0, end.guards), first, search.done, jumps, flat)

@@ -9,10 +9,11 @@ from jaxtyping import Array, Bool, Float, Int
 from svkc.chain import State
 from svkc.events import Plan
 from svkc.location import Found, Reading, arrived
-from svkc.marching import EVENT, MAX_STEPS, SUCCESSFUL, How, Path, Watched, World, march
+from svkc.marching import EVENT, MAX_STEPS, NON_FINITE, SUCCESSFUL, How, Path, Tally, World, march
 from svkc.replay import Replay, integrated
 from svkc.request import Options
-from svkc.stepping import Motion, Scene, Settled, frozen, staged
+from svkc.searching import Watched
+from svkc.stepping import Motion, Scene, Settled, finite, frozen, staged
 from svkc.trajectory import RESULTS, Events, Phases
 
 
@@ -39,7 +40,7 @@ class Solved(eqx.Module):
     fired: Bool[Array, " guards"]
     guards: Float[Array, " guards"] | None
     saved: Motion
-    stats: tuple[Int[Array, ""], Int[Array, ""]]
+    path: Path
     result: RESULTS
     derivative: RESULTS
 
@@ -53,16 +54,16 @@ def solve(run: Run, stop, ts, made: Plan, options: Options, scene: Scene) -> Sol
     begun, ended = frozen((run.t, jnp.maximum(stop, run.t)))
     at = jnp.where(ts < begun, begun, jnp.where(ts > ended, ended, ts))
     path, found = _path(start, (run.t, stop, at), World(scene, options.field), watched, options)
-    stats, result = (path.accepted, path.rejected), _translate(path.result, path.end)
+    result = _translate(path.result, path.end)
     # a scheduled end goes on to move with its time, where a diffrax adjoint has not seen to that
     late = jnp.where(path.result == SUCCESSFUL, stop - path.t, 0)
     t, motion = arrived(path.t, path.end, late, scene, options.field if guards is None else guards, found)
     if found is None:
-        return Solved(t, motion, jnp.zeros(0, bool), None, path.saved, stats, result, RESULTS.successful)
+        return Solved(t, motion, jnp.zeros(0, bool), None, path.saved, frozen(path), result, RESULTS.successful)
     code = RESULTS.where(found.jumps, RESULTS.jump, RESULTS.successful)
     code = RESULTS.where(jnp.sum(found.fired) > 1, RESULTS.together, code)
     code = RESULTS.where(found.flat, RESULTS.grazing, code)
-    return Solved(t, motion, found.fired, found.values, path.saved, stats, result, code)
+    return Solved(t, motion, found.fired, found.values, path.saved, frozen(path), result, code)
 
 
 def _path(start: Motion, times, world: World, watched: Watched | None, options: Options) -> tuple[Path, Found | None]:
@@ -93,13 +94,14 @@ def _path(start: Motion, times, world: World, watched: Watched | None, options: 
     (end, saved), t, result = sol.ys, sol.ts[0][0], sol.result._value
     if found is not None:
         result = jnp.where((result == SUCCESSFUL) & found.hit, EVENT, result)
-    counts = (jnp.asarray(sol.stats[name], jnp.int32) for name in ("num_accepted_steps", "num_rejected_steps"))
-    return Path(t, jax.tree.map(lambda x: x[0], end), saved, jnp.zeros(0, t0.dtype), saved, *counts, result, found), found
+    accepted, rejected = (jnp.asarray(sol.stats[name], jnp.int32) for name in ("num_accepted_steps", "num_rejected_steps"))
+    # diffrax tells the number of tries alone
+    tally = Tally(accepted + rejected, jnp.asarray(jnp.inf, t0.dtype), jnp.ones((), t0.dtype), jnp.asarray(-1, jnp.int32))
+    return Path(t, jax.tree.map(lambda x: x[0], end), saved, jnp.zeros(0, t0.dtype), saved, accepted, rejected, result, tally, found), found
 
 
 def _translate(result: Int[Array, ""], motion: Motion) -> RESULTS:
     """Diffrax's word for how a solve ended, as ours."""
     out = RESULTS.where((result == SUCCESSFUL) | (result == EVENT), RESULTS.successful, RESULTS.step_too_small)
     out = RESULTS.where(result == MAX_STEPS, RESULTS.max_steps, out)
-    finite = jnp.all(jnp.isfinite(motion.q)) & jnp.all(jnp.isfinite(motion.v))
-    return RESULTS.where(finite, out, RESULTS.non_finite)
+    return RESULTS.where(finite(motion) & (result != NON_FINITE), out, RESULTS.non_finite)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.ad_checkpoint import checkpoint_name
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from svkc.chain import Chain, State, Structure
 from svkc.closure import scaled_jacobian, scales
@@ -110,24 +110,30 @@ def close(chain: Chain, structure: Structure, q: Float[Array, " q"], iterations:
 @functools.partial(jax.jit, static_argnames=("iterations", "change"))
 def settle_loops(
     chain: Chain, structure: Structure, q, v, iterations: int, change: Callable = inertia_change
-) -> tuple[Float[Array, " q"], Float[Array, " dofs"]]:
-    """`close`, then `agree`: one body for both, the last turn of the loop being the velocities', so that it is compiled once."""
+) -> tuple[Float[Array, " q"], Float[Array, " dofs"], Float[Array, ""], Bool[Array, " dofs"]]:
+    """`close`, then `agree`: one body for both, the last turn of the loop being the velocities', so that it is compiled once.
+
+    And what the loops show: |R_mm| / |R_11|, and which coordinates are dependent.
+    """
     row, column = scales(chain)
     active = active_dofs(chain, structure)
 
     @functools.partial(jax.checkpoint, prevent_cse=False)
     def turn(i, both):
-        q, v = both
+        q, v, _, _ = both
         kin = kinematics(chain, q)
         end = ends(chain, structure, kin, q)
         J = scaled_jacobian(chain, structure, kin, end)
-        selection = _solvable(structure, select(J, structure.rank, structure.independent))
+        full = select(J, structure.rank, structure.independent)
+        selection = _solvable(structure, full)
         open_ = jnp.stack([row * gap(structure, end).ravel(), J @ jnp.where(active, v / column, 0)], 1)
         step = -change(chain, structure, kin, selection, J, open_)
         last = i == iterations
-        return integrate(chain, q, jnp.where(last, 0, step[:, 0])), jnp.where(last, v + step[:, 1], v)
+        seen = jax.lax.stop_gradient((weakest(full), jnp.any(full.P > 0, 0)))
+        return integrate(chain, q, jnp.where(last, 0, step[:, 0])), jnp.where(last, v + step[:, 1], v), *seen
 
-    return jax.lax.fori_loop(0, iterations + 1, turn, (normalize(chain, q), v))
+    none = jnp.ones((), q.dtype), jnp.zeros(chain.dofs, bool)
+    return jax.lax.fori_loop(0, iterations + 1, turn, (normalize(chain, q), v, *none))
 
 
 @jax.jit

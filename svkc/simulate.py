@@ -16,18 +16,17 @@ from jaxtyping import Array, Bool, Float
 
 from svkc.binding import emptied, grip
 from svkc.chain import Chain, State, Structure
-from svkc.closure import loop_gaps
-from svkc.energy import energy
+from svkc.closure import loop_gaps, velocity_gaps
 from svkc.events import Plan
 from svkc.guards import Sensor
 from svkc.location import Reading, event_tolerance
-from svkc.loops import active_dofs
 from svkc.phase import Run, Solved, solve
 from svkc.projection import rank_margin
+from svkc.records import no_events, no_phases, recorded, stages
 from svkc.request import Options, checked
 from svkc.selection import rank_tolerance
 from svkc.stepping import Motion, Scene, frozen
-from svkc.trajectory import RESULTS, Events, Phases, Trajectory
+from svkc.trajectory import RESULTS, Events, Trajectory
 from svkc.transition import change, connect_tolerance
 
 
@@ -58,7 +57,8 @@ def simulate(
     if isinstance(failed, jax.core.Tracer):
         return traj.result.error_if(traj, failed)
     if np.any(np.asarray(failed)):
-        raise RuntimeError(f"simulate stopped at t = {float(traj.t_final):.9g} s: {RESULTS[traj.result]}")
+        phase = int(traj.phases.count)
+        raise RuntimeError(f"simulate stopped at t = {float(traj.t_final):.9g} s, in phase {phase}: {RESULTS[traj.result]}")
     return traj
 
 
@@ -77,9 +77,9 @@ def _run(chain: Chain, state: State, t0, t1, ts, made: Plan, options: Options, a
     short = (run.t < t1) & (run.result == RESULTS.successful)
     result = RESULTS.where(short, RESULTS.max_events, run.result)
     saved = run.saved
-    gaps = jax.vmap(lambda s: _largest_gaps(chain, s))(saved)
+    gaps, gap_rates = (jax.vmap(lambda s, of=of: _largest(of(chain, s)))(saved) for of in (loop_gaps, velocity_gaps))
     result = RESULTS.where((result == RESULTS.successful) & (jnp.max(gaps) > options.gap), RESULTS.loop_open, result)
-    return Trajectory(ts, saved, gaps, run.events, run.phases, run.state, run.t, result, run.derivative)
+    return Trajectory(ts, saved, gaps, gap_rates, run.events, run.phases, run.state, run.t, result, run.derivative)
 
 
 def _converted(chain: Chain, state: State, t0, made: Plan, options: Options, args) -> tuple[Plan, Options]:
@@ -100,11 +100,11 @@ def _lockable(chain: Chain, state: State, made: Plan) -> State:
     return eqx.tree_at(lambda s: s.structure.locked, state, jnp.zeros(chain.dofs, bool), is_leaf=lambda x: x is None)
 
 
-def _largest_gaps(chain: Chain, state: State) -> Float[Array, "2"]:
-    """Largest rotation (rad) and distance (m) over the loops."""
-    if not len(chain.link_names):
-        return jnp.zeros(2, state.q.dtype)
-    square = jnp.sum(loop_gaps(chain, state).reshape(-1, 2, 3) ** 2, -1)
+def _largest(gaps: Float[Array, "links 6"]) -> Float[Array, "2"]:
+    """The largest angular and the largest linear size over the loops."""
+    if not len(gaps):
+        return jnp.zeros(2, gaps.dtype)
+    square = jnp.sum(gaps.reshape(-1, 2, 3) ** 2, -1)
     closed = square == 0
     # a root that can be differentiated where the loop is closed to the last bit
     return jnp.max(jnp.where(closed, 0, jnp.sqrt(jnp.where(closed, 1, square))), 0)
@@ -120,22 +120,14 @@ def _start(chain: Chain, state: State, t0, ts, made: Plan, options: Options, arg
         if isinstance(guard, Sensor) and guard.loaded:
             # a load that is too much from the start is seen to be
             guards = guards.at[i].set(guard.idle)
-    zero = jnp.asarray(0, jnp.int32)
     return Run(
         t=t0,
         state=state,
         work=jnp.zeros((), dtype) if options.has_work else None,
         guards=guards,
         pending=jnp.ones(len(made.timed), bool),
-        events=Events(
-            jnp.full(rows, jnp.inf, dtype), jnp.full(rows, -1, jnp.int32), jnp.zeros((rows, links, 3), dtype), jnp.zeros((rows, links, 3), dtype),
-            jnp.zeros(rows, dtype), zero,
-        ),
-        phases=Phases(
-            jnp.full(rows + 1, jnp.inf, dtype), jnp.full(rows + 1, jnp.inf, dtype), jnp.zeros((rows + 1, links), bool), jnp.full(rows + 1, -1, jnp.int32),
-            jnp.full(rows + 1, -1, jnp.int32), jnp.zeros((rows + 1, 2), dtype), jnp.zeros(rows + 1, dtype), jnp.ones(rows + 1, dtype),
-            jnp.zeros(rows + 1, jnp.int32), jnp.zeros(rows + 1, jnp.int32), zero,
-        ),
+        events=no_events(rows, links, dtype),
+        phases=no_phases(rows + 1, links, dtype),
         saved=jax.tree.map(lambda x: jnp.broadcast_to(x[None], (ts.shape[0], *x.shape)), state),
         result=RESULTS.successful,
         derivative=RESULTS.successful,
@@ -157,7 +149,9 @@ def _phase(chain: Chain, run: Run, index, t1, ts, made: Plan, options: Options, 
     ended = State(solved.motion.q, solved.motion.v, run.state.structure)
     saved = _save(run, ended, solved, ts)
     margin = rank_margin(chain, run.state, ended)
-    phases = _record_phase(chain, run, index, going, solved, ended, margin)
+    row = (jnp.arange(run.phases.start.shape[0]) == index) & going
+    work = jnp.zeros_like(run.t) if run.work is None else solved.motion.work - run.work
+    phases = recorded(chain, run.phases, row, (run.t, run.state), (solved.t, ended), work, solved.path, margin, stages(options.solver))
     derivative = _derivative(run, solved, going, timed, margin)
     after, events, result = ended, run.events, solved.result
     if made.actions:
@@ -198,29 +192,6 @@ def _save(run: Run, ended: State, solved: Solved, ts) -> State:
         return jnp.where((ts >= run.t).reshape(-1, *(1,) * new.ndim), new[None], old)
 
     return State(q, v, jax.tree.map(write, ended.structure, run.saved.structure))
-
-
-def _record_phase(chain: Chain, run: Run, index, going, solved: Solved, ended: State, margin) -> Phases:
-    s, row = run.state.structure, jnp.arange(run.phases.start.shape[0]) == index
-    row = row & going
-    work = jnp.zeros_like(run.t) if run.work is None else solved.motion.work - run.work
-    active = active_dofs(chain, s)
-    p = run.phases
-    both = jax.tree.map(lambda *x: jnp.stack(x), (run.state.q, run.state.v), (ended.q, ended.v))
-    energies = jax.checkpoint(jax.vmap(lambda q, v: energy(chain, State(q, v, s))))(*both)
-    return Phases(
-        jnp.where(row, run.t, p.start),
-        jnp.where(row, solved.t, p.stop),
-        jnp.where(row[:, None], s.connected[None], p.connected),
-        jnp.where(row, s.rank, p.rank),
-        jnp.where(row, jnp.sum(active, dtype=jnp.int32), p.joint_freedoms),
-        jnp.where(row[:, None], energies[None], p.energy),
-        jnp.where(row, work, p.work),
-        jnp.where(row, margin, p.margin),
-        jnp.where(row, jnp.asarray(solved.stats[0], jnp.int32), p.accepted),
-        jnp.where(row, jnp.asarray(solved.stats[1], jnp.int32), p.rejected),
-        p.count + jnp.where(going, 1, 0).astype(jnp.int32),
-    )
 
 
 def _keep_rank(primitive, /, *_, **params) -> bool:

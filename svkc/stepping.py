@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from svkc.chain import Chain, State, Structure
 from svkc.forward_dynamics import joint_torques, moving
@@ -30,6 +30,11 @@ def frozen(tree):
 def filled(x, dx):
     """The tangent of x: zeros where dx is None."""
     return jax.tree.map(lambda x, d: jnp.zeros_like(x) if d is None and x is not None else d, x, dx, is_leaf=lambda x: x is None)
+
+
+def chosen(which, new, old):
+    """The new tree where `which`, else the old one."""
+    return jax.tree.map(lambda a, b: jnp.where(which, a, b), new, old)
 
 
 class Motion(eqx.Module):
@@ -105,12 +110,30 @@ def projects(stabilization, scene: Scene) -> bool:
     return bool(scene.chain.topology.link_names) and isinstance(stabilization, Projection)
 
 
-def settle(stabilization, scene: Scene, y: Motion) -> Motion:
-    """The motion put back: quaternions to unit length, loops closed, velocities in agreement."""
+class Seen(eqx.Module):
+    """What the loops show as a step is put back onto them: |R_mm| / |R_11|, and which coordinates depend on the others."""
+
+    margin: Float[Array, ""]
+    dependent: Bool[Array, " dofs"]
+
+    @classmethod
+    def nothing(cls, chain: Chain) -> "Seen":
+        """Before the first step."""
+        return cls(jnp.ones((), chain.q_load.dtype), jnp.zeros(chain.dofs, bool))
+
+
+def settle(stabilization, scene: Scene, y: Motion) -> tuple[Motion, Seen | None]:
+    """The motion put back: quaternions to unit length, loops closed, velocities in agreement; and what that showed (None: loops are left alone)."""
     chain, structure = scene.chain, scene.structure
     if not projects(stabilization, scene):
-        return eqx.tree_at(lambda y: y.q, y, normalize(chain, y.q))
-    return eqx.tree_at(lambda y: (y.q, y.v), y, settle_loops(chain, structure, y.q, y.v, stabilization.iterations, stabilization.change))
+        return eqx.tree_at(lambda y: y.q, y, normalize(chain, y.q)), None
+    q, v, margin, dependent = settle_loops(chain, structure, y.q, y.v, stabilization.iterations, stabilization.change)
+    return eqx.tree_at(lambda y: (y.q, y.v), y, (q, v)), Seen(margin, dependent)
+
+
+def finite(y: Motion) -> Bool[Array, ""]:
+    """Whether every number is."""
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(y)]))
 
 
 class _Interpolation(diffrax.AbstractLocalInterpolation):
@@ -170,7 +193,7 @@ class Settled(diffrax.AbstractWrappedSolver):
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         fresh = True if projects(self.stabilization, args) else made_jump
         raw, error, dense, solver_state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, fresh)
-        y1 = settle(self.stabilization, args, raw)
+        y1, _ = settle(self.stabilization, args, raw)
         shift = jax.tree.map(lambda a, b: a - b, y1, raw)
         return y1, error, {"inner": dense, "shift": shift}, solver_state, result
 
@@ -192,7 +215,7 @@ def step_alone(solver: diffrax.AbstractSolver, field: Field, t0, t1, y: Motion, 
         solver = staged(solver, "bounded")
         term = diffrax.ODETerm(rate)
         raw = solver.step(term, t0, t1, y, scene, solver.init(term, t0, t1, y, scene), False)[0]
-    return settle(field.stabilization, scene, raw)
+    return settle(field.stabilization, scene, raw)[0]
 
 
 def _explicit_step(tableau: diffrax.ButcherTableau, rate, t0, t1, y: Motion, scene: Scene) -> Motion:

@@ -48,8 +48,12 @@ class Events(eqx.Module):
 class Phases(eqx.Module):
     """The stretches between changes of structure; rows past `count` are unused.
 
-    `energy`: mechanical energy (J) at start and end; `work`: done in between by control, limits and dampers (J); `margin`: the least |R_mm| / |R_11| at
-    start and end, how far the weakest row that counts is from being redundant.
+    `energy`: mechanical energy (J) at start and end; `work`: done in between by control, limits and dampers (J); `margin`: the least |R_mm| / |R_11| of
+    the phase (of its two ends where steps are not projected), how far the weakest row that counts is from being redundant; `swaps`: how often the
+    choice of dependent coordinates changed from step to step (-1: not looked at); `evaluations`: of the vector field, in steps alone; `error`: the
+    estimated errors of the steps added up (root mean square over q and v; inf: the solver estimates none); `free`: nothing holds the bodies to the
+    ground; `momentum_drift`: then, the change of linear momentum (N s) that gravity does not explain and that of the angular momentum about the centre
+    of mass (N m s).
     """
 
     start: Float[Array, " phases"]
@@ -62,6 +66,11 @@ class Phases(eqx.Module):
     margin: Float[Array, " phases"]
     accepted: Int[Array, " phases"]
     rejected: Int[Array, " phases"]
+    evaluations: Int[Array, " phases"]
+    swaps: Int[Array, " phases"]
+    error: Float[Array, " phases"]
+    free: Bool[Array, " phases"]
+    momentum_drift: Float[Array, "phases 2"]
     count: Int[Array, ""]
 
     @property
@@ -76,7 +85,7 @@ class Phases(eqx.Module):
 
 
 class Trajectory(eqx.Module):
-    """A run: `states` at `ts` (leading time axis), the loop gaps there, events, phases, the final state and how it ended.
+    """A run: `states` at `ts` (leading time axis), the loop gaps (rad, m) and their rates (rad/s, m/s) there, events, phases, the final state and how it ended.
 
     `derivative`: successful where the run has derivatives, else why not: a guard that grazed or jumped, events that could change order, rank lost.
     """
@@ -84,6 +93,7 @@ class Trajectory(eqx.Module):
     ts: Float[Array, " times"]
     states: State
     gaps: Float[Array, "times 2"]
+    gap_rates: Float[Array, "times 2"]
     events: Events
     phases: Phases
     final: State
@@ -111,29 +121,76 @@ class Trajectory(eqx.Module):
 
     def report(self) -> "Report":
         """The run's certificate."""
-        accepted, rejected = jnp.sum(self.phases.accepted, -1), jnp.sum(self.phases.rejected, -1)
-        drift = jnp.sum(jnp.where(jnp.isfinite(self.phases.start), self.phases.energy_drift, 0), -1)
-        finite = jnp.isfinite(self.gaps)
-        gaps = jnp.max(jnp.where(finite, self.gaps, 0), -2)
-        return Report(gaps[..., 1], gaps[..., 0], drift, jnp.sum(self.events.energy_lost, -1), accepted, rejected, self.result)
+        p = self.phases
+        largest = lambda x: jnp.max(jnp.where(jnp.isfinite(x), x, 0), -2)
+        gaps, rates, momentum = largest(self.gaps), largest(self.gap_rates), largest(p.momentum_drift)
+        begun = jnp.isfinite(p.start)
+        return Report(
+            gap=gaps[..., 1],
+            angular_gap=gaps[..., 0],
+            gap_rate=rates[..., 1],
+            angular_gap_rate=rates[..., 0],
+            energy_drift=jnp.sum(jnp.where(begun, p.energy_drift, 0), -1),
+            energy_lost=jnp.sum(self.events.energy_lost, -1),
+            momentum_drift=momentum[..., 0],
+            angular_momentum_drift=momentum[..., 1],
+            free=jnp.any(p.free, -1),
+            error=jnp.sum(p.error, -1),
+            margin=jnp.min(p.margin, -1),
+            swaps=jnp.where(jnp.any(p.swaps < 0, -1), -1, jnp.sum(p.swaps, -1)),
+            accepted=jnp.sum(p.accepted, -1),
+            rejected=jnp.sum(p.rejected, -1),
+            evaluations=jnp.sum(p.evaluations, -1),
+            phases=p.count,
+            t_final=self.t_final,
+            result=self.result,
+            derivative=self.derivative,
+        )
 
 
 class Report(eqx.Module):
-    """Largest loop gaps (m, rad) at the saved times, energy that no work or impact explains (J), energy lost in impacts (J), steps, result."""
+    """Largest loop gaps (m, rad) and rates (m/s, rad/s) at the saved times; energy that no work or impact explains and energy lost in impacts (J);
+    over phases in which nothing holds the bodies to the ground (`free`: there is one), momentum that gravity does not explain (N s, N m s); estimated
+    errors of all steps added up (inf: the solver estimates none); the least rank margin; changes of the dependent coordinates (-1: not looked at);
+    steps, evaluations of the vector field, phases; when and how the run ended, and whether it has derivatives."""
 
     gap: Float[Array, ""]
     angular_gap: Float[Array, ""]
+    gap_rate: Float[Array, ""]
+    angular_gap_rate: Float[Array, ""]
     energy_drift: Float[Array, ""]
     energy_lost: Float[Array, ""]
+    momentum_drift: Float[Array, ""]
+    angular_momentum_drift: Float[Array, ""]
+    free: Bool[Array, ""]
+    error: Float[Array, ""]
+    margin: Float[Array, ""]
+    swaps: Int[Array, ""]
     accepted: Int[Array, ""]
     rejected: Int[Array, ""]
+    evaluations: Int[Array, ""]
+    phases: Int[Array, ""]
+    t_final: Float[Array, ""]
     result: RESULTS
+    derivative: RESULTS
 
     def __str__(self) -> str:
         if isinstance(self.gap, jax.core.Tracer) or self.gap.ndim:
             return repr(self)
-        return (
-            f"largest loop gap {float(self.gap):.2e} m, {float(self.angular_gap):.2e} rad; energy drift {float(self.energy_drift):.2e} J, "
-            f"lost in impacts {float(self.energy_lost):.4g} J; {int(self.accepted)} steps, {int(self.rejected)} rejected; "
-            f"{RESULTS[self.result] or 'successful'}"
-        )
+        balance = f"{float(self.momentum_drift):.2e} N s, {float(self.angular_momentum_drift):.2e} N m s" if self.free else "held to the ground throughout"
+        error = f"{float(self.error):.2e}" if jnp.isfinite(self.error) else "not estimated by this solver"
+        swaps = f"{int(self.swaps)} changes of the dependent coordinates" if self.swaps >= 0 else "changes of the dependent coordinates not looked at"
+        lines = [
+            f"largest loop gap        {float(self.gap):.2e} m, {float(self.angular_gap):.2e} rad; rate {float(self.gap_rate):.2e} m/s, "
+            f"{float(self.angular_gap_rate):.2e} rad/s",
+            f"energy                  drift {float(self.energy_drift):.2e} J, lost in impacts {float(self.energy_lost):.4g} J",
+            f"momentum where free     {balance}",
+            f"errors of steps, summed {error}",
+            f"rank margin             {float(self.margin):.2e}; {swaps}",
+            f"work                    {int(self.accepted)} steps, {int(self.rejected)} rejected, {int(self.evaluations)} evaluations, "
+            f"{int(self.phases)} phases",
+            f"ended                   at {float(self.t_final):.9g} s: {RESULTS[self.result] or 'successful'}",
+        ]
+        if self.derivative != RESULTS.successful:
+            lines.append(f"derivatives             {RESULTS[self.derivative]}")
+        return "\n".join(lines)
