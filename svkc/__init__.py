@@ -35,7 +35,7 @@ from svkc.simulate import simulate as simulate
 from svkc.replay import Replay as Replay
 from svkc.projection import dependent_change as dependent_change, inertia_change as inertia_change, least_change as least_change
 from svkc.stepping import Baumgarte as Baumgarte, Drift as Drift, Projection as Projection
-from svkc.solvers import RodriguesEuler as RodriguesEuler
+from svkc.solvers import RodriguesEuler as RodriguesEuler, SemiImplicitEuler as SemiImplicitEuler
 
 # derivatives
 from svkc.derivative import Check as Check, check_grad as check_grad, tangent as tangent

@@ -59,7 +59,7 @@ def momentum_about_centre(chain: Chain, state: State) -> tuple[Float[Array, "3"]
     c, u, _, spin = _bodies(chain, kin, state.v)
     p, place = chain.mass[:, None] * u, kin.root + c
     centre = jnp.sum(chain.mass[:, None] * place, 0) / jnp.sum(chain.mass)
-    return jnp.sum(p, 0), jnp.sum(spin + cross(place - centre, p), 0)
+    return jnp.sum(p, 0), jnp.sum(spin + cross(place - centre[None], p), 0)
 
 
 @jax.jit

@@ -13,7 +13,10 @@ from svkc.closure import Coordinates, agreeing, choose, constrain, loop_rates, s
 from svkc.inverse_dynamics import generalized_forces, inertia_by_composites, inertia_by_unit_vectors, inertia_times, passive_forces
 from svkc.kinematics import Kinematics, kinematics, twists
 from svkc.loops import active_dofs, ends
-from svkc.selection import Selection, rank_tolerance, square
+from svkc.selection import Selection, rank_tolerance, square, weakest
+
+# part of the phase's own margin below which a configuration is near a singular one; elsewhere the motion depends on no choice of pivots
+NEAR = 0.1
 
 
 def joint_torques(chain: Chain, tau: Float[Array, " torques"]) -> Float[Array, " dofs"]:
@@ -99,7 +102,8 @@ def moving(
 ) -> tuple[Float[Array, " dofs"], Float[Array, " dofs"]]:
     """Velocity and acceleration: steps 1 to 5 of section III-B. On an open chain W is the identity and nothing of the closure is computed.
 
-    baumgarte: rate (1/s) at which open loops are pulled back; None: not at all. agree: dependent velocities are those of the independent ones.
+    baumgarte: rate (1/s) at which open loops are pulled back; None: not at all. agree: near a singular configuration dependent velocities are
+    those of the independent ones, for there the stages of a step would make their errors grow.
     """
     kin = kinematics(chain, q)
     loops = len(chain.topology.link_names)
@@ -108,7 +112,8 @@ def moving(
         J = scaled_jacobian(chain, structure, kin, end)
         selection = choose(structure, J)
         if agree:
-            v = agreeing(chain, selection, J, jnp.where(active_dofs(chain, structure), v, 0))
+            near = weakest(selection) < NEAR * structure.margin
+            v = jnp.where(near, agreeing(chain, selection, J, jnp.where(active_dofs(chain, structure), v, 0)), v)
     V = twists(chain, kin, v)
     bias = generalized_forces(chain, kin, V, v, jnp.zeros(chain.nv, v.dtype))
     force = tau + passive_forces(chain, q, v) - jnp.concatenate([bias, jnp.zeros(chain.dofs - chain.nv, v.dtype)])

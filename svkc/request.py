@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix
 from jaxtyping import Array, Float
 
 from svkc.assembly import gap_tolerance
@@ -80,7 +81,7 @@ def checked(
         controller = diffrax.PIDController(rtol, atol, norm=motion_norm, dtmin=smallest, force_dtmin=False)
     options = Options(
         control=control,
-        solver=diffrax.Tsit5() if solver is None else solver,
+        solver=diffrax.Tsit5() if solver is None else _solving(solver, None if dt is not None else controller, dtype),
         stabilization=Projection() if stabilization is None else stabilization,
         controller=controller,
         adjoint=_adjoint(adjoint, controller if dt is None else None),
@@ -94,6 +95,23 @@ def checked(
     )
     save_at = jnp.stack([jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)]) if ts is None else jnp.asarray(ts, dtype)
     return options, save_at, made
+
+
+def _solving(solver: diffrax.AbstractSolver, controller, dtype) -> diffrax.AbstractSolver:
+    """The solver; one with implicit stages solves them as closely as steps are controlled, or, where they are not, to sqrt(eps) and better."""
+    if not isinstance(solver, diffrax.AbstractSolver):
+        raise ValueError(f"solver: expected a diffrax solver, got {solver!r}")
+    if not isinstance(solver, diffrax.AbstractImplicitSolver):
+        return solver
+    finder = solver.root_finder
+    given = {name: getattr(controller, name, None) for name in ("rtol", "atol", "norm")}
+    # diffrax marks what is to be the step-size controller's with a thing that is neither a number nor a function
+    left_open = [name for name in given if not (callable(x := getattr(finder, name, 0.0)) or eqx.is_inexact_array_like(x))]
+    if None in given.values() and left_open:
+        # a step that cannot be made shorter has to be solved: by Newton's method
+        close = float(np.finfo(dtype).eps ** 0.5)
+        return eqx.tree_at(lambda s: s.root_finder, solver, optimistix.Newton(close, close, norm=motion_norm))
+    return eqx.tree_at(lambda s: [getattr(s.root_finder, name) for name in left_open], solver, [given[name] for name in left_open])
 
 
 def _adjoint(adjoint, controller) -> diffrax.AbstractAdjoint | Replay:
@@ -121,7 +139,9 @@ def _step_bound(max_steps, span, dt) -> int:
         if int(max_steps) != max_steps or max_steps < 1:
             raise ValueError(f"max_steps: got {max_steps}, expected a whole number, 1 or more")
         return int(max_steps)
-    return 65536
+    # room for every fixed step, and for those that save times and events make shorter
+    fixed = dt is not None and _concrete(span, dt)
+    return max(65536, int(1.1 * float(np.max(np.asarray(span / dt)))) + 1024) if fixed else 65536
 
 
 def _check_state(chain: Chain, state: State):

@@ -85,7 +85,6 @@ class Field(eqx.Module):
         chain, structure = scene.chain, scene.structure
         tau, power = self.torques(t, y, scene)
         rate = self.stabilization.rate if isinstance(self.stabilization, Baumgarte) else None
-        # near a singular configuration the stages of a step would make errors of the dependent velocities grow
         v, vdot = moving(chain, structure, y.q, y.v, tau, baumgarte=rate, agree=isinstance(self.stabilization, Projection))
         return Motion(rates(chain, y.q, jnp.where(active_dofs(chain, structure), v, 0)), vdot, power)
 

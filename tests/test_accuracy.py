@@ -1,0 +1,149 @@
+"""The dial: orders of the integrators, what each way against drift holds, and the certificate of a run."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import models
+import numpy as np
+import pytest
+
+import svkc
+
+
+@pytest.fixture(scope="module")
+def arm():
+    """A free body with a ball and a hinge on it, thrown and spinning: orientations all the way."""
+    rods = models.bar(
+        "base", 'type="free"', "0.2 0 -0.5", inside=models.bar("ball", 'type="ball"', "0.1 0.3 -0.4", "0.2 0 -0.5", models.bar("hinge", models.Y, "0 0 -0.3"))
+    )
+    chain = svkc.load(models.MJCF.format(rods))
+    return chain, chain.state(v=np.array([0.5, 0.2, 1.0, 2.0, -3.0, 1.5, 1.0, 2.0, -2.5, 3.0]))
+
+
+@pytest.mark.parametrize(
+    ("solver", "order", "dt"),
+    [
+        (svkc.RodriguesEuler(), 1, 2e-3),
+        (svkc.SemiImplicitEuler(), 1, 2e-3),
+        (diffrax.Heun(), 2, 4e-3),
+        (diffrax.Bosh3(), 3, 0.01),
+        (diffrax.Tsit5(), 5, 5e-3),
+        (diffrax.Dopri8(), 8, 0.05),
+        (diffrax.ImplicitEuler(), 1, 2e-3),
+        (diffrax.Kvaerno3(), 3, 5e-3),
+        (diffrax.Kvaerno5(), 5, 0.01),
+    ],
+    ids=lambda x: type(x).__name__ if isinstance(x, diffrax.AbstractSolver) else None,
+)
+def test_orders(arm, exact, solver, order, dt):
+    """Halving the step divides the error by two to the order, on balls and free joints as well."""
+    chain, state = arm
+    run = jax.jit(lambda dt: svkc.simulate(chain, state, 0.4, dt=dt, solver=solver, max_steps=2000).final)
+    errors = [np.linalg.norm(svkc.difference(chain, exact.q, end.q)) + np.linalg.norm(exact.v - end.v) for end in (run(dt), run(dt / 2))]
+    assert errors[1] > 1e-13
+    # (Tsit5's leading term is so small that it goes by the sixth order here)
+    assert order - 0.3 < np.log2(errors[0] / errors[1]) < order + 1.3
+
+
+@pytest.fixture(scope="module")
+def exact(arm):
+    return svkc.simulate(*arm, 0.4, rtol=1e-13, atol=1e-14, solver=diffrax.Dopri8()).final
+
+
+def test_symplectic_euler_keeps_energy():
+    """A pendulum for 100 swings with 60 steps each: the energy's error does not grow, that of the explicit one does."""
+    chain = svkc.load(models.MJCF.format(models.bar("rod", models.Y, "0 0 -1")).replace("0.3 -0.2", "0 0"))
+    state, ts = chain.state({"rod": 0.5}), jnp.linspace(0, 160.0, 161)
+    found = {}
+    for solver in (svkc.SemiImplicitEuler(), svkc.RodriguesEuler()):
+        traj = svkc.simulate(chain, state, 160.0, ts=ts, dt=0.026, solver=solver)
+        energy = jax.vmap(lambda s: svkc.energy(chain, s))(traj.states)
+        found[type(solver)] = np.abs(energy - energy[0])
+    kept, lost = found[svkc.SemiImplicitEuler], found[svkc.RodriguesEuler]
+    assert kept[80:].max() < 1.1 * kept[:80].max()
+    assert lost[-1] > 20 * kept.max()
+
+
+@pytest.mark.parametrize("change", [svkc.inertia_change, svkc.least_change, svkc.dependent_change])
+def test_each_way_back_onto_the_loops(change):
+    """One motion, loops closed to round-off; the independent coordinates stay where no other may be moved."""
+    chain = models.four_bar()
+    state = chain.state(v={"crank": 4.0})
+    kw = {"rtol": 1e-10, "atol": 1e-12, "solver": diffrax.Dopri8()}
+    free = svkc.simulate(chain, state, 0.5, stabilization=svkc.Drift(), **kw)
+    held = svkc.simulate(chain, state, 0.5, stabilization=svkc.Projection(change=change), **kw)
+    np.testing.assert_allclose(held.final.q, free.final.q, atol=1e-7)
+    assert float(held.gaps.max()) < 1e-14
+    assert float(held.gap_rates.max()) < 1e-13
+    rough = svkc.simulate(chain, state, 0.02, dt=0.02, solver=diffrax.Heun(), stabilization=svkc.Drift(), throw=False).final
+    gap = np.abs(svkc.loop_gaps(chain, rough)).max()
+    settled = svkc.simulate(chain, state, 0.02, dt=0.02, solver=diffrax.Heun(), stabilization=svkc.Projection(change=change)).final
+    assert gap > 1e-6
+    assert np.abs(svkc.loop_gaps(chain, settled)).max() < 1e-3 * gap
+    if change is svkc.dependent_change:
+        independent = np.asarray(svkc.coordinates(chain, rough).independent)
+        np.testing.assert_allclose(settled.q[independent], rough.q[independent], atol=1e-15)
+
+
+def test_the_certificate(tmp_path):
+    """Every line of it against what is known otherwise: four bars driven round, a figure in flight, lanes."""
+    chain = models.four_bar()
+    control = lambda t, s, args: jnp.zeros(chain.dofs).at[0].set(3.0)
+    run = jax.jit(lambda dt: svkc.simulate(chain, chain.state(v={"crank": 6.0}), 1.0, ts=jnp.linspace(0, 1, 11), control=control, dt=dt))
+    coarse, fine = run(0.02), run(0.001)
+    report = coarse.report()
+    states = coarse.states
+    assert float(report.gap_rate) == pytest.approx(float(jnp.max(jnp.linalg.norm(jax.vmap(lambda s: svkc.velocity_gaps(chain, s))(states)[..., 3:], axis=-1))))
+    gained = svkc.energy(chain, coarse.final) - svkc.energy(chain, jax.tree.map(lambda x: x[0], states))
+    assert float(report.energy_drift) == pytest.approx(float(gained - coarse.phases.work[0]), rel=1e-9)
+    assert (int(report.accepted), int(report.rejected), int(report.evaluations), int(report.phases)) == (50, 0, 350, 1)
+    # the sum of what steps are estimated to err is an estimate of what the run does, within an order or two
+    error = float(np.sqrt(np.mean((coarse.final.q - fine.final.q) ** 2)))
+    assert 0.01 * error < float(report.error) < 1000 * error
+    assert int(report.swaps) > 0
+    margins = [float(svkc.mobility(chain, jax.tree.map(lambda x, i=i: x[i], states)).margin) for i in range(11)]
+    assert 0 < float(report.margin) <= min(margins) + 1e-12
+    assert not bool(report.free)
+    for word in ("largest loop gap", "drift", "held to the ground", "rank margin", "350 evaluations", "successful"):
+        assert word in str(report)
+    coarse.save(tmp_path / "run.npz")
+    assert str(svkc.load_trajectory(tmp_path / "run.npz").report()) == str(report)
+
+
+def test_the_momentum_of_what_is_free(arm):
+    chain, state = arm
+    report = svkc.simulate(chain, state, 0.5, rtol=1e-10, atol=1e-12).report()
+    assert bool(report.free)
+    assert 0 < float(report.momentum_drift) < 1e-8
+    assert float(report.angular_momentum_drift) < 1e-8
+    rough = svkc.simulate(chain, state, 0.5, dt=0.05, solver=diffrax.Heun()).report()
+    assert float(rough.angular_momentum_drift) > 1e-3
+    assert "N m s" in str(rough)
+
+
+def test_what_is_not_finite_ends_its_lane_where_it_appears(arm):
+    """By control, by a guard, with fixed steps and adaptive ones: the time and the phase, the last state that was whole; other lanes are untouched."""
+    chain, state = arm
+
+    def run(when, **kw):
+        control = lambda t, s, args: jnp.where(t > when, jnp.nan, 0.0) * jnp.ones(chain.dofs)
+        return svkc.simulate(chain, state, 0.4, events=[svkc.at(0.1, cut=())], control=control, throw=False, **kw)
+
+    for kw, close in (({"dt": 0.01}, 0.011), ({"rtol": 1e-6, "atol": 1e-8}, 1e-9)):
+        lanes = jax.vmap(lambda when, kw=kw: run(when, **kw))(jnp.array([1.0, 0.25, 0.05]))
+        assert (lanes.result == svkc.RESULTS.non_finite).tolist() == [False, True, True]
+        assert (lanes.result == svkc.RESULTS.successful).tolist() == [True, False, False]
+        np.testing.assert_allclose(lanes.t_final, [0.4, 0.25, 0.05], atol=close)
+        assert np.all(lanes.t_final[1:] <= np.array([0.25, 0.05]) + 1e-12)
+        assert lanes.phases.count.tolist() == [2, 2, 1]
+        assert np.isfinite(lanes.final.q).all()
+        assert np.isfinite(lanes.states.q).all()
+        alone = run(jnp.asarray(1.0), **kw)
+        np.testing.assert_allclose(lanes.final.q[0], alone.final.q, atol=1e-12)
+    control = lambda t, s, args: jnp.where(t > 0.25, jnp.nan, 0.0) * jnp.ones(chain.dofs)
+    with pytest.raises(RuntimeError, match=r"t = 0\.2\d* s, in phase 2: A number that is not finite"):
+        svkc.simulate(chain, state, 0.4, events=[svkc.at(0.1, cut=())], control=control, dt=0.01)
+    blind = svkc.when(lambda t, s, args: jnp.where(t > 0.2, jnp.nan, 1.0), stop=True)
+    traj = svkc.simulate(chain, state, 0.4, events=[blind], throw=False, dt=0.01)
+    assert traj.result == svkc.RESULTS.non_finite
+    assert float(traj.t_final) == pytest.approx(0.2, abs=0.011)
