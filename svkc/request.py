@@ -78,6 +78,8 @@ def checked(
     if controller is None:
         rtol, atol = (1e-7 if double else 1e-4) if rtol is None else rtol, (1e-9 if double else 1e-6) if atol is None else atol
         smallest = jnp.finfo(dtype).eps * jnp.maximum(jnp.abs(span), jnp.abs(jnp.asarray(t1, dtype)))
+        # as arrays: another tolerance is the same program
+        rtol, atol = jnp.asarray(rtol, dtype), jnp.asarray(atol, dtype)
         controller = diffrax.PIDController(rtol, atol, norm=motion_norm, dtmin=smallest, force_dtmin=False)
     options = Options(
         control=control,

@@ -35,6 +35,13 @@ class Body:
 
 def load(problem: dict, **options) -> tuple[svkc.Chain, svkc.State]:
     """Chain and state of a problem: bodies' frames at their centres of mass, named as there; joints by their child, virtual links by both."""
+    text, bodies, tree, loops = mjcf(problem)
+    chain = svkc.load(text, virtual_links=[_link(joint, bodies) for joint in loops], **options)
+    return chain, chain.state(v={name: _rate(joint, bodies) for name, joint in tree.items()})
+
+
+def mjcf(problem: dict) -> tuple[str, dict, dict, list]:
+    """The spanning tree as MJCF, the bodies and the tree's joints by name, and the joints left over."""
     given = {body["name"]: body for body in problem["bodies"]}
     bodies = {"ground": Body()} | {name: Body(body) for name, body in given.items()}
     tree, loops = {}, []
@@ -57,8 +64,7 @@ def load(problem: dict, **options) -> tuple[svkc.Chain, svkc.State]:
 
     text = f'<mujoco><compiler balanceinertia="false" inertiafromgeom="false"/><option gravity="{_numbers(problem["gravity"])}"/><worldbody>'
     text += "".join(element(name) for name, joint in tree.items() if joint["parent"] == "ground") + "</worldbody></mujoco>"
-    chain = svkc.load(text, virtual_links=[_link(joint, bodies) for joint in loops], **options)
-    return chain, chain.state(v={name: _rate(joint, bodies) for name, joint in tree.items()})
+    return text, bodies, tree, loops
 
 
 def _rate(joint, bodies):

@@ -30,6 +30,7 @@ HOUSE = [
     "request records",
     "phase view derivative",
     "simulate",
+    "tuning",
     "__main__",
 ]
 FLOORS = {name: floor for floor, names in enumerate(HOUSE) for name in names.split()}

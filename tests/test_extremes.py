@@ -1,0 +1,222 @@
+"""Extremes: sizes, masses, speeds, stiffness, counts and coincidences at the ends of what a scene may hold, each with the bound that it keeps."""
+
+import warnings
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import maximal
+import models
+import numpy as np
+import pytest
+from test_reference import n_four_bar
+
+import svkc
+
+SPACE = '<mujoco><compiler balanceinertia="false" boundmass="0" boundinertia="0"/><option gravity="0 0 -9.81"/><worldbody>{}</worldbody></mujoco>'
+FINE = {"rtol": 1e-9, "atol": 1e-11}
+
+
+def rods(masses, lengths):
+    """A chain of slender rods on hinges about y, hanging."""
+    out = ""
+    for i, (m, l) in reversed(list(enumerate(zip(masses, lengths, strict=True)))):
+        inertia, above = m * l * l / 12, 0.0 if i == 0 else -lengths[i - 1]
+        joint = f'<joint name="j{i}" axis="0 1 0"/>'
+        inertial = f'<inertial pos="0 0 {-l / 2!r}" mass="{m!r}" diaginertia="{inertia!r} {inertia!r} {inertia!r}"/>'
+        out = f'<body name="b{i}" pos="0 0 {above!r}">{joint}{inertial}{out}</body>'
+    return svkc.load(SPACE.format(out))
+
+
+def zigzag(chain, angle=0.3):
+    return chain.state({name: angle * (-1) ** i for i, name in enumerate(chain.joint_names)})
+
+
+def drift(chain, traj):
+    """Energy gained, of the largest kinetic energy on the way."""
+    energy = jax.vmap(lambda s: svkc.energy(chain, s))(traj.states)
+    kinetic = jax.vmap(lambda s: svkc.kinetic_energy(chain, s))(traj.states)
+    return float(np.max(np.abs(energy - energy[0])) / np.max(kinetic))
+
+
+TIMES = jnp.linspace(0, 1.0, 11)
+
+
+@pytest.mark.parametrize(
+    "masses", [10.0 ** (6 - 2.0 * np.arange(7)), np.tile([1e6, 1e-6], 4)[:7], np.tile([1e-6, 1e6], 4)[:7]], ids=["falling", "heavy", "light"]
+)
+def test_masses_from_a_milligram_to_a_thousand_tons(masses):
+    chain = rods([float(m) for m in masses], [1.0] * 7)
+    traj = svkc.simulate(chain, zigzag(chain), 1.0, ts=TIMES, **FINE)
+    assert drift(chain, traj) < 1e-9
+
+
+def test_masses_in_a_loop():
+    """A four-bar whose bars weigh a milligram, a kilogram and a thousand tons, in every order."""
+    chain = models.four_bar()
+    run = jax.jit(lambda chain: svkc.simulate(chain, chain.state(v={"crank": 4.0}), 1.0, ts=TIMES, **FINE))
+    for order in ((1e-6, 1.0, 1e6), (1e6, 1e-6, 1.0), (1.0, 1e6, 1e-6)):
+        part = chain.mass[1:4] / np.array(order)
+        heavier = jax.tree.map(lambda x: x, chain)
+        mass = chain.mass.at[1:4].divide(part)
+        inertia = chain.inertia.at[1:4].divide(part[:, None, None])
+        heavier = chain.__class__(**{**vars(heavier), "mass": mass, "inertia": inertia})
+        traj = run(heavier)
+        assert drift(heavier, traj) < 1e-8
+        assert float(traj.gaps.max()) < 1e-13
+
+
+def four_bar_on_a_bar(small):
+    """A four-bar of links of some `small` metres at the end of a bar of 1 / small."""
+    bar = lambda *p: f'<geom type="capsule" fromto="0 0 0 {" ".join(repr(x * small) for x in p)}" size="{0.03 * small}" mass="1" contype="0"/>'
+    at = lambda *p: " ".join(repr(x * small) for x in p)
+    rocker = f'<body name="rocker" pos="{at(1, 0, 0.2)}"><joint name="rocker" axis="0 1 0"/>{bar(0.2, 0, -0.6)}</body>'
+    coupler = f'<body name="coupler" pos="{at(0, 0, 0.4)}"><joint name="coupler" axis="0 1 0"/>{bar(1, 0, 0.2)}{rocker}</body>'
+    crank = f'<body name="crank" pos="0 0 {-1 / small}"><joint name="crank" axis="0 1 0"/>{bar(0, 0, 0.4)}{coupler}</body>'
+    long = f'<geom type="capsule" fromto="0 0 0 0 0 {-1 / small}" size="{0.01 / small}" mass="1" contype="0"/>'
+    pin = svkc.VirtualLink(
+        "pin", "big", "rocker", "hinge", axis=(0, 1, 0), pos=(1.2 * small, 0, -1 / small), real_pos=(0.2 * small, 0, -0.6 * small), connected=True
+    )
+    return svkc.load(SPACE.format(f'<body name="big"><joint name="big" axis="0 1 0"/>{long}{crank}</body>'), virtual_links=[pin])
+
+
+def test_lengths_from_a_millimetre_to_a_kilometre():
+    """A four-bar of a kilometre at the end of a millimetre's bar; one of a millimetre at the end of a kilometre's, where its inertia about the far
+    root, 1e12 times its own, leaves four digits of its acceleration."""
+    chain = four_bar_on_a_bar(1e3)
+    traj = svkc.simulate(chain, chain.state(v={"crank": 4.0}), 1.0, ts=TIMES, **FINE)
+    assert drift(chain, traj) < 1e-8
+    chain = four_bar_on_a_bar(1e-3)
+    state = chain.state(v={"crank": 4.0})
+    assert svkc.mobility(chain, state).freedoms == 2
+    traj = svkc.simulate(chain, state, 0.05, ts=0.05 * TIMES, dt=1e-4)
+    assert float(traj.gaps[:, 1].max()) < 1e-12
+    assert drift(chain, traj) < 2e-2
+
+
+@pytest.fixture(scope="module")
+def thrown():
+    two = models.bar("a", 'type="free"', "0 0 -0.5", inside=models.bar("b", models.Y, "0.3 0 -0.3", "0 0 -.5"))
+    return svkc.load(models.MJCF.format(two))
+
+
+def test_far_away_and_fast(thrown):
+    """1e6 m from the origin at 1e3 m/s: turned and moving as at the origin, to the digits that positions of 1e6 m leave."""
+    start = {"v": [0.5, 0.1, 0.2, 1, 2, 3, 1.5]}
+    q, v = np.array(thrown.q_load), np.array(start["v"])
+    near = svkc.simulate(thrown, thrown.state(q, v), 1.0, **FINE)
+    there, speed = np.array([1e6, -1e6, 1e6]), np.array([1e3, -1e3, 1e3])
+    q[:3] += there
+    v[:3] += speed
+    far = svkc.simulate(thrown, thrown.state(q, v), 1.0, **FINE)
+    np.testing.assert_allclose(far.final.q[3:], near.final.q[3:], atol=3e-7)
+    np.testing.assert_allclose(far.final.v[3:], near.final.v[3:], atol=3e-6)
+    np.testing.assert_allclose(far.final.q[:3] - there - speed, near.final.q[:3], atol=1e-6)
+
+
+def test_fast_spin(thrown):
+    """1e3 rad/s for 160 turns: energy to 1e-7 and momentum to 1e-7 of themselves at rtol 1e-10."""
+    weightless = SPACE.replace("0 0 -9.81", "0 0 0").format(models.bar("a", 'type="free"', "0.2 0.3 -0.5"))
+    chain = svkc.load(weightless)
+    state = chain.state(v=np.array([0, 0, 0, 1e3, 20, -30.0]))
+    traj = svkc.simulate(chain, state, 1.0, ts=TIMES, rtol=1e-10, atol=1e-12, solver=diffrax.Dopri8())
+    assert drift(chain, traj) < 1e-7
+    linear, angular = svkc.momentum(chain, state)
+    assert float(traj.report().angular_momentum_drift) < 1e-7 * float(jnp.linalg.norm(angular))
+    assert np.isfinite(linear).all()
+
+
+def test_two_hundred_links():
+    chain = rods([0.1] * 200, [0.1] * 200)
+    traj = svkc.simulate(chain, zigzag(chain, 0.05), 0.1, ts=0.1 * TIMES)
+    assert drift(chain, traj) < 1e-6
+
+
+def test_twenty_loops():
+    """Twenty-one parallel legs under one plate, all loops but one redundant: one freedom, that of the two-legged one."""
+
+    def legs(count):
+        bodies = ""
+        for i in range(count + 1):
+            plate = models.bar("plate", models.Y, "20 0 0", "0 0 1") if i == 0 else ""
+            bodies += models.bar(f"leg{i}", models.Y, "0 0 1", f"{i if count > 1 else 20 * i} 0 0", plate)
+        links = [
+            svkc.VirtualLink(f"pin{i}", "plate", f"leg{i}", "hinge", pos=(i if count > 1 else 20.0, 0, 0), real_pos=(0, 0, 1), axis=(0, 1, 0), connected=True)
+            for i in range(1, count + 1)
+        ]
+        return svkc.load(SPACE.format(bodies), virtual_links=links)
+
+    chain = legs(20)
+    state = chain.state({"leg0": 0.3})
+    assert svkc.mobility(chain, state).freedoms == 1
+    traj = svkc.simulate(chain, state, 1.0, ts=TIMES)
+    assert drift(chain, traj) < 1e-5
+    assert float(traj.gaps.max()) < 1e-12
+    angles = np.asarray(traj.final.q)[[chain.dof_names.index(f"leg{i}") for i in range(21)]]
+    np.testing.assert_allclose(angles, angles[0], atol=1e-12)
+
+
+@pytest.mark.parametrize("solver", [diffrax.Tsit5(), diffrax.Kvaerno5()], ids=["explicit", "implicit"])
+def test_stiff_springs(solver):
+    """1e9 N/m under a pendulum: as on a rigid pivot, to the stretch of the spring; the implicit solver needs fewer steps."""
+    slide = '<joint name="a" type="slide" axis="0 0 1" stiffness="1e9" damping="1e4"/>'
+    ball = '<geom size=".1" mass="1" contype="0"/>'
+    pendulum = '<body name="b" pos="0 0 -1"><joint name="b" axis="0 1 0"/><geom size=".1" mass="1" pos="0 0 -.5" contype="0"/></body>'
+    chain = svkc.load(SPACE.format(f'<body name="a">{slide}{ball}{pendulum}</body>'))
+    rigid = svkc.load(SPACE.format(pendulum))
+    traj = svkc.simulate(chain, chain.state({"b": 0.5}), 0.1, solver=solver)
+    expected = svkc.simulate(rigid, rigid.state({"b": 0.5}), 0.1, **FINE)
+    assert float(traj.final.q[1]) == pytest.approx(float(expected.final.q[0]), abs=1e-6)
+    assert int(traj.report().accepted) < (500 if isinstance(solver, diffrax.Kvaerno5) else 3000)
+
+
+def test_no_inertia_at_the_end_of_a_ball():
+    """A body without inertia that a ball would have to turn is refused, by name; a tiny one is simulated."""
+    point = '<body name="tip"><joint name="tip" type="ball"/><inertial pos="0 0 -{}" mass="{}" diaginertia="{} {} {}"/></body>'
+    with pytest.raises(ValueError, match="tip"):
+        svkc.load(SPACE.format(point.format(0.5, 1, 0, 0, 0)))
+    chain = svkc.load(SPACE.format(point.format(0.5, 1, 1e-12, 1e-12, 1e-12)))
+    traj = svkc.simulate(chain, chain.state(v={"tip": [1.0, 0.5, 0.1]}), 1.0, ts=TIMES, **FINE)
+    assert drift(chain, traj) < 1e-7
+
+
+def test_chattering_ends_with_a_code():
+    """A joint locked and let go infinitely often before 0.1 s: as many events as allowed, then the code, the last state kept."""
+    body = '<body name="ball"><joint name="z" type="slide" axis="0 0 1"/><geom size="0.1" mass="1" contype="0"/></body>'
+    chain = svkc.load(SPACE.format(body))
+    wave = lambda t, s, args: jnp.sin(1.0 / (0.1001 - t))
+    events = [svkc.when(wave, lock="z", direction=True), svkc.when(wave, unlock="z", direction=False)]
+    traj = svkc.simulate(chain, chain.state(), 0.2, events=events, max_events=12, dt=1e-4, throw=False)
+    assert traj.result == svkc.RESULTS.max_events
+    assert int(traj.events.count) == 12
+    assert np.isfinite(traj.final.q).all()
+    assert 0 < float(traj.t_final) < 0.1001
+    with pytest.raises(RuntimeError, match="max_events"):
+        svkc.simulate(chain, chain.state(), 0.2, events=events, max_events=12, dt=1e-4)
+
+
+def test_velocities_that_break_the_loops_are_made_to_agree():
+    """What the loops allow of it is kept: the least change, said by the velocity's gap."""
+    chain = models.four_bar()
+    state = chain.state(v=np.array([1.0, -3.0, 2.0]))
+    assert float(jnp.max(jnp.abs(svkc.velocity_gaps(chain, state)))) < 1e-13
+    raw = svkc.State(state.q, state.v.at[0].add(5.0), state.structure)
+    traj = svkc.simulate(chain, raw, 0.1, **FINE)
+    assert float(traj.gap_rates[-1].max()) < 1e-12
+
+
+def test_single_precision():
+    """float32: the N four-bar and a chain of unlike masses, with bounds of their own; float64 input where x64 is off warns once."""
+    with jax.enable_x64(False):
+        chain, state = maximal.load(n_four_bar(2))
+        assert state.q.dtype == jnp.float32
+        traj = svkc.simulate(chain, state, 2.0, ts=2 * TIMES.astype(jnp.float32), rtol=1e-5, atol=1e-6)
+        assert float(traj.gaps.max()) < 1e-5
+        assert abs(float(traj.report().energy_drift)) < 1e-2 * 35.8
+        chain = rods([1e3, 1.0, 1e-3], [1.0] * 3)
+        traj = svkc.simulate(chain, zigzag(chain), 1.0, ts=TIMES.astype(jnp.float32))
+        assert drift(chain, traj) < 1e-3
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            svkc.simulate(chain, zigzag(chain), 0.1)
+        assert not caught
