@@ -66,7 +66,12 @@ def save(traj: Trajectory, path, chain=None) -> None:
 def _complete(arrays: dict[str, np.ndarray]) -> None:
     """What was not kept before schema 3, as not known: inf, -1, or nothing let go."""
     rows, dtype = arrays["phases.start"].shape[-1:], arrays["ts"].dtype
-    unknown = {"evaluations": np.full(rows, -1, np.int32), "swaps": np.full(rows, -1, np.int32), "error": np.full(rows, np.inf, dtype)}
+    unknown = {
+        "evaluations": np.full(rows, -1, np.int32),
+        "swaps": np.full(rows, -1, np.int32),
+        "loop": np.full(rows, -1, np.int32),
+        "error": np.full(rows, np.inf, dtype),
+    }
     unknown |= {"free": np.zeros(rows, bool), "momentum_drift": np.zeros((*rows, 2), dtype)}
     arrays |= {f"phases.{name}": value for name, value in unknown.items()} | {"gap_rates": np.full_like(arrays["gaps"], np.inf)}
     for part in ("states", "final"):

@@ -17,7 +17,7 @@ from svkc.location import Found
 from svkc.searching import Search, Watched, found, watch
 from svkc.stepping import REST, Field, Motion, Scene, Seen, chosen, finite, motion_norm, projects, settle
 
-NON_FINITE = -1
+NON_FINITE, OPEN = -1, -2
 SUCCESSFUL, EVENT, MAX_STEPS = diffrax.RESULTS.successful._value, diffrax.RESULTS.event_occurred._value, diffrax.RESULTS.max_steps_reached._value
 
 
@@ -36,24 +36,27 @@ class How(eqx.Module):
     controller: Any
     first_step: Any
     progress_meter: diffrax.AbstractProgressMeter
+    gap: float = eqx.field(static=True)
     max_steps: int = eqx.field(static=True)
     every: int = eqx.field(static=True)
 
 
 class Tally(eqx.Module):
     """What a run has cost and shown: tries, and of the steps that were kept the sum of their estimated errors (root mean square over q and v; inf: the
-    solver gives none), the least |R_mm| / |R_11| of the loops, and how often the dependent coordinates changed (-1: not looked at)."""
+    solver gives none), the least |R_mm| / |R_11| of the loops, how often the dependent coordinates changed (-1: not looked at), and the loop that could
+    not be closed (-1: none)."""
 
     tries: Int[Array, ""]
     error: Float[Array, ""]
     margin: Float[Array, ""]
     swaps: Int[Array, ""]
+    loop: Int[Array, ""]
 
     @classmethod
     def none(cls, dtype, looked: bool) -> "Tally":
         """Before the first step."""
         zero = jnp.zeros((), jnp.int32)
-        return cls(zero, jnp.zeros((), dtype), jnp.ones((), dtype), zero if looked else zero - 1)
+        return cls(zero, jnp.zeros((), dtype), jnp.ones((), dtype), zero if looked else zero - 1, zero - 1)
 
 
 class Path(eqx.Module):
@@ -179,6 +182,9 @@ def _try(s: Step, t1, world: World, how: How) -> Tried:
     y, error, _, solver, solved = how.solver.step(term, s.t, t1, s.y, world.scene, s.solver, fresh)
     y, seen = settle(stabilization, world.scene, y)
     whole, order = finite(y), how.solver.error_order(term)
+    why = jnp.where(whole, OPEN, NON_FINITE)
+    if seen is not None:
+        whole = whole & (jnp.max(seen.gap) <= how.gap)
     error = jax.tree.map(lambda x: jnp.where(whole & jnp.isfinite(x), x, jnp.inf), error)
     keep, t, ahead, jumped, controller, said = how.controller.adapt_step_size(s.t, t1, s.y, y, world.scene, error, order, s.controller)
     keep, length = jnp.asarray(keep), ahead - t
@@ -188,8 +194,8 @@ def _try(s: Step, t1, world: World, how: How) -> Tried:
         length = jnp.where(grown, jnp.maximum(length, s.length), length)
     failed = keep & (solved._value != SUCCESSFUL)
     result = jnp.where(failed, solved._value, said._value)
-    # what is not finite is never kept: a step of that length ends the run, one that can be shortened until there is no shorter one
-    result = jnp.where(~whole & (keep | (result != SUCCESSFUL)), NON_FINITE, result).astype(jnp.int32)
+    # what is not finite, or open, is never kept: it ends the run where the step has to be of that length, or when there is no shorter one
+    result = jnp.where(~whole & (keep | (result != SUCCESSFUL)), why, result).astype(jnp.int32)
     estimate = jnp.asarray(jnp.inf, t.dtype) if error is None else motion_norm(error)
     return Tried(t, y, keep & whole, length, jnp.asarray(jumped), solver, controller, result, estimate, seen)
 
@@ -248,7 +254,8 @@ def _counted(s: Step, tried: Tried) -> Tally:
     if tried.seen is not None:
         margin = jnp.where(kept, jnp.minimum(margin, tried.seen.margin), margin)
         swaps = swaps + (kept & jnp.any(s.seen.dependent) & jnp.any(s.seen.dependent != tried.seen.dependent)).astype(jnp.int32)
-    return Tally(old.tries + 1, old.error + jnp.where(kept, tried.error, 0), margin, swaps)
+    loop = old.loop if tried.seen is None else jnp.where(tried.result == OPEN, jnp.argmax(tried.seen.gap).astype(jnp.int32), old.loop)
+    return Tally(old.tries + 1, old.error + jnp.where(kept, tried.error, 0), margin, swaps, loop)
 
 
 def _written(rows, i, new, pred):

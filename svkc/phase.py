@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 from svkc.chain import State
 from svkc.events import Plan
 from svkc.location import Found, Reading, arrived
-from svkc.marching import EVENT, MAX_STEPS, NON_FINITE, SUCCESSFUL, How, Path, Tally, World, march
+from svkc.marching import EVENT, MAX_STEPS, NON_FINITE, OPEN, SUCCESSFUL, How, Path, Tally, World, march
 from svkc.replay import Replay, integrated
 from svkc.request import Options
 from svkc.searching import Watched
@@ -71,7 +71,7 @@ def _path(start: Motion, times, world: World, watched: Watched | None, options: 
     ours, adjoint = isinstance(options.adjoint, Replay), options.adjoint
     every = min(adjoint.every, options.max_steps) if isinstance(adjoint, Replay) else options.max_steps
     meter = options.progress_meter if ours else diffrax.NoProgressMeter()
-    how = How(*frozen((staged(options.solver, "lax"), watched, *options.steps())), meter, options.max_steps, every)
+    how = How(*frozen((staged(options.solver, "lax"), watched, *options.steps())), meter, options.gap, options.max_steps, every)
     if ours:
         path = integrated(start, times, world, how)
         return path, frozen(path.found)
@@ -96,7 +96,7 @@ def _path(start: Motion, times, world: World, watched: Watched | None, options: 
         result = jnp.where((result == SUCCESSFUL) & found.hit, EVENT, result)
     accepted, rejected = (jnp.asarray(sol.stats[name], jnp.int32) for name in ("num_accepted_steps", "num_rejected_steps"))
     # diffrax tells the number of tries alone
-    tally = Tally(accepted + rejected, jnp.asarray(jnp.inf, t0.dtype), jnp.ones((), t0.dtype), jnp.asarray(-1, jnp.int32))
+    tally = Tally(accepted + rejected, jnp.asarray(jnp.inf, t0.dtype), jnp.ones((), t0.dtype), *[jnp.asarray(-1, jnp.int32)] * 2)
     return Path(t, jax.tree.map(lambda x: x[0], end), saved, jnp.zeros(0, t0.dtype), saved, accepted, rejected, result, tally, found), found
 
 
@@ -104,4 +104,5 @@ def _translate(result: Int[Array, ""], motion: Motion) -> RESULTS:
     """Diffrax's word for how a solve ended, as ours."""
     out = RESULTS.where((result == SUCCESSFUL) | (result == EVENT), RESULTS.successful, RESULTS.step_too_small)
     out = RESULTS.where(result == MAX_STEPS, RESULTS.max_steps, out)
+    out = RESULTS.where(result == OPEN, RESULTS.loop_open, out)
     return RESULTS.where(finite(motion) & (result != NON_FINITE), out, RESULTS.non_finite)

@@ -110,17 +110,17 @@ def close(chain: Chain, structure: Structure, q: Float[Array, " q"], iterations:
 @functools.partial(jax.jit, static_argnames=("iterations", "change"))
 def settle_loops(
     chain: Chain, structure: Structure, q, v, iterations: int, change: Callable = inertia_change
-) -> tuple[Float[Array, " q"], Float[Array, " dofs"], Float[Array, ""], Bool[Array, " dofs"]]:
+) -> tuple[Float[Array, " q"], Float[Array, " dofs"], Float[Array, ""], Bool[Array, " dofs"], Float[Array, " links"]]:
     """`close`, then `agree`: one body for both, the last turn of the loop being the velocities', so that it is compiled once.
 
-    And what the loops show: |R_mm| / |R_11|, and which coordinates are dependent.
+    And what the loops show: |R_mm| / |R_11|, which coordinates are dependent, and the gap (rad, `chain.length`s) that each loop is left with.
     """
     row, column = scales(chain)
     active = active_dofs(chain, structure)
 
     @functools.partial(jax.checkpoint, prevent_cse=False)
     def turn(i, both):
-        q, v, _, _ = both
+        q, v = both[:2]
         kin = kinematics(chain, q)
         end = ends(chain, structure, kin, q)
         J = scaled_jacobian(chain, structure, kin, end)
@@ -129,10 +129,10 @@ def settle_loops(
         open_ = jnp.stack([row * gap(structure, end).ravel(), J @ jnp.where(active, v / column, 0)], 1)
         step = -change(chain, structure, kin, selection, J, open_)
         last = i == iterations
-        seen = jax.lax.stop_gradient((weakest(full), jnp.any(full.P > 0, 0)))
+        seen = jax.lax.stop_gradient((weakest(full), jnp.any(full.P > 0, 0), jnp.max(jnp.abs(open_[:, 0]).reshape(-1, 6), 1)))
         return integrate(chain, q, jnp.where(last, 0, step[:, 0])), jnp.where(last, v + step[:, 1], v), *seen
 
-    none = jnp.ones((), q.dtype), jnp.zeros(chain.dofs, bool)
+    none = jnp.ones((), q.dtype), jnp.zeros(chain.dofs, bool), jnp.zeros(len(chain.link_names), q.dtype)
     return jax.lax.fori_loop(0, iterations + 1, turn, (normalize(chain, q), v, *none))
 
 

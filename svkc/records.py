@@ -36,6 +36,7 @@ def no_phases(rows: int, links: int, dtype) -> Phases:
         rejected=count,
         evaluations=count,
         swaps=count,
+        loop=count - 1,
         error=number,
         free=jnp.zeros(rows, bool),
         momentum_drift=jnp.zeros((rows, 2), dtype),
@@ -53,7 +54,7 @@ def recorded(chain: Chain, p: Phases, row: Bool[Array, " phases"], began: tuple,
     written = {
         "start": start, "stop": stop, "connected": s.connected, "rank": s.rank, "joint_freedoms": jnp.sum(active_dofs(chain, s), dtype=jnp.int32),
         "energy": energies, "work": work, "margin": jnp.minimum(margin, path.tally.margin), "accepted": path.accepted, "rejected": path.rejected,
-        "evaluations": stages * path.tally.tries, "swaps": path.tally.swaps, "error": path.tally.error, "free": free,
+        "evaluations": stages * path.tally.tries, "swaps": path.tally.swaps, "loop": path.tally.loop, "error": path.tally.error, "free": free,
         "momentum_drift": jnp.where(free, _momentum_drift(chain, both, s, stop - start), 0),
     }  # fmt: skip
     new = {name: jnp.where(row.reshape(-1, *(1,) * jnp.ndim(x)), jnp.asarray(x)[None], getattr(p, name)) for name, x in written.items()}

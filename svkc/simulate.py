@@ -57,8 +57,9 @@ def simulate(
     if isinstance(failed, jax.core.Tracer):
         return traj.result.error_if(traj, failed)
     if np.any(np.asarray(failed)):
-        phase = int(traj.phases.count)
-        raise RuntimeError(f"simulate stopped at t = {float(traj.t_final):.9g} s, in phase {phase}: {RESULTS[traj.result]}")
+        phase, loop = int(traj.phases.count), int(traj.report().loop)
+        where = f"phase {phase}" if loop < 0 else f"phase {phase}, loop {chain.link_names[loop]!r}"
+        raise RuntimeError(f"simulate stopped at t = {float(traj.t_final):.9g} s, in {where}: {RESULTS[traj.result]}")
     return traj
 
 

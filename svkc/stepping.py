@@ -110,15 +110,17 @@ def projects(stabilization, scene: Scene) -> bool:
 
 
 class Seen(eqx.Module):
-    """What the loops show as a step is put back onto them: |R_mm| / |R_11|, and which coordinates depend on the others."""
+    """What the loops show as a step is put back onto them: |R_mm| / |R_11|, which coordinates depend on the others, how far each loop is open yet."""
 
     margin: Float[Array, ""]
     dependent: Bool[Array, " dofs"]
+    gap: Float[Array, " links"]
 
     @classmethod
     def nothing(cls, chain: Chain) -> "Seen":
         """Before the first step."""
-        return cls(jnp.ones((), chain.q_load.dtype), jnp.zeros(chain.dofs, bool))
+        dtype = chain.q_load.dtype
+        return cls(jnp.ones((), dtype), jnp.zeros(chain.dofs, bool), jnp.zeros(len(chain.link_names), dtype))
 
 
 def settle(stabilization, scene: Scene, y: Motion) -> tuple[Motion, Seen | None]:
@@ -126,8 +128,8 @@ def settle(stabilization, scene: Scene, y: Motion) -> tuple[Motion, Seen | None]
     chain, structure = scene.chain, scene.structure
     if not projects(stabilization, scene):
         return eqx.tree_at(lambda y: y.q, y, normalize(chain, y.q)), None
-    q, v, margin, dependent = settle_loops(chain, structure, y.q, y.v, stabilization.iterations, stabilization.change)
-    return eqx.tree_at(lambda y: (y.q, y.v), y, (q, v)), Seen(margin, dependent)
+    q, v, *seen = settle_loops(chain, structure, y.q, y.v, stabilization.iterations, stabilization.change)
+    return eqx.tree_at(lambda y: (y.q, y.v), y, (q, v)), Seen(*seen)
 
 
 def finite(y: Motion) -> Bool[Array, ""]:

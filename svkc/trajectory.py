@@ -17,7 +17,7 @@ class RESULTS(eqx.Enumeration):
     max_steps = "More steps than max_steps in one phase. Raise max_steps, or loosen rtol and atol."
     step_too_small = "The step size fell to its lower bound: the problem is too stiff, or singular, for this solver and tolerance."
     not_in_place = "A link was to be connected at its declared placement, but its bodies were elsewhere. Use here, or a guard that waits."
-    loop_open = "A loop is open by more than the tolerance. Use smaller steps, or projection."
+    loop_open = "A loop is open by more than the tolerance. Use smaller steps, or projection; look at mobility and its margin there."
     non_finite = "A number that is not finite appeared."
     grazing = "A guard touched zero rather than crossed it: the time of its event has no derivative, and those given are not numbers."
     jump = "A guard jumped over zero: the time of its event counts as fixed in derivatives."
@@ -50,10 +50,10 @@ class Phases(eqx.Module):
 
     `energy`: mechanical energy (J) at start and end; `work`: done in between by control, limits and dampers (J); `margin`: the least |R_mm| / |R_11| of
     the phase (of its two ends where steps are not projected), how far the weakest row that counts is from being redundant; `swaps`: how often the
-    choice of dependent coordinates changed from step to step (-1: not looked at); `evaluations`: of the vector field, in steps alone; `error`: the
-    estimated errors of the steps added up (root mean square over q and v; inf: the solver estimates none); `free`: nothing holds the bodies to the
-    ground; `momentum_drift`: then, the change of linear momentum (N s) that gravity does not explain and that of the angular momentum about the centre
-    of mass (N m s).
+    choice of dependent coordinates changed from step to step (-1: not looked at); `loop`: the one that could not be closed (-1: none);
+    `evaluations`: of the vector field, in steps alone; `error`: the estimated errors of the steps added up (root mean square over q and v; inf: the
+    solver estimates none); `free`: nothing holds the bodies to the ground; `momentum_drift`: then, the change of linear momentum (N s) that gravity
+    does not explain and that of the angular momentum about the centre of mass (N m s).
     """
 
     start: Float[Array, " phases"]
@@ -68,6 +68,7 @@ class Phases(eqx.Module):
     rejected: Int[Array, " phases"]
     evaluations: Int[Array, " phases"]
     swaps: Int[Array, " phases"]
+    loop: Int[Array, " phases"]
     error: Float[Array, " phases"]
     free: Bool[Array, " phases"]
     momentum_drift: Float[Array, "phases 2"]
@@ -141,6 +142,7 @@ class Trajectory(eqx.Module):
             accepted=jnp.sum(p.accepted, -1),
             rejected=jnp.sum(p.rejected, -1),
             evaluations=jnp.sum(p.evaluations, -1),
+            loop=jnp.max(p.loop, -1),
             phases=p.count,
             t_final=self.t_final,
             result=self.result,
@@ -152,7 +154,7 @@ class Report(eqx.Module):
     """Largest loop gaps (m, rad) and rates (m/s, rad/s) at the saved times; energy that no work or impact explains and energy lost in impacts (J);
     over phases in which nothing holds the bodies to the ground (`free`: there is one), momentum that gravity does not explain (N s, N m s); estimated
     errors of all steps added up (inf: the solver estimates none); the least rank margin; changes of the dependent coordinates (-1: not looked at);
-    steps, evaluations of the vector field, phases; when and how the run ended, and whether it has derivatives."""
+    the loop that could not be closed (-1: none); steps, evaluations of the vector field, phases; when and how the run ended, and whether it has derivatives."""
 
     gap: Float[Array, ""]
     angular_gap: Float[Array, ""]
@@ -169,6 +171,7 @@ class Report(eqx.Module):
     accepted: Int[Array, ""]
     rejected: Int[Array, ""]
     evaluations: Int[Array, ""]
+    loop: Int[Array, ""]
     phases: Int[Array, ""]
     t_final: Float[Array, ""]
     result: RESULTS
@@ -191,6 +194,8 @@ class Report(eqx.Module):
             f"{int(self.phases)} phases",
             f"ended                   at {float(self.t_final):.9g} s: {RESULTS[self.result] or 'successful'}",
         ]
+        if self.loop >= 0:
+            lines.append(f"could not be closed     loop {int(self.loop)}, counted from 0")
         if self.derivative != RESULTS.successful:
             lines.append(f"derivatives             {RESULTS[self.derivative]}")
         return "\n".join(lines)
