@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import svkc
+from svkc.tuning import Candidate, candidates
 
 
 @pytest.fixture(scope="module")
@@ -147,3 +148,39 @@ def test_what_is_not_finite_ends_its_lane_where_it_appears(arm):
     traj = svkc.simulate(chain, state, 0.4, events=[blind], throw=False, dt=0.01)
     assert traj.result == svkc.RESULTS.non_finite
     assert float(traj.t_final) == pytest.approx(0.2, abs=0.011)
+
+
+def test_tune():
+    """The fastest of those that hold the target on this scene; a target that nobody holds; bad ones."""
+    chain = models.four_bar()
+    state = chain.state(v={"crank": 4.0})
+    given = [
+        Candidate("rough", {"dt": 0.02, "solver": svkc.SemiImplicitEuler()}),
+        Candidate("fine", {"rtol": 1e-8, "atol": 1e-10}),
+        Candidate("loose", {"rtol": 1e-3, "atol": 1e-5}),
+    ]
+    found = svkc.tune(chain, state, 0.5, target=1e-6, options=given, repeats=1)
+    assert found.best is given[1].options
+    assert found.table[0].name == "fine"
+    assert found.table[0].error <= 1e-6 < min(c.error for c in found.table[1:])
+    assert all(c.seconds > 0 and c.steps > 0 for c in found.table)
+    for word in ("* fine", "  rough", "loop gap", "* the fastest"):
+        assert word in str(found)
+    svkc.simulate(chain, state, 0.5, **found.best)
+    none = svkc.tune(chain, state, 0.5, target=1e-9, options=given[:1], repeats=1)
+    assert none.best is None
+    assert "no candidate holds the target" in str(none)
+    with pytest.raises(ValueError, match=r"target: got 0"):
+        svkc.tune(chain, state, 0.5, target=0.0)
+    names = [c.name for c in candidates(jnp.float64, 1.0)]
+    assert len(set(names)) == len(names)
+
+
+def test_errors_by_halving(arm, exact):
+    """The difference of a run and a finer one is what the run errs by."""
+    chain, state = arm
+    for options in ({"dt": 0.02, "solver": diffrax.Heun()}, {"rtol": 1e-5, "atol": 1e-7}):
+        estimate = svkc.halved(chain, state, 0.4, **options)
+        run = svkc.simulate(chain, state, 0.4, **options)
+        error = float(np.sqrt(np.mean(svkc.difference(chain, exact.q, run.final.q) ** 2)))
+        assert 0.5 * error < estimate < 2 * error

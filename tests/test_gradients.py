@@ -12,9 +12,10 @@ import svkc
 TIGHT = derivatives.TIGHT
 
 
-@pytest.mark.parametrize("name", [*derivatives.ALGEBRAIC, "breaking", "four_bar_turning", "high_bar"])
+@pytest.mark.parametrize("name", [*derivatives.ALGEBRAIC, "pendulum_cut", "breaking", "four_bar_turning"])
 def test_against_differences(name):
-    """Both modes, along a random direction of each parameter; forward and reverse to 1e-10. Other runs: `python tests/derivatives.py`."""
+    """Both modes, along a random direction of each parameter; forward and reverse to 1e-10. Figures: examples 05 and 06, and
+    `python tests/derivatives.py`."""
     f, x, limit = derivatives.CASES[name]()
     found = svkc.check_grad(f, x, directions=1, step=0.1 if name in derivatives.ALGEBRAIC else 0.05)
     assert found.error <= limit, found
