@@ -12,6 +12,7 @@ import models
 import numpy as np
 
 import svkc
+import svkc.scenes
 
 TIGHT = {"rtol": 1e-11, "atol": 1e-13, "solver": diffrax.Dopri8()}
 ALGEBRA, RUN = 1e-8, 1e-6
