@@ -242,19 +242,19 @@ def _step(s: Step, times, world: World, how: How) -> Step:
         accepted=accepted,
         rejected=s.rejected + (~tried.keep & ~still).astype(jnp.int32),
         result=next_(tried.result, s.result),
-        tally=_counted(s, tried),
+        tally=_counted(s, tried, next_(tried.result, s.result)),
         seen=moved(tried.seen, s.seen),
     )
 
 
-def _counted(s: Step, tried: Tried) -> Tally:
-    """With one more try."""
+def _counted(s: Step, tried: Tried, result: Int[Array, ""]) -> Tally:
+    """With one more try. result: how the run stands after it."""
     old, kept = s.tally, tried.keep
     margin, swaps = old.margin, old.swaps
     if tried.seen is not None:
         margin = jnp.where(kept, jnp.minimum(margin, tried.seen.margin), margin)
         swaps = swaps + (kept & jnp.any(s.seen.dependent) & jnp.any(s.seen.dependent != tried.seen.dependent)).astype(jnp.int32)
-    loop = old.loop if tried.seen is None else jnp.where(tried.result == OPEN, jnp.argmax(tried.seen.gap).astype(jnp.int32), old.loop)
+    loop = old.loop if tried.seen is None else jnp.where(result == OPEN, jnp.argmax(tried.seen.gap).astype(jnp.int32), old.loop)
     return Tally(old.tries + 1, old.error + jnp.where(kept, tried.error, 0), margin, swaps, loop)
 
 

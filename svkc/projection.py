@@ -1,4 +1,4 @@
-"""F5: the way back onto closed loops, by the least change, and the rank that a phase goes by."""
+"""F5: the way back onto closed loops, by the smallest change, and the rank that a phase goes by."""
 
 import functools
 from collections.abc import Callable
