@@ -1,6 +1,6 @@
 """The trade of speed for accuracy: error against time of computing, each integrator and each way against drift, float64 and float32, MuJoCo beside them.
 
-`python benchmarks/accuracy.py [problem ...]` prints results/accuracy.csv and draws results/accuracy_PROBLEM.png, in some twenty minutes. Errors are
+`python benchmarks/accuracy.py [problem ...]` prints results/accuracy.csv and draws results/accuracy_PROBLEM.png, in about an hour. Errors are
 those at the end, root mean square over coordinates (rad, m), against closed forms, published digits, or, where the reference says so, Dopri8 at
 rtol 1e-12. Seconds are per simulated second, the median of five runs of a compiled program, one run at a time."""
 
@@ -22,11 +22,12 @@ sys.path.insert(0, str(ROOT / "tests"))
 
 import maximal  # the tests' reader of the reference problems
 import test_reference as reference
+from munthe_kaas import MuntheKaas
 
 import svkc
 import svkc.scenes
 
-RESULTS, RUNS = pathlib.Path(__file__).parent / "results", 5
+RESULTS, RUNS, ENOUGH = pathlib.Path(__file__).parent / "results", 5, 10.0
 FIXED, ADAPTIVE, SINGLE = (1e-2, 3e-3, 1e-3, 3e-4), (1e-3, 1e-5, 1e-7, 1e-9, 1e-11), (1e-2, 1e-3, 1e-4, 1e-5)
 INTEGRATORS = {
     "Rodrigues-Euler": (svkc.RodriguesEuler(), FIXED),
@@ -35,14 +36,21 @@ INTEGRATORS = {
     "Tsit5, fixed": (diffrax.Tsit5(), FIXED),
     "Tsit5": (diffrax.Tsit5(), ADAPTIVE),
     "Dopri8": (diffrax.Dopri8(), ADAPTIVE),
+    "Tsit5, Munthe-Kaas": (MuntheKaas(diffrax.Tsit5()), ADAPTIVE),
+    "Dopri8, Munthe-Kaas": (MuntheKaas(diffrax.Dopri8()), ADAPTIVE),
     "Kvaerno5": (diffrax.Kvaerno5(), ADAPTIVE[:3]),
 }
-DRIFT = {
-    "": svkc.Projection(),
-    ", least change": svkc.Projection(change=svkc.least_change),
-    ", dependent change": svkc.Projection(change=svkc.dependent_change),
-    ", Baumgarte": svkc.Baumgarte(),
-    ", drift": svkc.Drift(),
+# with Dopri8, on what has loops
+WAYS = {
+    "least change": {"stabilization": svkc.Projection(change=svkc.least_change)},
+    "dependent change": {"stabilization": svkc.Projection(change=svkc.dependent_change)},
+    "exact": {"stabilization": svkc.Exact()},
+    "Baumgarte": {"stabilization": svkc.Baumgarte()},
+    "drift": {"stabilization": svkc.Drift()},
+    "pivots never new": {"dynamics": svkc.Dynamics(hold=0.0)},
+    "pivots always new": {"dynamics": svkc.Dynamics(hold=None)},
+    "articulated bodies": {"dynamics": svkc.Dynamics(inertia=svkc.by_bodies)},
+    "unit vectors": {"dynamics": svkc.Dynamics(inertia=svkc.inertia_by_unit_vectors)},
 }
 
 
@@ -115,23 +123,25 @@ PROBLEMS = {f.__name__: f for f in (heavy_top, free_top, n_four_bar, andrews, hi
 
 
 def timed(run, *args):
-    """What a run gives, and the median of its seconds."""
+    """What a run gives, and the median of its seconds; no more runs once they have taken long enough."""
     out, seconds = jax.block_until_ready(run(*args)), []
     for _ in range(RUNS):
         begun = time.perf_counter()
         jax.block_until_ready(run(*args))
         seconds.append(time.perf_counter() - begun)
+        if sum(seconds) > ENOUGH:
+            break
     return out, float(np.median(seconds))
 
 
-def measured(problem: Problem, label: str, solver, settings, held):
+def measured(problem: Problem, label: str, solver, settings, way=None):
     """Rows of one curve."""
     dtype, scale = problem.state.q.dtype, min(1.0, problem.end)
 
     def run(state, setting):
         steps = {"dt": setting * scale} if settings is FIXED else {"rtol": setting, "atol": setting / 100}
         bound = int(1.2 / FIXED[-1] * max(problem.end, 1)) + 100 if settings is FIXED else 20000
-        return svkc.simulate(problem.chain, state, problem.end, solver=solver, stabilization=held, throw=False, max_steps=bound, **steps, **problem.call)
+        return svkc.simulate(problem.chain, state, problem.end, solver=solver, throw=False, max_steps=bound, **steps, **problem.call, **(way or {}))
 
     run = jax.jit(run)
     for setting in settings:
@@ -142,35 +152,67 @@ def measured(problem: Problem, label: str, solver, settings, held):
         yield [label, setting, seconds / problem.end, error, gap, energy, int(report.accepted + report.rejected), svkc.RESULTS[traj.result]]
 
 
+def soft_n_four_bar(problem: Problem, dt: float):
+    """MuJoCo's model of the four-bar, its pins soft `connect`s, and no releases."""
+    xml, bodies, _, loops = maximal.mjcf(reference.n_four_bar(2))
+    soft = ""
+    for joint in loops:
+        parent = bodies[joint["parent"]]
+        anchor = parent.turn.T @ (np.array(joint["point_world0"]) - parent.place)
+        soft += f'<connect body1="{joint["parent"]}" body2="{joint["child"]}" anchor="{maximal._numbers(anchor)}" solref="{2 * dt} 1"/>'
+    return mujoco.MjModel.from_xml_string(xml.replace("</mujoco>", f"<equality>{soft}</equality></mujoco>")), {}
+
+
+def soft_high_bar(problem: Problem, dt: float):
+    """MuJoCo's model of the figure, each grip two soft `connect`s on the bar's axis, and the times they are let go."""
+    spec, chain = mujoco.MjSpec.from_file(str(svkc.scenes.FOLDER / "figure16.xml")), problem.chain
+    rows, s, released = {row: name for name, row in zip(chain.body_names, chain.topology.body_row)}, chain.structure, {}
+    for i, name in enumerate(chain.link_names):
+        turns = int(np.flatnonzero(np.asarray(s.freedoms[i]))[0])
+        for side in (-0.05, 0.05):
+            sites = []
+            for row, place, quat in ((s.real[i], s.real_pos[i], s.real_quat[i]), (s.parent[i], s.pos[i], s.quat[i])):
+                along = np.zeros(3)
+                mujoco.mju_rotVecQuat(along, np.eye(3)[turns] * side, np.asarray(quat, float))
+                body = rows[int(row)]
+                sites.append(f"{name}{side}{body}")
+                (spec.worldbody if body == "world" else spec.body(body)).add_site(name=sites[-1], pos=np.asarray(place) + along)
+            pin = spec.add_equality(name=f"{name}{side}", type=mujoco.mjtEq.mjEQ_CONNECT, objtype=mujoco.mjtObj.mjOBJ_SITE, name1=sites[0], name2=sites[1])
+            pin.solref = [2 * dt, 1]
+    model = spec.compile()
+    for event, name in zip(problem.call["events"], ("right_hand_grip", "left_hand_grip")):
+        released[float(event.time)] = [i for i in range(model.neq) if model.equality(i).name.startswith(name)]
+    return model, released
+
+
 def in_mujoco(problem: Problem, name: str):
     """MuJoCo's integrators on the same model; loops as soft `connect`s, as stiff as twice the time step lets them be."""
-    text = maximal.mjcf(reference.n_four_bar(2)) if name == "n_four_bar" else None
+    soft = {"n_four_bar": soft_n_four_bar, "high_bar": soft_high_bar}
     for integrator in ("Euler", "implicitfast", "RK4"):
         for dt in FIXED:
-            if text is None:
-                model = problem.chain.model.model
-            else:
-                xml, bodies, _, loops = text
-                soft = ""
-                for joint in loops:
-                    parent = bodies[joint["parent"]]
-                    anchor = parent.turn.T @ (np.array(joint["point_world0"]) - parent.place)
-                    soft += f'<connect body1="{joint["parent"]}" body2="{joint["child"]}" anchor="{maximal._numbers(anchor)}" solref="{2 * dt} 1"/>'
-                model = mujoco.MjModel.from_xml_string(xml.replace("</mujoco>", f"<equality>{soft}</equality></mujoco>"))
-            steps = round(problem.end / (dt * min(1.0, problem.end)))
+            dt = dt * min(1.0, problem.end)
+            model, released = soft[name](problem, dt) if name in soft else (problem.chain.model.model, {})
+            # whole steps to each release, and to the end
+            stops = [*sorted(released), problem.end]
+            steps = round(problem.end / dt) if not released else sum(round((b - a) / dt) for a, b in zip([0.0, *stops], stops))
             model.opt.timestep, model.opt.jacobian = problem.end / steps, mujoco.mjtJacobian.mjJAC_DENSE
             model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
-            data = mujoco.MjData(model)
+            model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_LIMIT
+            data, worst = mujoco.MjData(model), []
 
-            def run(model=model, data=data, steps=steps):
+            def run(model=model, data=data, steps=steps, released=released, stops=stops, worst=worst):
                 mujoco.mj_resetData(model, data)
                 data.qpos[:], data.qvel[:] = problem.state.q[: model.nq], problem.state.v[: model.nv]
-                mujoco.mj_step(model, data, steps)
+                worst.clear()
+                for begun, stop in zip([0.0, *stops], stops):
+                    mujoco.mj_step(model, data, round((stop - begun) / model.opt.timestep))
+                    worst.append(float(np.abs(data.efc_pos).max()) if data.nefc else 0.0)
+                    data.eq_active[released.get(stop, [])] = 0
                 return data.qpos.copy()
 
             q, seconds = timed(run)
-            gap = float(np.abs(data.efc_pos).max()) if data.nefc else 0.0
-            yield [f"MuJoCo {integrator}", dt, seconds / problem.end, problem.error(q), gap, np.nan, steps, "" if np.isfinite(q).all() else "not finite"]
+            failed = "" if np.isfinite(q).all() else "not finite"
+            yield [f"MuJoCo {integrator}", dt / min(1.0, problem.end), seconds / problem.end, problem.error(q), max(worst), np.nan, steps, failed]
 
 
 def rows(name: str):
@@ -178,17 +220,21 @@ def rows(name: str):
     problem = PROBLEMS[name]()
     loops = bool(problem.chain.link_names)
     for label, (solver, settings) in INTEGRATORS.items():
-        if loops and label in ("Heun, fixed", "Kvaerno5") and name not in ("n_four_bar", "andrews"):
+        if name in ("high_bar", "swing") and label in ("Heun, fixed", "Kvaerno5"):
             continue
-        yield from (["float64", *row] for row in measured(problem, label, solver, settings, DRIFT[""]))
-    for label, held in list(DRIFT.items())[1:] if loops else ():
-        yield from (["float64", *row] for row in measured(problem, "Dopri8" + label, diffrax.Dopri8(), ADAPTIVE, held))
-    if "control" not in problem.call and "events" not in problem.call:
+        if name in ("n_four_bar", "andrews") and "Munthe-Kaas" in label:
+            # no orientations in space
+            continue
+        yield from (["float64", *row] for row in measured(problem, label, solver, settings))
+    for label, way in WAYS.items() if loops else ():
+        yield from (["float64", *row] for row in measured(problem, f"Dopri8, {label}", diffrax.Dopri8(), ADAPTIVE, way))
+    if name not in ("andrews", "swing"):
+        # (a force of the user's, and an end of contact found by its force, would be Python between MuJoCo's steps)
         yield from (["float64", *row] for row in in_mujoco(problem, name))
     with jax.enable_x64(False):
         single = PROBLEMS[name]()
         single.exact = problem.exact
-        yield from (["float32", *row] for row in measured(single, "Tsit5", diffrax.Tsit5(), SINGLE, DRIFT[""]))
+        yield from (["float32", *row] for row in measured(single, "Tsit5", diffrax.Tsit5(), SINGLE))
 
 
 def draw(name: str, table):
@@ -200,9 +246,11 @@ def draw(name: str, table):
     for dtype, label, _, seconds, error, *_ in table:
         if np.isfinite(error) and error > 0:
             curves.setdefault((dtype, label), []).append((seconds, error))
-    for (dtype, label), points in curves.items():
+    colors = plt.get_cmap("tab20")(np.arange(20))
+    for color, ((dtype, label), points) in zip(colors, curves.items(), strict=False):
         style = "s:" if "MuJoCo" in label else ("^--" if dtype == "float32" else "o-")
-        axes.loglog(*zip(*points, strict=True), style, markersize=4, linewidth=1.2, label=label + (", float32" if dtype == "float32" else ""))
+        name_of = label + (", float32" if dtype == "float32" else "")
+        axes.loglog(*zip(*points, strict=True), style, color=color, markersize=4, linewidth=1.2, label=name_of)
     axes.set(xlabel="seconds of computing per simulated second", ylabel="error at the end (rad, m; root mean square)", title=name.replace("_", " "))
     axes.set_ylim(top=10)
     axes.grid(alpha=0.3)

@@ -33,9 +33,13 @@ from svkc.guards import leaves as leaves, overload as overload, touch as touch
 # runs
 from svkc.simulate import simulate as simulate
 from svkc.replay import Replay as Replay
+from svkc.rollout import rollout as rollout
 from svkc.tuning import error_between as error_between, halved as halved, tune as tune
 from svkc.projection import dependent_change as dependent_change, inertia_change as inertia_change, least_change as least_change
-from svkc.stepping import Baumgarte as Baumgarte, Drift as Drift, Projection as Projection
+from svkc.stepping import Baumgarte as Baumgarte, Drift as Drift, Exact as Exact, Projection as Projection
+from svkc.articulated import by_bodies as by_bodies
+from svkc.forward_dynamics import Dynamics as Dynamics
+from svkc.inverse_dynamics import inertia_by_composites as inertia_by_composites, inertia_by_unit_vectors as inertia_by_unit_vectors
 from svkc.solvers import RodriguesEuler as RodriguesEuler, SemiImplicitEuler as SemiImplicitEuler
 
 # derivatives

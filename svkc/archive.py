@@ -6,12 +6,15 @@ import os
 import pathlib
 import tempfile
 import zipfile
+from typing import Any
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from svkc.chain import State, Structure
-from svkc.trajectory import RESULT_NAMES, RESULTS, Events, Phases, Trajectory
+from svkc.trajectory import RESULTS, Events, Phases, Trajectory
 
 # 2: with `derivative` and the phases' `margin`; 3: with the structures' `margin` and the whole certificate
 SCHEMA = 3
@@ -31,7 +34,7 @@ def _flatten(node, prefix: str = "") -> dict[str, np.ndarray]:
     return out
 
 
-def _build(cls, arrays: dict[str, np.ndarray], prefix: str = "", **known):
+def _build(cls, arrays: dict[str, Any], prefix: str = "", **known):
     fields = dict(known)
     for field in dataclasses.fields(cls):
         name = prefix + field.name
@@ -44,12 +47,10 @@ def _build(cls, arrays: dict[str, np.ndarray], prefix: str = "", **known):
 
 def save(traj: Trajectory, path, chain=None) -> None:
     """Writes one .npz: every array by name, and a JSON line of metadata (schema, result, versions, names if the chain is given)."""
-    import jax
-
     import svkc
 
     meta = {"schema": SCHEMA, "svkc": svkc.__version__, "jax": jax.__version__, "units": "SI, rad, wxyz"}
-    meta |= {name: int(np.asarray(getattr(traj, name)._value)) for name in _CODES}
+    meta |= {name: np.asarray(getattr(traj, name)._value).tolist() for name in _CODES}
     if chain is not None:
         meta |= {"bodies": chain.body_names, "joints": chain.joint_names, "links": chain.link_names}
     path = pathlib.Path(path)
@@ -95,5 +96,9 @@ def load_trajectory(path) -> Trajectory:
         raise ValueError(f"{path} lacks {', '.join(sorted(missing))}; it is not a trajectory written by svkc")
     if meta["schema"] < 3:
         _complete(arrays)
-    codes = {int(np.asarray(item._value)): item for item in (getattr(RESULTS, name) for name in RESULT_NAMES)}
-    return _build(Trajectory, arrays, **{name: codes.get(meta.get(name, 0), RESULTS.successful) for name in _CODES})
+    code = lambda value: eqx.tree_at(lambda item: item._value, RESULTS.successful, value)
+    build = lambda arrays, codes: _build(Trajectory, arrays, **{name: code(value) for name, value in codes.items()})
+    for _ in range(arrays["ts"].ndim - 1):
+        # lanes
+        build = jax.vmap(build)
+    return build(arrays, {name: jnp.asarray(meta.get(name, 0), jnp.int32) for name in _CODES})

@@ -1,5 +1,7 @@
 """F4: a consistent state from what the user knows of it: names to numbers, loops closed, velocities made to agree."""
 
+import warnings
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -157,6 +159,9 @@ def assemble(chain: Chain, q, v, connected) -> State:
     top = chain.topology
     structure = eqx.tree_at(lambda s: s.connected, chain.structure, jnp.asarray(connection_mask(chain, connected)))
     given = q
+    wide = [name for name, x in (("q", q), ("v", v)) if isinstance(x, np.ndarray) and x.dtype == np.float64]
+    if wide and chain.q_load.dtype == np.float32:
+        warnings.warn(f"state: {' and '.join(wide)} in float64, kept in float32: jax_enable_x64 was off when the chain was loaded", stacklevel=3)
     q, held_q = _filled(chain, "q", q, chain.q_load, top.nq, Q_SIZE, top.q_start)
     v, held_v = _filled(chain, "v", v, jnp.zeros(top.dofs, chain.q_load.dtype), top.nv, V_SIZE, top.v_start)
     _check_quaternions(chain, q)

@@ -4,6 +4,7 @@ Rows in metres and columns of slides are divided by the chain's `length`, so tha
 """
 
 import equinox as eqx
+import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,8 +13,11 @@ from jaxtyping import Array, Bool, Float
 from svkc.chain import Chain, State, Structure
 from svkc.kinematics import Kinematics, bias_accelerations, kinematics, twists
 from svkc.loops import active_dofs, ends, gap, loop_bias, loop_jacobian
-from svkc.selection import Selection, held_part, select, solve_frozen, square, without_weak
+from svkc.selection import Selection, held_part, select, select_again, solve_frozen, square, weakest, without_weak
 from svkc.topology import FREE, SLIDE
+
+# part of the phase's own margin below which a configuration is near a singular one; elsewhere the motion depends on no choice of pivots
+NEAR = 0.1
 
 
 class Coordinates(eqx.Module):
@@ -84,9 +88,20 @@ def agreeing(chain: Chain, selection: Selection, J: Float[Array, "rows dofs"], v
     return v - column * (selection.P.T @ solve_frozen(JS, Jm @ (v / column)))
 
 
-def choose(structure: Structure, J: Float[Array, "rows dofs"]) -> Selection:
-    """The pivots of J_C, with the rank of the phase and the coordinates that are asked to be independent; without rows that are too weak just now."""
-    return without_weak(select(J, structure.rank, structure.independent), held_part(J.dtype) * structure.margin)
+def choose(structure: Structure, J: Float[Array, "rows dofs"], pivots=None) -> Selection:
+    """The pivots of J_C, with the rank of the phase and the coordinates that are asked to be independent; without rows that are too weak just now.
+
+    pivots [steps, dofs]: one-hot, chosen before (None: to be chosen now); near a singular configuration new ones are.
+    """
+    new = lambda: select(J, structure.rank, structure.independent)
+    if pivots is None:
+        selection = new()
+    else:
+        held = select_again(J, pivots)
+        near = weakest(held) < NEAR * structure.margin
+        # (one lane near is enough to choose for all)
+        selection = jax.lax.cond(eqxi.unvmap_any(near), lambda: jax.tree.map(lambda a, b: jnp.where(near, a, b), new(), held), lambda: held)
+    return without_weak(selection, held_part(J.dtype) * structure.margin)
 
 
 def constrain(chain: Chain, structure: Structure, selection: Selection, J: Float[Array, "rows dofs"], bias: Float[Array, " rows"]) -> Coordinates:
@@ -117,11 +132,17 @@ def coordinates(chain: Chain, state: State) -> Coordinates:
     return constrained(chain, state.structure, state.q, state.v, kin, twists(chain, kin, state.v))
 
 
+def gaps_and_rates(chain: Chain, state: State) -> tuple[Float[Array, "links 6"], Float[Array, "links 6"]]:
+    """`loop_gaps` and `velocity_gaps` from one pass over the tree."""
+    kin = kinematics(chain, state.q)
+    end = ends(chain, state.structure, kin, state.q)
+    return gap(state.structure, end), (loop_jacobian(chain, state.structure, kin, end) @ state.v).reshape(-1, 6)
+
+
 @jax.jit
 def loop_gaps(chain: Chain, state: State) -> Float[Array, "links 6"]:
     """How far each connected loop is open: rotation vector (rad), then distance (m), in the world; zero where not connected."""
-    kin = kinematics(chain, state.q)
-    return gap(state.structure, ends(chain, state.structure, kin, state.q))
+    return gaps_and_rates(chain, state)[0]
 
 
 @jax.jit
@@ -136,6 +157,4 @@ def jacobian(chain: Chain, state: State) -> tuple[Float[Array, "links 3 dofs"], 
 @jax.jit
 def velocity_gaps(chain: Chain, state: State) -> Float[Array, "links 6"]:
     """J_C v: relative twist (rad/s, m/s) across each connected virtual link."""
-    kin = kinematics(chain, state.q)
-    end = ends(chain, state.structure, kin, state.q)
-    return (loop_jacobian(chain, state.structure, kin, end) @ state.v).reshape(-1, 6)
+    return gaps_and_rates(chain, state)[1]

@@ -19,9 +19,8 @@ def _bodies(chain: Chain, kin: Kinematics, v):
     return c, V[:, 3:] + cross(w, c), w, spin
 
 
-def _energies(chain: Chain, state: State) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    kin = kinematics(chain, state.q)
-    c, u, w, spin = _bodies(chain, kin, state.v)
+def _energies(chain: Chain, state: State, kin: Kinematics, bodies) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    c, u, w, spin = bodies
     kinetic = jnp.sum(chain.mass * jnp.sum(u * u, -1)) / 2 + jnp.sum(w * spin) / 2
     if chain.armature is not None:
         kinetic = kinetic + jnp.sum(chain.armature * state.v[: chain.nv] ** 2) / 2
@@ -35,31 +34,39 @@ def _energies(chain: Chain, state: State) -> tuple[Float[Array, ""], Float[Array
     return kinetic, potential
 
 
+def _both(chain: Chain, state: State) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    kin = kinematics(chain, state.q)
+    return _energies(chain, state, kin, _bodies(chain, kin, state.v))
+
+
 @jax.jit
 def kinetic_energy(chain: Chain, state: State) -> Float[Array, ""]:
     """Kinetic energy (J), armature included: v^T M v / 2."""
-    return _energies(chain, state)[0]
+    return _both(chain, state)[0]
 
 
 @jax.jit
 def potential_energy(chain: Chain, state: State) -> Float[Array, ""]:
     """Gravity's potential (J), zero at the world's origin, and that of the joints' springs."""
-    return _energies(chain, state)[1]
+    return _both(chain, state)[1]
 
 
 @jax.jit
 def energy(chain: Chain, state: State) -> Float[Array, ""]:
     """Mechanical energy (J): kinetic, gravity's and the joint springs'."""
-    return sum(_energies(chain, state), jnp.zeros((), state.q.dtype))
+    kinetic, potential = _both(chain, state)
+    return kinetic + potential
 
 
-def momentum_about_centre(chain: Chain, state: State) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-    """Linear momentum (N s) and angular momentum about the centre of mass of all bodies (N m s), in world axes."""
+def energy_and_momentum(chain: Chain, state: State) -> tuple[Float[Array, ""], Float[Array, "3"], Float[Array, "3"]]:
+    """From one pass over the tree: `energy`, and linear momentum (N s) and angular momentum about the centre of mass of all bodies (N m s), in world axes."""
     kin = kinematics(chain, state.q)
-    c, u, _, spin = _bodies(chain, kin, state.v)
+    bodies = _bodies(chain, kin, state.v)
+    kinetic, potential = _energies(chain, state, kin, bodies)
+    c, u, _, spin = bodies
     p, place = chain.mass[:, None] * u, kin.root + c
     centre = jnp.sum(chain.mass[:, None] * place, 0) / jnp.sum(chain.mass)
-    return jnp.sum(p, 0), jnp.sum(spin + cross(place - centre[None], p), 0)
+    return kinetic + potential, jnp.sum(p, 0), jnp.sum(spin + cross(place - centre[None], p), 0)
 
 
 @jax.jit

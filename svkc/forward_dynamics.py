@@ -1,22 +1,36 @@
 """F4: the acceleration of any structure (paper, section III-B) and the forces its loops carry."""
 
 import functools
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import cho_factor, cho_solve, solve_triangular
+from jax.scipy.linalg import cho_factor, cho_solve, lu_factor, lu_solve, solve_triangular
 from jaxtyping import Array, Bool, Float
 
+from svkc.articulated import accelerations, articulate, by_bodies
 from svkc.chain import Chain, State, Structure
-from svkc.closure import Coordinates, agreeing, choose, constrain, loop_rates, scaled_jacobian, scales
+from svkc.closure import NEAR, Coordinates, agreeing, choose, constrain, loop_rates, scaled_jacobian, scales
 from svkc.inverse_dynamics import generalized_forces, inertia_by_composites, inertia_by_unit_vectors, inertia_times, passive_forces
-from svkc.kinematics import Kinematics, kinematics, twists
+from svkc.kinematics import LEVELS_UNROLLED, Kinematics, kinematics, twists
 from svkc.loops import active_dofs, ends
 from svkc.selection import Selection, rank_tolerance, square, weakest
 
-# part of the phase's own margin below which a configuration is near a singular one; elsewhere the motion depends on no choice of pivots
-NEAR = 0.1
+
+class Dynamics(eqx.Module):
+    """How `svkc.simulate` computes accelerations. All of these agree; they differ in what they cost.
+
+    inertia: None (default), articulated bodies where the scene has no loops, else composite ones; `svkc.inertia_by_composites` always;
+    `svkc.inertia_by_unit_vectors`, the paper's columns by inverse dynamics; or `svkc.by_bodies`, articulated bodies and the forces of the loops, which
+    square the loops' conditioning near singular configurations.
+    hold: dependent coordinates are chosen at every evaluation (None), or held until, at the end of a step, the least |R_kk| / |R_11| of their columns is
+    below this part of what a new choice has (default 0.3); 0 holds them until the structure changes. Held only where steps are projected; near a
+    singular configuration, and in what is differentiated, they are chosen at every evaluation, as the motion does not depend on the choice.
+    """
+
+    inertia: Callable | None = eqx.field(static=True, default=None)
+    hold: float | None = eqx.field(static=True, default=0.3)
 
 
 def joint_torques(chain: Chain, tau: Float[Array, " torques"]) -> Float[Array, " dofs"]:
@@ -47,26 +61,19 @@ def with_links(chain: Chain, tree: Float[Array, " nv"], own: Float[Array, " dofs
 
 def solve_motion(
     chain: Chain, structure: Structure, kin: Kinematics, selection: Selection, J: Float[Array, "rows dofs"], force: Float[Array, " dofs"],
-    bias: Float[Array, " rows"], inertia=inertia_by_composites,
+    bias: Float[Array, " rows"], inertia=None,
 ) -> Float[Array, " dofs"]:  # fmt: skip
-    """The x with M x = force + J_C^T lambda and J_C x + bias = 0, through W, A and b (paper, section III-B).
+    """The x with M x = force + J_C^T lambda and J_C x + bias = 0 (paper, section III-B).
 
-    Its derivatives are those of these equations, M x by Newton-Euler: one more solve with the same W and A, nothing through recursions for M or pivots.
+    Its derivatives are those of these equations, M x by Newton-Euler: one more solve with the same factors, nothing through recursions for M or pivots.
     """
     nv, (_, column) = chain.nv, scales(chain)
-    chosen, rows = jax.lax.stop_gradient((selection, J))
-    co = constrain(chain, structure, chosen, rows, jnp.zeros_like(bias))
-    tree = inertia(*jax.lax.stop_gradient((chain, kin)))
-    W, active = co.W, active_dofs(chain, structure)
-    A = cho_factor(reduced_inertia(jax.lax.stop_gradient(chain), co, tree))
-    _, JS = square(chosen, rows)
-
-    def solve(_, right):
-        force, rate = right
-        x = column * (chosen.P.T @ solve_triangular(JS, rate))
-        x = x + W @ cho_solve(A, W.T @ (force - with_links(chain, tree @ x[:nv], x)))
-        rest = column * (force - with_links(chain, tree @ x[:nv], x))
-        return x, jnp.where(chosen.used, solve_triangular(JS, chosen.P @ rest, trans=1), rate)
+    chosen, rows, frozen, static = jax.lax.stop_gradient((selection, J, (chain, kin), structure))
+    active = active_dofs(chain, structure)
+    if inertia is by_bodies:
+        solve = _by_loop_forces(*frozen, static, chosen, rows)
+    else:
+        solve = _by_independent(*frozen, static, chosen, rows, inertia or inertia_by_composites)
 
     def equations(unknown):
         x, mu = unknown
@@ -77,40 +84,84 @@ def solve_motion(
 
     # jax transposes the solve only where both sides take part in the derivative
     right = (jnp.where(active, force, 0) + 0 * jnp.sum(bias), -chosen.Q @ bias + 0 * jnp.sum(force))
-    return jax.lax.custom_linear_solve(equations, right, solve=solve, symmetric=True)[0]
+    return jax.lax.custom_linear_solve(equations, right, solve=lambda _, right: solve(*right), symmetric=True)[0]
 
 
-def solve_free_motion(
-    chain: Chain, structure: Structure, kin: Kinematics, force: Float[Array, " dofs"], inertia=inertia_by_composites
-) -> Float[Array, " dofs"]:
+def _by_independent(chain: Chain, kin: Kinematics, structure: Structure, chosen: Selection, J, inertia: Callable) -> Callable:
+    """The solution through W, A and b, as the paper has it."""
+    nv, (_, column) = chain.nv, scales(chain)
+    co = constrain(chain, structure, chosen, J, jnp.zeros(J.shape[0], J.dtype))
+    tree, W = inertia(chain, kin), co.W
+    A = cho_factor(reduced_inertia(chain, co, tree))
+    _, JS = square(chosen, J)
+
+    def solve(force, rate):
+        x = column * (chosen.P.T @ solve_triangular(JS, rate))
+        x = x + W @ cho_solve(A, W.T @ (force - with_links(chain, tree @ x[:nv], x)))
+        rest = column * (force - with_links(chain, tree @ x[:nv], x))
+        return x, jnp.where(chosen.used, solve_triangular(JS, chosen.P @ rest, trans=1), rate)
+
+    return solve
+
+
+def _by_loop_forces(chain: Chain, kin: Kinematics, structure: Structure, chosen: Selection, J) -> Callable:
+    """The solution through articulated bodies and the forces of the loops: J M^-1 J^T over the rows that count, beside it the virtual joints' own
+    coordinates, which have no inertia but their armature."""
+    top, nv, (_, column) = chain.topology, chain.nv, scales(chain)
+    active = active_dofs(chain, structure)
+    bodies = articulate(chain, kin, None if structure.locked is None else active[:nv])
+    held = jnp.where(active[None], chosen.Q @ J / column[None], 0)
+    tree, own = held[:, :nv], held[:, nv:]
+    moved = jax.vmap(lambda row: accelerations(top, bodies, row))(tree)
+    loops = tree @ moved.T + jnp.diag(jnp.where(chosen.used, 0, 1).astype(J.dtype))
+    light = jnp.zeros(chain.dofs - nv, J.dtype) if chain.link_armature is None else chain.link_armature
+    links = jnp.diag(jnp.where(active[nv:], light, 1))
+    factor = lu_factor(jnp.block([[loops, -own], [own.T, links]]))
+
+    def solve(force, rate):
+        alone = accelerations(top, bodies, force[:nv])
+        both = lu_solve(factor, jnp.concatenate([jnp.where(chosen.used, tree @ alone - rate, rate), force[nv:]]))
+        mu = both[: rate.shape[0]]
+        return jnp.concatenate([alone - mu @ moved, both[rate.shape[0] :]]), mu
+
+    return solve
+
+
+def solve_free_motion(chain: Chain, structure: Structure, kin: Kinematics, force: Float[Array, " dofs"], inertia=None) -> Float[Array, " dofs"]:
     """The same on an open chain: M x = force, zero for locked joints."""
-    free = jnp.ones(chain.nv, bool) if structure.locked is None else ~structure.locked
-    M = inertia(*jax.lax.stop_gradient((chain, kin)))
-    if structure.locked is not None:
-        M = jnp.where(free[:, None] & free[None], M, jnp.eye(chain.nv, dtype=M.dtype))
-    factor = cho_factor(M)
+    locked, frozen = structure.locked, jax.lax.stop_gradient((chain, kin))
+    free = jnp.ones(chain.nv, bool) if locked is None else ~locked
+    if inertia in (None, by_bodies) and len(chain.topology.levels) <= LEVELS_UNROLLED:
+        bodies = articulate(*frozen, None if locked is None else free)
+        solve = lambda _, x: accelerations(chain.topology, bodies, x)
+    else:
+        M = (inertia or inertia_by_composites)(*frozen)
+        if locked is not None:
+            M = jnp.where(free[:, None] & free[None], M, jnp.eye(chain.nv, dtype=M.dtype))
+        factor = cho_factor(M)
+        solve = lambda _, x: cho_solve(factor, x)
 
     def equations(x):
         return jnp.where(free, inertia_times(chain, kin, jnp.where(free, x, 0)), x)
 
-    return jax.lax.custom_linear_solve(equations, jnp.where(free, force, 0), solve=lambda _, x: cho_solve(factor, x), symmetric=True)
+    return jax.lax.custom_linear_solve(equations, jnp.where(free, force, 0), solve=solve, symmetric=True)
 
 
 @functools.partial(jax.jit, static_argnames=("inertia", "agree"))
 def moving(
-    chain: Chain, structure: Structure, q, v, tau: Float[Array, " dofs"], inertia=inertia_by_composites, baumgarte=None, agree: bool = False
+    chain: Chain, structure: Structure, q, v, tau: Float[Array, " dofs"], inertia=None, baumgarte=None, agree: bool = False, pivots=None
 ) -> tuple[Float[Array, " dofs"], Float[Array, " dofs"]]:
     """Velocity and acceleration: steps 1 to 5 of section III-B. On an open chain W is the identity and nothing of the closure is computed.
 
     baumgarte: rate (1/s) at which open loops are pulled back; None: not at all. agree: near a singular configuration dependent velocities are
-    those of the independent ones, for there the stages of a step would make their errors grow.
+    those of the independent ones, for there the stages of a step would make their errors grow. pivots: as `choose` takes them.
     """
     kin = kinematics(chain, q)
     loops = len(chain.topology.link_names)
     if loops:
         end = ends(chain, structure, kin, q)
         J = scaled_jacobian(chain, structure, kin, end)
-        selection = choose(structure, J)
+        selection = choose(structure, J, pivots)
         if agree:
             near = weakest(selection) < NEAR * structure.margin
             v = jnp.where(near, agreeing(chain, selection, J, jnp.where(active_dofs(chain, structure), v, 0)), v)
@@ -123,7 +174,7 @@ def moving(
     return v, solve_motion(chain, structure, kin, selection, J, force, rates, inertia)
 
 
-def acceleration(chain: Chain, structure: Structure, q, v, tau: Float[Array, " dofs"], inertia=inertia_by_composites) -> Float[Array, " dofs"]:
+def acceleration(chain: Chain, structure: Structure, q, v, tau: Float[Array, " dofs"], inertia=None) -> Float[Array, " dofs"]:
     """The acceleration alone, for the velocity as it is."""
     return moving(chain, structure, q, v, tau, inertia)[1]
 
@@ -132,7 +183,7 @@ def acceleration(chain: Chain, structure: Structure, q, v, tau: Float[Array, " d
 def forward_dynamics(chain: Chain, state: State, tau: Float[Array, " torques"]) -> Float[Array, " dofs"]:
     """Accelerations (rad/s^2, m/s^2) of every joint coordinate for the joint torques tau (N m, N), loops kept (paper, section III-B).
 
-    Springs and dampers of the joints act too. tau: over every coordinate, or the tree's alone. Inertia by composite bodies.
+    Springs and dampers of the joints act too. tau: over every coordinate, or the tree's alone. By articulated bodies, or composites where there are loops.
     """
     return acceleration(chain, state.structure, state.q, state.v, joint_torques(chain, tau))
 

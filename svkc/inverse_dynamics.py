@@ -52,12 +52,15 @@ def inertia_by_unit_vectors(chain: Chain, kin: Kinematics) -> Float[Array, "nv n
     return jax.vmap(lambda unit: inertia_times(chain, kin, unit), out_axes=1)(jnp.eye(chain.nv, dtype=kin.r.dtype))
 
 
+def central_inertias(chain: Chain, kin: Kinematics) -> tuple[Float[Array, "rows 3"], Float[Array, "rows 3 3"]]:
+    """Of each row: the centre of mass from the root's origin, and the inertia about it, in world axes."""
+    RI = jnp.sum(kin.R[:, :, :, None] * chain.rotational[:, None, :, :], 2)
+    return kin.r + rotate(kin.R, chain.com), jnp.sum(RI[:, :, None, :] * kin.R[:, None, :, :], -1)
+
+
 def inertia_by_composites(chain: Chain, kin: Kinematics) -> Float[Array, "nv nv"]:
     """Composite rigid bodies (Featherstone section 6.2): mass, first moment and rotational inertia simply add up towards the root."""
-    top = chain.topology
-    c = kin.r + rotate(kin.R, chain.com)
-    RI = jnp.sum(kin.R[:, :, :, None] * chain.rotational[:, None, :, :], 2)
-    central = jnp.sum(RI[:, :, None, :] * kin.R[:, None, :, :], -1)
+    top, (c, central) = chain.topology, central_inertias(chain, kin)
     m = chain.mass[:, None]
     square = jnp.sum(c * c, -1)[:, None, None] * jnp.eye(3, dtype=c.dtype)[None] - c[:, :, None] * c[:, None, :]
     I = central + m[:, :, None] * square

@@ -32,22 +32,23 @@ def up(top: Topology, x: Float[Array, "rows *n"]) -> Float[Array, "rows *n"]:
     """Sum of x over each row and its descendants, level by level."""
     if len(top.levels) > LEVELS_UNROLLED:
         return jnp.tensordot(jnp.asarray(top.ancestor.T, x.dtype), x, 1)
-    parent, levels = np.array(top.parent), []
-    below = None
+    levels, below = [], None
     for level, (first, last) in reversed(list(enumerate(top.levels))):
-        here = x[first:last]
-        if below is not None:
-            lo, hi = top.levels[level + 1]
-            children = [np.flatnonzero(parent[lo:hi] == i) for i in range(first, last)]
-            # children padded with a row of zeros: a gather and a sum, no scatter
-            table = np.full((last - first, max(map(len, children))), hi - lo)
-            for i, c in enumerate(children):
-                table[i, : len(c)] = c
-            padded = jnp.concatenate([below, jnp.zeros_like(below[:1])])
-            here = here + jnp.sum(padded[table], 1)
-        levels.append(here)
-        below = here
+        below = x[first:last] if below is None else x[first:last] + from_children(top, level, below)
+        levels.append(below)
     return jnp.concatenate(levels[::-1])
+
+
+def from_children(top: Topology, level: int, below: Float[Array, "below *n"]) -> Float[Array, "here *n"]:
+    """For each row of a level, the sum of its children's rows in the level below."""
+    (first, last), (lo, hi) = top.levels[level], top.levels[level + 1]
+    parent = np.array(top.parent)[lo:hi]
+    children = [np.flatnonzero(parent == i) for i in range(first, last)]
+    # children padded with a row of zeros: a gather and a sum, no scatter
+    table = np.full((last - first, max(map(len, children))), hi - lo)
+    for i, c in enumerate(children):
+        table[i, : len(c)] = c
+    return jnp.sum(jnp.concatenate([below, jnp.zeros_like(below[:1])])[table], 1)
 
 
 def to_rows(top: Topology, x: Float[Array, "nv *n"]) -> Float[Array, "rows *n"]:

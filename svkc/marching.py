@@ -163,7 +163,7 @@ def _begin(start: Motion, times, world: World, how: How) -> Step:
         rejected=zero,
         result=jnp.asarray(SUCCESSFUL, jnp.int32),
         tally=Tally.none(t0.dtype, projects(world.field.stabilization, world.scene)),
-        seen=Seen.nothing(world.scene.chain) if projects(world.field.stabilization, world.scene) else None,
+        seen=Seen.first(world.scene, start.q) if projects(world.field.stabilization, world.scene) else None,
     )
 
 
@@ -180,7 +180,7 @@ def _try(s: Step, t1, world: World, how: How) -> Tried:
     # a step begins with the rate where the one before was settled to, not with one remembered from where it was before that
     fresh = True if projects(stabilization, world.scene) else s.jumped
     y, error, _, solver, solved = how.solver.step(term, s.t, t1, s.y, world.scene, s.solver, fresh)
-    y, seen = settle(stabilization, world.scene, y)
+    y, seen = settle(world.field, world.scene, y)
     whole, order = finite(y), how.solver.error_order(term)
     why = jnp.where(whole, OPEN, NON_FINITE)
     if seen is not None:
@@ -203,6 +203,8 @@ def _try(s: Step, t1, world: World, how: How) -> Tried:
 def _step(s: Step, times, world: World, how: How) -> Step:
     """One try: kept, or to be made shorter; or one more look at the step in which a guard went through zero."""
     t0, stop, at = times
+    if s.seen is not None and world.field.dynamics.hold is not None:
+        world = eqx.tree_at(lambda w: w.scene.pivots, world, s.seen.pivots, is_leaf=lambda x: x is None)
     if s.search is None:
         tried = _try(s, s.next, world, how)
         guards, search, still = None, None, jnp.zeros((), bool)
@@ -253,7 +255,7 @@ def _counted(s: Step, tried: Tried, result: Int[Array, ""]) -> Tally:
     margin, swaps = old.margin, old.swaps
     if tried.seen is not None:
         margin = jnp.where(kept, jnp.minimum(margin, tried.seen.margin), margin)
-        swaps = swaps + (kept & jnp.any(s.seen.dependent) & jnp.any(s.seen.dependent != tried.seen.dependent)).astype(jnp.int32)
+        swaps = swaps + (kept & jnp.any(s.seen.dependent != tried.seen.dependent)).astype(jnp.int32)
     loop = old.loop if tried.seen is None else jnp.where(result == OPEN, jnp.argmax(tried.seen.gap).astype(jnp.int32), old.loop)
     return Tally(old.tries + 1, old.error + jnp.where(kept, tried.error, 0), margin, swaps, loop)
 

@@ -1,6 +1,7 @@
-"""F0: functions that have derivatives of their own, in every transformation and where they are differentiated twice."""
+"""F0: functions that have derivatives of their own, in every transformation and where they are differentiated twice; and functions whose closures do."""
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import equinox.internal as eqxi
@@ -25,3 +26,24 @@ def operation(name: str, function: Callable, jvp: Callable, transpose: Callable 
     backwards = not_linear if transpose is None else eqxi.filter_primitive_transpose(transpose, materialise_zeros=True)
     primitive = eqxi.create_vprim(name, *defined, eqxi.filter_primitive_jvp(jvp), backwards)
     return lambda *args: eqxi.filter_primitive_bind(primitive, *args)
+
+
+class Closed(eqx.Module):
+    """A function with all the arrays that it closes over as leaves, so that it can be differentiated by them.
+
+    (equinox's own refuses arguments on another mesh than the example's, which are the same arrays seen from within `jax.shard_map`.)
+    """
+
+    consts: list[Any]
+    jaxpr: Any = eqx.field(static=True)
+    out: Any = eqx.field(static=True)
+
+    @classmethod
+    def over(cls, function: Callable, *example) -> "Closed":
+        """`function`, for arguments like these."""
+        made, out, static = eqx.filter_make_jaxpr(function)(*example)
+        return cls(made.consts, made.jaxpr, (jax.tree.structure(out), static))
+
+    def __call__(self, *args):
+        out = jax.core.eval_jaxpr(self.jaxpr, self.consts, *jax.tree.leaves(eqx.filter(args, eqx.is_array)))
+        return eqx.combine(jax.tree.unflatten(self.out[0], out), self.out[1])

@@ -85,7 +85,7 @@ def _path(start: Motion, times, world: World, watched: Watched | None, options: 
     controller, first_step = options.steps(at)
     # as diffrax would set it, did it see through the wrapper
     kind = {diffrax.ForwardMode: "lax", diffrax.DirectAdjoint: "bounded"}.get(type(adjoint))
-    solver = Settled(staged(options.solver, kind), options.stabilization)
+    solver = Settled(staged(options.solver, kind), options.field)
     saveat = diffrax.SaveAt(subs=[diffrax.SubSaveAt(t1=True), diffrax.SubSaveAt(ts=at)])
     sol = diffrax.diffeqsolve(
         diffrax.ODETerm(world.field), solver, t0, stop, first_step, start, world.scene, saveat=saveat, stepsize_controller=controller,

@@ -8,14 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.ad_checkpoint import checkpoint_name
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from svkc.chain import Chain, State, Structure
 from svkc.closure import scaled_jacobian, scales
 from svkc.forward_dynamics import solve_motion
 from svkc.kinematics import Kinematics, integrate, kinematics, normalize
 from svkc.loops import active_dofs, ends, gap
-from svkc.selection import Selection, count_rank, held_part, rank_tolerance, select, solve_frozen, solve_positive, square, weakest, without_weak
+from svkc.selection import Selection, count_rank, held_part, rank_tolerance, select, select_again, solve_frozen, solve_positive, square, weakest, without_weak
 
 
 @jax.jit
@@ -58,6 +58,12 @@ def rank_margin(chain: Chain, *states: State) -> Float[Array, ""]:
         return weakest(select(scaled_jacobian(chain, structure, kin, ends(chain, structure, kin, q)), structure.rank))
 
     return jnp.min(jax.lax.map(margin, jnp.stack([s.q for s in states])))
+
+
+def first_pivots(chain: Chain, structure: Structure, q) -> Float[Array, "steps dofs"]:
+    """The pivots of the loops' rows at q."""
+    kin = kinematics(chain, q)
+    return select(scaled_jacobian(chain, structure, kin, ends(chain, structure, kin, q)), structure.rank, structure.independent).P
 
 
 def least_change(chain: Chain, structure: Structure, kin: Kinematics, selection: Selection, J, x: Float[Array, "rows n"]) -> Float[Array, "dofs n"]:
@@ -107,13 +113,14 @@ def close(chain: Chain, structure: Structure, q: Float[Array, " q"], iterations:
     return jax.lax.fori_loop(0, iterations, newton, normalize(chain, q))
 
 
-@functools.partial(jax.jit, static_argnames=("iterations", "change"))
+@functools.partial(jax.jit, static_argnames=("iterations", "change", "hold"))
 def settle_loops(
-    chain: Chain, structure: Structure, q, v, iterations: int, change: Callable = inertia_change
-) -> tuple[Float[Array, " q"], Float[Array, " dofs"], Float[Array, ""], Bool[Array, " dofs"], Float[Array, " links"]]:
+    chain: Chain, structure: Structure, q, v, iterations: int, change: Callable = inertia_change, pivots=None, hold: float = 0.0
+) -> tuple[Float[Array, " q"], Float[Array, " dofs"], Float[Array, ""], Float[Array, "steps dofs"], Float[Array, " links"]]:
     """`close`, then `agree`: one body for both, the last turn of the loop being the velocities', so that it is compiled once.
 
-    And what the loops show: |R_mm| / |R_11|, which coordinates are dependent, and the gap (rad, `chain.length`s) that each loop is left with.
+    And what the loops show: |R_mm| / |R_11|, the pivots to go on with, and the gap (rad, `chain.length`s) that each loop is left with. pivots: those held
+    so far (None: none are), which go on until their |R_mm| / |R_11| is below `hold` times that of new ones.
     """
     row, column = scales(chain)
     active = active_dofs(chain, structure)
@@ -125,14 +132,18 @@ def settle_loops(
         end = ends(chain, structure, kin, q)
         J = scaled_jacobian(chain, structure, kin, end)
         full = select(J, structure.rank, structure.independent)
-        selection = _solvable(structure, full)
+        selection, chosen = _solvable(structure, full), full.P
+        if pivots is not None:
+            # (asked of the last turn alone)
+            poor = lambda: weakest(select_again(J, pivots)) < hold * weakest(full)
+            chosen = jax.lax.cond(i == iterations, lambda: jnp.where(poor(), full.P, pivots), lambda: pivots)
         open_ = jnp.stack([row * gap(structure, end).ravel(), J @ jnp.where(active, v / column, 0)], 1)
         step = -change(chain, structure, kin, selection, J, open_)
         last = i == iterations
-        seen = jax.lax.stop_gradient((weakest(full), jnp.any(full.P > 0, 0), jnp.max(jnp.abs(open_[:, 0]).reshape(-1, 6), 1)))
+        seen = jax.lax.stop_gradient((weakest(full), chosen, jnp.max(jnp.abs(open_[:, 0]).reshape(-1, 6), 1)))
         return integrate(chain, q, jnp.where(last, 0, step[:, 0])), jnp.where(last, v + step[:, 1], v), *seen
 
-    none = jnp.ones((), q.dtype), jnp.zeros(chain.dofs, bool), jnp.zeros(len(chain.link_names), q.dtype)
+    none = jnp.ones((), q.dtype), jnp.zeros((min(row.shape[0], chain.dofs), chain.dofs), q.dtype), jnp.zeros(len(chain.link_names), q.dtype)
     return jax.lax.fori_loop(0, iterations + 1, turn, (normalize(chain, q), v, *none))
 
 

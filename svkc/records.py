@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from svkc.chain import Chain, State, Structure
-from svkc.energy import energy, momentum_about_centre
+from svkc.energy import energy_and_momentum
 from svkc.loops import active_dofs
 from svkc.marching import Path
 from svkc.topology import FREE
@@ -49,13 +49,13 @@ def recorded(chain: Chain, p: Phases, row: Bool[Array, " phases"], began: tuple,
     (start, first), (stop, last) = began, ended
     s = first.structure
     both = jax.tree.map(lambda *x: jnp.stack(x), (first.q, first.v), (last.q, last.v))
-    energies = jax.checkpoint(jax.vmap(lambda q, v: energy(chain, State(q, v, s))))(*both)
+    energies, *momenta = jax.checkpoint(jax.vmap(lambda q, v: energy_and_momentum(chain, State(q, v, s))))(*both)
     free = _free(chain, s)
     written = {
         "start": start, "stop": stop, "connected": s.connected, "rank": s.rank, "joint_freedoms": jnp.sum(active_dofs(chain, s), dtype=jnp.int32),
         "energy": energies, "work": work, "margin": jnp.minimum(margin, path.tally.margin), "accepted": path.accepted, "rejected": path.rejected,
         "evaluations": stages * path.tally.tries, "swaps": path.tally.swaps, "loop": path.tally.loop, "error": path.tally.error, "free": free,
-        "momentum_drift": jnp.where(free, _momentum_drift(chain, both, s, stop - start), 0),
+        "momentum_drift": jnp.where(free, _momentum_drift(chain, *jax.lax.stop_gradient(momenta), stop - start), 0),
     }  # fmt: skip
     new = {name: jnp.where(row.reshape(-1, *(1,) * jnp.ndim(x)), jnp.asarray(x)[None], getattr(p, name)) for name, x in written.items()}
     return Phases(**new, count=p.count + jnp.any(row).astype(jnp.int32))
@@ -70,9 +70,8 @@ def _free(chain: Chain, s: Structure) -> Bool[Array, ""]:
     return ~jnp.any(s.connected & ((s.parent == 0) | (s.real == 0)))
 
 
-def _momentum_drift(chain: Chain, both, s: Structure, span) -> Float[Array, "2"]:
+def _momentum_drift(chain: Chain, linear: Float[Array, "2 3"], angular: Float[Array, "2 3"], span) -> Float[Array, "2"]:
     """Change of linear momentum (N s) that gravity does not explain, and of the angular momentum about the centre of mass (N m s)."""
-    linear, angular = jax.lax.stop_gradient(jax.vmap(lambda q, v: momentum_about_centre(chain, State(q, v, s)))(*both))
     fallen = jnp.sum(chain.mass) * chain.gravity * span
     return jnp.stack([jnp.linalg.norm(linear[1] - linear[0] - fallen), jnp.linalg.norm(angular[1] - angular[0])])
 

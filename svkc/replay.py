@@ -80,22 +80,24 @@ def _moved_on(y: Motion, dy: Motion, t, dt, world: World, d_world) -> Motion:
     return jax.tree.map(lambda d, r: d + r * dt, dy, rate)
 
 
-@eqx.filter_jit
-def _through(start: Motion, d_start: Motion, grid, place, world: World, d_world, path: Path, how: How):
-    """The tangents at the end, at the save times and at the kept states: block after block of steps, each from its kept state."""
-    every, count = how.every, path.kept.q.shape[0] + 1
-    groups = -(-count // GROUP)
-    pad = groups * GROUP - count
+def _blocks(start: Motion, grid, path: Path, every: int):
+    """For every block of steps, in whole groups: its place, whether it was begun, the state it begins from, the times of its steps' begins and ends."""
+    groups = -(-(path.kept.q.shape[0] + 1) // GROUP)
+    pad = groups * GROUP - path.kept.q.shape[0] - 1
     index = jnp.arange(groups * GROUP, dtype=jnp.int32)
-
-    def ends(x):
-        x = jnp.concatenate([x, jnp.broadcast_to(x[-1:], (groups * GROUP * every + 1 - x.shape[0],))])
-        return x[:-1].reshape(-1, every), x[1:].reshape(-1, every)
-
     going = index * every < path.accepted
     kept = jax.tree.map(lambda s, k: jnp.concatenate([s[None], k, jnp.broadcast_to(s[None], (pad, *s.shape))]), start, path.kept)
     # blocks that were not begun get numbers that are finite
     kept = jax.tree.map(lambda s, k: jnp.where(going.reshape(-1, *(1,) * s.ndim), k, s[None]), start, kept)
+    times = jnp.concatenate([grid, jnp.broadcast_to(grid[-1:], (groups * GROUP * every + 1 - grid.shape[0],))])
+    return index, going, kept, (times[:-1].reshape(-1, every), times[1:].reshape(-1, every))
+
+
+@eqx.filter_jit
+def _through(start: Motion, d_start: Motion, grid, place, world: World, d_world, path: Path, how: How):
+    """The tangents at the end, at the save times and at the kept states: block after block of steps, each from its kept state."""
+    every, blocks = how.every, path.kept.q.shape[0]
+    index, *rest = _blocks(start, grid, path, every)
 
     @eqx.filter_checkpoint
     def block(d_y, y, times):
@@ -127,10 +129,10 @@ def _through(start: Motion, d_start: Motion, grid, place, world: World, d_world,
         return jax.lax.cond(eqxi.unvmap_any(jnp.any(x[1])), some, none, carry)
 
     d_saved = jax.tree.map(lambda d: jnp.where((place == 0).reshape(-1, *(1,) * d.ndim), d[None], 0), d_start)
-    xs = jax.tree.map(lambda x: x.reshape(groups, GROUP, *x.shape[1:]), (index, going, kept, ends(grid)))
+    xs = jax.tree.map(lambda x: x.reshape(-1, GROUP, *x.shape[1:]), (index, *rest))
     (d_end, d_saved), after = jax.lax.scan(group, (d_start, d_saved), xs)
-    written = (index[: count - 1] + 1) * every <= path.accepted
-    flat = jax.tree.map(lambda d: d.reshape(-1, *d.shape[2:])[: count - 1], after)
+    written = (index[:blocks] + 1) * every <= path.accepted
+    flat = jax.tree.map(lambda d: d.reshape(-1, *d.shape[2:])[:blocks], after)
     d_kept = jax.tree.map(lambda d: jnp.where(written.reshape(-1, *(1,) * (d.ndim - 1)), d, 0), flat)
     return d_end, d_saved, d_kept
 

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from svkc.assembly import gap_tolerance
 from svkc.chain import Chain, State
 from svkc.events import At, Plan, plan
+from svkc.forward_dynamics import Dynamics
 from svkc.replay import Replay
 from svkc.stepping import Baumgarte, Drift, Field, FixedSteps, Projection, motion_norm
 
@@ -24,6 +25,7 @@ class Options(eqx.Module):
     control: Callable | None
     solver: diffrax.AbstractSolver
     stabilization: Projection | Baumgarte | Drift
+    dynamics: Dynamics
     controller: Any
     adjoint: diffrax.AbstractAdjoint | Replay
     progress_meter: diffrax.AbstractProgressMeter
@@ -37,7 +39,7 @@ class Options(eqx.Module):
     @property
     def field(self) -> Field:
         """The vector field of a phase."""
-        return Field(self.control, self.stabilization)
+        return Field(self.control, self.stabilization, self.dynamics)
 
     def steps(self, ts=None):
         """The step-size controller and the first step; for a loop that does not look to the save times itself, made to stop at each of `ts`."""
@@ -53,8 +55,8 @@ def _concrete(*values) -> bool:
 
 
 def checked(
-    chain: Chain, state: State, t0, t1, ts, events, control, dt, rtol, atol, solver, stepsize_controller, stabilization, adjoint, max_events,
-    max_steps, progress_meter,
+    chain: Chain, state: State, t0, t1, ts, events, control, dt, rtol, atol, solver, stepsize_controller, stabilization, dynamics, adjoint,
+    max_events, max_steps, progress_meter,
 ) -> tuple[Options, Float[Array, " times"], Plan]:  # fmt: skip
     """The call's options, save times and plan of events; ValueError for what cannot be right."""
     dtype = state.q.dtype
@@ -71,6 +73,10 @@ def checked(
         raise ValueError(f"control: expected a function of (t, state, args), got {control!r}")
     if stabilization is not None and not isinstance(stabilization, Projection | Baumgarte | Drift):
         raise ValueError(f"stabilization: expected svkc.Projection, svkc.Baumgarte or svkc.Drift, got {stabilization!r}")
+    if dynamics is not None and not isinstance(dynamics, Dynamics):
+        raise ValueError(f"dynamics: expected svkc.Dynamics, got {dynamics!r}")
+    if dynamics is not None and dynamics.hold is not None and not 0 <= dynamics.hold <= 1:
+        raise ValueError(f"dynamics.hold: got {dynamics.hold}, expected None or a part between 0 and 1")
     made = plan(chain, tuple(events), dtype)
     span = jnp.asarray(t1, dtype) - jnp.asarray(t0, dtype)
     double = np.finfo(dtype).eps < 1e-10
@@ -83,8 +89,9 @@ def checked(
         controller = diffrax.PIDController(rtol, atol, norm=motion_norm, dtmin=smallest, force_dtmin=False)
     options = Options(
         control=control,
-        solver=diffrax.Tsit5() if solver is None else _solving(solver, None if dt is not None else controller, dtype),
+        solver=_solving(solver, None if dt is not None else controller, dtype),
         stabilization=Projection() if stabilization is None else stabilization,
+        dynamics=Dynamics() if dynamics is None else dynamics,
         controller=controller,
         adjoint=_adjoint(adjoint, controller if dt is None else None),
         progress_meter=diffrax.NoProgressMeter() if progress_meter is None else progress_meter,
@@ -99,8 +106,10 @@ def checked(
     return options, save_at, made
 
 
-def _solving(solver: diffrax.AbstractSolver, controller, dtype) -> diffrax.AbstractSolver:
-    """The solver; one with implicit stages solves them as closely as steps are controlled, or, where they are not, to sqrt(eps) and better."""
+def _solving(solver: diffrax.AbstractSolver | None, controller, dtype) -> diffrax.AbstractSolver:
+    """The solver, or the default; one with implicit stages solves them as closely as steps are controlled, or, where they are not, to sqrt(eps) and better."""
+    if solver is None:
+        return diffrax.Dopri8() if np.finfo(dtype).eps < 1e-10 and controller is not None else diffrax.Tsit5()
     if not isinstance(solver, diffrax.AbstractSolver):
         raise ValueError(f"solver: expected a diffrax solver, got {solver!r}")
     if not isinstance(solver, diffrax.AbstractImplicitSolver):
@@ -155,6 +164,8 @@ def _check_state(chain: Chain, state: State):
             raise ValueError(f"state.{name}: got shape {shape}, expected ({size},); for many states use vmap or svkc.rollout")
     if state.q.dtype != chain.q_load.dtype:
         raise ValueError(f"state.q is {state.q.dtype}, the chain is {chain.q_load.dtype}; load and state must be made with the same precision")
+    if state.q.dtype == np.float64 and not jax.config.read("jax_enable_x64"):
+        raise ValueError("state and chain are float64, but jax_enable_x64 is off now; make them in the precision that simulate is to compute in")
     if _concrete(state) and not (np.isfinite(np.asarray(state.q)).all() and np.isfinite(np.asarray(state.v)).all()):
         raise ValueError("state: q and v must be finite")
 

@@ -38,7 +38,7 @@ def held_part(dtype) -> float:
 
 def without_weak(selection: Selection, floor: Float[Array, ""]) -> Selection:
     """Steps whose |R_kk| / |R_11| is not above the floor left out: their pivots are independent."""
-    keep = selection.used & (selection.size > floor * selection.size[0])
+    keep = selection.used & (selection.size > floor * jnp.max(selection.size))
     return Selection(jnp.where(keep[:, None], selection.Q, 0), jnp.where(keep[:, None], selection.P, 0), selection.size, keep)
 
 
@@ -73,6 +73,26 @@ def select(J: Float[Array, "rows dofs"], rank: Int[Array, ""] | None = None, wan
     return Selection(Q, P, size, jnp.any(P > 0, 1))
 
 
+def select_again(J: Float[Array, "rows dofs"], P: Float[Array, "steps dofs"]) -> Selection:
+    """The same with pivots that were chosen before: only their columns are orthogonalised, nothing is searched for."""
+    used = jnp.any(P > 0, 1)
+    columns = P @ jax.lax.stop_gradient(J).T
+
+    def step(k, carry):
+        Q, size = carry
+        column = columns[k]
+        for _ in range(2):
+            column = column - (Q @ column) @ Q
+        r = jnp.sqrt(jnp.sum(column * column))
+        here = (jnp.arange(used.shape[0]) == k) & (r > 0)
+        return jnp.where(here[:, None], (column / jnp.where(r > 0, r, 1))[None], Q), jnp.where(here, r, size)
+
+    none = jnp.zeros((used.shape[0], J.shape[0]), J.dtype), jnp.zeros(used.shape[0], J.dtype)
+    Q, size = jax.lax.fori_loop(0, used.shape[0], step, none)
+    Q, size = _following(J, Q, P, size)
+    return Selection(Q, P, size, used & (size > 0))
+
+
 def _following_jvp(primals, tangents):
     """Derivatives of Q = R^-T (J P^T)^T with R frozen, and of the diagonal of the R that J has, which is that of Cholesky's factor of Q Q^T times R's."""
     J, _, P, _ = primals
@@ -96,7 +116,7 @@ def count_rank(size: Float[Array, " steps"]) -> Int[Array, ""]:
 def weakest(selection: Selection) -> Float[Array, ""]:
     """|R_mm| / |R_11|, 1 where no row counts."""
     size, used = selection.size, selection.used
-    return jnp.min(jnp.where(used, size, jnp.inf), initial=1, where=used) / jnp.where(jnp.any(used), size[0], 1)
+    return jnp.min(jnp.where(used, size, jnp.inf), initial=1, where=used) / jnp.where(jnp.any(used), jnp.max(size), 1)
 
 
 def solve_frozen(B: Float[Array, "steps steps"], x: Float[Array, "steps *n"]) -> Float[Array, "steps *n"]:

@@ -16,10 +16,11 @@ from jaxtyping import Array, Bool, Float
 
 from svkc.binding import emptied, grip
 from svkc.chain import Chain, State, Structure
-from svkc.closure import loop_gaps, velocity_gaps
+from svkc.closure import gaps_and_rates
 from svkc.events import Plan
 from svkc.guards import Sensor
 from svkc.location import Reading, event_tolerance
+from svkc.operation import Closed
 from svkc.phase import Run, Solved, solve
 from svkc.projection import rank_margin
 from svkc.records import no_events, no_phases, recorded, stages
@@ -32,7 +33,7 @@ from svkc.transition import change, connect_tolerance
 
 def simulate(
     chain: Chain, state: State, t1, *, t0=0.0, ts=None, events=(), control=None, args=None, dt=None, rtol=None, atol=None, solver=None,
-    stepsize_controller=None, stabilization=None, adjoint=None, max_events=None, max_steps=None, throw=True, progress_meter=None,
+    stepsize_controller=None, stabilization=None, dynamics=None, adjoint=None, max_events=None, max_steps=None, throw=True, progress_meter=None,
 ) -> Trajectory:  # fmt: skip
     """The motion from t0 to t1 (s), through every change of structure in `events` (`svkc.at`, `svkc.when`).
 
@@ -40,14 +41,14 @@ def simulate(
     stopped early hold its last state.
     control(t, state, args): joint torques (N m, N) over every coordinate, or the tree's.
     dt: fixed steps (s). rtol, atol: adaptive steps, by default 1e-7 and 1e-9 (float32: 1e-4 and 1e-6).
-    solver, stepsize_controller, adjoint, progress_meter: diffrax objects, passed through; Tsit5 by default.
-    stabilization: `svkc.Projection()` (default), `svkc.Baumgarte(rate)` or `svkc.Drift()`.
+    solver, stepsize_controller, adjoint, progress_meter: diffrax objects, passed through; by default Dopri8 with rtol, Tsit5 with dt or in float32.
+    stabilization: `svkc.Projection()` (default), `svkc.Exact()`, `svkc.Baumgarte(rate)` or `svkc.Drift()`. dynamics: `svkc.Dynamics(inertia, hold)`.
     max_events: how many events may happen (default: each timed one, four times each guard); max_steps: in one phase.
     ValueError: a call that cannot be right. A run that goes wrong ends with a code in `result`, raised when throw=True.
     """
     options, save_at, made = checked(
-        chain, state, t0, t1, ts, events, control, dt, rtol, atol, solver, stepsize_controller, stabilization, adjoint, max_events, max_steps,
-        progress_meter,
+        chain, state, t0, t1, ts, events, control, dt, rtol, atol, solver, stepsize_controller, stabilization, dynamics, adjoint, max_events,
+        max_steps, progress_meter,
     )  # fmt: skip
     dtype = state.q.dtype
     traj = _run(chain, state, jnp.asarray(t0, dtype), jnp.asarray(t1, dtype), save_at, made, options, args)
@@ -78,7 +79,7 @@ def _run(chain: Chain, state: State, t0, t1, ts, made: Plan, options: Options, a
     short = (run.t < t1) & (run.result == RESULTS.successful)
     result = RESULTS.where(short, RESULTS.max_events, run.result)
     saved = run.saved
-    gaps, gap_rates = (jax.vmap(lambda s, of=of: _largest(of(chain, s)))(saved) for of in (loop_gaps, velocity_gaps))
+    gaps, gap_rates = jax.vmap(lambda s: jax.tree.map(_largest, gaps_and_rates(chain, s)))(saved)
     result = RESULTS.where((result == RESULTS.successful) & (jnp.max(gaps) > options.gap), RESULTS.loop_open, result)
     return Trajectory(ts, saved, gaps, gap_rates, run.events, run.phases, run.state, run.t, result, run.derivative)
 
@@ -88,7 +89,7 @@ def _converted(chain: Chain, state: State, t0, made: Plan, options: Options, arg
     state = _lockable(chain, state, made)
 
     def converted(fn):
-        return fn if fn is None or isinstance(fn, Sensor) else eqx.filter_closure_convert(fn, t0, state, args)
+        return fn if fn is None or isinstance(fn, Sensor) else Closed.over(fn, t0, state, args)
 
     guards, control = tuple(converted(g) for g in made.guards), converted(options.control)
     fresh = lambda node, name, value: dataclasses.replace(node, **{name: value})

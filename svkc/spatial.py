@@ -49,6 +49,29 @@ def rotate(R: Float[Array, "*#n k k"], x: Float[Array, "*#n k"]) -> Float[Array,
     return jnp.sum(R * x[..., None, :], -1)
 
 
+def skew(a: Float[Array, "*n 3"]) -> Float[Array, "*n 3 3"]:
+    """The matrix of b -> a x b."""
+    return _by(SKEW, a)
+
+
+def inverse_positive(D: Float[Array, "*n k k"]) -> Float[Array, "*n k k"]:
+    """The inverses of small symmetric positive matrices, 1, 3 or 6 wide, without a call of LAPACK for each."""
+    if D.shape[-1] == 1:
+        return 1 / D
+    if D.shape[-1] == 3:
+        a, b, c = D[..., 0, :], D[..., 1, :], D[..., 2, :]
+        adjugate = cross(jnp.stack([b, c, a], -2), jnp.stack([c, a, b], -2))
+        return adjugate / jnp.sum(a * adjugate[..., 0, :], -1)[..., None, None]
+    times = lambda x, y: jnp.sum(x[..., None] * y[..., None, :, :], -2)
+    A, B, C = D[..., :3, :3], D[..., :3, 3:], D[..., 3:, 3:]
+    part = times(B, inverse_positive(C))
+    turned = jnp.swapaxes(part, -1, -2)
+    upper = inverse_positive(A - times(part, jnp.swapaxes(B, -1, -2)))
+    right = -times(upper, part)
+    lower = inverse_positive(C) - times(turned, right)
+    return jnp.concatenate([jnp.concatenate([upper, right], -1), jnp.concatenate([jnp.swapaxes(right, -1, -2), lower], -1)], -2)
+
+
 def motion_cross(a: Float[Array, "*#n 6"], b: Float[Array, "*#n 6"]) -> Float[Array, "*n 6"]:
     """A x b of two motion vectors (Featherstone 2.9, eq. 2.31)."""
     (w, v), (m, n) = halves(a), halves(b)

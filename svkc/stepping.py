@@ -12,11 +12,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from svkc.chain import Chain, State, Structure
-from svkc.forward_dynamics import joint_torques, moving
+from svkc.forward_dynamics import Dynamics, joint_torques, moving
 from svkc.inverse_dynamics import limit_forces
 from svkc.kinematics import normalize, rates
 from svkc.loops import active_dofs
-from svkc.projection import inertia_change, settle_loops
+from svkc.projection import dependent_change, first_pivots, inertia_change, settle_loops
 
 # a step that would leave less than this part of itself before a time to be met goes all the way
 REST = 1e-6
@@ -46,11 +46,12 @@ class Motion(eqx.Module):
 
 
 class Scene(eqx.Module):
-    """The `args` of the vector field: all it depends on besides time and motion."""
+    """The `args` of the vector field: all it depends on besides time and motion. pivots: of the loops' rows, where they are held (`Dynamics.hold`)."""
 
     chain: Chain
     structure: Structure
     args: Any
+    pivots: Float[Array, "steps dofs"] | None = None
 
 
 class Projection(eqx.Module):
@@ -63,6 +64,13 @@ class Projection(eqx.Module):
 
     iterations: int = eqx.field(static=True, default=2)
     change: Callable = eqx.field(static=True, default=inertia_change)
+
+
+class Exact(Projection):
+    """Dependent coordinates are functions of the independent ones, solved for at every evaluation of the field as well as after every step: what is
+    integrated is the paper's theta_G, and the rest follows from it. `iterations` and `change` as in `Projection`."""
+
+    change: Callable = eqx.field(static=True, default=dependent_change)
 
 
 class Baumgarte(eqx.Module):
@@ -80,12 +88,15 @@ class Field(eqx.Module):
 
     control: Callable | None
     stabilization: Projection | Baumgarte | Drift
+    dynamics: Dynamics
 
     def __call__(self, t, y: Motion, scene: Scene) -> Motion:
-        chain, structure = scene.chain, scene.structure
+        chain, structure, held = scene.chain, scene.structure, self.stabilization
+        if isinstance(held, Exact):
+            y, _ = settle(self, scene, y)
         tau, power = self.torques(t, y, scene)
-        rate = self.stabilization.rate if isinstance(self.stabilization, Baumgarte) else None
-        v, vdot = moving(chain, structure, y.q, y.v, tau, baumgarte=rate, agree=isinstance(self.stabilization, Projection))
+        rate = held.rate if isinstance(held, Baumgarte) else None
+        v, vdot = moving(chain, structure, y.q, y.v, tau, self.dynamics.inertia, rate, isinstance(held, Projection), scene.pivots)
         return Motion(rates(chain, y.q, jnp.where(active_dofs(chain, structure), v, 0)), vdot, power)
 
     def torques(self, t, y: Motion, scene: Scene):
@@ -110,25 +121,30 @@ def projects(stabilization, scene: Scene) -> bool:
 
 
 class Seen(eqx.Module):
-    """What the loops show as a step is put back onto them: |R_mm| / |R_11|, which coordinates depend on the others, how far each loop is open yet."""
+    """What the loops show as a step is put back onto them: |R_mm| / |R_11|, the pivots to go on with, how far each loop is open yet."""
 
     margin: Float[Array, ""]
-    dependent: Bool[Array, " dofs"]
+    pivots: Float[Array, "steps dofs"]
     gap: Float[Array, " links"]
 
     @classmethod
-    def nothing(cls, chain: Chain) -> "Seen":
+    def first(cls, scene: Scene, q) -> "Seen":
         """Before the first step."""
-        dtype = chain.q_load.dtype
-        return cls(jnp.ones((), dtype), jnp.zeros(chain.dofs, bool), jnp.zeros(len(chain.link_names), dtype))
+        dtype = q.dtype
+        return cls(jnp.ones((), dtype), first_pivots(scene.chain, scene.structure, q), jnp.zeros(len(scene.chain.link_names), dtype))
+
+    @property
+    def dependent(self) -> Bool[Array, " dofs"]:
+        """Coordinates that depend on the others."""
+        return jnp.any(self.pivots > 0, 0)
 
 
-def settle(stabilization, scene: Scene, y: Motion) -> tuple[Motion, Seen | None]:
+def settle(field: Field, scene: Scene, y: Motion) -> tuple[Motion, Seen | None]:
     """The motion put back: quaternions to unit length, loops closed, velocities in agreement; and what that showed (None: loops are left alone)."""
-    chain, structure = scene.chain, scene.structure
-    if not projects(stabilization, scene):
+    chain, structure, held = scene.chain, scene.structure, field.stabilization
+    if not projects(held, scene):
         return eqx.tree_at(lambda y: y.q, y, normalize(chain, y.q)), None
-    q, v, *seen = settle_loops(chain, structure, y.q, y.v, stabilization.iterations, stabilization.change)
+    q, v, *seen = settle_loops(chain, structure, y.q, y.v, held.iterations, held.change, scene.pivots, field.dynamics.hold or 0.0)
     return eqx.tree_at(lambda y: (y.q, y.v), y, (q, v)), Seen(*seen)
 
 
@@ -166,7 +182,7 @@ class Settled(diffrax.AbstractWrappedSolver):
     scan_kind: ClassVar[str] = "inner"
 
     solver: diffrax.AbstractSolver
-    stabilization: Projection | Baumgarte | Drift
+    field: Field
 
     @property
     def term_structure(self):  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -192,9 +208,9 @@ class Settled(diffrax.AbstractWrappedSolver):
         return self.solver.func(terms, t0, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        fresh = True if projects(self.stabilization, args) else made_jump
+        fresh = True if projects(self.field.stabilization, args) else made_jump
         raw, error, dense, solver_state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, fresh)
-        y1, _ = settle(self.stabilization, args, raw)
+        y1, _ = settle(self.field, args, raw)
         shift = jax.tree.map(lambda a, b: a - b, y1, raw)
         return y1, error, {"inner": dense, "shift": shift}, solver_state, result
 
@@ -216,7 +232,7 @@ def step_alone(solver: diffrax.AbstractSolver, field: Field, t0, t1, y: Motion, 
         solver = staged(solver, "bounded")
         term = diffrax.ODETerm(rate)
         raw = solver.step(term, t0, t1, y, scene, solver.init(term, t0, t1, y, scene), False)[0]
-    return settle(field.stabilization, scene, raw)[0]
+    return settle(field, scene, raw)[0]
 
 
 def _explicit_step(tableau: diffrax.ButcherTableau, rate, t0, t1, y: Motion, scene: Scene) -> Motion:

@@ -26,10 +26,6 @@ class RESULTS(eqx.Enumeration):
     no_slot = "A grip was to be made and every spare slot was taken: it was not made, everything else was. Load with more spare slots, or unbind."
 
 
-# equinox has no public way to list them
-RESULT_NAMES = tuple(RESULTS._name_to_item)
-
-
 class Events(eqx.Module):
     """What happened, in the order of time; rows past `count` are unused (time inf, which -1).
 

@@ -1,6 +1,7 @@
 """The dial: orders of the integrators, what each way against drift holds, and the certificate of a run."""
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import models
@@ -86,11 +87,63 @@ def test_each_way_back_onto_the_loops(change):
         np.testing.assert_allclose(settled.q[independent], rough.q[independent], atol=1e-15)
 
 
+WAYS = {
+    "exact": {"stabilization": svkc.Exact()},
+    "unit vectors": {"dynamics": svkc.Dynamics(inertia=svkc.inertia_by_unit_vectors)},
+    "bodies": {"dynamics": svkc.Dynamics(inertia=svkc.by_bodies)},
+    "chosen at every evaluation": {"dynamics": svkc.Dynamics(hold=None)},
+    "held": {"dynamics": svkc.Dynamics(hold=0.0)},
+}
+
+
+@pytest.fixture(scope="module")
+def swinging():
+    """Three equal bars that swing on a base too long for any of them to go round: whatever two coordinates depend on the third, they come in line."""
+    inner = models.bar("coupler", models.Y, "1 0 0", "0.6 0 0.8", models.bar("rocker", models.Y, "0.6 0 -0.8", "1 0 0"))
+    pin = svkc.VirtualLink("pin", "world", "rocker", "hinge", pos=(2.2, 0, 0), axis=(0, 1, 0), real_pos=(0.6, 0, -0.8), connected=True)
+    chain = svkc.load(models.MJCF.format(models.bar("crank", models.Y, "0.6 0 0.8", inside=inner)), virtual_links=[pin])
+    start, ts = chain.state(v={"crank": 1.0}), jnp.linspace(0, 1.5, 16)
+
+    def run(crank, **way):
+        state = eqx.tree_at(lambda s: s.v, start, crank * start.v)
+        return svkc.simulate(chain, state, 1.5, ts=ts, rtol=1e-10, atol=1e-12, solver=diffrax.Dopri8(), **way)
+
+    return run, run(1.0)
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_each_way_to_compute_is_the_same_motion(swinging, way):
+    run, usual = swinging
+    other = run(1.0, **WAYS[way])
+    # the steps' own errors, and what the ways back onto the loops make of them
+    np.testing.assert_allclose(other.states.q, usual.states.q, atol=1e-8)
+    swaps = int(other.phases.swaps[0])
+    assert swaps == 0 if way == "held" else swaps >= 3
+    tries = [int(r.report().accepted + r.report().rejected) for r in (other, usual)]
+    assert tries[0] < 1.5 * tries[1]
+
+
+def test_held_pivots_leave_derivatives_as_they_are(swinging):
+    run, _ = swinging
+    held = jax.jvp(lambda x: run(x).final.q, (1.0,), (1.0,))[1]
+    step = 1e-4
+    differences = (run(1 + step).final.q - run(1 - step).final.q) / (2 * step)
+    np.testing.assert_allclose(held, differences, rtol=1e-5, atol=1e-5)
+
+
+def test_bad_dynamics():
+    chain = models.four_bar()
+    for given, said in ((svkc.Exact(), "dynamics: expected svkc.Dynamics"), (svkc.Dynamics(hold=2.0), r"dynamics.hold: got 2.0")):
+        with pytest.raises(ValueError, match=said):
+            svkc.simulate(chain, chain.state(), 1.0, dynamics=given)
+
+
 def test_the_certificate(tmp_path):
     """Every line of it against what is known otherwise: four bars driven round, a figure in flight, lanes."""
     chain = models.four_bar()
     control = lambda t, s, args: jnp.zeros(chain.dofs).at[0].set(3.0)
-    run = jax.jit(lambda dt: svkc.simulate(chain, chain.state(v={"crank": 6.0}), 1.0, ts=jnp.linspace(0, 1, 11), control=control, dt=dt))
+    new = svkc.Dynamics(hold=None)
+    run = jax.jit(lambda dt: svkc.simulate(chain, chain.state(v={"crank": 6.0}), 1.0, ts=jnp.linspace(0, 1, 11), control=control, dt=dt, dynamics=new))
     coarse, fine = run(0.02), run(0.001)
     report = coarse.report()
     states = coarse.states

@@ -17,7 +17,7 @@ HOUSE = [
     "chain reading selection",
     "kinematics trajectory cuttable",
     "inverse_dynamics loops archive load",
-    "energy closure",
+    "energy closure articulated",
     "forward_dynamics",
     "projection",
     "assembly mobility",
@@ -30,7 +30,7 @@ HOUSE = [
     "request records",
     "phase view derivative",
     "simulate",
-    "tuning",
+    "tuning rollout",
     "__main__",
 ]
 FLOORS = {name: floor for floor, names in enumerate(HOUSE) for name in names.split()}
@@ -64,7 +64,9 @@ CACHE = tempfile.TemporaryDirectory()
 
 
 def run(*args, cwd=ROOT, optimized=True):
-    env = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS" or not optimized}
+    env = dict(os.environ)
+    if optimized:
+        env["XLA_FLAGS"] = env.get("XLA_FLAGS", "").replace("--xla_backend_optimization_level=0", "")
     # an example and the command of the same scene compile the same program
     env["JAX_COMPILATION_CACHE_DIR"] = CACHE.name
     return subprocess.run([sys.executable, *map(str, args)], capture_output=True, text=True, cwd=cwd, timeout=1200, check=False, env=env)

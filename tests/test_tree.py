@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import svkc
-from svkc.forward_dynamics import forward_dynamics_by_unit_vectors
-from svkc.inverse_dynamics import inertia_by_unit_vectors
+from svkc.forward_dynamics import acceleration, forward_dynamics_by_unit_vectors
+from svkc.inverse_dynamics import inertia_by_composites, inertia_by_unit_vectors
 from svkc.kinematics import kinematics, rates
 
 ASSETS = pathlib.Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
@@ -60,6 +60,7 @@ def everything(chain, state, tau):
         "mass": svkc.mass_matrix(chain, state), "mass by unit vectors": inertia_by_unit_vectors(chain, kin),
         "bias": svkc.bias_force(chain, state), "acceleration": vdot,
         "acceleration by unit vectors": forward_dynamics_by_unit_vectors(chain, state, tau),
+        "acceleration by composites": acceleration(chain, state.structure, state.q, state.v, tau, inertia_by_composites),
         "inverse": svkc.inverse_dynamics(chain, state, vdot), "kinetic": svkc.kinetic_energy(chain, state),
         "power": jax.jvp(
             lambda q, v: svkc.energy(chain, svkc.State(q, v, state.structure)), (state.q, state.v), (rates(chain, state.q, state.v), vdot)
@@ -83,8 +84,8 @@ def test_every_intermediate(run):
         damping = data.qfrc_damper @ v if hasattr(data, "qfrc_damper") else -(model.dof_damping.ravel() * v) @ v
         expected = {
             "position": data.xpos, "linear": twist[:, 3:], "angular": twist[:, :3], "mass": M, "mass by unit vectors": M,
-            "bias": data.qfrc_bias, "acceleration": data.qacc, "acceleration by unit vectors": data.qacc, "inverse": tau,
-            "kinetic": v @ M @ v / 2, "power": tau @ v + damping,
+            "bias": data.qfrc_bias, "acceleration": data.qacc, "acceleration by unit vectors": data.qacc, "acceleration by composites": data.qacc,
+            "inverse": tau, "kinetic": v @ M @ v / 2, "power": tau @ v + damping,
         }  # fmt: skip
         np.testing.assert_allclose(R, data.xmat, atol=1e-12)
         for name, value in expected.items():

@@ -1,0 +1,161 @@
+"""Many runs at once: lanes that differ in all they can, chunks, devices, processes, interruptions."""
+
+import os
+import pathlib
+import signal
+import socket
+import subprocess
+import sys
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import models
+import numpy as np
+import pytest
+
+import svkc
+
+LANES = 11
+
+
+def lane(chain, x):
+    """Every lane its own release, torque, gravity and end."""
+    chain = eqx.tree_at(lambda c: c.gravity, chain, chain.gravity * x["gravity"])
+    return {"chain": chain, "events": [svkc.at(x["release"], cut="grip")], "args": x["torque"], "t1": x["end"]}
+
+
+def control(t, state, torque):
+    return torque * jnp.ones_like(state.v)
+
+
+def hanging():
+    """Two rods held by a grip at the far end, let go at some time."""
+    rods = models.bar("upper", models.Y, "0.5 0 -0.8", inside=models.bar("lower", models.Y, "0.5 0 0.8", "0.5 0 -0.8"))
+    grip = svkc.VirtualLink("grip", "world", "lower", "hinge", pos=(1.0, 0, 0), axis=(0, 1, 0), real_pos=(0.5, 0, 0.8), connected=True)
+    chain = svkc.load(models.MJCF.format(rods), virtual_links=[grip])
+    share = jnp.linspace(0, 1, LANES)
+    # every other lane is not held from the first
+    starts = [chain.state({"upper": 0.0}), chain.state({"upper": 0.3}, connected=())]
+    states = jax.tree.map(lambda *x: jnp.stack([x[i % 2] for i in range(LANES)]), *starts)
+    return chain, states, {"release": 0.05 + 0.3 * share, "torque": share, "gravity": 1 + share, "end": 0.2 + 0.2 * share}
+
+
+def call(chain, states, data, **options):
+    return svkc.rollout(chain, states, 0.4, data=data, lane=lane, control=control, rtol=1e-6, atol=1e-8, **options)
+
+
+def main(rank, count, port, out, dies=""):
+    """One process of several; `dies`: the one that is killed after its first chunk."""
+    if rank == dies:
+        save = svkc.Trajectory.save
+        svkc.Trajectory.save = lambda *args: (save(*args), os.kill(os.getpid(), signal.SIGKILL))
+    jax.distributed.initialize(f"localhost:{port}", int(count), int(rank), heartbeat_timeout_seconds=10)
+    traj = call(*hanging(), chunk=2, out=out, progress=False)
+    np.savez(pathlib.Path(out) / f"whole_{rank}.npz", q=traj.final.q, times=traj.events.time, result=traj.result._value)
+
+
+@pytest.fixture(scope="module")
+def case():
+    return hanging()
+
+
+@pytest.fixture(scope="module")
+def alone(case):
+    """Each lane by itself."""
+    chain, states, data = case
+    single = lambda s, own: svkc.simulate(own.pop("chain"), s, control=control, rtol=1e-6, atol=1e-8, throw=False, **own)
+    run = jax.jit(lambda s, x: single(s, dict(lane(chain, x))))
+    return [run(*jax.tree.map(lambda x, i=i: x[i], (states, data))) for i in range(LANES)]
+
+
+def agrees(traj, alone):
+    for i, one in enumerate(alone):
+        np.testing.assert_allclose(traj.final.q[i], one.final.q, atol=1e-12)
+        np.testing.assert_allclose(traj.events.time[i], one.events.time)
+        assert float(traj.t_final[i]) == pytest.approx(float(one.t_final))
+    assert np.all(traj.result == svkc.RESULTS.successful)
+    assert traj.states.q.shape[:2] == (LANES, 2)
+
+
+def test_lanes_are_those_of_single_runs(case, alone, capsys):
+    """Whatever the chunks, and the order in which lanes are taken."""
+    traj = call(*case, chunk=4, cost=-np.arange(LANES) % 3)
+    agrees(traj, alone)
+    assert "3 of 3 chunks (11 lanes)" in capsys.readouterr().err
+    agrees(call(*case, progress=False), alone)
+    assert capsys.readouterr().err == ""
+
+
+def test_an_interrupted_run_goes_on(case, alone, tmp_path, monkeypatch):
+    chain, states, data = case
+    asked = []
+    save = svkc.Trajectory.save
+
+    def interrupted(self, path, chain=None):
+        asked.append(path.name)
+        if len(asked) == 2:
+            raise KeyboardInterrupt
+        save(self, path, chain)
+
+    monkeypatch.setattr(svkc.Trajectory, "save", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        call(*case, chunk=4, out=tmp_path / "run")
+    kept = tmp_path / "run" / "chunk_00000.npz"
+    stamp = kept.stat().st_mtime_ns
+    agrees(call(*case, chunk=4, out=tmp_path / "run"), alone)
+    # the finished chunk was read, not made again
+    assert asked == ["chunk_00000.npz", "chunk_00001.npz", "chunk_00001.npz", "chunk_00002.npz"]
+    assert kept.stat().st_mtime_ns == stamp
+    assert svkc.load_trajectory(kept).final.q.shape == (4, chain.topology.nq_all)
+    with pytest.raises(ValueError, match="holds another rollout"):
+        call(chain, states, {**data, "torque": data["torque"] + 1}, chunk=4, out=tmp_path / "run")
+
+
+def test_bad_calls(case):
+    chain, states, _ = case
+    with pytest.raises(ValueError, match=r"states: expected a svkc.State"):
+        svkc.rollout(chain, states.q, 1.0)
+    with pytest.raises(ValueError, match=r"one leading axis of lanes, got sizes \['11', '3'\]"):
+        svkc.rollout(chain, states, 1.0, data=jnp.zeros(3))
+    with pytest.raises(ValueError, match=r"one leading axis of lanes"):
+        svkc.rollout(chain, chain.state(), 1.0)
+
+
+def start(count, out, dies=""):
+    with socket.socket() as s:
+        s.bind(("localhost", 0))
+        port = s.getsockname()[1]
+    env = {**os.environ, "JAX_ENABLE_X64": "1", "PYTHONPATH": str(pathlib.Path(__file__).parent)}
+    line = "import sys, test_rollout; test_rollout.main(*sys.argv[1:])"
+    return [
+        subprocess.Popen([sys.executable, "-c", line, str(i), str(count), str(port), str(out), dies], env=env, stderr=subprocess.PIPE, text=True)
+        for i in range(count)
+    ]
+
+
+@pytest.mark.parametrize("count", [2, 4])
+def test_several_processes(alone, tmp_path, count):
+    """Each takes its share, all have the whole."""
+    for process in start(count, tmp_path):
+        _, said = process.communicate(timeout=600)
+        assert process.returncode == 0, said[-3000:]
+    for i in range(count):
+        whole = np.load(tmp_path / f"whole_{i}.npz")
+        np.testing.assert_allclose(whole["q"], [one.final.q for one in alone], atol=1e-12)
+        assert whole["result"].tolist() == [0] * LANES
+    assert len(list(tmp_path.glob("chunk_*.npz"))) == 6
+
+
+def test_a_killed_process(case, alone, tmp_path):
+    """The other one ends and says why; what is finished stays, and the next run goes on from it."""
+    other, killed = start(2, tmp_path, dies="1")
+    _, said = other.communicate(timeout=600)
+    killed.communicate(timeout=600)
+    assert killed.returncode == -signal.SIGKILL
+    assert other.returncode != 0
+    # ours, or that of jax, whichever sees it first
+    assert "another process has ended" in said or "another task died" in said
+    kept = sorted(path.name for path in tmp_path.glob("chunk_*.npz"))
+    assert kept == ["chunk_00000.npz", "chunk_00001.npz", "chunk_00002.npz", "chunk_00004.npz"]
+    agrees(call(*case, chunk=2, out=tmp_path, progress=False), alone)
