@@ -29,7 +29,7 @@ def arm():
         (svkc.SemiImplicitEuler(), 1, 2e-3),
         (diffrax.Heun(), 2, 4e-3),
         (diffrax.Bosh3(), 3, 0.01),
-        (diffrax.Tsit5(), 5, 5e-3),
+        (diffrax.Tsit5(), 5, 0.02),
         (diffrax.Dopri8(), 8, 0.05),
         (diffrax.ImplicitEuler(), 1, 2e-3),
         (diffrax.Kvaerno3(), 3, 5e-3),
