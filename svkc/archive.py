@@ -16,8 +16,8 @@ import numpy as np
 from svkc.chain import State, Structure
 from svkc.trajectory import RESULTS, Events, Phases, Trajectory
 
-# 2: with `derivative` and the phases' `margin`; 3: with the structures' `margin` and the whole certificate
-SCHEMA = 3
+# 2: with `derivative` and the phases' `margin`; 3: with the structures' `margin` and the rest of the certificate; 4: with the phases' gaps
+SCHEMA = 4
 _CODES = ("result", "derivative")
 _PARTS = {"states": State, "final": State, "structure": Structure, "events": Events, "phases": Phases}
 
@@ -64,9 +64,12 @@ def save(traj: Trajectory, path, chain=None) -> None:
         raise
 
 
-def _complete(arrays: dict[str, np.ndarray]) -> None:
-    """What was not kept before schema 3, as not known: inf, -1, or nothing let go."""
-    rows, dtype = arrays["phases.start"].shape[-1:], arrays["ts"].dtype
+def _complete(arrays: dict[str, np.ndarray], schema: int) -> None:
+    """What was not kept before schema 4, as not known: inf, -1, or nothing let go."""
+    rows, dtype = arrays["phases.start"].shape, arrays["ts"].dtype
+    arrays |= {f"phases.{name}": np.full((*rows, 2), np.inf, dtype) for name in ("gap", "gap_rate")}
+    if schema >= 3:
+        return
     unknown = {
         "evaluations": np.full(rows, -1, np.int32),
         "swaps": np.full(rows, -1, np.int32),
@@ -94,8 +97,8 @@ def load_trajectory(path) -> Trajectory:
     missing = {"ts", "states.q", "final.q", "events.time"} - set(arrays)
     if missing:
         raise ValueError(f"{path} lacks {', '.join(sorted(missing))}; it is not a trajectory written by svkc")
-    if meta["schema"] < 3:
-        _complete(arrays)
+    if meta["schema"] < 4:
+        _complete(arrays, meta["schema"])
     code = lambda value: eqx.tree_at(lambda item: item._value, RESULTS.successful, value)
     build = lambda arrays, codes: _build(Trajectory, arrays, **{name: code(value) for name, value in codes.items()})
     for _ in range(arrays["ts"].ndim - 1):

@@ -139,6 +139,21 @@ def gaps_and_rates(chain: Chain, state: State) -> tuple[Float[Array, "links 6"],
     return gap(state.structure, end), (loop_jacobian(chain, state.structure, kin, end) @ state.v).reshape(-1, 6)
 
 
+def largest_gaps(chain: Chain, state: State) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
+    """The largest over the loops: of the gaps (rad, m) and of their rates (rad/s, m/s)."""
+
+    def largest(x):
+        if not len(x):
+            return jnp.zeros(2, x.dtype)
+        square = jnp.sum(x.reshape(-1, 2, 3) ** 2, -1)
+        closed = square == 0
+        # a root that can be differentiated where the loop is closed to the last bit
+        return jnp.max(jnp.where(closed, 0, jnp.sqrt(jnp.where(closed, 1, square))), 0)
+
+    gaps, rates = gaps_and_rates(chain, state)
+    return largest(gaps), largest(rates)
+
+
 @jax.jit
 def loop_gaps(chain: Chain, state: State) -> Float[Array, "links 6"]:
     """How far each connected loop is open: rotation vector (rad), then distance (m), in the world; zero where not connected."""

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from svkc.chain import Chain, State, Structure
+from svkc.closure import largest_gaps
 from svkc.energy import energy_and_momentum
 from svkc.loops import active_dofs
 from svkc.marching import Path
@@ -38,6 +39,8 @@ def no_phases(rows: int, links: int, dtype) -> Phases:
         swaps=count,
         loop=count - 1,
         error=number,
+        gap=jnp.zeros((rows, 2), dtype),
+        gap_rate=jnp.zeros((rows, 2), dtype),
         free=jnp.zeros(rows, bool),
         momentum_drift=jnp.zeros((rows, 2), dtype),
         count=jnp.asarray(0, jnp.int32),
@@ -50,11 +53,13 @@ def recorded(chain: Chain, p: Phases, row: Bool[Array, " phases"], began: tuple,
     s = first.structure
     both = jax.tree.map(lambda *x: jnp.stack(x), (first.q, first.v), (last.q, last.v))
     energies, *momenta = jax.checkpoint(jax.vmap(lambda q, v: energy_and_momentum(chain, State(q, v, s))))(*both)
+    gaps = jax.vmap(lambda q, v: largest_gaps(*jax.lax.stop_gradient((chain, State(q, v, s)))))(*both)
+    gap, gap_rate = (jnp.max(x, 0) for x in gaps)
     free = _free(chain, s)
     written = {
         "start": start, "stop": stop, "connected": s.connected, "rank": s.rank, "joint_freedoms": jnp.sum(active_dofs(chain, s), dtype=jnp.int32),
         "energy": energies, "work": work, "margin": jnp.minimum(margin, path.tally.margin), "accepted": path.accepted, "rejected": path.rejected,
-        "evaluations": stages * path.tally.tries, "swaps": path.tally.swaps, "loop": path.tally.loop, "error": path.tally.error, "free": free,
+        "evaluations": stages * path.tally.tries, "swaps": path.tally.swaps, "loop": path.tally.loop, "error": path.tally.error, "free": free, "gap": gap, "gap_rate": gap_rate,
         "momentum_drift": jnp.where(free, _momentum_drift(chain, *jax.lax.stop_gradient(momenta), stop - start), 0),
     }  # fmt: skip
     new = {name: jnp.where(row.reshape(-1, *(1,) * jnp.ndim(x)), jnp.asarray(x)[None], getattr(p, name)) for name, x in written.items()}

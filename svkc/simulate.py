@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from svkc.binding import emptied, grip
 from svkc.chain import Chain, State, Structure
-from svkc.closure import gaps_and_rates
+from svkc.closure import largest_gaps
 from svkc.events import Plan
 from svkc.guards import Sensor
 from svkc.location import Reading, event_tolerance
@@ -79,8 +79,9 @@ def _run(chain: Chain, state: State, t0, t1, ts, made: Plan, options: Options, a
     short = (run.t < t1) & (run.result == RESULTS.successful)
     result = RESULTS.where(short, RESULTS.max_events, run.result)
     saved = run.saved
-    gaps, gap_rates = jax.vmap(lambda s: jax.tree.map(_largest, gaps_and_rates(chain, s)))(saved)
-    result = RESULTS.where((result == RESULTS.successful) & (jnp.max(gaps) > options.gap), RESULTS.loop_open, result)
+    gaps, gap_rates = jax.vmap(lambda s: largest_gaps(chain, s))(saved)
+    worst = jnp.maximum(jnp.max(gaps), jnp.max(run.phases.gap))
+    result = RESULTS.where((result == RESULTS.successful) & (worst > options.gap), RESULTS.loop_open, result)
     return Trajectory(ts, saved, gaps, gap_rates, run.events, run.phases, run.state, run.t, result, run.derivative)
 
 
@@ -100,16 +101,6 @@ def _lockable(chain: Chain, state: State, made: Plan) -> State:
     if not made.locks or state.structure.locked is not None:
         return state
     return eqx.tree_at(lambda s: s.structure.locked, state, jnp.zeros(chain.dofs, bool), is_leaf=lambda x: x is None)
-
-
-def _largest(gaps: Float[Array, "links 6"]) -> Float[Array, "2"]:
-    """The largest angular and the largest linear size over the loops."""
-    if not len(gaps):
-        return jnp.zeros(2, gaps.dtype)
-    square = jnp.sum(gaps.reshape(-1, 2, 3) ** 2, -1)
-    closed = square == 0
-    # a root that can be differentiated where the loop is closed to the last bit
-    return jnp.max(jnp.where(closed, 0, jnp.sqrt(jnp.where(closed, 1, square))), 0)
 
 
 def _start(chain: Chain, state: State, t0, ts, made: Plan, options: Options, args) -> Run:

@@ -48,7 +48,8 @@ class Phases(eqx.Module):
     the phase (of its two ends where steps are not projected), how far the weakest row that counts is from being redundant; `swaps`: how often the
     choice of dependent coordinates changed from step to step (-1: not looked at); `loop`: the one that could not be closed (-1: none);
     `evaluations`: of the vector field, in steps alone; `error`: the estimated errors of the steps added up (root mean square over q and v; inf: the
-    solver estimates none); `free`: nothing holds the bodies to the ground; `momentum_drift`: then, the change of linear momentum (N s) that gravity
+    solver estimates none); `gap`, `gap_rate`: the largest of the loops' gaps (rad, m) and of their rates (rad/s, m/s) at the phase's two ends, before
+    the event that ends it; `free`: nothing holds the bodies to the ground; `momentum_drift`: then, the change of linear momentum (N s) that gravity
     does not explain and that of the angular momentum about the centre of mass (N m s).
     """
 
@@ -66,6 +67,8 @@ class Phases(eqx.Module):
     swaps: Int[Array, " phases"]
     loop: Int[Array, " phases"]
     error: Float[Array, " phases"]
+    gap: Float[Array, "phases 2"]
+    gap_rate: Float[Array, "phases 2"]
     free: Bool[Array, " phases"]
     momentum_drift: Float[Array, "phases 2"]
     count: Int[Array, ""]
@@ -120,7 +123,8 @@ class Trajectory(eqx.Module):
         """The run's certificate."""
         p = self.phases
         largest = lambda x: jnp.max(jnp.where(jnp.isfinite(x), x, 0), -2)
-        gaps, rates, momentum = largest(self.gaps), largest(self.gap_rates), largest(p.momentum_drift)
+        worst = lambda saved, ends: jnp.maximum(largest(saved), largest(ends))
+        gaps, rates, momentum = worst(self.gaps, p.gap), worst(self.gap_rates, p.gap_rate), largest(p.momentum_drift)
         begun = jnp.isfinite(p.start)
         return Report(
             gap=gaps[..., 1],
@@ -147,7 +151,7 @@ class Trajectory(eqx.Module):
 
 
 class Report(eqx.Module):
-    """Largest loop gaps (m, rad) and rates (m/s, rad/s) at the saved times; energy that no work or impact explains and energy lost in impacts (J);
+    """Largest loop gaps (m, rad) and rates (m/s, rad/s) at the saved times and the ends of phases; energy that no work or impact explains and energy lost in impacts (J);
     over phases in which nothing holds the bodies to the ground (`free`: there is one), momentum that gravity does not explain (N s, N m s); estimated
     errors of all steps added up (inf: the solver estimates none); the least rank margin; changes of the dependent coordinates (-1: not looked at);
     the loop that could not be closed (-1: none); steps, evaluations of the vector field, phases; when and how the run ended, and whether it has derivatives."""

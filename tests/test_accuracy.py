@@ -164,6 +164,27 @@ def test_the_certificate(tmp_path):
     assert str(svkc.load_trajectory(tmp_path / "run.npz").report()) == str(report)
 
 
+def test_gaps_are_seen_where_phases_end(tmp_path):
+    """A loop that drifts open and is cut: no saved state shows it, the certificate does, and the run's code; a file of before that says it is not known."""
+    chain = models.four_bar()
+    rough = {"dt": 0.02, "solver": diffrax.Heun(), "stabilization": svkc.Drift(), "throw": False}
+    cut = svkc.simulate(chain, chain.state(v={"crank": 6.0}), 0.4, events=[svkc.at(0.2, cut="pin")], **rough)
+    whole = svkc.simulate(chain, chain.state(v={"crank": 6.0}), 0.2, **rough)
+    gap = float(jnp.linalg.norm(svkc.loop_gaps(chain, whole.final)[:, 3:]))
+    assert float(cut.gaps.max()) < 1e-12 < 1e-4 < gap
+    assert float(cut.report().gap) == pytest.approx(gap, rel=1e-12)
+    assert cut.result == svkc.RESULTS.loop_open
+    cut.save(tmp_path / "run.npz")
+    with np.load(tmp_path / "run.npz") as file:
+        arrays = dict(file)
+    old = {name: x for name, x in arrays.items() if not name.startswith("phases.gap")}
+    old["metadata"] = np.array(str(arrays["metadata"]).replace('"schema": 4', '"schema": 3'))
+    np.savez(tmp_path / "old.npz", **old)
+    read = svkc.load_trajectory(tmp_path / "old.npz")
+    assert np.isinf(read.phases.gap).all()
+    assert float(read.report().gap) == float(cut.gaps[:, 1].max())
+
+
 def test_the_momentum_of_what_is_free(arm):
     chain, state = arm
     report = svkc.simulate(chain, state, 0.5, rtol=1e-10, atol=1e-12).report()

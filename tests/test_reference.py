@@ -276,3 +276,34 @@ def test_simple_pendulum_for_a_long_time():
     traj = svkc.simulate(chain, chain.state(), 100.0, ts=jnp.array(ts), **tight(1e-13))
     found = np.stack([np.cos(traj.states.q[:, 0]), np.sin(traj.states.q[:, 0])], 1)
     np.testing.assert_allclose(found, case["xy"][: len(ts)], atol=1e-9)
+
+
+def test_an_elbow_that_locks():
+    """Rate, angular momentum and kinetic energy of a double pendulum whose elbow is locked in full swing: the closed form."""
+    case = given("events")["joint_lock"]
+    rod = '<body name="{0}" pos="{1}"><joint name="{0}" axis="0 0 1"/><inertial pos="0 -0.5 0" mass="1" diaginertia="{2} 0.01 {2}"/>{3}</body>'
+    text = rod.format("shoulder", "0 0 0", repr(1 / 12), rod.format("elbow", "0 -1 0", repr(1 / 12), ""))
+    chain = svkc.load(f'<mujoco><option gravity="0 -9.81 0"/><worldbody>{text}</worldbody></mujoco>')
+    before = chain.state({"elbow": 0.8}, {"shoulder": 2.0, "elbow": -5.0})
+    after = svkc.lock(chain, before, "elbow")
+    np.testing.assert_allclose(after.v, [case["rate_after"], 0], atol=1e-14)
+    for state, energy in zip((before, after), case["kinetic"], strict=True):
+        assert float(svkc.kinetic_energy(chain, state)) == pytest.approx(energy, rel=1e-14)
+        # about the shoulder: of what the ground's pin cannot change
+        assert float((svkc.mass_matrix(chain, state) @ state.v)[0]) == pytest.approx(case["angular_momentum"], rel=1e-14)
+
+
+def test_a_ball_that_bounces_ever_faster():
+    """Impacts are plastic here; one with restitution is a run that ends, a velocity put in by hand, and the next run: 25 of them, towards a last instant."""
+    case = given("events")["bouncing_ball_zeno"]
+    ball = '<body name="ball"><joint name="z" type="slide" axis="0 0 1"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body>'
+    chain = svkc.load(f'<mujoco><option gravity="0 0 -9.81"/><worldbody>{ball}</worldbody></mujoco>')
+    ground = svkc.when(lambda t, s, args: s.q[0], stop=True, direction=False)
+    fall = jax.jit(lambda state, atol: svkc.simulate(chain, state, 2.0, events=[ground], rtol=1e-12, atol=atol))
+    state, time = chain.state({"z": 1.0}), 0.0
+    for impact in case["impacts"]:
+        end = fall(state, 1e-15)
+        time = time + float(end.events.time[0])
+        assert time == pytest.approx(impact, abs=1e-12)
+        state = svkc.State(end.final.q, -0.5 * end.final.v, end.final.structure)
+    assert float(end.final.v[0]) == pytest.approx(-np.sqrt(2 * 9.81) * 0.5**24, rel=1e-6)

@@ -18,6 +18,13 @@ def swing(angle: float = 0.6, **options) -> tuple[Chain, State]:
     30 joint freedoms and the swing's own one; the seat gives way where a slide is cut, as when a thigh has passed the plate's edge: two fewer after
     both have. State: at rest, the swing turned by `angle` (rad) about its pivot. `options` go to `svkc.load`.
     """
+    spec, links = parts()
+    chain = load(spec, virtual_links=links, **options)
+    return chain, _sitting(chain, angle)
+
+
+def parts():
+    """The model, an `mujoco.MjSpec`, and its virtual links."""
     import mujoco
 
     from svkc.scenes import FOLDER, PALM
@@ -41,8 +48,7 @@ def swing(angle: float = 0.6, **options) -> tuple[Chain, State]:
             real_quat=(quarter, 0, quarter, 0), connected=True,
         )  # fmt: skip
         links += [hand, thigh]
-    chain = load(spec, virtual_links=links, **options)
-    return chain, _sitting(chain, angle)
+    return spec, links
 
 
 def leaving(chain: Chain) -> list[When]:
