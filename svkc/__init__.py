@@ -40,7 +40,7 @@ from svkc.stepping import Baumgarte as Baumgarte, Drift as Drift, Exact as Exact
 from svkc.articulated import by_bodies as by_bodies
 from svkc.forward_dynamics import Dynamics as Dynamics
 from svkc.inverse_dynamics import inertia_by_composites as inertia_by_composites, inertia_by_unit_vectors as inertia_by_unit_vectors
-from svkc.solvers import RodriguesEuler as RodriguesEuler, SemiImplicitEuler as SemiImplicitEuler
+from svkc.solvers import RodriguesEuler as RodriguesEuler, SemiImplicitEuler as SemiImplicitEuler, step as step
 
 # derivatives
 from svkc.derivative import Check as Check, check_grad as check_grad, tangent as tangent

@@ -59,7 +59,8 @@ def recorded(chain: Chain, p: Phases, row: Bool[Array, " phases"], began: tuple,
     written = {
         "start": start, "stop": stop, "connected": s.connected, "rank": s.rank, "joint_freedoms": jnp.sum(active_dofs(chain, s), dtype=jnp.int32),
         "energy": energies, "work": work, "margin": jnp.minimum(margin, path.tally.margin), "accepted": path.accepted, "rejected": path.rejected,
-        "evaluations": stages * path.tally.tries, "swaps": path.tally.swaps, "loop": path.tally.loop, "error": path.tally.error, "free": free, "gap": gap, "gap_rate": gap_rate,
+        "evaluations": stages * path.tally.tries, "swaps": path.tally.swaps, "loop": path.tally.loop, "error": path.tally.error,
+        "gap": gap, "gap_rate": gap_rate, "free": free,
         "momentum_drift": jnp.where(free, _momentum_drift(chain, *jax.lax.stop_gradient(momenta), stop - start), 0),
     }  # fmt: skip
     new = {name: jnp.where(row.reshape(-1, *(1,) * jnp.ndim(x)), jnp.asarray(x)[None], getattr(p, name)) for name, x in written.items()}

@@ -12,7 +12,7 @@ import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
 from svkc.binding import emptied, grip
 from svkc.chain import Chain, State, Structure

@@ -151,9 +151,9 @@ class Trajectory(eqx.Module):
 
 
 class Report(eqx.Module):
-    """Largest loop gaps (m, rad) and rates (m/s, rad/s) at the saved times and the ends of phases; energy that no work or impact explains and energy lost in impacts (J);
-    over phases in which nothing holds the bodies to the ground (`free`: there is one), momentum that gravity does not explain (N s, N m s); estimated
-    errors of all steps added up (inf: the solver estimates none); the least rank margin; changes of the dependent coordinates (-1: not looked at);
+    """Largest loop gaps (m, rad) and rates (m/s, rad/s) at the saved times and the ends of phases; energy that no work or impact explains and energy lost in
+    impacts (J); over phases in which nothing holds the bodies to the ground (`free`: there is one), momentum that gravity does not explain (N s, N m s);
+    estimated errors of all steps added up (inf: the solver estimates none); the least rank margin; changes of the dependent coordinates (-1: not looked at);
     the loop that could not be closed (-1: none); steps, evaluations of the vector field, phases; when and how the run ended, and whether it has derivatives."""
 
     gap: Float[Array, ""]
