@@ -200,12 +200,12 @@ def draw(name: str, table):
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(figsize=(8, 5), layout="constrained")
-    curves = {}
+    curves, drawn = {}, {*INTEGRATORS, *(f"Dopri8, {way}" for way in DRIFT), *(f"MuJoCo {name}" for name in soft_loops.INTEGRATORS)}
     for dtype, label, _, seconds, error, *_ in table:
-        if np.isfinite(error) and error > 0:
+        if np.isfinite(error) and error > 0 and label in drawn:
             curves.setdefault((dtype, label), []).append((seconds, error))
     colors = plt.get_cmap("tab20")(np.arange(20))
-    for color, ((dtype, label), points) in zip(colors, curves.items(), strict=False):
+    for color, ((dtype, label), points) in zip(colors, curves.items()):
         style = "s:" if "MuJoCo" in label else ("^--" if dtype == "float32" else "o-")
         name_of = label + (", float32" if dtype == "float32" else "")
         axes.loglog(*zip(*points, strict=True), style, color=color, markersize=4, linewidth=1.2, label=name_of)

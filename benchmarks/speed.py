@@ -38,7 +38,7 @@ HEAD = ["case", "dtype", "batch", "by", "us per step", "least", "most", "times s
 
 def steps_for(batch: int) -> int:
     """Steps in one timed call: enough to be measured, not so many that it takes long."""
-    return max(5, min(2000, 40000 // batch))
+    return max(5, min(250, 40000 // batch))
 
 
 class Program:

@@ -6,12 +6,13 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import cho_factor, cho_solve, lu_factor, lu_solve, solve_triangular
+from jax.scipy.linalg import cho_factor, cho_solve, solve_triangular
 from jaxtyping import Array, Bool, Float
 
 from svkc.articulated import accelerations, articulate, by_bodies
 from svkc.chain import Chain, State, Structure
 from svkc.closure import NEAR, Coordinates, agreeing, choose, constrain, loop_rates, scaled_jacobian, scales
+from svkc.delassus import by_loop_forces
 from svkc.inverse_dynamics import generalized_forces, inertia_by_composites, inertia_by_unit_vectors, inertia_times, passive_forces
 from svkc.kinematics import LEVELS_UNROLLED, Kinematics, kinematics, twists
 from svkc.loops import active_dofs, ends
@@ -60,7 +61,7 @@ def with_links(chain: Chain, tree: Float[Array, " nv"], own: Float[Array, " dofs
 
 
 def solve_motion(
-    chain: Chain, structure: Structure, kin: Kinematics, selection: Selection, J: Float[Array, "rows dofs"], force: Float[Array, " dofs"],
+    chain: Chain, structure: Structure, kin: Kinematics, selection: Selection | None, J: Float[Array, "rows dofs"], force: Float[Array, " dofs"],
     bias: Float[Array, " rows"], inertia=None,
 ) -> Float[Array, " dofs"]:  # fmt: skip
     """The x with M x = force + J_C^T lambda and J_C x + bias = 0 (paper, section III-B).
@@ -71,19 +72,22 @@ def solve_motion(
     chosen, rows, frozen, static = jax.lax.stop_gradient((selection, J, (chain, kin), structure))
     active = active_dofs(chain, structure)
     if inertia is by_bodies:
-        solve = _by_loop_forces(*frozen, static, chosen, rows)
+        # every row as it is, whether or not it repeats others
+        pick, used = (lambda x: x), jnp.ones(J.shape[0], bool)
+        solve = by_loop_forces(*frozen, jnp.where(active[None], rows / column[None], 0), active, static.locked is not None)
     else:
+        pick, used = (lambda x: chosen.Q @ x), chosen.used
         solve = _by_independent(*frozen, static, chosen, rows, inertia or inertia_by_composites)
 
     def equations(unknown):
         x, mu = unknown
-        held = (chosen.Q @ J) / column[None]
+        held = pick(J) / column[None]
         moving = jnp.where(active, x, 0)
         force = with_links(chain, inertia_times(chain, kin, moving[:nv]), moving) + held.T @ mu
-        return jnp.where(active, force, x), held @ x + jnp.where(chosen.used, 0, mu)
+        return jnp.where(active, force, x), held @ x + jnp.where(used, 0, mu)
 
     # jax transposes the solve only where both sides take part in the derivative
-    right = (jnp.where(active, force, 0) + 0 * jnp.sum(bias), -chosen.Q @ bias + 0 * jnp.sum(force))
+    right = (jnp.where(active, force, 0) + 0 * jnp.sum(bias), -pick(bias) + 0 * jnp.sum(force))
     return jax.lax.custom_linear_solve(equations, right, solve=lambda _, right: solve(*right), symmetric=True)[0]
 
 
@@ -100,29 +104,6 @@ def _by_independent(chain: Chain, kin: Kinematics, structure: Structure, chosen:
         x = x + W @ cho_solve(A, W.T @ (force - with_links(chain, tree @ x[:nv], x)))
         rest = column * (force - with_links(chain, tree @ x[:nv], x))
         return x, jnp.where(chosen.used, solve_triangular(JS, chosen.P @ rest, trans=1), rate)
-
-    return solve
-
-
-def _by_loop_forces(chain: Chain, kin: Kinematics, structure: Structure, chosen: Selection, J) -> Callable:
-    """The solution through articulated bodies and the forces of the loops: J M^-1 J^T over the rows that count, beside it the virtual joints' own
-    coordinates, which have no inertia but their armature."""
-    top, nv, (_, column) = chain.topology, chain.nv, scales(chain)
-    active = active_dofs(chain, structure)
-    bodies = articulate(chain, kin, None if structure.locked is None else active[:nv])
-    held = jnp.where(active[None], chosen.Q @ J / column[None], 0)
-    tree, own = held[:, :nv], held[:, nv:]
-    moved = jax.vmap(lambda row: accelerations(top, bodies, row))(tree)
-    loops = tree @ moved.T + jnp.diag(jnp.where(chosen.used, 0, 1).astype(J.dtype))
-    light = jnp.zeros(chain.dofs - nv, J.dtype) if chain.link_armature is None else chain.link_armature
-    links = jnp.diag(jnp.where(active[nv:], light, 1))
-    factor = lu_factor(jnp.block([[loops, -own], [own.T, links]]))
-
-    def solve(force, rate):
-        alone = accelerations(top, bodies, force[:nv])
-        both = lu_solve(factor, jnp.concatenate([jnp.where(chosen.used, tree @ alone - rate, rate), force[nv:]]))
-        mu = both[: rate.shape[0]]
-        return jnp.concatenate([alone - mu @ moved, both[rate.shape[0] :]]), mu
 
     return solve
 
@@ -161,7 +142,7 @@ def moving(
     if loops:
         end = ends(chain, structure, kin, q)
         J = scaled_jacobian(chain, structure, kin, end)
-        selection = choose(structure, J, pivots)
+        selection = choose(structure, J, pivots) if agree or inertia is not by_bodies else None
         if agree:
             near = weakest(selection) < NEAR * structure.margin
             v = jnp.where(near, agreeing(chain, selection, J, jnp.where(active_dofs(chain, structure), v, 0)), v)

@@ -18,6 +18,7 @@ HOUSE = [
     "kinematics trajectory cuttable",
     "inverse_dynamics loops archive load",
     "energy closure articulated",
+    "delassus",
     "forward_dynamics",
     "projection",
     "assembly mobility",
