@@ -22,94 +22,104 @@ REFINEMENTS = 2
 
 
 class Joints(eqx.Module):
-    """The virtual joints' own coordinates, link by link: motion [links, row, freedom] of those without inertia and of those with armature, (S^T S)^-1 of
-    the former, the armature, and where each stands among the coordinates of virtual joints (out of range: nowhere)."""
+    """The virtual joints' own coordinates, link by link: motion [links, row, freedom] of those without inertia, and (S^T S)^-1 of it; of those with
+    armature (N m s^2, N s^2/m), and that (None: no joint has any); where each stands among the coordinates of virtual joints (`count`: nowhere)."""
 
     light: Float[Array, "links 6 6"]
-    heavy: Float[Array, "links 6 6"]
     inverse: Float[Array, "links 6 6"]
-    armature: Float[Array, "links 6"]
+    heavy: Float[Array, "links 6 6"] | None
+    armature: Float[Array, "links 6"] | None
     place: np.ndarray
+    count: int
 
     def across(self, x: Float[Array, "*n rows"]) -> Float[Array, "*n rows"]:
         """The part of the rows that virtual joints without inertia cannot follow."""
-        return x - self.motion(self.along(x))
+        rates = self.along(x)
+        return x - rotate(_led(self.light, rates), rates).reshape(x.shape)
 
     def along(self, x: Float[Array, "*n rows"]) -> Float[Array, "*n links 6"]:
         """The rates of virtual joints without inertia that follow the rows best."""
         x = x.reshape(*x.shape[:-1], -1, 6)
-        return rotate(_lead(self.inverse, x), rotate(_lead(jnp.swapaxes(self.light, -1, -2), x), x))
+        return rotate(_led(self.inverse, x), rotate(_led(jnp.swapaxes(self.light, -1, -2), x), x))
 
-    def motion(self, rates: Float[Array, "*n links 6"]) -> Float[Array, "*n rows"]:
-        """What the rows see of these rates."""
-        x = rotate(_lead(self.light, rates), rates)
-        return x.reshape(*x.shape[:-2], -1)
+    def of(self, x: Float[Array, " virtual"]) -> Float[Array, "links 6"]:
+        """What stands for each freedom of each link; zero for those that are none."""
+        return jnp.concatenate([x, jnp.zeros_like(self.light[0, 0, :1])])[np.minimum(self.place, self.count)]
+
+    def order(self, rates: Float[Array, "links 6"]) -> Float[Array, " virtual"]:
+        """The same in the order of the coordinates."""
+        flat = self.place.ravel()
+        return rates.ravel()[np.argsort(flat, kind="stable")[: np.sum(flat < self.count)]]
 
 
-def _lead(A: Float[Array, "links 6 6"], x: Float[Array, "*n links 6"]) -> Float[Array, "*n links 6 6"]:
+def _led(A: Float[Array, "links 6 6"], x: Float[Array, "*n links 6"]) -> Float[Array, "*m links 6 6"]:
     return A.reshape(*(1,) * (x.ndim - 2), *A.shape)
 
 
-def joints(chain: Chain, J: Float[Array, "rows dofs"], active: Bool[Array, " dofs"]) -> Joints:
+def joints(chain: Chain, J: Float[Array, "rows dofs"]) -> Joints:
     """From the columns of the virtual joints in J."""
-    own, place = J[:, chain.nv :], chain.topology.links.dof - chain.nv
-    count = own.shape[1]
-    padded = jnp.concatenate([own, jnp.zeros_like(J[:, :1])], 1)
-    mine = padded.reshape(-1, 6, count + 1)[np.arange(len(place))[:, None], :, np.minimum(place, count)]
-    mine = jnp.swapaxes(mine, -1, -2)
-    armature = jnp.zeros((*mine.shape[:1], 6), J.dtype)
+    place, count = chain.topology.links.dof - chain.nv, chain.dofs - chain.nv
+    own = jnp.concatenate([J[:, chain.nv :], jnp.zeros_like(J[:, :1])], 1).reshape(-1, 6, count + 1)
+    light = jnp.swapaxes(own[np.arange(len(place))[:, None], :, np.minimum(place, count)], -1, -2)
+    heavy = armature = None
     if chain.link_armature is not None:
-        armature = jnp.concatenate([chain.link_armature, jnp.zeros_like(armature[0, :1])])[np.minimum(place, count)]
-    light = jnp.where(armature[:, None] == 0, mine, 0)
-    still = jnp.all(light == 0, 1)
-    G = jnp.sum(light[:, :, :, None] * light[:, :, None], 1) + jnp.where(still, 1, 0).astype(J.dtype)[:, :, None] * np.eye(6, dtype=J.dtype)[None]
-    return Joints(light, mine - light, inverse_positive(G), armature, place)
+        armature = jnp.concatenate([chain.link_armature, jnp.zeros_like(J[0, :1])])[np.minimum(place, count)]
+        heavy = jnp.where(armature[:, None] > 0, light, 0)
+        light = light - heavy
+    still = jnp.where(jnp.all(light == 0, 1), 1, 0).astype(J.dtype)
+    G = jnp.sum(light[:, :, :, None] * light[:, :, None], 1) + still[:, :, None] * np.eye(6, dtype=J.dtype)[None]
+    return Joints(light, inverse_positive(G), heavy, armature, place, count)
 
 
-def by_loop_forces(chain: Chain, kin: Kinematics, J: Float[Array, "rows dofs"], active: Bool[Array, " dofs"], locked: bool) -> Callable:
-    """(force, rate) -> (x, mu) with M x = force + J^T mu and J x = rate, of rows that need not be independent.
+def by_loop_forces(chain: Chain, kin: Kinematics, J: Float[Array, "rows dofs"], free: Bool[Array, " nv"] | None) -> Callable:
+    """(force, rate) -> (x, mu) with M x = force + J^T mu and J x = rate, of rows that need not be independent. free: joints not locked (None: all).
 
-    Cholesky's factor of D + a little, and refinement against D (the proximal form): where rows repeat one another, or nearly so, the forces stay finite
-    and the motion is that of the others.
+    D + a little is inverted, and refined against D (the proximal form): where rows repeat one another, or nearly so, the forces stay finite and the
+    motion is that of the others.
     """
-    top, nv = chain.topology, chain.nv
-    bodies, own = articulate(chain, kin, active[:nv] if locked else None), joints(chain, J, active)
-    tree = J[:, :nv]
+    top, nv, tree = chain.topology, chain.nv, J[:, : chain.nv]
+    bodies, own = articulate(chain, kin, free), joints(chain, J)
     moved = jax.vmap(lambda row: accelerations(top, bodies, row))(tree)
     D = tree @ moved.T
-    if chain.link_armature is not None:
+    if own.heavy is not None:
+        # virtual joints with armature add what they give way by
         weight = jnp.where(own.armature > 0, 1 / jnp.where(own.armature > 0, own.armature, 1), 0)
-        blocks = jnp.sum(own.heavy[:, :, None] * own.heavy[:, None] * weight[:, None, None], -1)
-        D = D + jax.scipy.linalg.block_diag(*blocks)
+        given = lambda force, mu: weight * (force + rotate(jnp.swapaxes(own.heavy, -1, -2), mu.reshape(-1, 6)))
+        D = D + jax.scipy.linalg.block_diag(*jnp.sum(own.heavy[:, :, None] * own.heavy[:, None] * weight[:, None, None], -1))
     D = own.across(own.across(D).T)
-    little = jnp.finfo(J.dtype).eps ** 0.625 * jnp.maximum(jnp.max(jnp.diagonal(D)), jnp.finfo(J.dtype).tiny)
-    factor = jax.scipy.linalg.cho_factor(D + little * jnp.eye(D.shape[0], dtype=J.dtype))
+    most = jnp.max(jnp.diagonal(D))
+    # (none where no loop is closed)
+    little = jnp.finfo(J.dtype).eps ** 0.625 * jnp.where(most > 0, most, 1)
+    undo = _undone(D + little * jnp.eye(D.shape[0], dtype=J.dtype))
 
     def solve(force, rate):
-        # on virtual joints without inertia nothing acts but what the loops carry
-        padded = jnp.concatenate([force[nv:], jnp.zeros_like(force[:1])])[np.minimum(own.place, force.shape[0] - nv)]
-        applied = jnp.where(own.armature > 0, padded, 0)
-        carried = -own.motion(rotate(own.inverse, jnp.where(own.armature > 0, 0, padded)))
-        alone = accelerations(top, bodies, force[:nv] + carried @ tree)
-        heavy = lambda mu: jnp.where(
-            own.armature > 0, (applied + rotate(jnp.swapaxes(own.heavy, -1, -2), mu.reshape(-1, 6))) / jnp.where(own.armature > 0, own.armature, 1), 0
-        )
-        seen = lambda rates: rotate(own.heavy, rates).ravel()
-        wanted = own.across(rate - tree @ alone - seen(heavy(carried)))
-        z = jax.scipy.linalg.cho_solve(factor, wanted)
+        applied = own.of(force[nv:])
+        massless = applied if own.heavy is None else jnp.where(own.armature > 0, 0, applied)
+        # what acts on joints without inertia is carried by the loops
+        carried = -rotate(own.light, rotate(own.inverse, massless)).ravel()
+        alone = accelerations(top, bodies, force[:nv]) + carried @ moved
+        left = rate - tree @ alone
+        if own.heavy is not None:
+            left = left - rotate(own.heavy, given(applied, carried)).ravel()
+        left = own.across(left)
+        z = undo(left)
         for _ in range(REFINEMENTS):
-            z = z + jax.scipy.linalg.cho_solve(factor, wanted - D @ z)
-        mu = carried + own.across(z)
-        x = alone + own.across(z) @ moved
-        turned = heavy(mu)
-        turned = turned + own.along(rate - tree @ x - seen(turned))
-        return jnp.concatenate([x, _placed(turned, own.place, force.shape[0] - nv)]), mu
+            z = z + undo(left - D @ z)
+        mu = own.across(z)
+        x, mu = alone + mu @ moved, carried + mu
+        turning = jnp.zeros_like(applied) if own.heavy is None else given(applied, mu)
+        seen = tree @ x if own.heavy is None else tree @ x + rotate(own.heavy, turning).ravel()
+        return jnp.concatenate([x, own.order(turning + own.along(rate - seen))]), mu
 
     return solve
 
 
-def _placed(rates: Float[Array, "links 6"], place: np.ndarray, count: int) -> Float[Array, " virtual"]:
-    """Rates of virtual joints in the order of their coordinates."""
-    flat = place.ravel()
-    here = np.flatnonzero(flat < count)
-    return rates.ravel()[here[np.argsort(flat[here], kind="stable")]]
+def _undone(A: Float[Array, "n n"]) -> Callable:
+    """A^-1, of up to four loops as a matrix of blocks: a call of LAPACK for each lane would cost more than all else."""
+    n = A.shape[0]
+    if n > 24:
+        factor = jax.scipy.linalg.cho_factor(A)
+        return lambda x: jax.scipy.linalg.cho_solve(factor, x)
+    size = 6 * 2 ** int(np.ceil(np.log2(n / 6)))
+    inverse = inverse_positive(jnp.eye(size, dtype=A.dtype).at[:n, :n].set(A))[:n, :n]
+    return lambda x: rotate(inverse, x)

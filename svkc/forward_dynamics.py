@@ -74,7 +74,7 @@ def solve_motion(
     if inertia is by_bodies:
         # every row as it is, whether or not it repeats others
         pick, used = (lambda x: x), jnp.ones(J.shape[0], bool)
-        solve = by_loop_forces(*frozen, jnp.where(active[None], rows / column[None], 0), active, static.locked is not None)
+        solve = by_loop_forces(*frozen, jnp.where(active[None], rows / column[None], 0), None if static.locked is None else active[:nv])
     else:
         pick, used = (lambda x: chosen.Q @ x), chosen.used
         solve = _by_independent(*frozen, static, chosen, rows, inertia or inertia_by_composites)

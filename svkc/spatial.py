@@ -55,7 +55,7 @@ def skew(a: Float[Array, "*n 3"]) -> Float[Array, "*n 3 3"]:
 
 
 def inverse_positive(D: Float[Array, "*n k k"]) -> Float[Array, "*n k k"]:
-    """The inverses of small symmetric positive matrices, 1, 3 or 6 wide, without a call of LAPACK for each."""
+    """The inverses of small symmetric positive matrices, 1, 3, 6, 12, ... wide, without a call of LAPACK for each."""
     if D.shape[-1] == 1:
         return 1 / D
     if D.shape[-1] == 3:
@@ -63,12 +63,14 @@ def inverse_positive(D: Float[Array, "*n k k"]) -> Float[Array, "*n k k"]:
         adjugate = cross(jnp.stack([b, c, a], -2), jnp.stack([c, a, b], -2))
         return adjugate / jnp.sum(a * adjugate[..., 0, :], -1)[..., None, None]
     times = lambda x, y: jnp.sum(x[..., None] * y[..., None, :, :], -2)
-    A, B, C = D[..., :3, :3], D[..., :3, 3:], D[..., 3:, 3:]
-    part = times(B, inverse_positive(C))
+    n = D.shape[-1] // 2
+    A, B, C = D[..., :n, :n], D[..., :n, n:], D[..., n:, n:]
+    of_lower = inverse_positive(C)
+    part = times(B, of_lower)
     turned = jnp.swapaxes(part, -1, -2)
     upper = inverse_positive(A - times(part, jnp.swapaxes(B, -1, -2)))
     right = -times(upper, part)
-    lower = inverse_positive(C) - times(turned, right)
+    lower = of_lower - times(turned, right)
     return jnp.concatenate([jnp.concatenate([upper, right], -1), jnp.concatenate([jnp.swapaxes(right, -1, -2), lower], -1)], -2)
 
 

@@ -38,6 +38,21 @@ def test_acceleration_is_that_of_the_multipliers(case):
     assert np.abs(bodies - fast).max() < 1e-10 * np.abs(fast).max()
 
 
+def test_articulated_bodies_carry_what_acts_on_virtual_joints(case):
+    """The same with torques at the joints of the loops, and with a joint of the tree locked; and its derivative by masses, on each side."""
+    name, chain, state, tau = case
+    locked = svkc.lock(chain, state, chain.joint_names[-1]) if name in ("stewart", "two_hands") else state
+
+    def both(scale):
+        c = eqx.tree_at(lambda c: c.mass, chain, chain.mass * (1 + scale * jnp.linspace(0.0, 3.0, chain.mass.shape[0])))
+        return [accelerated(c, locked.structure, locked.q, locked.v, tau, way) for way in (None, svkc.by_bodies)]
+
+    for usual, bodies in (both(0.0), jax.jvp(both, (0.0,), (1.0,))[1]):
+        assert np.abs(bodies - usual).max() < 1e-9 * np.abs(usual).max()
+    back = [jax.grad(lambda x, i=i: jnp.sum(both(x)[i] * jnp.linspace(-1.0, 2.0, chain.dofs)))(0.0) for i in (0, 1)]
+    np.testing.assert_allclose(*back, rtol=1e-8)
+
+
 def test_the_choice_of_coordinates_does_not_matter(case):
     """Asking for what was dependent gives another choice of theta_G and the same acceleration."""
     _, chain, state, tau = case

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import svkc
+from svkc.forward_dynamics import acceleration
 from svkc.scenes import FOLDER
 
 FIGURE = str(FOLDER / "figure16.xml")
@@ -126,6 +127,9 @@ def test_springs_ranges_armature_and_motors_go_with_the_joint():
     a, b = (c.state({"a": 0.4, "b": 0.55}, {"a": 1.0, "b": 2.0}) for c in (plain, chain))
     np.testing.assert_allclose(svkc.energy(plain, a), svkc.energy(chain, b), rtol=1e-13)
     u = jnp.array([0.7])
+    tau = jnp.linspace(-1.0, 2.0, chain.dofs)
+    usual, bodies = (acceleration(chain, b.structure, b.q, b.v, tau, way) for way in (None, svkc.by_bodies))
+    np.testing.assert_allclose(bodies, usual, atol=1e-10 * float(jnp.abs(usual).max()))
     motors = {c.dofs: (lambda t, s, args, c=c: c.motors(u)) for c in (plain, chain)}
     run = lambda c, s, t1: svkc.simulate(c, s, t1, control=motors[c.dofs], rtol=1e-11, atol=1e-13)
     ends = [run(c, s, 0.5) for c, s in ((plain, a), (chain, b))]

@@ -269,3 +269,28 @@ def test_guards_that_jump(pendulum):
     traj = svkc.simulate(pendulum, state, 1.0, events=[jumps, svkc.at(0.3, connect="hook", here=True), later], rtol=1e-8)
     assert traj.events.which[: int(traj.events.count)].tolist() == [1, 0]
     assert traj.events.time[1] == pytest.approx(0.5, abs=1e-7)
+
+
+def test_one_step_by_itself():
+    """What `simulate` does in a step of that kind; loops stay closed for a thousand steps of one's own; first order; a batch of lanes that are joined differently."""
+    chain = models.four_bar()
+    state, dt = chain.state(v={"crank": 3.0}), 1e-3
+    alone = svkc.step(chain, state, jnp.zeros(chain.nv), dt)
+    held = {"solver": svkc.SemiImplicitEuler(), "stabilization": svkc.Baumgarte(0.5 / dt)}
+    run = svkc.simulate(chain, state, dt, dt=dt, **held).final
+    np.testing.assert_allclose(alone.q, run.q, atol=1e-14)
+    np.testing.assert_allclose(alone.v, run.v, atol=1e-11)
+    other = svkc.cut(chain, state, "pin")
+    lanes = jax.tree.map(lambda *x: jnp.stack(x), state, state, other, other)
+    walk = lambda s, n: jax.lax.fori_loop(0, n, lambda _, s: svkc.step(chain, s, jnp.zeros(chain.nv), 0.5 / n.astype(float)), s)
+    ends = jax.jit(jax.vmap(walk))(lanes, jnp.array([500, 1000, 500, 1000]))
+    # what loops are open by is of second order
+    gaps = [float(jnp.abs(svkc.loop_gaps(chain, jax.tree.map(lambda x, lane=lane: x[lane], ends))).max()) for lane in (0, 1)]
+    assert 1.8 < np.log2(gaps[0] / gaps[1]) < 2.2
+    assert gaps[1] < 1e-4
+    for i, start in ((0, state), (2, other)):
+        exact = svkc.simulate(chain, start, 0.5, rtol=1e-9).final.q
+        coarse, fine = (float(jnp.abs(ends.q[lane] - exact).max()) for lane in (i, i + 1))
+        assert 0.8 < np.log2(coarse / fine) < 1.2
+    with pytest.raises(ValueError, match="expected 4 joint torques"):
+        svkc.step(chain, state, jnp.zeros(2), dt)
