@@ -30,6 +30,14 @@ import svkc.scenes
 hook.uninstall()
 
 
+# the longest first, so that no worker is left with one of them in the end
+LONGEST = ("test_house", "test_transformations", "test_gradients", "test_extremes", "test_reference", "test_cuttable", "test_accuracy")
+
+
+def pytest_collection_modifyitems(items):
+    items.sort(key=lambda item: LONGEST.index(item.path.stem) if item.path.stem in LONGEST else len(LONGEST))
+
+
 def pytest_configure(config):
     config.addinivalue_line("filterwarnings", "error")
 

@@ -272,7 +272,7 @@ def test_guards_that_jump(pendulum):
 
 
 def test_one_step_by_itself():
-    """What `simulate` does in a step of that kind; loops stay closed for a thousand steps of one's own; first order; a batch of lanes that are joined differently."""
+    """What `simulate` does in a step of that kind; of first order, loops kept, in a batch of lanes that are joined differently."""
     chain = models.four_bar()
     state, dt = chain.state(v={"crank": 3.0}), 1e-3
     alone = svkc.step(chain, state, jnp.zeros(chain.nv), dt)

@@ -47,25 +47,26 @@ def test_the_end_and_an_event_at_a_save_time(pendulum):
 def test_every_order_of_the_transformations(pendulum):
     """Lanes with other structures, numbers of events and times: vmap(grad), grad(vmap), jit, jacfwd, jacrev, in a scan: all the same."""
     lanes = jnp.array([[1.2, 0.3, 0.8, 1.3], [1.2, -2.0, 0.5, 0.6], [0.4, 0.3, 0.35, 1.0]])
-    loss = lambda x: held(pendulum, x).final.q[0]
+    # of the lanes' own starts and times, and of what they share
+    loss = lambda x, com: held(derivatives.changed(pendulum, {"com": com}), x).final.q[0]
     counts = [int(held(pendulum, x).events.count) for x in lanes]
     assert len(set(counts)) > 1
-    alone = jax.jit(jax.jacrev(loss))
-    single = np.stack([alone(x) for x in lanes])
+    com, both = pendulum.com, (0, 1)
+    alone = jax.jit(jax.jacrev(loss, both))
+    single, shares = (np.stack(x) for x in zip(*(alone(x, com) for x in lanes), strict=True))
     assert np.isfinite(single).all()
-    looped = lambda x: jax.lax.scan(lambda total, lane: (total + loss(lane), None), jnp.zeros(()), x)[0]
-    for name, got in {
-        "jit(vmap(grad))": jax.jit(jax.vmap(jax.grad(loss)))(lanes),
-        "grad(vmap)": jax.grad(lambda x: jnp.sum(jax.vmap(loss)(x)))(lanes),
-        "vmap(jacfwd)": jax.jit(jax.vmap(jax.jacfwd(loss)))(lanes),
-        "grad(scan)": jax.jit(jax.grad(looped))(lanes),
+    assert np.abs(shares).max() > 0
+    looped = lambda x, com: jax.lax.scan(lambda total, lane: (total + loss(lane, com), None), jnp.zeros(()), x)[0]
+    lanewise = lambda derivative: jax.jit(jax.vmap(derivative(loss, both), (0, None)))
+    for name, (got, share) in {
+        "jit(vmap(grad))": lanewise(jax.grad)(lanes, com),
+        "vmap(jacfwd)": lanewise(jax.jacfwd)(lanes, com),
+        "grad(vmap)": jax.grad(lambda x, com: jnp.sum(jax.vmap(loss, (0, None))(x, com)), both)(lanes, com),
+        "grad(scan)": jax.jit(jax.grad(looped, both))(lanes, com),
     }.items():
         np.testing.assert_allclose(got, single, atol=1e-9, err_msg=name)
-    # what the lanes share: their gradients add up
-    shared = lambda com, x: held(derivatives.changed(pendulum, {"com": com}), x).final.q[0]
-    apart = sum(jax.jit(jax.grad(shared))(pendulum.com, x) for x in lanes)
-    together = jax.jit(jax.grad(lambda com: jnp.sum(jax.vmap(lambda x: shared(com, x))(lanes))))(pendulum.com)
-    np.testing.assert_allclose(together, apart, atol=1e-9)
+        # gradients by what is shared add up
+        np.testing.assert_allclose(share, shares if share.ndim > com.ndim else shares.sum(0), atol=1e-9, err_msg=name)
 
 
 def test_second_derivatives(pendulum):
