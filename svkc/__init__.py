@@ -8,6 +8,7 @@ from svkc.chain import Chain as Chain, State as State, Structure as Structure, V
 
 # models in, runs out
 from svkc.archive import load_trajectory as load_trajectory
+from svkc.interop import from_mujoco as from_mujoco, to_mujoco as to_mujoco, xyzw as xyzw
 from svkc.load import load as load
 from svkc.trajectory import RESULTS as RESULTS, Trajectory as Trajectory
 from svkc.view import plot as plot, render as render

@@ -15,7 +15,7 @@ ROOT = pathlib.Path(__file__).parent.parent
 HOUSE = [
     "spatial topology unsupported operation",
     "chain reading selection",
-    "kinematics trajectory cuttable",
+    "kinematics trajectory cuttable interop",
     "inverse_dynamics loops archive load",
     "energy closure articulated",
     "delassus",
