@@ -1,9 +1,10 @@
 """The trade of speed for accuracy: error against time of computing, each integrator and each way against drift, float64 and float32, MuJoCo beside them.
 
-`python benchmarks/accuracy.py [problem ...]` prints results/accuracy.csv and draws results/accuracy_PROBLEM.png. Errors are
+`python benchmarks/accuracy.py [problem ...] [--only TEXT]` prints results/accuracy.csv and draws results/accuracy_PROBLEM.png. Errors are
 those at the end, root mean square over coordinates (rad, m), against closed forms, published digits, or, where the reference says so, Dopri8 at
 rtol 1e-12. Seconds are per simulated second, the median of five runs of a compiled program, one run at a time."""
 
+import argparse
 import csv
 import os
 import pathlib
@@ -99,12 +100,17 @@ def free_top():
     return _top(reference.ROTATION.format("0 0 0", "0 0 0", 1, reference.numbers(case["inertia"])), case)
 
 
-def n_four_bar():
+def n_four_bar(windows: int = 2):
     """Two windows for 10 s, twenty times through configurations where rank drops."""
-    case = next(case for case in reference.given("n_four_bar")["cases"] if case["N"] == 2)
-    chain, state = maximal.load(reference.n_four_bar(2))
+    case = next(case for case in reference.given("n_four_bar")["cases"] if case["N"] == windows)
+    chain, state = maximal.load(reference.n_four_bar(windows))
     angle = -case["theta"][-1]
     return Problem(chain, state, case["t_end"], np.array([angle if name.startswith("vert") else -angle for name in chain.dof_names[: chain.nq]]))
+
+
+def forty_windows():
+    """Forty windows for 20 s: 81 bars, 40 loops."""
+    return n_four_bar(40)
 
 
 def andrews():
@@ -131,7 +137,7 @@ def swing():
     return Problem(chain, chain.state(seated.q[: chain.nq], {"base": back, "pivot": 0.0}), 0.2, events=leaving(chain))
 
 
-PROBLEMS = {f.__name__: f for f in (heavy_top, free_top, n_four_bar, andrews, high_bar, swing)}
+PROBLEMS = {f.__name__: f for f in (heavy_top, free_top, n_four_bar, andrews, high_bar, swing, forty_windows)}
 
 
 def timed(run, *args):
@@ -174,35 +180,56 @@ def in_mujoco(problem: Problem, name: str):
             yield [f"MuJoCo {integrator}", dt, seconds / problem.end, problem.error(q), run.gap, np.nan, run.steps, failed]
 
 
-def rows(name: str):
-    """All curves of one problem."""
-    problem = PROBLEMS[name]()
-    ways = (WAYS, DRIFT) if problem.chain.link_names else ({}, {})
+def curves(name: str, loops: bool):
+    """(dtype, label, solver, settings, way) of each: every integrator, and each with every way against drift at some settings; Dopri8 with all ways."""
+    if name == "forty_windows":
+        yield "float64", "Dopri8", INTEGRATORS["Dopri8"][0], (1e-8,), {}
+        yield "float64", "Dopri8, pivots always new", INTEGRATORS["Dopri8"][0], (1e-8,), WAYS["pivots always new"]
+        return
+    drift = DRIFT if loops else {}
     for label, (solver, settings) in INTEGRATORS.items():
         if (name, label) in LEFT_OUT:
             continue
-        yield from (["float64", *row] for row in measured(problem, label, solver, settings))
-        if label != "Dopri8" and "Munthe-Kaas" not in label:
-            for other, way in ways[1].items():
-                yield from (["float64", *row] for row in measured(problem, f"{label}, {other}", solver, settings[1:3], way))
-    for label, way in ways[0].items():
-        yield from (["float64", *row] for row in measured(problem, f"Dopri8, {label}", diffrax.Dopri8(), ADAPTIVE, way))
-    yield from (["float64", *row] for row in in_mujoco(problem, name))
-    with jax.enable_x64(False):
-        single = PROBLEMS[name]()
-        single.exact = problem.exact
-        for label, way in ({"": {}} | ways[1]).items():
-            yield from (["float32", *row] for row in measured(single, ", ".join(filter(None, ("Tsit5", label))), diffrax.Tsit5(), SINGLE, way))
+        yield "float64", label, solver, settings, {}
+        if "Munthe-Kaas" in label:
+            continue
+        single = settings[1:3] if settings is FIXED else SINGLE if label == "Tsit5" else SINGLE[1::2]
+        yield "float32", label, solver, single, {}
+        for other, way in drift.items():
+            yield "float32", f"{label}, {other}", solver, single, way
+            if label != "Dopri8":
+                yield "float64", f"{label}, {other}", solver, settings[1:3], way
+    for other, way in (WAYS if loops else {}).items():
+        yield "float64", f"Dopri8, {other}", INTEGRATORS["Dopri8"][0], ADAPTIVE, way
 
 
-def draw(name: str, table):
-    """Error against time of computing, a curve for each way."""
+def rows(name: str, only: str):
+    """All rows of one problem, or those of curves whose dtype and label have `only` in them."""
+    problem = PROBLEMS[name]()
+    for dtype, label, solver, settings, way in curves(name, bool(problem.chain.link_names)):
+        if only not in f"{dtype} {label}":
+            continue
+        with jax.enable_x64(dtype == "float64"):
+            asked = problem
+            if dtype == "float32":
+                asked = PROBLEMS[name]()
+                asked.exact = problem.exact
+            yield from ([dtype, *row] for row in measured(asked, label, solver, settings, way))
+        jax.clear_caches()
+    if name != "forty_windows" and any(only in f"float64 MuJoCo {integrator}" for integrator in soft_loops.INTEGRATORS):
+        yield from (["float64", *row] for row in in_mujoco(problem, name) if only in f"float64 {row[0]}")
+
+
+def draw(name: str):
+    """Error against time of computing, from the file of all rows: a curve for each integrator, each way against drift with Dopri8, float32 with Tsit5."""
     import matplotlib.pyplot as plt
 
+    with (RESULTS / "accuracy.csv").open() as file:
+        table = [[*row[1:3], *map(float, row[3:6])] for row in csv.reader(file) if row[0] == name]
     figure, axes = plt.subplots(figsize=(8, 5), layout="constrained")
     curves, drawn = {}, {*INTEGRATORS, *(f"Dopri8, {way}" for way in DRIFT), *(f"MuJoCo {name}" for name in soft_loops.INTEGRATORS)}
-    for dtype, label, _, seconds, error, *_ in table:
-        if np.isfinite(error) and error > 0 and label in drawn:
+    for dtype, label, _, seconds, error in table:
+        if np.isfinite(error) and error > 0 and label in drawn and (dtype == "float64" or label == "Tsit5"):
             curves.setdefault((dtype, label), []).append((seconds, error))
     colors = plt.get_cmap("tab20")(np.arange(20))
     for color, ((dtype, label), points) in zip(colors, curves.items()):
@@ -217,30 +244,33 @@ def draw(name: str, table):
     plt.close(figure)
 
 
-def save(name: str, head, table):
+def save(name: str, only: str, head, table):
     """Rows of a problem in the file of all, in place of its old ones; the file is read only now, as another problem may have been run beside."""
     path, kept = RESULTS / "accuracy.csv", []
     if path.exists():
         with path.open() as file:
-            kept = [row for row in list(csv.reader(file))[1:] if row[0] != name]
+            kept = [row for row in list(csv.reader(file))[1:] if row[0] != name or only not in f"{row[1]} {row[2]}"]
     with path.open("w", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows([head, *kept, *table])
 
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
+    parser = argparse.ArgumentParser()
+    parser.add_argument("problems", nargs="*", metavar="problem", help=f"of {', '.join(PROBLEMS)}; none: all")
+    parser.add_argument("--only", default="", help="curves with this in their dtype and label alone, such as 'float32' or 'articulated'")
+    options = parser.parse_args()
     cpu = [line.split(":")[1].strip() for line in open("/proc/cpuinfo") if line.startswith("model name")]
     machine = {"python": platform.python_version(), "jax": jax.__version__, "svkc": svkc.__version__, "mujoco": mujoco.__version__}
     machine |= {"backend": jax.default_backend(), "processor": cpu[0], "cores": os.cpu_count()}
     head = ["problem", "dtype", "way", "dt or rtol", "s per s", "error", "loop gap", "energy drift", "steps", "result"]
-    asked = sys.argv[1:] or list(PROBLEMS)
     print("| " + " | ".join(head) + " |")
-    for name in asked:
+    for name in options.problems or PROBLEMS:
         table = []
-        for row in rows(name):
+        for row in rows(name, options.only):
             table.append(row)
             print(
                 f"| {name} | {row[0]} | {row[1]} | {row[2]:.0e} | {row[3]:.2e} | {row[4]:.1e} | {row[5]:.1e} | {row[6]:.1e} | {row[7]} | {row[8]} |", flush=True
             )
-        draw(name, table)
-        save(name, [*head, *machine], [[name, *row, *machine.values()] for row in table])
+        save(name, options.only, [*head, *machine], [[name, *row, *machine.values()] for row in table])
+        draw(name)
