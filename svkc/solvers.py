@@ -12,7 +12,7 @@ from svkc.articulated import by_bodies
 from svkc.chain import Chain, State
 from svkc.forward_dynamics import joint_torques, moving
 from svkc.inverse_dynamics import limit_forces
-from svkc.kinematics import integrate
+from svkc.kinematics import LEVELS_UNROLLED, integrate
 from svkc.loops import active_dofs
 
 
@@ -68,6 +68,7 @@ def step(chain: Chain, state: State, tau: Float[Array, " torques"], dt: Float[Ar
     """
     tau = joint_torques(chain, tau) + limit_forces(chain, state.q, state.v)
     dt = jnp.asarray(dt, state.q.dtype)
-    v, vdot = moving(chain, state.structure, state.q, state.v, tau, by_bodies, 0.5 / dt if chain.link_names else None)
+    way = by_bodies if len(chain.topology.levels) <= LEVELS_UNROLLED else None
+    v, vdot = moving(chain, state.structure, state.q, state.v, tau, way, 0.5 / dt if chain.link_names else None)
     v = v + dt * vdot
     return State(integrate(chain, state.q, dt * jnp.where(active_dofs(chain, state.structure), v, 0)), v, state.structure)

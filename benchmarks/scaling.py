@@ -1,0 +1,131 @@
+"""How cost and memory grow: with links, with loops, with lanes, with the time that is simulated and with events; exponents fitted.
+
+`python benchmarks/scaling.py [links loops lanes time events]` (extra `bench`) prints and writes results/scaling.csv and draws results/scaling.png.
+Microseconds per `svkc.step` (links, loops, lanes) or milliseconds per run of `svkc.simulate` (time, events), medians; seconds to trace, lower and compile;
+megabytes of temporary memory. `mj_step` of MuJoCo beside the links."""
+
+import csv
+import sys
+
+import figures
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import speed  # (sets precision and devices)
+from speed import RESULTS, Program, scanned
+
+import svkc
+
+HEAD = ["what grows", "to", "unit", "median", "least", "most", "MuJoCo", "trace s", "lower s", "compile s", "temporary MB"]
+LINK = '<body name="b{0}" pos="0 0 {1}"><joint name="j{0}" type="{2}" {3}/><geom type="capsule" fromto="0 0 0 0 0 -0.1" size="0.02" mass="0.1"/>{4}</body>'
+
+
+def chain_of(count: int, balls: bool = False) -> str:
+    """MJCF of bars in a row, on hinges whose axes take turns, or on balls."""
+    text = ""
+    for i in reversed(range(count)):
+        kind, axis = ("ball", "") if balls else ("hinge", f'axis="{i % 2} {(i + 1) % 2} 0" damping="0.01"')
+        text = LINK.format(i, -0.1 if i else 0, kind, axis, text)
+    return f'<mujoco><option timestep="{figures.DT}"><flag contact="disable"/></option><worldbody>{text}</worldbody></mujoco>'
+
+
+def stepping(chain, state, batch: int = 1):
+    """Steps in one call, and the program of them."""
+    steps, tau = speed.steps_for(batch), jnp.zeros(chain.nv)
+    step = lambda s: svkc.step(chain, s, tau, figures.DT)
+    return steps * batch, Program(scanned(step if batch == 1 else jax.vmap(step), steps), state)
+
+
+def links():
+    """An open chain of bars, 5 to 200."""
+    for count in (5, 10, 20, 50, 100, 200):
+        chain = svkc.load(chain_of(count))
+        state = chain.state(np.full(count, 0.1))
+        steps, program = stepping(chain, state)
+        model, data = chain.model.model, mujoco.MjData(chain.model.model)
+
+        def peer(model=model, data=data, state=state, steps=steps):
+            mujoco.mj_resetData(model, data)
+            data.qpos[:] = state.q
+            mujoco.mj_step(model, data, steps)
+
+        yield count, "us a step", 1e6 / steps, {"svkc": program, "MuJoCo": peer}
+
+
+def loops():
+    """Forty bars on balls, 1 to 20 of them held to the ground by a ball each."""
+    for count in (1, 2, 5, 10, 20):
+        held = [svkc.VirtualLink(f"pin{i}", "world", f"b{40 * (i + 1) // count - 1}", "ball", real_pos=(0, 0, -0.1)) for i in range(count)]
+        chain = svkc.load(chain_of(40, balls=True), virtual_links=held)
+        state = svkc.connect(chain, chain.state(connected=()), *chain.link_names, here=True)
+        steps, program = stepping(chain, state)
+        yield count, "us a step", 1e6 / steps, {"svkc": program}
+
+
+def lanes():
+    """The open figure of 46 freedoms, 256 to 16384 lanes."""
+    chain, state = figures.case("open")
+    for batch in (256, 1024, 4096, 16384):
+        steps, program = stepping(chain, figures.lanes(chain, state, batch), batch)
+        yield batch, "us a step and lane", 1e6 / steps, {"svkc": program}
+
+
+def time():
+    """The high bar without releases, 0.5 to 8 s."""
+    chain, state = figures.case("high bar")
+    for end in (0.5, 1.0, 2.0, 4.0, 8.0):
+        yield end, "ms a run", 1e3, {"svkc": Program(lambda s, end=end: svkc.simulate(chain, s, end, throw=False).final, state)}
+
+
+def events():
+    """A pendulum for 2 s, its pin cut and made again 1 to 64 times."""
+    chain = svkc.load(chain_of(1), cuttable="j0")
+    state = chain.state({"j0": 1.0})
+    for count in (1, 4, 16, 64):
+        when = [svkc.at(2 * (i + 1) / (count + 1), **({"connect": "j0", "here": True} if i % 2 else {"cut": "j0"})) for i in range(count)]
+        run = lambda s, when=when, count=count: svkc.simulate(chain, s, 2.0, events=when, max_events=count, throw=False).final
+        yield count, "ms a run", 1e3, {"svkc": Program(run, state)}
+
+
+GROWTH = {f.__name__: f for f in (links, loops, lanes, time, events)}
+
+
+def draw(table):
+    """A panel for each of what grows."""
+    import matplotlib.pyplot as plt
+
+    names = list(dict.fromkeys(row[0] for row in table))
+    figure, axes = plt.subplots(1, len(names), figsize=(3.2 * len(names), 3), layout="constrained", squeeze=False)
+    for ax, name in zip(axes[0], names):
+        rows = [row for row in table if row[0] == name]
+        ax.loglog([float(row[1]) for row in rows], [float(row[3]) for row in rows], "o-", label="svkc")
+        if rows[0][6]:
+            ax.loglog([float(row[1]) for row in rows], [float(row[6]) for row in rows], "s:", label="MuJoCo")
+            ax.legend(fontsize=8)
+        ax.set(xlabel=name, ylabel=rows[0][2])
+        ax.grid(alpha=0.3)
+    figure.savefig(RESULTS / "scaling.png", dpi=110)
+
+
+def main(asked):
+    """Measures, prints, fits, writes."""
+    table = []
+    print("| " + " | ".join(HEAD) + " |")
+    for name in asked:
+        begun = len(table)
+        for size, unit, scale, runs in GROWTH[name]():
+            seconds = {who: x * scale for who, x in speed.timed(runs).items()}
+            ours, peer = seconds["svkc"], seconds.get("MuJoCo")
+            made = [f"{value:.2f}" for value in runs["svkc"].made]
+            table.append([name, size, unit, *(f"{f(ours):.3g}" for f in (np.median, min, max)), "" if peer is None else f"{np.median(peer):.3g}", *made])
+            print("| " + " | ".join(map(str, table[-1])) + " |", flush=True)
+        sizes, costs = (np.log([float(row[i]) for row in table[begun:]]) for i in (1, 3))
+        print(f"{name}: exponent {np.polyfit(sizes, costs, 1)[0]:.2f} over all, {np.polyfit(sizes[-3:], costs[-3:], 1)[0]:.2f} over the last three", flush=True)
+    with (RESULTS / "scaling.csv").open("w", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows([[*HEAD, *speed.machine()], *([*row, *speed.machine().values()] for row in table)])
+    draw(table)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:] or GROWTH)
