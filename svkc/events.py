@@ -1,7 +1,7 @@
 """F5: changes of structure to come, at a time or when a guard crosses zero, and where in a step it does."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import equinox as eqx
@@ -44,18 +44,23 @@ class When(eqx.Module):
     direction: bool | None = eqx.field(static=True, default=None)
 
 
+def _several(value) -> tuple:
+    """One thing, or what holds several."""
+    return tuple(value) if isinstance(value, Iterable) and not isinstance(value, str) else (value,)
+
+
 def _names(value) -> tuple[str, ...]:
-    names = (value,) if isinstance(value, str) else tuple(value)
+    names = _several(value)
     if not all(isinstance(n, str) for n in names):
         raise ValueError(f"expected names, got {value!r}")
     return names
 
 
 def _action(connect, cut, lock, unlock, here, stop, bind, unbind) -> Action:
-    bind = (bind,) if isinstance(bind, Grip) else tuple(bind)
+    bind = _several(bind)
     if not all(isinstance(g, Grip) for g in bind):
         raise ValueError(f"bind: expected svkc.Grip objects, got {bind!r}")
-    unbind = (unbind,) if isinstance(unbind, str) else tuple(unbind)
+    unbind = _several(unbind)
     if len(unbind) == 2 and all(isinstance(u, str) for u in unbind) and not all(u.startswith("spare_") for u in unbind):
         unbind = (unbind,)
     if not all(isinstance(u, str) or (isinstance(u, tuple) and len(u) == 2) for u in unbind):

@@ -70,12 +70,13 @@ def compile_model(source):
 
     if isinstance(source, mujoco.MjModel):
         return source
+    if not isinstance(source, (mujoco.MjSpec, str, os.PathLike)):
+        raise ValueError(f"source: expected MJCF or URDF text, a path, MjSpec or MjModel, got {type(source).__name__}")
+    text = "<" if isinstance(source, mujoco.MjSpec) else os.fspath(source)
+    if "<" not in text and not pathlib.Path(text).is_file():
+        raise ValueError(f"source: no such file: {text}")
     try:
-        if isinstance(source, mujoco.MjSpec):
-            return source.compile()
-        return _read(os.fspath(source))
-    except TypeError as error:
-        raise ValueError(f"source: expected MJCF or URDF text, a path, MjSpec or MjModel, got {type(source).__name__}") from error
+        return source.compile() if isinstance(source, mujoco.MjSpec) else _read(text)
     except (ValueError, OSError) as error:
         raise ValueError(f"source: the model cannot be read: {error}") from error
 
@@ -85,8 +86,6 @@ def _read(text: str):
     import mujoco
 
     inline = "<" in text
-    if not inline and not pathlib.Path(text).is_file():
-        raise ValueError(f"no such file: {text}")
     if "<robot" not in (text if inline else pathlib.Path(text).read_text(errors="replace")):
         return mujoco.MjModel.from_xml_string(text) if inline else mujoco.MjModel.from_xml_path(text)
     spec = mujoco.MjSpec.from_string(text) if inline else mujoco.MjSpec.from_file(text)

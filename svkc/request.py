@@ -106,7 +106,7 @@ def checked(
     return options, save_at, made
 
 
-def _solving(solver: diffrax.AbstractSolver | None, controller, dtype) -> diffrax.AbstractSolver:
+def _solving(solver, controller, dtype) -> diffrax.AbstractSolver:
     """The solver, or the default; one with implicit stages solves them as closely as steps are controlled, or, where they are not, to sqrt(eps) and better."""
     if solver is None:
         return diffrax.Dopri8() if np.finfo(dtype).eps < 1e-10 and controller is not None else diffrax.Tsit5()

@@ -1,0 +1,210 @@
+"""docs/errors.md: every message of the library is on the page, and every one of them is provoked, here or where the page's list says."""
+
+import pathlib
+import re
+from unittest import mock
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import models
+import numpy as np
+import pytest
+import said
+
+import svkc
+from svkc.operation import operation
+from svkc.request import _check_state
+
+PAGE = (pathlib.Path(__file__).parent.parent / "docs" / "errors.md").read_text()
+LINES = PAGE.split("| message | raised by | what to do |\n|---|---|---|\n")[1].splitlines()
+ROWS = [line.removeprefix("| ").split(" | ")[0].replace("&lt;", "<") for line in LINES]
+# provoked in tests that need more than a call
+ELSEWHERE = {
+    "rollout: another process": ("test_rollout.py", "another process"),
+    "out: ... holds another": ("test_rollout.py", "holds another rollout"),
+}
+
+
+class Setting:
+    """What calls are made on."""
+
+    def __init__(self, folder):
+        self.folder = folder
+        self.four = models.four_bar()
+        self.state = self.four.state()
+        self.spare = svkc.load(models.MJCF.format(models.FOUR_BAR), spare=1)
+        self.empty = self.spare.state()
+        self.motor = models.MJCF.format(models.bar("arm", models.Y, "0 0 -1")).replace("</mujoco>", '<actuator><motor joint="arm"/></actuator></mujoco>')
+
+    def simulate(self, chain=None, **kw):
+        chain = chain or self.four
+        state = kw.pop("state", self.state if chain is self.four else self.empty)
+        return svkc.simulate(chain, state, **({"t1": 1.0} | kw))
+
+    def load(self, text=None, **kw):
+        return svkc.load(text or models.MJCF.format(models.FOUR_BAR), **kw)
+
+    def file(self, **changed):
+        """Loads a run whose file was changed."""
+        path = self.folder / "run.npz"
+        if not path.exists():
+            self.simulate(t1=1e-3, dt=1e-3).save(path)
+        with np.load(path) as file:
+            arrays = dict(file) | changed
+        np.savez(self.folder / "changed.npz", **{name: x for name, x in arrays.items() if x is not None})
+        return svkc.load_trajectory(self.folder / "changed.npz")
+
+    def bound(self, *args, **kw):
+        return svkc.bind(self.spare, self.empty, "spare_0", *args, **kw)
+
+
+def away(s):
+    """A link that is to hold what is elsewhere."""
+    chain = s.load(virtual_links=[link(pos=(5, 0, 0), real_pos=(0, 0, 0))])
+    return svkc.connect(chain, chain.state(), "x")
+
+
+def link(**kw):
+    return svkc.VirtualLink(**({"name": "x", "parent": "world", "real": "rocker"} | kw))
+
+
+def single(s):
+    with jax.enable_x64(False):
+        s.simulate()
+
+
+def crowded(s):
+    with mock.patch("jax.process_count", return_value=9):
+        svkc.rollout(s.four, jax.tree.map(lambda x: x[None], s.state), 1.0)
+
+
+def undrawn(s):
+    traj = s.simulate(t1=1e-3, dt=1e-3)
+    with mock.patch.dict("sys.modules", {"mujoco.egl": None, "mujoco.osmesa": None, "mujoco.glfw": None}):
+        svkc.render(s.four, traj, s.folder / "x.gif")
+
+
+CASES = {
+    "... is not linear": lambda s: jax.linear_transpose(operation("odd", jnp.sin, lambda p, t: (p[0], t[0])), jnp.ones(2))(jnp.ones(2)),
+    "no library to draw with": undrawn,
+    "state and chain are float64": single,
+    "states: ... lanes": crowded,
+    "... has schema": lambda s: s.file(metadata=np.array('{"schema": 99}')),
+    "... is not a whole trajectory": lambda s: s.file(metadata=None),
+    "... lacks": lambda s: s.file(ts=None),
+    "...: expected finite": lambda s: s.four.state([np.nan, 0, 0]),
+    "...: expected real": lambda s: s.four.state(["a", "b", "c"]),
+    "...: got ..., expected a positive": lambda s: s.simulate(dt=-1.0),
+    "...: got shape ..., expected (...,) for the tree": lambda s: s.four.state(np.zeros(7)),
+    "...: got shape ..., expected a number or": lambda s: svkc.actuation(s.four, s.state, jnp.zeros(4), bounds=(np.zeros(2), np.ones(2))),
+    "...: got shape ..., expected one number": lambda s: s.simulate(t1=jnp.ones(2)),
+    "...[...]: got": lambda s: s.four.state({"crank": [1.0, 2.0]}),
+    "actuated: expected": lambda s: svkc.actuation(s.four, s.state, jnp.zeros(4), actuated=np.ones(2, bool)),
+    "adjoint: expected": lambda s: s.simulate(adjoint="replay"),
+    "adjoint: svkc.Replay": lambda s: s.simulate(stepsize_controller=diffrax.StepTo(jnp.linspace(0, 1, 5)), adjoint=svkc.Replay()),
+    "at: got time": lambda s: s.simulate(events=[svkc.at(-1.0, cut="pin")]),
+    "at: time must": lambda s: s.simulate(events=[svkc.at(jnp.ones(2), cut="pin")]),
+    "bind: ... is not": lambda s: svkc.bind(s.four, s.state, "pin", "world", "rocker"),
+    "bind: a spare slot has no": lambda s: s.bound("world", "rocker", joint="universal"),
+    "bind: axis": lambda s: s.bound("world", "rocker", joint="hinge", axis=(0, 0, 0)),
+    "bind: expected": lambda s: svkc.at(0.5, bind="rocker"),
+    "bind: no body": lambda s: s.bound("world", "nobody"),
+    "bind: real_pos": lambda s: s.simulate(s.spare, events=[svkc.at(0.5, bind=[svkc.Grip("world", "rocker", real_pos=jnp.zeros(2))])]),
+    "bind: the chain": lambda s: s.simulate(events=[svkc.at(0.5, bind=[svkc.Grip("world", "rocker")])]),
+    "bounds: expected": lambda s: svkc.actuation(s.four, s.state, jnp.zeros(4), bounds=(1.0, -1.0)),
+    "bounds: the bounded": lambda s: jax.jit(lambda x: svkc.actuation(s.four, s.state, x, bounds=(-1.0, 1.0)))(jnp.zeros(4)),
+    "check_grad: f(x)": lambda s: svkc.check_grad(lambda x: jnp.log(x), jnp.asarray(-1.0)),
+    "check_grad: x has": lambda s: svkc.check_grad(lambda x: x, jnp.asarray(1)),
+    "connect: the bodies": away,
+    "connected: expected": lambda s: s.four.state(connected=np.ones(3)),
+    "control: expected": lambda s: s.simulate(control=3),
+    "cuttable: ... belongs": lambda s: s.load(
+        models.MJCF.format('<body name="b"><joint name="x" type="slide"/><joint name="y" type="slide"/><geom size="0.1"/></body>'), cuttable="x"
+    ),
+    "cuttable: no joint": lambda s: s.load(cuttable="nobody"),
+    "data: got": lambda s: svkc.to_mujoco(s.four, s.state, type("Data", (), {"qpos": np.zeros(1), "qvel": np.zeros(1)})()),
+    "dt asks": lambda s: s.simulate(dt=0.1, rtol=1e-3),
+    "dynamics.hold": lambda s: s.simulate(dynamics=svkc.Dynamics(hold=2.0)),
+    "dynamics: expected": lambda s: s.simulate(dynamics=3),
+    "events: expected": lambda s: s.simulate(events=["pin"]),
+    "expected names": lambda s: svkc.at(0.5, connect=3),
+    "here: ...": lambda s: svkc.at(0.5, connect="pin", here="other"),
+    "ignore: got": lambda s: s.load(ignore=("nothing",)),
+    "joint: got": lambda s: link(joint="screw"),
+    "leaves: axis": lambda s: svkc.leaves(s.four, "pin", axis=(0, 0, 0)),
+    "max_events": lambda s: s.simulate(max_events=-1),
+    "max_steps": lambda s: s.simulate(max_steps=0),
+    "mode: got": lambda s: svkc.check_grad(lambda x: x, jnp.asarray(1.0), mode="sideways"),
+    "no joint ...": lambda s: s.four.state({"nobody": 1.0}),
+    "no joint coordinate": lambda s: svkc.prefer(s.four, s.state, "nobody"),
+    "source: no such file": lambda s: s.load("nowhere.xml"),
+    "no virtual link": lambda s: svkc.cut(s.four, s.state, "nobody"),
+    "overload: give": lambda s: svkc.overload(s.four, "pin"),
+    "q: the quaternion": lambda s: s.load(models.MJCF.format(models.bar("b", 'type="ball"', "0 0 1"))).state([1.0, 1.0, 0, 0]),
+    "render: ...": lambda s: svkc.render(s.four, s.simulate(t1=1e-3, dt=1e-3), "x.bmp"),
+    "rtol and atol": lambda s: s.simulate(rtol=1e-3, stepsize_controller=diffrax.PIDController(rtol=1e-3, atol=1e-6)),
+    "simulate stopped": lambda s: s.simulate(t1=1e-2, dt=1e-3, max_steps=2),
+    "solver: expected": lambda s: s.simulate(solver="euler"),
+    "source: expected": lambda s: svkc.load(3),
+    "source: the model": lambda s: s.load("<mujoco><nonsense/></mujoco>"),
+    "stabilization": lambda s: s.simulate(stabilization=3),
+    "state....: got": lambda s: s.simulate(state=svkc.State(jnp.zeros(2), s.state.v, s.state.structure)),
+    "state.q is": lambda s: s.simulate(state=eqx.tree_at(lambda x: (x.q, x.v), s.state, replace_fn=lambda x: x.astype(jnp.float32))),
+    "state: expected": lambda s: _check_state.__wrapped__(s.four, 3),
+    "state: q and v": lambda s: s.simulate(state=svkc.State(s.state.q * jnp.nan, s.state.v, s.state.structure)),
+    "states, data, cost": lambda s: svkc.rollout(s.four, jax.tree.map(lambda x: x[None], s.state), 1.0, data=jnp.zeros(3)),
+    "states: expected": lambda s: svkc.rollout(s.four, 3, 1.0),
+    "t1: got": lambda s: s.simulate(t1=-1.0),
+    "target: ... cannot": lambda s: svkc.tune(s.four, s.state, 1e-2, target=1e-3, control=lambda t, x, args: jnp.full(s.four.dofs, jnp.nan)),
+    "target: got": lambda s: svkc.tune(s.four, s.state, 1.0, target=-1.0),
+    "tau: got": lambda s: svkc.forward_dynamics(s.four, s.state, jnp.zeros(9)),
+    "the loops cannot": lambda s: s.load(virtual_links=[link(pos=(50, 0, 0), real_pos=(0, 0, 0), connected=True)]).state(),
+    "the model has elements": lambda s: s.load(s.motor.replace("</worldbody>", '<site name="s"/></worldbody>').replace("<motor", "<position")),
+    "touch: axes": lambda s: svkc.touch(s.four, "pin", 0.1, axes="w"),
+    "ts: expected": lambda s: s.simulate(ts=jnp.array([0.5, 0.2])),
+    "u: got": lambda s: s.load(s.motor).motors(jnp.zeros(3)),
+    "unbind: expected": lambda s: svkc.at(0.5, unbind=3),
+    "vdot: got": lambda s: svkc.inverse_dynamics(s.four, s.state, jnp.zeros(9)),
+    "vdot_G: got": lambda s: svkc.actuation(s.four, s.state, jnp.zeros(9)),
+    "virtual link ...: ... is": lambda s: s.load(virtual_links=[link(parent="nobody")]),
+    "virtual link ...: ... must be ... finite": lambda s: link(pos=(1, 2)),
+    "virtual link ...: ... must be a unit": lambda s: link(quat=(1, 1, 0, 0)),
+    "virtual link ...: axis": lambda s: link(axis=(0, 0, 0)),
+    "virtual_links: expected": lambda s: s.load(virtual_links=["pin"]),
+    "virtual_links: names": lambda s: s.load(virtual_links=[link(), link()]),
+    "weight: expected": lambda s: svkc.actuation(s.four, s.state, jnp.zeros(4), weight=-np.ones(4)),
+    "when: direction": lambda s: svkc.when(lambda t, x, args: t, direction="up"),
+    "when: guard": lambda s: svkc.when(3),
+}
+
+
+@pytest.fixture(scope="module")
+def setting(tmp_path_factory):
+    return Setting(tmp_path_factory.mktemp("errors"))
+
+
+def _row(opening: str) -> str:
+    """The one row that begins so, and with no longer opening of another case."""
+    rows = [row for row in ROWS if row.startswith(opening) and not any(len(o) > len(opening) and row.startswith(o) for o in (*CASES, *ELSEWHERE))]
+    assert len(rows) == 1, (opening, rows)
+    return rows[0]
+
+
+def test_the_page_has_every_message():
+    assert sorted(ROWS) == sorted(said.messages())
+    assert sorted(map(_row, [*CASES, *ELSEWHERE])) == sorted(ROWS)
+    for file, words in ELSEWHERE.values():
+        assert words in (pathlib.Path(__file__).parent / file).read_text(), file
+    codes = [name for name in vars(svkc.RESULTS) if not name.startswith("_")]
+    for name in codes:
+        assert f"| `{name}` |" in PAGE, name
+
+
+@pytest.mark.parametrize("opening", CASES)
+def test_each_message(setting, opening):
+    pattern = r"[\s\S]*".join(map(re.escape, re.split(r"\.{3,}", _row(opening))))
+    with pytest.raises((ValueError, RuntimeError, NotImplementedError)) as caught:
+        CASES[opening](setting)
+    assert re.fullmatch(pattern, " ".join(str(caught.value).split())), caught.value
