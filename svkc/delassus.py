@@ -10,6 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.linalg import block_diag, cho_factor, cho_solve
 from jaxtyping import Array, Bool, Float
 
 from svkc.articulated import accelerations, articulate
@@ -74,7 +75,7 @@ def joints(chain: Chain, J: Float[Array, "rows dofs"]) -> Joints:
 def by_loop_forces(chain: Chain, kin: Kinematics, J: Float[Array, "rows dofs"], free: Bool[Array, " nv"] | None) -> Callable:
     """(force, rate) -> (x, mu) with M x = force + J^T mu and J x = rate, of rows that need not be independent. free: joints not locked (None: all).
 
-    D + a little is inverted, and refined against D (the proximal form): where rows repeat one another, or nearly so, the forces stay finite and the
+    D + a little is factored, and the forces refined against D (the proximal form): where rows repeat one another, or nearly so, the forces stay finite and the
     motion is that of the others.
     """
     top, nv, tree = chain.topology, chain.nv, J[:, : chain.nv]
@@ -85,12 +86,12 @@ def by_loop_forces(chain: Chain, kin: Kinematics, J: Float[Array, "rows dofs"], 
         # virtual joints with armature add what they give way by
         weight = jnp.where(own.armature > 0, 1 / jnp.where(own.armature > 0, own.armature, 1), 0)
         given = lambda force, mu: weight * (force + rotate(jnp.swapaxes(own.heavy, -1, -2), mu.reshape(-1, 6)))
-        D = D + jax.scipy.linalg.block_diag(*jnp.sum(own.heavy[:, :, None] * own.heavy[:, None] * weight[:, None, None], -1))
+        D = D + block_diag(*jnp.sum(own.heavy[:, :, None] * own.heavy[:, None] * weight[:, None, None], -1))
     D = own.across(own.across(D).T)
     most = jnp.max(jnp.diagonal(D))
     # (none where no loop is closed)
     little = jnp.finfo(J.dtype).eps ** 0.625 * jnp.where(most > 0, most, 1)
-    undo = _undone(D + little * jnp.eye(D.shape[0], dtype=J.dtype))
+    factor = cho_factor(D + little * jnp.eye(D.shape[0], dtype=J.dtype))
 
     def solve(force, rate):
         applied = own.of(force[nv:])
@@ -102,9 +103,9 @@ def by_loop_forces(chain: Chain, kin: Kinematics, J: Float[Array, "rows dofs"], 
         if own.heavy is not None:
             left = left - rotate(own.heavy, given(applied, carried)).ravel()
         left = own.across(left)
-        z = undo(left)
+        z = cho_solve(factor, left)
         for _ in range(REFINEMENTS):
-            z = z + undo(left - D @ z)
+            z = z + cho_solve(factor, left - D @ z)
         mu = own.across(z)
         x, mu = alone + mu @ moved, carried + mu
         turning = jnp.zeros_like(applied) if own.heavy is None else given(applied, mu)
@@ -112,14 +113,3 @@ def by_loop_forces(chain: Chain, kin: Kinematics, J: Float[Array, "rows dofs"], 
         return jnp.concatenate([x, own.order(turning + own.along(rate - seen))]), mu
 
     return solve
-
-
-def _undone(A: Float[Array, "n n"]) -> Callable:
-    """A^-1, of up to four loops as a matrix of blocks: a call of LAPACK for each lane would cost more than all else."""
-    n = A.shape[0]
-    if n > 24:
-        factor = jax.scipy.linalg.cho_factor(A)
-        return lambda x: jax.scipy.linalg.cho_solve(factor, x)
-    size = 6 * 2 ** int(np.ceil(np.log2(n / 6)))
-    inverse = inverse_positive(jnp.eye(size, dtype=A.dtype).at[:n, :n].set(A))[:n, :n]
-    return lambda x: rotate(inverse, x)

@@ -55,7 +55,7 @@ def skew(a: Float[Array, "*n 3"]) -> Float[Array, "*n 3 3"]:
 
 
 def inverse_positive(D: Float[Array, "*n k k"]) -> Float[Array, "*n k k"]:
-    """The inverses of small symmetric positive matrices, 1, 3, 6, 12, ... wide, without a call of LAPACK for each."""
+    """The inverses of small symmetric positive matrices, 1, 3 or 6 wide, without a call of LAPACK for each."""
     if D.shape[-1] == 1:
         return 1 / D
     if D.shape[-1] == 3:
