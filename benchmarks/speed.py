@@ -1,9 +1,9 @@
 """Steps of the 40-freedom figure on a free base (46 freedoms), open and with two grips, and of the high bar's, beside MuJoCo, MJX and Pinocchio.
 
-`python benchmarks/speed.py [case ...]` (extra `bench`) prints and writes results/speed.csv and draws results/speed.png. One step is symplectic Euler of 2 ms
+`python benchmarks/speed.py [case ...]` (extra `bench`) prints and writes results/speed.csv. One step is symplectic Euler of 2 ms
 with all that it needs; microseconds per step and lane, the median of rounds in which all that are compared take turns, and the least and most.
 svkc on one core is `vmap` of `svkc.step` in one program, on all cores tiles of 64 lanes, each device its own. Grips are hard in svkc and Pinocchio,
-soft in MuJoCo and MJX. Compile seconds: trace, lower, XLA. Then the time until a run of 2 s is within 1e-3 and 1e-6 of its exact end."""
+soft in MuJoCo and MJX. Compile seconds: trace, lower, XLA."""
 
 import csv
 import os
@@ -154,7 +154,6 @@ def compared(name: str, dtype: str, batch: int, said: set):
     v, steps, runs = np.asarray(figures.lanes(chain, state, batch).v[:, : chain.nv], float), steps_for(batch), {}
     peers = [lambda *_: by_svkc(chain, state, batch, steps)]
     peers += [lambda *a: by_mujoco(*a), lambda *a: by_pinocchio(*a)] if dtype == "float64" or batch > 1 else [by_mujoco]
-    # (16384 lanes of MJX take minutes and gigabytes)
     peers += [by_mjx] if batch <= 1024 else []
     for peer in peers:
         try:
