@@ -69,19 +69,37 @@ def articulate(chain: Chain, kin: Kinematics, free: Bool[Array, " nv"] | None = 
     return out
 
 
-def accelerations(top: Topology, bodies: Articulated, f: Float[Array, " nv"]) -> Float[Array, " nv"]:
-    """M^-1 f: the joints' accelerations at rest, without gravity (Featherstone table 7.1)."""
+def _apply(A: Float[Array, "n i j"], x: Float[Array, "n j *k"]) -> Float[Array, "n i *k"]:
+    return jnp.sum(A.reshape(*A.shape, *(1,) * (x.ndim - 2)) * x[:, None], 2)
+
+
+def _carried(top: Topology, bodies: Articulated, f: Float[Array, "nv *k"]) -> list[tuple[Float[Array, "n d *k"], Float[Array, "n d *k"]]]:
+    """For each level the forces that its joints are left with, those from below taken off, and the accelerations that these give each joint alone."""
     index = tables(top)
     f = jnp.concatenate([f, jnp.zeros_like(f[:1])])
-    forces, below = [], None
+    found, below = [], None
     for level in range(len(index), 0, -1):
         S, U, inverse, table = bodies.S[level - 1], bodies.U[level - 1], bodies.inverse[level - 1], index[level - 1]
         p = None if below is None else from_children(top, level, below)
-        u = f[table] if p is None else f[table] - jnp.sum(S * p[:, None], -1)
-        u = jnp.sum(inverse * u[:, None], -1)
-        passed = jnp.sum(U * u[..., None], 1)
+        u = f[table] if p is None else f[table] - _apply(S, p)
+        x = _apply(inverse, u)
+        passed = _apply(jnp.swapaxes(U, 1, 2), x)
         below = passed if p is None else passed + p
-        forces.insert(0, u)
+        found.insert(0, (u, x))
+    return found
+
+
+def seen_by(top: Topology, bodies: Articulated, J: Float[Array, "rows nv"]) -> Float[Array, "rows rows"]:
+    """J M^-1 J^T. M = L D L^T with a joint's block of D for each (Featherstone section 6.5), so that half the way to M^-1 J^T is enough."""
+    parts = _carried(top, bodies, J.T)
+    u, x = (jnp.concatenate([part[i].reshape(-1, J.shape[0]) for part in parts]) for i in (0, 1))
+    # a sum, not a `dot`, which XLA's CPU backend would not put into one kernel with what is around it
+    return jnp.sum(u[:, :, None] * x[:, None], 0)
+
+
+def accelerations(top: Topology, bodies: Articulated, f: Float[Array, " nv"]) -> Float[Array, " nv"]:
+    """M^-1 f: the joints' accelerations at rest, without gravity (Featherstone table 7.1)."""
+    index, forces = tables(top), [x for _, x in _carried(top, bodies, f)]
     found, above = [], None
     for level in range(1, len(index) + 1):
         S, U, inverse, x = bodies.S[level - 1], bodies.U[level - 1], bodies.inverse[level - 1], forces[level - 1]

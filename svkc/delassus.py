@@ -7,29 +7,31 @@ inertia: along them nothing is carried, so the rows are seen across them alone.
 from collections.abc import Callable
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import block_diag, cho_factor, cho_solve
 from jaxtyping import Array, Bool, Float
 
-from svkc.articulated import accelerations, articulate
+from svkc.articulated import accelerations, articulate, seen_by
 from svkc.chain import Chain
 from svkc.kinematics import Kinematics
 from svkc.spatial import inverse_positive, rotate
 
 # of the forces' error, along a row with 1e-6 of the others' inverse inertia, each leaves 1e-4 (float64)
 REFINEMENTS = 2
+# rows from which LAPACK factors D: the inverse by halves is compiled for each size, and its operations grow with the rows
+LARGE = 36
 
 
 class Joints(eqx.Module):
-    """The virtual joints' own coordinates, link by link: motion [links, row, freedom] of those without inertia, and (S^T S)^-1 of it; of those with
-    armature (N m s^2, N s^2/m), and that (None: no joint has any); where each stands among the coordinates of virtual joints (`count`: nowhere)."""
+    """The virtual joints' own coordinates, link by link, as many as the freest has: motion [links, row, freedom] of those without inertia, and
+    (S^T S)^-1 of it; of those with armature (N m s^2, N s^2/m), and that (None: no joint has any); where each stands among the coordinates of virtual
+    joints (`count`: nowhere)."""
 
-    light: Float[Array, "links 6 6"]
-    inverse: Float[Array, "links 6 6"]
-    heavy: Float[Array, "links 6 6"] | None
-    armature: Float[Array, "links 6"] | None
+    light: Float[Array, "links 6 d"]
+    inverse: Float[Array, "links d d"]
+    heavy: Float[Array, "links 6 d"] | None
+    armature: Float[Array, "links d"] | None
     place: np.ndarray
     count: int
 
@@ -38,28 +40,29 @@ class Joints(eqx.Module):
         rates = self.along(x)
         return x - rotate(_led(self.light, rates), rates).reshape(x.shape)
 
-    def along(self, x: Float[Array, "*n rows"]) -> Float[Array, "*n links 6"]:
+    def along(self, x: Float[Array, "*n rows"]) -> Float[Array, "*n links d"]:
         """The rates of virtual joints without inertia that follow the rows best."""
         x = x.reshape(*x.shape[:-1], -1, 6)
         return rotate(_led(self.inverse, x), rotate(_led(jnp.swapaxes(self.light, -1, -2), x), x))
 
-    def of(self, x: Float[Array, " virtual"]) -> Float[Array, "links 6"]:
+    def of(self, x: Float[Array, " virtual"]) -> Float[Array, "links d"]:
         """What stands for each freedom of each link; zero for those that are none."""
         return jnp.concatenate([x, jnp.zeros_like(self.light[0, 0, :1])])[np.minimum(self.place, self.count)]
 
-    def order(self, rates: Float[Array, "links 6"]) -> Float[Array, " virtual"]:
+    def order(self, rates: Float[Array, "links d"]) -> Float[Array, " virtual"]:
         """The same in the order of the coordinates."""
         flat = self.place.ravel()
         return rates.ravel()[np.argsort(flat, kind="stable")[: np.sum(flat < self.count)]]
 
 
-def _led(A: Float[Array, "links 6 6"], x: Float[Array, "*n links 6"]) -> Float[Array, "*m links 6 6"]:
+def _led(A: Float[Array, "links i j"], x: Float[Array, "*n links k"]) -> Float[Array, "*m links i j"]:
     return A.reshape(*(1,) * (x.ndim - 2), *A.shape)
 
 
 def joints(chain: Chain, J: Float[Array, "rows dofs"]) -> Joints:
     """From the columns of the virtual joints in J."""
-    place, count = chain.topology.links.dof - chain.nv, chain.dofs - chain.nv
+    place, count = np.sort(chain.topology.links.dof - chain.nv, 1), chain.dofs - chain.nv
+    place = place[:, : max(1, np.max(np.sum(place < count, 1)))]
     own = jnp.concatenate([J[:, chain.nv :], jnp.zeros_like(J[:, :1])], 1).reshape(-1, 6, count + 1)
     light = jnp.swapaxes(own[np.arange(len(place))[:, None], :, np.minimum(place, count)], -1, -2)
     heavy = armature = None
@@ -68,7 +71,7 @@ def joints(chain: Chain, J: Float[Array, "rows dofs"]) -> Joints:
         heavy = jnp.where(armature[:, None] > 0, light, 0)
         light = light - heavy
     still = jnp.where(jnp.all(light == 0, 1), 1, 0).astype(J.dtype)
-    G = jnp.sum(light[:, :, :, None] * light[:, :, None], 1) + still[:, :, None] * np.eye(6, dtype=J.dtype)[None]
+    G = jnp.sum(light[:, :, :, None] * light[:, :, None], 1) + still[:, :, None] * np.eye(place.shape[1], dtype=J.dtype)[None]
     return Joints(light, inverse_positive(G), heavy, armature, place, count)
 
 
@@ -80,34 +83,39 @@ def by_loop_forces(chain: Chain, kin: Kinematics, J: Float[Array, "rows dofs"], 
     """
     top, nv, tree = chain.topology, chain.nv, J[:, : chain.nv]
     bodies, own = articulate(chain, kin, free), joints(chain, J)
-    moved = jax.vmap(lambda row: accelerations(top, bodies, row))(tree)
-    D = tree @ moved.T
+    D = seen_by(top, bodies, tree)
     if own.heavy is not None:
         # virtual joints with armature add what they give way by
         weight = jnp.where(own.armature > 0, 1 / jnp.where(own.armature > 0, own.armature, 1), 0)
         given = lambda force, mu: weight * (force + rotate(jnp.swapaxes(own.heavy, -1, -2), mu.reshape(-1, 6)))
         D = D + block_diag(*jnp.sum(own.heavy[:, :, None] * own.heavy[:, None] * weight[:, None, None], -1))
     D = own.across(own.across(D).T)
-    most = jnp.max(jnp.diagonal(D))
+    most = jnp.max(jnp.where(np.eye(D.shape[0], dtype=bool), D, 0))
     # (none where no loop is closed)
     little = jnp.finfo(J.dtype).eps ** 0.625 * jnp.where(most > 0, most, 1)
-    factor = cho_factor(D + little * jnp.eye(D.shape[0], dtype=J.dtype))
+    raised = D + little * jnp.eye(D.shape[0], dtype=J.dtype)
+    if D.shape[0] < LARGE:
+        inverse = inverse_positive(raised)
+        nearly = lambda x: rotate(inverse, x)
+    else:
+        factor = cho_factor(raised)
+        nearly = lambda x: cho_solve(factor, x)
 
     def solve(force, rate):
         applied = own.of(force[nv:])
         massless = applied if own.heavy is None else jnp.where(own.armature > 0, 0, applied)
         # what acts on joints without inertia is carried by the loops
         carried = -rotate(own.light, rotate(own.inverse, massless)).ravel()
-        alone = accelerations(top, bodies, force[:nv]) + carried @ moved
+        alone = accelerations(top, bodies, force[:nv] + carried @ tree)
         left = rate - tree @ alone
         if own.heavy is not None:
             left = left - rotate(own.heavy, given(applied, carried)).ravel()
         left = own.across(left)
-        z = cho_solve(factor, left)
+        z = nearly(left)
         for _ in range(REFINEMENTS):
-            z = z + cho_solve(factor, left - D @ z)
-        mu = own.across(z)
-        x, mu = alone + mu @ moved, carried + mu
+            z = z + nearly(left - D @ z)
+        mu = carried + own.across(z)
+        x = accelerations(top, bodies, force[:nv] + mu @ tree)
         turning = jnp.zeros_like(applied) if own.heavy is None else given(applied, mu)
         seen = tree @ x if own.heavy is None else tree @ x + rotate(own.heavy, turning).ravel()
         return jnp.concatenate([x, own.order(turning + own.along(rate - seen))]), mu

@@ -35,7 +35,7 @@ def newton_euler(chain: Chain, kin: Kinematics, V: Float[Array, "rows 6"] | None
 def generalized_forces(chain: Chain, kin: Kinematics, V, v, vdot: Float[Array, " nv"]) -> Float[Array, " nv"]:
     """ID(q, v, vdot) of the tree with gravity and armature (paper, section III-A, step 2)."""
     A = down(chain.topology, to_rows(chain.topology, kin.S * vdot[:, None]) + velocity_products(chain, kin, V, v))
-    A = A.at[:, 3:].add(-chain.gravity[None])
+    A = A - jnp.concatenate([jnp.zeros_like(chain.gravity), chain.gravity])[None]
     tau = newton_euler(chain, kin, V, A)
     return tau if chain.armature is None else tau + chain.armature * vdot
 

@@ -51,6 +51,13 @@ def from_children(top: Topology, level: int, below: Float[Array, "below *n"]) ->
     return jnp.sum(jnp.concatenate([below, jnp.zeros_like(below[:1])])[table], 1)
 
 
+def put(x: Float[Array, "rows *n"], rows: np.ndarray, values: Float[Array, "some *n"]) -> Float[Array, "rows *n"]:
+    """X with some of its rows replaced. (No scatter: XLA's CPU backend makes one kernel of a loop's whole body only where there is none.)"""
+    source = np.arange(len(x))
+    source[rows] = len(x) + np.arange(len(rows))
+    return jnp.concatenate([x, values])[source]
+
+
 def to_rows(top: Topology, x: Float[Array, "nv *n"]) -> Float[Array, "rows *n"]:
     """Sum of x over the coordinates of each row's joint."""
     parts, order = [], []
@@ -86,13 +93,13 @@ def _joint_poses(chain: Chain, q: Float[Array, " q"]):
     if len(balls):
         turn.append((balls, quat_normalize(q[start[balls][:, None] + np.arange(4)])))
     for rows, joint in turn:
-        quat = quat.at[rows].set(quat_multiply(fixed[rows], joint))
+        quat = put(quat, rows, quat_multiply(fixed[rows], joint))
     free = top.rows_of(FREE)
     if len(free):
-        quat = quat.at[free].set(quat_normalize(q[start[free][:, None] + np.arange(3, 7)]))
+        quat = put(quat, free, quat_normalize(q[start[free][:, None] + np.arange(3, 7)]))
     if len(slides):
         along = q[start[slides]] - chain.q_load[start[slides]]
-        slide = jnp.zeros_like(chain.axis).at[slides].set(along[:, None] * chain.axis[slides])
+        slide = put(jnp.zeros_like(chain.axis), slides, along[:, None] * chain.axis[slides])
     return quat, fixed, slide
 
 
@@ -102,7 +109,7 @@ def _compose(top: Topology, quat: Float[Array, "rows 4"]) -> Float[Array, "rows 
     if len(top.levels) > LEVELS_UNROLLED:
         above = np.maximum(parent, 0)
         for _ in range(int(np.ceil(np.log2(len(top.levels))))):
-            quat, above = quat_multiply(quat[above], quat).at[0].set(quat[0]), above[above]
+            quat, above = jnp.concatenate([quat[:1], quat_multiply(quat[above], quat)[1:]]), above[above]
         return quat
     levels = [quat[:1]]
     for (start, _), (first, last) in zip(top.levels[:-1], top.levels[1:], strict=True):
@@ -127,9 +134,9 @@ def kinematics(chain: Chain, q: Float[Array, " q"]) -> Kinematics:
         step = step + rotate(above, rotate(quat_matrix(fixed), chain.anchor)) - rotate(R, chain.anchor)
     free = top.rows_of(FREE)
     if len(free):
-        step = step.at[free].set(q[np.array(top.q_start)[free][:, None] + np.arange(3)])
-    roots = np.array(top.parent) == 0
-    r = down(top, jnp.where(roots[:, None], 0, step).at[0].set(0))
+        step = put(step, free, q[np.array(top.q_start)[free][:, None] + np.arange(3)])
+    roots = np.array(top.parent) <= 0
+    r = down(top, jnp.where(roots[:, None], 0, step))
     return Kinematics(R, quat, r, step[top.root], _axes(chain, R, r))
 
 
@@ -220,7 +227,7 @@ def normalize(chain: Chain, q: Float[Array, " q"]) -> Float[Array, " q"]:
     if not len(quat_q):
         return q
     at = quat_q[:, None] + np.arange(4)
-    return q.at[at].set(quat_normalize(q[at]))
+    return put(q, at.ravel(), quat_normalize(q[at]).ravel())
 
 
 @jax.jit

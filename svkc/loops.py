@@ -127,10 +127,10 @@ def loop_jacobian(chain: Chain, structure: Structure, kin: Kinematics, end: Ends
     tree = sign[:, :, None] * shift_motion(kin.S[None], place)
     own = _virtual_axes(chain, structure, end)
     count = len(top.link_names)
-    virtual = jnp.zeros((count, top.dofs - top.nv, 6), kin.r.dtype)
-    for i in range(count):
-        slots = np.flatnonzero(top.links.dof[i] < top.dofs)
-        virtual = virtual.at[i, top.links.dof[i, slots] - top.nv].set(own[i, slots])
+    # of each link and coordinate the row in `own`, which is followed by zeros
+    source = np.full((count, top.dofs + 1), 6 * count)
+    np.put_along_axis(source, top.links.dof, np.arange(6 * count).reshape(-1, 6), 1)
+    virtual = jnp.concatenate([own.reshape(-1, 6), jnp.zeros((1, 6), own.dtype)])[source[:, top.nv : top.dofs]]
     J = jnp.concatenate([tree, virtual], 1)
     J = jnp.where(structure.connected[:, None, None] & active_dofs(chain, structure)[None, :, None], J, 0)
     return jnp.swapaxes(J, 1, 2).reshape(-1, top.dofs)

@@ -13,6 +13,7 @@ from svkc.chain import Chain, State
 from svkc.forward_dynamics import joint_torques, moving
 from svkc.inverse_dynamics import limit_forces
 from svkc.kinematics import LEVELS_UNROLLED, integrate
+from svkc.lanes import with_lanes_last
 from svkc.loops import active_dofs
 
 
@@ -66,8 +67,12 @@ def step(chain: Chain, state: State, tau: Float[Array, " torques"], dt: Float[Ar
     Each step takes away a quarter of what loops are open by (Baumgarte's rate 1 / (2 dt)). First order; structure, events, other orders and error
     control: `svkc.simulate`. ValueError: tau has another size.
     """
-    tau = joint_torques(chain, tau) + limit_forces(chain, state.q, state.v)
-    dt = jnp.asarray(dt, state.q.dtype)
+    return _step(chain, state, joint_torques(chain, tau), jnp.asarray(dt, state.q.dtype))
+
+
+@with_lanes_last
+def _step(chain: Chain, state: State, tau: Float[Array, " dofs"], dt: Float[Array, ""]) -> State:
+    tau = tau + limit_forces(chain, state.q, state.v)
     way = by_bodies if len(chain.topology.levels) <= LEVELS_UNROLLED else None
     v, vdot = moving(chain, state.structure, state.q, state.v, tau, way, 0.5 / dt if chain.link_names else None)
     v = v + dt * vdot

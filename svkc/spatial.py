@@ -44,8 +44,8 @@ def cross(a: Float[Array, "*#n 3"], b: Float[Array, "*#n 3"]) -> Float[Array, "*
     return rotate(_by(SKEW, a), b)
 
 
-def rotate(R: Float[Array, "*#n k k"], x: Float[Array, "*#n k"]) -> Float[Array, "*n k"]:
-    """R x (of vectors, or of quaternions), as a product and a sum, which fuse where a small `dot` would not."""
+def rotate(R: Float[Array, "*#n i k"], x: Float[Array, "*#n k"]) -> Float[Array, "*n i"]:
+    """R x (of vectors, quaternions, ...), as a product and a sum, which fuse where a small `dot` would not."""
     return jnp.sum(R * x[..., None, :], -1)
 
 
@@ -55,7 +55,7 @@ def skew(a: Float[Array, "*n 3"]) -> Float[Array, "*n 3 3"]:
 
 
 def inverse_positive(D: Float[Array, "*n k k"]) -> Float[Array, "*n k k"]:
-    """The inverses of small symmetric positive matrices, 1, 3 or 6 wide, without a call of LAPACK for each."""
+    """The inverses of small symmetric positive matrices by their halves, without a call of LAPACK for each."""
     if D.shape[-1] == 1:
         return 1 / D
     if D.shape[-1] == 3:

@@ -14,7 +14,7 @@ ROOT = pathlib.Path(__file__).parent.parent
 # the house floor by floor, the ground first
 HOUSE = [
     "spatial topology unsupported operation",
-    "chain reading selection",
+    "chain reading selection lanes",
     "kinematics trajectory cuttable interop",
     "inverse_dynamics loops archive load",
     "energy closure articulated",
