@@ -4,6 +4,7 @@ jax puts them first; the axes of 3, 6 or 46 that end up last are too short for t
 [..., lanes]; what has no rule here goes through jax's own `vmap`.
 """
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -18,11 +19,13 @@ from svkc.operation import operation
 
 # lanes that one processor takes at a time: what they need between two operations stays in its cache (benchmarks/README.md)
 TILE = 32
+# terms of a sum at a time: 46 in one loop cost a step with two grips a quarter of its time
+FEW = 8
 ELEMENTWISE = set(
     "abs add add_any and atan2 ceil clamp convert_element_type copy copy_p cos div eq exp exp2 expm1 floor ge gt integer_pow is_finite le log log1p lt max min "
     "mul ne neg not or pow rem round rsqrt select_n sign sin sqrt square stop_gradient sub tan tanh xor".split()
 )
-ALONG = {"argmax", "argmin", "cumsum", "reduce_and", "reduce_max", "reduce_min", "reduce_or", "reduce_prod", "reduce_sum", "rev", "split", "squeeze"}
+ALONG = {"argmax", "argmin", "cumsum", "reduce_and", "reduce_max", "reduce_min", "reduce_or", "reduce_prod", "rev", "split", "squeeze"}
 JOINING = {"concatenate", "stack"}
 CALLS = {
     "closed_call": "call_jaxpr",
@@ -74,6 +77,15 @@ def _gather(x, index, lanes: int, *, dimension_numbers, slice_sizes, **rest):
     return lax.gather(x.x, index, d._replace(operand_batching_dims=of_x, start_indices_batching_dims=of_index), (*slice_sizes, 1), **rest)
 
 
+def _sum(x: Array, axes: tuple[int, ...]) -> Array:
+    """Sums of few at a time: such a loop is unrolled, and the one over lanes around it can take several in one instruction."""
+    for axis in sorted(axes, reverse=True):
+        size = x.shape[axis]
+        parts = [jnp.sum(lax.slice_in_dim(x, i, min(i + FEW, size), axis=axis), axis) for i in range(0, max(size, 1), FEW)]
+        x = functools.reduce(jnp.add, parts)
+    return x
+
+
 def _dot(*sides, dimension_numbers, **_):
     """Products and sums: XLA has no `dot` whose lanes come last."""
     sides = [v.x if isinstance(v, Lanes) else jnp.asarray(v)[..., None] for v in sides]
@@ -85,7 +97,7 @@ def _dot(*sides, dimension_numbers, **_):
     # the other side's own axes are of one
     left, right = (jnp.transpose(x, (*b, *f, *c, x.ndim - 1)) for x, b, f, c in zip(sides, batch, free, contracted, strict=True))
     products = jnp.expand_dims(left, range(middle, end)) * jnp.expand_dims(right, range(axes, middle))
-    return jnp.sum(products, range(end, end + len(contracted[0])))
+    return _sum(products, tuple(range(end, end + len(contracted[0]))))
 
 
 def _scan(inputs: list, lanes: int, *, jaxpr, num_consts, num_carry, length, reverse, **_):
@@ -127,6 +139,8 @@ def _as_jax_does(primitive, inputs: list, params: dict, lanes: int):
 def _one(primitive, inputs: list, params: dict, shape: tuple[int, ...], lanes: int):
     """What one operation makes of values of which some are `Lanes`, in arrays [..., lanes]."""
     name, alone = primitive.name, len(inputs) == 1
+    if name == "reduce_sum":
+        return _sum(inputs[0].x, params["axes"])
     if name in ALONG:
         return primitive.bind(inputs[0].x, **params)
     if name in JOINING:
