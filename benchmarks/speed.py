@@ -1,19 +1,28 @@
 """Steps of the 40-freedom figure on a free base (46 freedoms), open and with two grips, and of the high bar's, beside MuJoCo, MJX and Pinocchio.
 
-`python benchmarks/speed.py [case ...]` (extra `bench`) prints and writes results/speed.csv. One step is symplectic Euler of 2 ms
-with all that it needs; microseconds per step and lane, the median of rounds in which all that are compared take turns, and the least and most.
+`python benchmarks/speed.py [case ...]` (extra `bench`) prints and writes results/speed.csv and draws results/speed.png. One step is symplectic Euler of 2 ms
+with all that it needs; microseconds per step and lane, the median of rounds in which all that are compared take turns, and the least and most;
+`times svkc`: of svkc on as many cores.
 XLA is told to make one kernel of a loop (README). svkc on one core is `vmap` of `svkc.step` in one program, on all cores each device has its own lanes.
 Grips are hard in svkc, soft in MuJoCo and MJX. Compile seconds: trace, lower, XLA."""
 
 import csv
+import json
 import os
 import pathlib
 import platform
+import subprocess
 import sys
 import time
 
-# before jax makes its first program; for all that are compared
-os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000000"
+WORKER = "--mjx"
+FLAGS = os.environ.get("XLA_FLAGS", "")
+if WORKER in sys.argv:
+    # on two cores its batches wait for one another for ever (mujoco-mjx 3.17.0, jax 0.10.1)
+    os.sched_setaffinity(0, {0})
+else:
+    # before jax makes its first program
+    os.environ["XLA_FLAGS"] = FLAGS + " --xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000000"
 
 import jax
 
@@ -54,7 +63,7 @@ class Program:
         stages = stages.lower()
         seconds.append(time.perf_counter())
         self.program, self.states = stages.compile(), states
-        self.made = [*np.diff([*seconds, time.perf_counter()]), self.program.memory_analysis().temp_size_in_bytes / 1e6]
+        self.made = [*np.diff([*seconds, time.perf_counter()]).tolist(), self.program.memory_analysis().temp_size_in_bytes / 1e6]
 
     def __call__(self):
         jax.block_until_ready(self.program(self.states))
@@ -104,17 +113,51 @@ def by_mujoco(model, q, v, batch: int, steps: int):
     yield "MuJoCo rollout, all cores", lambda: pool.rollout([model] * batch, workers, start, nstep=steps)
 
 
-def by_mjx(model, q, v, batch: int, steps: int):
-    """MJX in the precision of the moment, one device."""
-    from mujoco import mjx
+class Mjx:
+    """MJX in a process and on a core of its own, compiled as XLA does by itself."""
 
-    put = mjx.put_model(model)
-    data, step = mjx.make_data(put), lambda d: mjx.step(put, d)
-    place = lambda v: data.replace(qpos=jnp.asarray(q, jnp.result_type(float)), qvel=jnp.asarray(v, jnp.result_type(float)))
-    if batch == 1:
-        yield "MJX", Program(scanned(step, steps), place(v[0]))
-    else:
-        yield "MJX", Program(scanned(jax.vmap(step), steps), jax.vmap(place)(jnp.asarray(v)))
+    def __init__(self, *case):
+        env = os.environ | {"XLA_FLAGS": FLAGS}
+        self.process = subprocess.Popen([sys.executable, __file__, WORKER, *map(str, case)], env=env, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        answer = json.loads(self.process.stdout.readline())
+        if "missing" in answer:
+            raise ImportError(answer["missing"])
+        self.made = answer["made"]
+
+    def __call__(self):
+        """All its steps."""
+        self.process.stdin.write("\n")
+        self.process.stdin.flush()
+        self.process.stdout.readline()
+
+    def close(self):
+        """Ends the process."""
+        self.process.stdin.close()
+        self.process.wait()
+
+
+def mjx_worker(name: str, dtype: str, batch: int, steps: int):
+    """The other end of it: compiles, says what that took, and runs once for every line it reads."""
+    said = os.dup(1)
+    os.dup2(2, 1)
+    answer = lambda x: os.write(said, (json.dumps(x) + "\n").encode())
+    with jax.enable_x64(dtype == "float64"):
+        try:
+            from mujoco import mjx
+        except ImportError as missing:
+            answer({"missing": str(missing)})
+            return
+        chain, state = figures.case(name)
+        model, q, _ = figures.in_mujoco(name, chain, state)
+        v = jnp.asarray(figures.lanes(chain, state, batch).v[:, : chain.nv])
+        put = mjx.put_model(model)
+        data, step = mjx.make_data(put), lambda d: mjx.step(put, d)
+        place = lambda v: data.replace(qpos=jnp.asarray(q, v.dtype), qvel=v)
+        program = Program(scanned(step, steps), place(v[0])) if batch == 1 else Program(scanned(jax.vmap(step), steps), jax.vmap(place)(v))
+        answer({"made": program.made})
+        for _ in sys.stdin:
+            program()
+            answer("done")
 
 
 def by_pinocchio(model, q, v, batch: int, steps: int):
@@ -156,7 +199,7 @@ def compared(name: str, dtype: str, batch: int, said: set):
     v, steps, runs = np.asarray(figures.lanes(chain, state, batch).v[:, : chain.nv], float), steps_for(batch), {}
     peers = [lambda *_: by_svkc(chain, state, batch, steps)]
     peers += [lambda *a: by_mujoco(*a), lambda *a: by_pinocchio(*a)] if dtype == "float64" or batch > 1 else [by_mujoco]
-    peers += [by_mjx] if batch <= 1024 else []
+    peers += [lambda *_: [("MJX, one core", Mjx(name, dtype, batch, steps))]] if batch <= 1024 else []
     for peer in peers:
         try:
             runs |= dict(peer(model, q, v, batch, steps))
@@ -165,10 +208,32 @@ def compared(name: str, dtype: str, batch: int, said: set):
                 said.add(str(missing))
                 print(f"left out: {missing}", flush=True)
     times = {who: seconds / steps / batch * 1e6 for who, seconds in timed(runs).items()}
-    ours = min(float(np.median(x)) for who, x in times.items() if who.startswith("svkc"))
+    if "MJX, one core" in runs:
+        runs["MJX, one core"].close()
+    ours = {"all cores" in who: float(np.median(x)) for who, x in times.items() if who.startswith("svkc")}
     for who, x in times.items():
-        made = [f"{value:.2f}" for value in runs[who].made] if isinstance(runs[who], Program) else [""] * 4
-        yield [name, dtype, batch, who, *(f"{f(x):.3g}" for f in (np.median, min, max)), f"{np.median(x) / ours:.2f}", *made]
+        made = [f"{value:.2f}" for value in runs[who].made] if isinstance(runs[who], Program | Mjx) else [""] * 4
+        yield [name, dtype, batch, who, *(f"{f(x):.3g}" for f in (np.median, min, max)), f"{np.median(x) / ours.get('all cores' in who, np.nan):.2f}", *made]
+
+
+def draw(table):
+    """Microseconds per step and lane by lanes: a panel for each case, float32 dashed."""
+    import matplotlib.pyplot as plt
+
+    cases = list(dict.fromkeys(row[0] for row in table))
+    figure, axes = plt.subplots(1, len(cases), figsize=(4 * len(cases), 4), layout="constrained", squeeze=False, sharey=True)
+    kinds = {"svkc": "C0", "svkc, vmap on one core": "C0", "svkc, all cores": "C2", "MuJoCo": "C1", "MuJoCo rollout, all cores": "C3", "MJX, one core": "C4"}
+    for ax, case in zip(axes[0], cases, strict=True):
+        for who, color in kinds.items():
+            for dtype, style in (("float64", "o-"), ("float32", "s--")):
+                rows = [row for row in table if row[:2] == [case, dtype] and row[3] == who]
+                if rows:
+                    ax.loglog([row[2] for row in rows], [float(row[4]) for row in rows], style, color=color, markersize=4, label=f"{who}, {dtype}")
+        ax.set(title=case, xlabel="lanes")
+        ax.grid(alpha=0.3)
+    axes[0, 0].set_ylabel("us per step and lane")
+    axes[0, -1].legend(fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
+    figure.savefig(RESULTS / "speed.png", dpi=110)
 
 
 def machine() -> dict:
@@ -192,8 +257,12 @@ def main(cases):
                     jax.clear_caches()
     with (RESULTS / "speed.csv").open("w", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows([[*HEAD, *machine()], *([*row, *machine().values()] for row in table)])
+    draw(table)
     print(machine())
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:] or figures.CASES)
+    if sys.argv[1:2] == [WORKER]:
+        mjx_worker(*sys.argv[2:4], *map(int, sys.argv[4:]))
+    else:
+        main(sys.argv[1:] or figures.CASES)
