@@ -11,6 +11,7 @@ import json
 import os
 import pathlib
 import platform
+import select
 import subprocess
 import sys
 import time
@@ -18,7 +19,7 @@ import time
 WORKER = "--mjx"
 FLAGS = os.environ.get("XLA_FLAGS", "")
 if WORKER in sys.argv:
-    # on two cores its batches wait for one another for ever (mujoco-mjx 3.17.0, jax 0.10.1)
+    # on two cores, and now and then on one, its batches wait for one another for ever (mujoco-mjx 3.17.0, jax 0.10.1)
     os.sched_setaffinity(0, {0})
 else:
     # before jax makes its first program
@@ -44,7 +45,7 @@ from figures import DT
 import svkc
 
 RESULTS = pathlib.Path(__file__).parent / "results"
-BATCHES, ROUNDS = (1, 64, 1024, 16384), 7
+BATCHES, ROUNDS, PATIENCE = (1, 64, 1024, 16384), 7, 60
 HEAD = ["case", "dtype", "batch", "by", "us per step", "least", "most", "times svkc", "trace s", "lower s", "compile s", "temporary MB"]
 
 
@@ -125,9 +126,12 @@ class Mjx:
         self.made = answer["made"]
 
     def __call__(self):
-        """All its steps."""
+        """All its steps. TimeoutError: it does not answer."""
         self.process.stdin.write("\n")
         self.process.stdin.flush()
+        if not select.select([self.process.stdout], [], [], PATIENCE)[0]:
+            self.process.kill()
+            raise TimeoutError(f"MJX did not answer within {PATIENCE} s")
         self.process.stdout.readline()
 
     def close(self):
@@ -185,11 +189,16 @@ def timed(runs: dict) -> dict[str, np.ndarray]:
     """Seconds of each, in turns; a first one is left out."""
     seconds = {name: [] for name in runs}
     for _ in range(ROUNDS + 1):
-        for name, run in runs.items():
+        for name, run in list(runs.items()):
             begun = time.perf_counter()
-            run()
+            try:
+                run()
+            except TimeoutError as late:
+                print(f"left out: {late}", flush=True)
+                del runs[name]
+                continue
             seconds[name].append(time.perf_counter() - begun)
-    return {name: np.array(x[1:]) for name, x in seconds.items()}
+    return {name: np.array(seconds[name][1:]) for name in runs}
 
 
 def compared(name: str, dtype: str, batch: int, said: set):
