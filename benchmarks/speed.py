@@ -241,7 +241,7 @@ def draw(table):
         ax.set(title=case, xlabel="lanes")
         ax.grid(alpha=0.3)
     axes[0, 0].set_ylabel("us per step and lane")
-    axes[0, -1].legend(fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), fontsize=7, loc="outside right center")
     figure.savefig(RESULTS / "speed.png", dpi=110)
 
 
