@@ -100,27 +100,6 @@ def _dot(*sides, dimension_numbers, **_):
     return _sum(products, tuple(range(end, end + len(contracted[0]))))
 
 
-def _scan(inputs: list, lanes: int, *, jaxpr, num_consts, num_carry, length, reverse, **_):
-    first, last = num_consts, num_consts + num_carry
-    bare, own, out_own = [v.x if isinstance(v, Lanes) else v for v in inputs], [isinstance(v, Lanes) for v in inputs], []
-
-    def step(carry, x):
-        values = [Lanes(v) if flag else v for v, flag in zip([*bare[:first], *carry, *x], own, strict=True)]
-        out = evaluate(jaxpr, values, lanes)
-        out_own[:] = [isinstance(v, Lanes) for v in out[:num_carry]]
-        return [spread(v, lanes) if flag else v for v, flag in zip(out, own[first:last])], [spread(v, lanes) for v in out[num_carry:]]
-
-    while True:
-        start = [spread(v, lanes) if flag else v for v, flag in zip(inputs[first:last], own[first:last], strict=True)]
-        jax.eval_shape(step, start, [jax.ShapeDtypeStruct(jnp.shape(x)[1:], x.dtype) for x in bare[last:]])
-        # what each lane makes of it in a step is each lane's own
-        if all(before or not after for before, after in zip(own[first:last], out_own, strict=True)):
-            break
-        own[first:last] = [before or after for before, after in zip(own[first:last], out_own, strict=True)]
-    carry, kept = lax.scan(step, start, bare[last:], length=length, reverse=reverse)
-    return [*(Lanes(v) if flag else v for v, flag in zip(carry, own[first:last], strict=True)), *map(Lanes, kept)]
-
-
 def _solve(inputs: list, lanes: int, *, const_lengths, jaxprs, **_):
     """The solve itself; what it is the inverse of matters to derivatives alone."""
     before = const_lengths.matvec + const_lengths.vecmat
@@ -167,8 +146,6 @@ def evaluate(closed: core.ClosedJaxpr, inputs: list, lanes: int) -> list:
         mixed = any(isinstance(v, Lanes) for v in values)
         if name in CALLS:
             out = evaluate(params[CALLS[name]], values, lanes)
-        elif name == "scan" and mixed:
-            out = _scan(values, lanes, **params)
         elif name in ("custom_linear_solve", "linear_solve") and mixed:
             out = _solve(values, lanes, **params)
         else:
