@@ -81,12 +81,12 @@ def _sum(x: Array, axes: tuple[int, ...]) -> Array:
     """Sums of few at a time: such a loop is unrolled, and the one over lanes around it can take several in one instruction."""
     for axis in sorted(axes, reverse=True):
         size = x.shape[axis]
-        parts = [jnp.sum(lax.slice_in_dim(x, i, min(i + FEW, size), axis=axis), axis) for i in range(0, max(size, 1), FEW)]
+        parts = [jnp.sum(lax.slice_in_dim(x, i, min(i + FEW, size), axis=axis), axis, x.dtype) for i in range(0, max(size, 1), FEW)]
         x = functools.reduce(jnp.add, parts)
     return x
 
 
-def _dot(*sides, dimension_numbers, **_):
+def _dot(*sides, dimension_numbers, preferred_element_type, **_):
     """Products and sums: XLA has no `dot` whose lanes come last."""
     sides = [v.x if isinstance(v, Lanes) else jnp.asarray(v)[..., None] for v in sides]
     contracted, batch = dimension_numbers
@@ -97,14 +97,14 @@ def _dot(*sides, dimension_numbers, **_):
     # the other side's own axes are of one
     left, right = (jnp.transpose(x, (*b, *f, *c, x.ndim - 1)) for x, b, f, c in zip(sides, batch, free, contracted, strict=True))
     products = jnp.expand_dims(left, range(middle, end)) * jnp.expand_dims(right, range(axes, middle))
+    products = products if preferred_element_type is None else products.astype(preferred_element_type)
     return _sum(products, tuple(range(end, end + len(contracted[0]))))
 
 
 def _solve(inputs: list, lanes: int, *, const_lengths, jaxprs, **_):
     """The solve itself; what it is the inverse of matters to derivatives alone."""
     before = const_lengths.matvec + const_lengths.vecmat
-    right = sum(length for length in const_lengths)
-    return evaluate(jaxprs.solve, [*inputs[before : before + const_lengths.solve], *inputs[right:]], lanes)
+    return evaluate(jaxprs.solve, [*inputs[before : before + const_lengths.solve], *inputs[sum(const_lengths) :]], lanes)
 
 
 def _as_jax_does(primitive, inputs: list, params: dict, lanes: int):
@@ -162,7 +162,7 @@ def _for_lanes(function: Callable, lanes: int, flags: list[bool], args):
     shapes = [jax.ShapeDtypeStruct(jnp.shape(x)[flag:], jnp.result_type(x)) for x, flag in zip(leaves, flags, strict=True)]
     closed, made = jax.make_jaxpr(function, return_shape=True)(*tree.unflatten(shapes))
     gathered = jax.tree.structure(made).unflatten
-    tile = lanes if jax.default_backend() != "cpu" else min(lanes, TILE)
+    tile = max(1, min(lanes, TILE) if jax.default_backend() == "cpu" else lanes)
     count = -(-lanes // tile)
 
     def some(own):

@@ -47,6 +47,17 @@ def test_every_rule(count):
             assert got.dtype == expected.dtype
 
 
+def test_no_lanes_and_whole_numbers():
+    """Sums and products of whole numbers stay what they are; of no lanes there is nothing."""
+    counted = lambda x: (jnp.sum(x, dtype=jnp.int32), x @ x, jnp.stack([x, x]))
+    one = rules.with_lanes_last(counted)
+    for count in (0, 4):
+        x = jnp.ones((count, 11), jnp.int32)
+        for expected, got in zip(jax.vmap(counted)(x), jax.vmap(one)(x), strict=True):
+            np.testing.assert_array_equal(got, expected)
+            assert got.dtype == expected.dtype
+
+
 def test_no_operation_of_a_step_goes_the_other_way(monkeypatch):
     """All that `svkc.step` is made of has a rule: what has none would put its lanes first and last again."""
     seen = []
