@@ -35,6 +35,7 @@ from svkc.guards import leaves as leaves, overload as overload, touch as touch
 from svkc.simulate import simulate as simulate
 from svkc.replay import Replay as Replay
 from svkc.rollout import rollout as rollout
+from svkc.ahead import Program as Program, compile as compile
 from svkc.tuning import error_between as error_between, halved as halved, tune as tune
 from svkc.projection import dependent_change as dependent_change, inertia_change as inertia_change, least_change as least_change
 from svkc.stepping import Baumgarte as Baumgarte, Drift as Drift, Exact as Exact, Projection as Projection

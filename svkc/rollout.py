@@ -32,8 +32,9 @@ def rollout(
     data, lane: what differs between lanes besides the state. `lane(chain, data of one lane)` gives a dict of arguments of `simulate` (events, args, control,
     t1, or `chain` itself with other floats); data: a pytree with the lanes as leading axis.
     cost: [lanes], how long each may take (any unit): lanes alike go together, so that the short do not wait for the long.
-    chunk: lanes at once on one device (default: 64 on a CPU, 4096 otherwise, and no more than there are). devices: default all of this process; each
-    goes its own way through its lanes. On a CPU there are as many as `jax.config.update("jax_num_cpu_devices", n)` asked for before the first use of jax.
+    chunk: lanes at once on one device (default: 64 on a CPU, 4096 otherwise, no more than there are, nor than have trajectories that fit into a quarter
+    of the memory that is free). devices: default all of this process; each goes its own way through its lanes. On a CPU there are as many as
+    `jax.config.update("jax_num_cpu_devices", n)` asked for before the first use of jax.
     out: folder for finished chunks, chunk_00000.npz and so on, each a trajectory (`svkc.load_trajectory`); a run that was interrupted goes on from them.
     Under `jax.distributed` each process takes its share of the chunks, and all get the whole result.
     options: of `simulate`, for all lanes; `throw` is False by default: lanes that fail say so in `result`.
@@ -42,7 +43,7 @@ def rollout(
     lanes = _count(states, data, cost)
     devices = list(jax.local_devices() if devices is None else devices)
     most = max(1, lanes // (len(devices) * jax.process_count()))
-    size = min(chunk or (64 if devices[0].platform == "cpu" else 4096), most) * len(devices)
+    size = min(chunk or min(64 if devices[0].platform == "cpu" else 4096, _fitting(states, options.get("ts"), devices)), most) * len(devices)
     order = np.arange(lanes) if cost is None else np.argsort(np.asarray(cost), kind="stable")
     # a chunk that lacks lanes is filled up with its last one
     chunks = [np.pad(order[i : i + size], (0, max(0, i + size - lanes)), mode="edge") for i in range(0, lanes, size)]
@@ -70,6 +71,27 @@ def _count(states, data, cost) -> int:
     if len(sizes) != 1 or not lanes or states.q.ndim != 2:
         raise ValueError(f"states, data, cost: expected one leading axis of lanes, got sizes {sorted(map(str, sizes))} and q of shape {states.q.shape}")
     return lanes
+
+
+def _fitting(states, ts, devices) -> int:
+    """How many lanes' trajectories go into a quarter of the memory that is free on each device; at least one."""
+    lane = sum(x.nbytes // x.shape[0] for x in jax.tree.leaves(states))
+    # every phase keeps numbers of about a state's size, and a step as many again as its stages
+    need = lane * (np.size(2 if ts is None else ts) + 64)
+    # devices that are cores of one machine share its memory
+    sharing = len(devices) if devices[0].platform == "cpu" else 1
+    return max(1, int(min(min(_free_memory(device) for device in devices) / sharing / 4 // need, 1 << 30)))
+
+
+def _free_memory(device) -> float:
+    """Bytes: what the device says, the machine's for a CPU; inf where nobody says."""
+    stats = device.memory_stats() or {}
+    if "bytes_limit" in stats:
+        return stats["bytes_limit"] - stats.get("bytes_in_use", 0)
+    try:
+        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (ValueError, OSError, AttributeError):
+        return np.inf
 
 
 @eqx.filter_jit

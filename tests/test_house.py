@@ -29,9 +29,10 @@ HOUSE = [
     "marching",
     "replay",
     "request records",
-    "phase view derivative",
-    "simulate",
-    "tuning rollout",
+    "phase drawing derivative",
+    "simulate animation figures",
+    "tuning rollout view",
+    "commands bench ahead",
     "__main__",
 ]
 FLOORS = {name: floor for floor, names in enumerate(HOUSE) for name in names.split()}

@@ -87,6 +87,18 @@ def test_lanes_are_those_of_single_runs(case, alone, capsys):
     assert capsys.readouterr().err == ""
 
 
+def test_chunks_fit_into_memory(case, alone, capsys, monkeypatch):
+    """Where little memory is free the default chunk is smaller, and never nothing."""
+    module, states = sys.modules["svkc.rollout"], case[1]
+    lane = sum(x.nbytes // LANES for x in jax.tree.leaves(states))
+    # four times what four lanes with two times and the rest of a trajectory need
+    monkeypatch.setattr(module, "_free_memory", lambda device: 4.0 * 4 * lane * 66)
+    agrees(call(*case), alone)
+    assert "3 of 3 chunks (11 lanes)" in capsys.readouterr().err
+    monkeypatch.setattr(module, "_free_memory", lambda device: 0.0)
+    assert module._fitting(states, None, jax.local_devices()) == 1
+
+
 def test_an_interrupted_run_goes_on(case, alone, tmp_path, monkeypatch):
     chain, states, data = case
     asked = []
