@@ -77,7 +77,7 @@ def _fitting(states, ts, devices) -> int:
     """How many lanes' trajectories go into a quarter of the memory that is free on each device; at least one."""
     lane = sum(x.nbytes // x.shape[0] for x in jax.tree.leaves(states))
     # every phase keeps numbers of about a state's size, and a step as many again as its stages
-    need = lane * (np.size(2 if ts is None else ts) + 64)
+    need = lane * ((2 if ts is None else np.size(ts)) + 64)
     # devices that are cores of one machine share its memory
     sharing = len(devices) if devices[0].platform == "cpu" else 1
     return max(1, int(min(min(_free_memory(device) for device in devices) / sharing / 4 // need, 1 << 30)))
@@ -87,9 +87,9 @@ def _free_memory(device) -> float:
     """Bytes: what the device says, the machine's for a CPU; inf where nobody says."""
     stats = device.memory_stats() or {}
     if "bytes_limit" in stats:
-        return stats["bytes_limit"] - stats.get("bytes_in_use", 0)
+        return float(stats["bytes_limit"] - stats.get("bytes_in_use", 0))
     try:
-        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+        return float(os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     except (ValueError, OSError, AttributeError):
         return np.inf
 
