@@ -203,6 +203,19 @@ class Chain(eqx.Module):
 
         return assemble(self, q, v, connected)
 
+    def to_mjcf(self) -> str:
+        """MJCF text of the scene: the model as it was loaded, every number to its last digit, with the virtual links as <equality>.
+
+        ball and weld are connect and weld, a hinge two connects (the second, NAME_axis, at `chain.length` along its axis), each between two new sites,
+        active where the link is connected; MuJoCo holds them softly. What has no such form (other joints, motors on virtual joints, spare slots, which
+        joints may be cut) is said in a comment at the top. Files of meshes are named by absolute paths, except those in memory (`MjSpec.assets`) and of
+        attached specs. Changes to the chain's own arrays are not written, but for the links' placements. ValueError: loaded from a MjModel.
+        """
+        # as above: the text needs what stands higher up
+        from svkc.interop import to_mjcf
+
+        return to_mjcf(self)
+
 
 def _pointers(chain: Chain) -> np.ndarray:
     """[4, bodies + links] parent, child, brother, real."""

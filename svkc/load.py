@@ -10,6 +10,7 @@ import numpy as np
 
 from svkc.chain import Chain, Structure, VirtualLink
 from svkc.cuttable import cuts_of, placed_in
+from svkc.interop import text_of
 from svkc.reading import bodies_of, by_dof, joint_forces_of, motors_of, name_of, rows_of
 from svkc.topology import Topology, joint_freedoms
 from svkc.unsupported import what_is_left_out
@@ -17,9 +18,13 @@ from svkc.unsupported import what_is_left_out
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Source:
-    """The MuJoCo model a chain was made of, for pictures; chains are told apart by their numbers and topology, not by it."""
+    """The MuJoCo model a chain was made of and its MJCF (None where only the compiled model was given), for pictures and `chain.to_mjcf`.
+
+    Chains are told apart by their numbers and topology, not by it.
+    """
 
     model: Any
+    text: str | None = None
 
     def __eq__(self, other):
         return isinstance(other, Source)
@@ -33,16 +38,18 @@ def load(source, *, virtual_links=(), cuttable=(), spare=0, ignore=()) -> Chain:
 
     `virtual_links`: more of them, beside the <equality> connect (ball) and weld of the model; `spare`: slots for links bound at run time;
     `cuttable`: names of joints of the tree that may be cut, each a virtual link of its name, connected at first (paper, Fig. 15);
-    `ignore`: kinds of elements to leave out, by the names the error message uses, or "all". "limit" leaves out joint ranges.
+    `ignore`: kinds of elements to leave out, by the names the error message uses, or "all"; "equality" means those that are neither connect
+    nor weld. "limit" leaves out joint ranges.
     Collisions between geoms are never modelled. ValueError: the source does not parse, elements not supported, unknown names.
     """
-    model = compile_model(source)
+    kept = _compiled(source)
+    model = kept.model
     cuts = cuts_of(model, cuttable)
     if isinstance(ignore, str):
         ignore = (ignore,)
     left_out = what_is_left_out(model, ignore)
     rows, topology = rows_of(model, {cut.body: cut.link.name for cut in cuts})
-    links = [*_equalities(model, ignore), *virtual_links]
+    links = [*_equalities(model), *virtual_links]
     first = len(links)
     for link in links:
         if not isinstance(link, VirtualLink):
@@ -61,22 +68,23 @@ def load(source, *, virtual_links=(), cuttable=(), spare=0, ignore=()) -> Chain:
     )
     topology = placed_in(model, topology, cuts, first)
     structure = _structure(model, topology, links, int(spare))
-    return _chain(model, topology, rows, structure, ignore, left_out)
+    return _chain(kept, topology, rows, structure, ignore, left_out)
 
 
-def compile_model(source):
-    """The mujoco.MjModel of any source; ValueError with MuJoCo's own words where it does not parse."""
+def _compiled(source) -> Source:
+    """The mujoco.MjModel of any source and its text; ValueError with MuJoCo's own words where it does not parse."""
     import mujoco
 
     if isinstance(source, mujoco.MjModel):
-        return source
+        return Source(source)
     if not isinstance(source, (mujoco.MjSpec, str, os.PathLike)):
         raise ValueError(f"source: expected MJCF or URDF text, a path, MjSpec or MjModel, got {type(source).__name__}")
     text = "<" if isinstance(source, mujoco.MjSpec) else os.fspath(source)
     if "<" not in text and not pathlib.Path(text).is_file():
         raise ValueError(f"source: no such file: {text}")
     try:
-        return source.compile() if isinstance(source, mujoco.MjSpec) else _read(text)
+        spec = source.copy() if isinstance(source, mujoco.MjSpec) else _read(text)
+        return Source(spec.compile(), text_of(spec))
     except (ValueError, OSError) as error:
         raise ValueError(f"source: the model cannot be read: {error}") from error
 
@@ -86,20 +94,17 @@ def _read(text: str):
     import mujoco
 
     inline = "<" in text
-    if "<robot" not in (text if inline else pathlib.Path(text).read_text(errors="replace")):
-        return mujoco.MjModel.from_xml_string(text) if inline else mujoco.MjModel.from_xml_path(text)
     spec = mujoco.MjSpec.from_string(text) if inline else mujoco.MjSpec.from_file(text)
-    spec.compiler.fusestatic = False
-    return spec.compile()
+    if "<robot" in (text if inline else pathlib.Path(text).read_text(errors="replace")):
+        spec.compiler.fusestatic = False
+    return spec
 
 
-def _equalities(model, ignore) -> list[VirtualLink]:
+def _equalities(model) -> list[VirtualLink]:
     """<equality> connect and weld as virtual links: ball and weld, child of the first body, under their own names."""
     import mujoco
 
     links = []
-    if "equality" in ignore:
-        return links
     for i in range(model.neq):
         kind, data = int(model.eq_type[i]), model.eq_data[i]
         if kind not in (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)):
@@ -203,9 +208,10 @@ def _load_pose(model, topology: Topology) -> np.ndarray:
     return q
 
 
-def _chain(model, topology, rows, structure, ignore, left_out) -> Chain:
+def _chain(source: Source, topology, rows, structure, ignore, left_out) -> Chain:
     import mujoco
 
+    model = source.model
     ignored, bodies = set(ignore), bodies_of(model, topology, rows)
     stiffness, limit, spring = joint_forces_of(model, ignored, topology)
     damping = by_dof(topology, 0 * model.dof_damping if "damping" in ignored else model.dof_damping)
@@ -240,6 +246,6 @@ def _chain(model, topology, rows, structure, ignore, left_out) -> Chain:
         q_spring=unless(not stiffness.any(), q_spring),
         limit=unless(not np.isfinite(limit).any(), limit),
         limit_spring=unless(not np.isfinite(limit).any(), spring),
-        model=Source(model),
+        model=source,
         left_out=left_out,
     )

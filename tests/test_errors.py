@@ -162,6 +162,7 @@ CASES = {
     "tau: got": lambda s: svkc.forward_dynamics(s.four, s.state, jnp.zeros(9)),
     "the loops cannot": lambda s: s.load(virtual_links=[link(pos=(50, 0, 0), real_pos=(0, 0, 0), connected=True)]).state(),
     "the model has elements": lambda s: s.load(s.motor.replace("</worldbody>", '<site name="s"/></worldbody>').replace("<motor", "<position")),
+    "to_mjcf: the": lambda s: svkc.load(s.four.model.model).to_mjcf(),
     "touch: axes": lambda s: svkc.touch(s.four, "pin", 0.1, axes="w"),
     "ts: expected": lambda s: s.simulate(ts=jnp.array([0.5, 0.2])),
     "u: got": lambda s: s.load(s.motor).motors(jnp.zeros(3)),

@@ -1,5 +1,8 @@
-"""States to and from MuJoCo, and quaternions with the scalar last."""
+"""States and scenes to and from MuJoCo, and quaternions with the scalar last."""
 
+import re
+
+import equinox as eqx
 import jax.numpy as jnp
 import models
 import mujoco
@@ -60,3 +63,112 @@ def test_scalar_last():
     np.testing.assert_allclose(svkc.xyzw(chain, q), [0.4, *last[0], 1, 2, 3, *last[1]], atol=1e-15)
     plain = svkc.load(models.MJCF.format(models.bar("arm", models.Y, "0 0 -1")))
     np.testing.assert_array_equal(svkc.xyzw(plain, jnp.array([0.7])), [0.7])
+
+
+def test_an_equality_without_a_name():
+    """It is a virtual link all the same, and holds in MuJoCo as it does in svkc."""
+    chain = svkc.load(XML.replace('name="w" ', ""))
+    assert chain.link_names == ("equality_0",)
+    data = mujoco.MjData(chain.model.model)
+    svkc.to_mujoco(chain, chain.state(connected="equality_0"), data)
+    assert data.eq_active.tolist() == [1]
+    assert bool(svkc.from_mujoco(chain, data).structure.connected[0])
+
+
+TWO = models.bar("a", models.Y, "0 0 -1") + '<body name="b" pos="1 0.2 1" quat="0.8 0 0.6 0"><freejoint name="b"/><geom size="0.1" pos="0 0.1 0"/></body>'
+UNNAMED = """<body pos="0.4 0 1"><freejoint/><geom type="box" size="0.2 0.1 0.02" pos="0.1 0 0"/></body>
+<body pos="0 1 1"><joint axis="1 0 0"/><geom size="0.1"/></body>"""
+# any angles, none of them a number of few digits
+TURNED, SIDEWAYS = (tuple(Rotation.from_rotvec(r).as_quat(scalar_first=True).tolist()) for r in ([0.3, -0.2, 0.5], [0, 0.7, 0.1]))
+WELDED = svkc.VirtualLink("held", "a", "b", "weld", pos=(0.1, 0, -1 / 3), quat=TURNED, real_pos=(0, -0.1, 1 / 7), real_quat=SIDEWAYS, connected=True)
+OPEN = svkc.VirtualLink("open", "world", "a", "ball", pos=(0, 0, -3), real_pos=(0, 0, -1))
+
+
+def with_cut():
+    ball = svkc.VirtualLink("catch", "b", "a", "ball", pos=(0.2, 0, 0), real_pos=(0, 0, -1), connected=True)
+    return svkc.load(models.MJCF.format(TWO), virtual_links=[ball], cuttable="a")
+
+
+# chain, and with what its text is loaded
+SCENES = {
+    "ball": lambda: (models.rod_on_balls(), {}),
+    "balls": lambda: (models.stewart(), {}),
+    "weld": lambda: (svkc.load(models.MJCF.format(TWO), virtual_links=[WELDED, OPEN]), {}),
+    "cuttable": lambda: (with_cut(), {"cuttable": "a"}),
+    "equalities": lambda: (svkc.load(XML.replace('active="false"', "")), {}),
+    "no names": lambda: (svkc.load(models.MJCF.format(UNNAMED), virtual_links=[svkc.VirtualLink("w", "body_1", "body_2", "weld", connected=True)]), {}),
+    "spec": lambda: (svkc.load(mujoco.MjSpec.from_string(models.MJCF.format(TWO)), virtual_links=[WELDED, OPEN]), {}),
+    "hinge": lambda: (models.four_bar(), {}),
+}
+
+
+def residual(chain, state):
+    """The largest of MuJoCo's own equality residuals at a state."""
+    data = mujoco.MjData(chain.model.model)
+    svkc.to_mujoco(chain, state, data)
+    mujoco.mj_forward(chain.model.model, data)
+    gaps = data.efc_pos[data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY]
+    assert len(gaps)
+    return np.abs(gaps).max()
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_a_scene_as_mjcf_and_back(scene):
+    """The same bodies, joints, links, masses to the last digit; the same loops and motion; MuJoCo finds the loops closed."""
+    chain, how = SCENES[scene]()
+    again = svkc.load(chain.to_mjcf(), **how)
+    assert (again.body_names, again.joint_names) == (chain.body_names, chain.joint_names)
+    for name in ("pos", "quat", "axis", "mass", "com", "inertia", "gravity", "q_load", "armature", "damping"):
+        a, b = getattr(chain, name), getattr(again, name)
+        size = chain.nq if name == "q_load" else chain.nv if name == "damping" else None
+        assert (a is None and b is None) or bool(jnp.all(a[:size] == b[:size])), name
+    rng = np.random.default_rng(0)
+    state = chain.state(None, rng.normal(size=chain.nv))
+    # by name they are kept; the velocities of the links differ
+    kept = dict(zip(chain.joint_names, state.v, strict=False)) if scene == "hinge" else state.v[: chain.nv]
+    other = again.state(state.q[: chain.nq], kept)
+    if scene == "hinge":
+        assert again.link_names == tuple(name + end for name in chain.link_names for end in ("", "_axis"))
+    else:
+        assert again.link_names == chain.link_names
+        assert bool(jnp.all(again.structure.connected == chain.structure.connected))
+    assert int(svkc.mobility(again, other).freedoms) == int(svkc.mobility(chain, state).freedoms)
+    for x, y in zip(svkc.poses(chain, state) + svkc.velocities(chain, state), svkc.poses(again, other) + svkc.velocities(again, other), strict=True):
+        np.testing.assert_allclose(x, y, atol=1e-11)
+    tau = jnp.asarray(rng.normal(size=chain.nv))
+    a, b = (svkc.forward_dynamics(c, s, tau)[: chain.nv] for c, s in ((chain, state), (again, other)))
+    np.testing.assert_allclose(a, b, atol=1e-9 * float(jnp.abs(a).max()))
+    assert residual(again, other) < 1e-9
+
+
+def test_what_has_no_mjcf_is_said():
+    """Other joints, motors on virtual joints, slots and what may be cut: a comment, from which the links can be declared; connected is the chain's."""
+    screw = svkc.VirtualLink("rail--1", "world", "b", "slide", axis=(1, 0, 0), pos=(1, 0.2, -1), connected=True, actuated=True)
+    driven = svkc.VirtualLink("wrist", "a", "b", "ball", actuated=True)
+    scene = models.MJCF.format(TWO).replace("<mujoco>", "<mujoco><!-- by hand -->")
+    chain = svkc.load(scene, virtual_links=[screw, driven], cuttable="a", spare=2)
+    chain = eqx.tree_at(lambda c: c.structure.connected, chain, jnp.array([True, True, True, False, False]))
+    text = chain.to_mjcf()
+    comment = re.search("<!--(.*?)-->", text, re.S).group(1)
+    for words in ("by hand", "no <equality> is like svkc.VirtualLink('rail- -1'", "motors on the virtual joint of svkc.VirtualLink('wrist'"):
+        assert words in comment, comment
+    for words in ("2 spare slots, svkc.load(..., spare=2)", "svkc.load(..., cuttable=['a'])"):
+        assert words in comment, comment
+    link = eval(re.search(r"no <equality> is like (.*)", comment).group(1), {"svkc": svkc})
+    again = svkc.load(text, virtual_links=[link])
+    assert again.link_names == ("wrist", "rail- -1")
+    assert again.structure.connected.tolist() == [True, True]
+    np.testing.assert_allclose(again.structure.real_pos[1], chain.structure.real_pos[0], atol=1e-15)
+
+
+def test_names_that_are_taken():
+    """Sites and second connects keep out of the way of the scene's own."""
+    hinges = [svkc.VirtualLink(name, "a", "b", "hinge", connected=True) for name in ("pin", "pin_axis")]
+    scene = models.MJCF.format(TWO).replace('<freejoint name="b"/>', '<freejoint name="b"/><site name="pin_real"/>')
+    again = svkc.load(svkc.load(scene, virtual_links=hinges).to_mjcf())
+    assert again.link_names == ("pin", "pin_axis_", "pin_axis", "pin_axis_axis")
+
+
+def test_a_compiled_model_has_no_text():
+    with pytest.raises(ValueError, match="MjModel"):
+        svkc.load(mujoco.MjModel.from_xml_string(XML)).to_mjcf()
