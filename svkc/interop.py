@@ -36,7 +36,10 @@ def to_mjcf(chain: Chain) -> str:
 
     if chain.model.text is None:
         raise ValueError("to_mjcf: the chain was loaded from a MjModel, which does not say what it was compiled from; load a path, text or MjSpec")
-    spec = mujoco.MjSpec.from_string(chain.model.text)
+    try:
+        spec = mujoco.MjSpec.from_string(chain.model.text)
+    except ValueError as error:
+        raise ValueError(f"to_mjcf: MuJoCo cannot read what it writes of this MjSpec: {error}") from error
     own, top, notes = dict(_equalities(chain)), chain.topology, []
     for link, name in enumerate(chain.link_names):
         if link in own:

@@ -3,6 +3,7 @@
 import dataclasses
 import os
 import pathlib
+import warnings
 from typing import Any
 
 import jax.numpy as jnp
@@ -84,20 +85,34 @@ def _compiled(source) -> Source:
         raise ValueError(f"source: no such file: {text}")
     try:
         spec = source.copy() if isinstance(source, mujoco.MjSpec) else _read(text)
-        return Source(spec.compile(), text_of(spec))
+        model = spec.compile()
+        with warnings.catch_warnings(action="ignore"):
+            return Source(model, text_of(spec))
     except (ValueError, OSError) as error:
         raise ValueError(f"source: the model cannot be read: {error}") from error
 
 
 def _read(text: str):
-    """MJCF or URDF, by text or path. URDF keeps the links that fixed joints hold: their names are wanted for grips."""
+    """MJCF or URDF, by text or path. URDF keeps the links that fixed joints hold, whose names are wanted for grips; ROS's package:// is looked up."""
     import mujoco
 
     inline = "<" in text
     spec = mujoco.MjSpec.from_string(text) if inline else mujoco.MjSpec.from_file(text)
     if "<robot" in (text if inline else pathlib.Path(text).read_text(errors="replace")):
         spec.compiler.fusestatic = False
+        for mesh in spec.meshes:
+            mesh.file = _found(mesh.file, pathlib.Path("." if inline else text).resolve().parent)
     return spec
+
+
+def _found(file: str, folder: pathlib.Path) -> str:
+    """A file of package://NAME/...: in a folder NAME above, or beside what stands above, or else by its last name in `folder`; others as they are."""
+    if not file.startswith("package://"):
+        return file
+    name = pathlib.PurePosixPath(file.removeprefix("package://"))
+    inside = name.relative_to(name.parts[0])
+    places = [place / path for path in (name, inside) for place in (folder, *folder.parents)] + [folder / name.name]
+    return next((str(place) for place in places if place.is_file()), file)
 
 
 def _equalities(model) -> list[VirtualLink]:

@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import models
+import mujoco
 import numpy as np
 import pytest
 import said
@@ -84,6 +85,16 @@ def undrawn(s):
     traj = s.simulate(t1=1e-3, dt=1e-3)
     with mock.patch.dict("sys.modules", {"mujoco.egl": None, "mujoco.osmesa": None, "mujoco.glfw": None}):
         svkc.render(s.four, traj, s.folder / "x.gif")
+
+
+def twice(s):
+    """Two specs attached with one prefix: two default classes of one name."""
+    spec = mujoco.MjSpec()
+    for name in ("a", "b"):
+        part = mujoco.MjSpec()
+        part.worldbody.add_body(name=name).add_geom(size=[0.1, 0, 0])
+        spec.attach(part, prefix="the_", frame=spec.worldbody.add_frame())
+    svkc.load(spec).to_mjcf()
 
 
 CASES = {
@@ -162,6 +173,7 @@ CASES = {
     "tau: got": lambda s: svkc.forward_dynamics(s.four, s.state, jnp.zeros(9)),
     "the loops cannot": lambda s: s.load(virtual_links=[link(pos=(50, 0, 0), real_pos=(0, 0, 0), connected=True)]).state(),
     "the model has elements": lambda s: s.load(s.motor.replace("</worldbody>", '<site name="s"/></worldbody>').replace("<motor", "<position")),
+    "to_mjcf: MuJoCo": twice,
     "to_mjcf: the": lambda s: svkc.load(s.four.model.model).to_mjcf(),
     "touch: axes": lambda s: svkc.touch(s.four, "pin", 0.1, axes="w"),
     "ts: expected": lambda s: s.simulate(ts=jnp.array([0.5, 0.2])),

@@ -1,5 +1,6 @@
 """Models in: everything read, everything else named."""
 
+import jax.numpy as jnp
 import models
 import mujoco
 import numpy as np
@@ -53,8 +54,6 @@ def test_motors():
     data = mujoco.MjData(chain.model.model)
     data.ctrl[:] = 5, 0.5
     mujoco.mj_forward(chain.model.model, data)
-    import jax.numpy as jnp
-
     np.testing.assert_allclose(chain.motors(jnp.array([5, 0.5])), data.qfrc_actuator)
     assert chain.actuated.tolist() == [True, False, True, True]
     assert svkc.load(PENDULUM).actuated.tolist() == [True]
@@ -82,6 +81,122 @@ def test_limits_and_springs_are_the_models():
     free = svkc.simulate(svkc.load(xml, ignore="limit"), chain.state(), 3.0).final
     assert abs(float(end.q[0])) < 0.52
     assert np.isfinite(float(free.q[0]))
+
+
+GRIPPER = models.MJCF.format(models.bar("left", models.Y, "0 0 1") + models.bar("right", models.Y, "0 0 1", "1 0 0")).replace(
+    "</mujoco>", '<equality><joint joint1="left" joint2="right"/><connect body1="left" body2="right" anchor="0.5 0 1"/></equality></mujoco>'
+)
+
+
+def test_ignored_equalities_are_those_that_are_not_simulated():
+    with pytest.raises(ValueError, match=r"equality: equality constraints: joint .*\n.*ignore=\('equality',\)"):
+        svkc.load(GRIPPER)
+    for ignore in ("equality", "all"):
+        assert svkc.load(GRIPPER, ignore=ignore).link_names == ("equality_1",)
+
+
+OFF_TETRAHEDRON = "v 0 0 0\nv 0.3 0 0\nv 0 0.2 0\nv 0 0 0.4\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
+# of that tetrahedron of density 1000 about its centre of mass
+MASS, COM = 1000 * 0.3 * 0.2 * 0.4 / 6, np.array([0.3, 0.2, 0.4]) / 4
+INERTIA = MASS / 80 * np.array([[3 * 0.2, 0.06, 0.12], [0.06, 3 * 0.25, 0.08], [0.12, 0.08, 3 * 0.13]])
+INERTIA[np.diag_indices(3)] = MASS * 3 / 80 * np.array([0.2**2 + 0.4**2, 0.3**2 + 0.4**2, 0.3**2 + 0.2**2])
+
+
+def test_mesh_include_and_defaults(tmp_path):
+    """A scene of two files: classes of defaults, a mesh in a folder of its own, a weld; and the text made of it, which is read anywhere."""
+    (tmp_path / "parts" / "shapes").mkdir(parents=True)
+    (tmp_path / "parts" / "shapes" / "wedge.obj").write_text(OFF_TETRAHEDRON)
+    (tmp_path / "parts" / "arm.xml").write_text(
+        """<mujoco><compiler meshdir="parts/shapes" angle="radian"/>
+        <default><joint damping="0.1"/><geom contype="0" conaffinity="0"/><default class="stiff"><joint stiffness="5" armature="0.01"/></default></default>
+        <asset><mesh name="wedge" file="wedge.obj"/></asset>
+        <worldbody><body name="arm" pos="0 0 1"><joint name="arm" axis="0 1 0"/><geom type="mesh" mesh="wedge"/>
+        <body name="hand" pos="0.3 0 0" childclass="stiff"><joint name="hand" axis="0 1 0"/><geom type="sphere" size="0.05"/></body></body></worldbody>
+        </mujoco>"""
+    )
+    (tmp_path / "scene.xml").write_text(
+        """<mujoco><include file="parts/arm.xml"/><worldbody><body name="cup" pos="0.3 0 1"><freejoint/><geom size="0.05" mass="1"/></body></worldbody>
+        <equality><weld name="hold" body1="hand" body2="cup"/></equality></mujoco>"""
+    )
+    first = svkc.load(tmp_path / "scene.xml")
+    for chain in (first, svkc.load(first.to_mjcf())):
+        assert chain.body_names == ("world", "arm", "hand", "cup")
+        assert chain.link_names == ("hold",)
+        row = chain.topology.body_row[1]
+        np.testing.assert_allclose(chain.mass[row], MASS, rtol=1e-6)
+        np.testing.assert_allclose(chain.com[row], COM, rtol=1e-6)
+        np.testing.assert_allclose(chain.inertia[row], INERTIA, rtol=1e-5)
+        assert chain.damping[:2].tolist() == [0.1, 0.1]
+        assert chain.stiffness[:2].tolist() == [0.0, 5.0]
+        assert chain.armature[:2].tolist() == [0.0, 0.01]
+        assert int(svkc.mobility(chain, chain.state()).freedoms) == 2
+
+
+@pytest.mark.parametrize(
+    ("written", "stands"),
+    [
+        ("wedge.obj", "arm/urdf/wedge.obj"),
+        ("../wedge.obj", "arm/wedge.obj"),
+        ("package://arm/meshes/wedge.obj", "arm/meshes/wedge.obj"),
+        ("package://shapes/wedge.obj", "shapes/wedge.obj"),
+        ("package://other/meshes/wedge.obj", "arm/meshes/wedge.obj"),
+        ("package://other/meshes/wedge.obj", "arm/urdf/wedge.obj"),
+    ],
+)
+def test_urdf_with_a_mesh(tmp_path, written, stands):
+    """By path: the mesh is found, of a ROS package too; the link that is fixed is kept for a grip; and the text made of it."""
+    for file in (tmp_path / stands, tmp_path / "arm" / "urdf" / "arm.urdf"):
+        file.parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / stands).write_text(OFF_TETRAHEDRON)
+    file.write_text(
+        f"""<robot name="arm"><link name="base"/>
+        <link name="fore"><inertial><origin xyz="0.1 0 0"/><mass value="2"/><inertia ixx="0.01" iyy="0.02" izz="0.025" ixy="0" ixz="0" iyz="0"/></inertial>
+        <collision><geometry><mesh filename="{written}" scale="2 2 2"/></geometry></collision></link>
+        <link name="tip"/>
+        <joint name="turn" type="revolute"><parent link="base"/><child link="fore"/><origin xyz="0 0 1"/><axis xyz="0 1 0"/>
+        <limit lower="-1" upper="1" effort="10" velocity="1"/></joint>
+        <joint name="weld" type="fixed"><parent link="fore"/><child link="tip"/><origin xyz="0.5 0 0"/></joint></robot>"""
+    )
+    grip = svkc.VirtualLink("grip", "world", "tip", "hinge", pos=(0.5, 0, 1), axis=(0, 1, 0))
+    first = svkc.load(file, virtual_links=[grip], ignore="all")
+    assert first.model.model.nmesh == 1
+    for chain in (first, svkc.load(first.to_mjcf(), ignore="all")):
+        assert chain.joint_names == ("turn",)
+        assert {"fore", "tip"} < set(chain.body_names)
+        row = chain.topology.body_row[chain.body_names.index("fore")]
+        assert float(chain.mass[row]) == 2.0
+        np.testing.assert_allclose(chain.inertia[row], np.diag([0.01, 0.02, 0.025]), atol=1e-12)
+        np.testing.assert_allclose(chain.limit[:, 0], [-1, 1])
+
+
+def test_a_scene_written_in_python():
+    """A five-bar as mujoco.MjSpec, part of it attached from another, its loop a virtual link; the spec stays the caller's own."""
+
+    def arm(side):
+        spec = mujoco.MjSpec()
+        upper = spec.worldbody.add_body(name="upper")
+        upper.add_joint(name="shoulder", axis=[0, 1, 0])
+        fore = upper.add_body(name="fore", pos=[0, 0, 0.5])
+        fore.add_joint(name="elbow", axis=[0, 1, 0])
+        for body, end in ((upper, [0, 0, 0.5]), (fore, [-0.3 * side, 0, 0.5])):
+            body.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=[0, 0, 0, *end], size=[0.03, 0, 0])
+        return spec
+
+    spec = mujoco.MjSpec()
+    spec.option.gravity = [0.3, -0.2, -9.81]
+    for name, side in (("left", -1), ("right", 1)):
+        spec.attach(arm(side), prefix=f"{name}_", frame=spec.worldbody.add_frame(pos=[0.3 * side, 0, 0]))
+    before = spec.to_xml()
+    tip = svkc.VirtualLink("tip", "left_fore", "right_fore", "hinge", pos=(0.3, 0, 0.5), real_pos=(-0.3, 0, 0.5), axis=(0, 1, 0), connected=True)
+    chain, by_text = svkc.load(spec, virtual_links=[tip]), models.five_bar()
+    assert spec.to_xml() == before
+    assert int(svkc.mobility(chain, chain.state()).freedoms) == 2
+    tau = jnp.arange(float(chain.nv))
+    expected = svkc.forward_dynamics(by_text, by_text.state(), tau)
+    np.testing.assert_allclose(svkc.forward_dynamics(chain, chain.state(), tau), expected, atol=1e-9 * float(jnp.abs(expected).max()))
+    # a change of the caller's afterwards is not the chain's
+    spec.worldbody.add_body(name="late").add_geom(size=[0.1, 0, 0])
+    assert svkc.load(chain.to_mjcf()).body_names == chain.body_names
 
 
 @pytest.mark.parametrize(
