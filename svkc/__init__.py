@@ -7,7 +7,7 @@ from importlib.metadata import version as _version
 from svkc.chain import Chain as Chain, State as State, Structure as Structure, VirtualLink as VirtualLink
 
 # models in, runs out
-from svkc.archive import load_trajectory as load_trajectory
+from svkc.archive import load_chain as load_chain, load_trajectory as load_trajectory
 from svkc.interop import from_mujoco as from_mujoco, to_mujoco as to_mujoco, xyzw as xyzw
 from svkc.load import load as load
 from svkc.trajectory import RESULTS as RESULTS, Trajectory as Trajectory

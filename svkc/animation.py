@@ -60,10 +60,6 @@ def frames(chain: Chain, traj: Trajectory, *, fps: float, size, trails, camera, 
     import mujoco
     from PIL import Image
 
-    context = _gl_context()
-    import mujoco.rendering.classic.gl_context as gl
-
-    gl.GLContext = context
     model = chain.model.model
     unknown = [name for name in trails if name not in chain.body_names]
     if unknown:
@@ -75,6 +71,10 @@ def frames(chain: Chain, traj: Trajectory, *, fps: float, size, trails, camera, 
     holding, events = held(chain, traj, positions, R), happened(traj, chain)
     eye = _camera(model, positions, camera, lookat, distance, azimuth, elevation)
     shapes = [matrix(quat) for quat in model.geom_quat]
+    context = _gl_context()
+    import mujoco.rendering.classic.gl_context as gl
+
+    gl.GLContext = context
     mujoco.mj_forward(model, data)
     with mujoco.Renderer(model, height=size[1], width=size[0]) as renderer:
         for t in np.arange(ts[0], ts[-1] + 0.5 / fps, 1 / fps):
@@ -83,6 +83,9 @@ def frames(chain: Chain, traj: Trajectory, *, fps: float, size, trails, camera, 
             for g, body in enumerate(model.geom_bodyid):
                 data.geom_xpos[g] = positions[i, body] + R[i, body] @ model.geom_pos[g]
                 data.geom_xmat[g] = (R[i, body] @ shapes[g]).ravel()
+            for c, body in enumerate(model.cam_bodyid):
+                data.cam_xpos[c] = positions[i, body] + R[i, body] @ model.cam_pos[c]
+                data.cam_xmat[c] = (R[i, body] @ matrix(model.cam_quat[c])).ravel()
             renderer.update_scene(data, eye)
             _draw_links(renderer.scene, holding[i], any(0 <= t - when < FLASH for when, _ in events))
             for k, name in enumerate(trails):

@@ -1,4 +1,4 @@
-"""F3: trajectories on disk: one npz, written whole or not at all."""
+"""F4: trajectories on disk: one npz, written whole or not at all."""
 
 import dataclasses
 import json
@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from svkc.chain import State, Structure
+from svkc.chain import Chain, State, Structure, VirtualLink
+from svkc.load import load
 from svkc.trajectory import RESULTS, Events, Phases, Trajectory
 
 # 2: with `derivative` and the phases' `margin`; 3: with the structures' `margin` and the rest of the certificate; 4: with the phases' gaps
@@ -45,19 +46,25 @@ def _build(cls, arrays: dict[str, Any], prefix: str = "", **known):
     return cls(**fields)
 
 
-def save(traj: Trajectory, path, chain=None) -> None:
-    """Writes one .npz: every array by name, and a JSON line of metadata (schema, result, versions, names if the chain is given)."""
+def save(traj: Trajectory, path, chain=None, options=None) -> None:
+    """Writes one .npz: every array by name, and a JSON line of metadata (schema, result, versions, certificate, options; names and model of the chain)."""
     import svkc
 
     meta = {"schema": SCHEMA, "svkc": svkc.__version__, "jax": jax.__version__, "units": "SI, rad, wxyz"}
     meta |= {name: np.asarray(getattr(traj, name)._value).tolist() for name in _CODES}
+    report = traj.report()
+    meta["certificate"] = {f.name: np.asarray(getattr(report, f.name)).tolist() for f in dataclasses.fields(report) if f.name not in _CODES}
+    meta["options"] = options or {}
+    arrays = _flatten(traj)
     if chain is not None:
         meta |= {"bodies": chain.body_names, "joints": chain.joint_names, "links": chain.link_names}
+        meta |= {"model": chain.model.text, "arguments": _plain(chain.model.arguments)}
+        arrays |= {f"chain.{i}": np.asarray(x) for i, x in enumerate(jax.tree.leaves(chain))}
     path = pathlib.Path(path)
     handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".part")
     try:
         with os.fdopen(handle, "wb") as file:
-            np.savez_compressed(file, metadata=np.array(json.dumps(meta)), **_flatten(traj))
+            np.savez_compressed(file, metadata=np.array(json.dumps(meta, default=str)), **arrays)
         os.replace(temporary, path)
     except BaseException:
         os.unlink(temporary)
@@ -82,8 +89,51 @@ def _complete(arrays: dict[str, np.ndarray], schema: int) -> None:
         arrays[f"{part}.structure.margin"] = np.zeros_like(arrays[f"{part}.structure.rank"], dtype)
 
 
+def _plain(value):
+    """What load was given, as JSON has it."""
+    if isinstance(value, VirtualLink):
+        return {key: _plain(x) for key, x in dataclasses.asdict(value).items()}
+    if isinstance(value, dict):
+        return {key: _plain(x) for key, x in value.items()}
+    if isinstance(value, (list, tuple, np.ndarray, jax.Array)):
+        return [_plain(x) for x in value]
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def load_chain(path) -> Chain:
+    """The chain that a trajectory was saved with: loaded from its MJCF as it was then, with the floats that it had. Files of meshes are read where they were.
+
+    ValueError: saved without a chain, or with one that came from a compiled model, which says not what it was compiled from; no whole file (as above).
+    """
+    arrays, meta = _read(path)
+    if not meta.get("model"):
+        raise ValueError(f"{path} holds no model; save with traj.save(path, chain), the chain loaded from a path, text or MjSpec")
+    given = meta["arguments"]
+    given["virtual_links"] = [VirtualLink(**link) for link in given["virtual_links"]]
+    chain = load(meta["model"], **given)
+    leaves, how = jax.tree.flatten(chain)
+    return jax.tree.unflatten(how, [jnp.asarray(arrays[f"chain.{i}"]) for i in range(len(leaves))])
+
+
 def load_trajectory(path) -> Trajectory:
     """The trajectory that `Trajectory.save` wrote. ValueError: not such a file, cut short, or of a newer schema."""
+    arrays, meta = _read(path)
+    missing = {"ts", "states.q", "final.q", "events.time"} - set(arrays)
+    if missing:
+        raise ValueError(f"{path} lacks {', '.join(sorted(missing))}; it is not a trajectory written by svkc")
+    if meta["schema"] < 4:
+        _complete(arrays, meta["schema"])
+    code = lambda value: eqx.tree_at(lambda item: item._value, RESULTS.successful, value)
+    build = lambda arrays, codes: _build(Trajectory, arrays, **{name: code(value) for name, value in codes.items()})
+    arrays = {name: x for name, x in arrays.items() if not name.startswith("chain.")}
+    for _ in range(arrays["ts"].ndim - 1):
+        # lanes
+        build = jax.vmap(build)
+    return build(arrays, {name: jnp.asarray(meta.get(name, 0), jnp.int32) for name in _CODES})
+
+
+def _read(path) -> tuple[dict[str, np.ndarray], dict]:
+    """Arrays and metadata of a file of ours."""
     try:
         with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
@@ -94,14 +144,4 @@ def load_trajectory(path) -> Trajectory:
         raise ValueError(f"{path} is not a whole trajectory written by svkc: {error}") from error
     if meta["schema"] > SCHEMA:
         raise ValueError(f"{path} has schema {meta['schema']}, this version reads up to {SCHEMA}; use a newer svkc")
-    missing = {"ts", "states.q", "final.q", "events.time"} - set(arrays)
-    if missing:
-        raise ValueError(f"{path} lacks {', '.join(sorted(missing))}; it is not a trajectory written by svkc")
-    if meta["schema"] < 4:
-        _complete(arrays, meta["schema"])
-    code = lambda value: eqx.tree_at(lambda item: item._value, RESULTS.successful, value)
-    build = lambda arrays, codes: _build(Trajectory, arrays, **{name: code(value) for name, value in codes.items()})
-    for _ in range(arrays["ts"].ndim - 1):
-        # lanes
-        build = jax.vmap(build)
-    return build(arrays, {name: jnp.asarray(meta.get(name, 0), jnp.int32) for name in _CODES})
+    return arrays, meta

@@ -78,8 +78,10 @@ def run(name: str, t1: float | None, events, ignore, out: pathlib.Path, video: b
     # phases of long runs show how far they are
     meter = None if stages.disable or end <= 10 else diffrax.TqdmProgressMeter()
 
+    numbers = {"rtol": 1e-8, "atol": 1e-10}
+
     def once():
-        return jax.block_until_ready(svkc.simulate(chain, state, end, ts=ts, events=events, rtol=1e-8, atol=1e-10, throw=False, progress_meter=meter))
+        return jax.block_until_ready(svkc.simulate(chain, state, end, ts=ts, events=events, throw=False, progress_meter=meter, **numbers))
 
     _next(stages, "compiling, and the first run")
     once()
@@ -88,7 +90,7 @@ def run(name: str, t1: float | None, events, ignore, out: pathlib.Path, video: b
     traj = once()
     done = time.perf_counter()
     _next(stages, "pictures")
-    written, missing = _write(chain, traj, out, pathlib.Path(name).stem, video)
+    written, missing = _write(chain, traj, out, pathlib.Path(name).stem, video, {**numbers, "t1": end, "what": name})
     _next(stages, "done")
     stages.close()
     print_phases(chain, traj)
@@ -127,13 +129,13 @@ def _asked(chain, events):
     return tuple(svkc.at(t, cut=link) if kind == "release" else svkc.at(t, connect=link, here=True) for kind, link, t in events)
 
 
-def _write(chain, traj, out: pathlib.Path, stem: str, video: bool) -> tuple[list, list[str]]:
+def _write(chain, traj, out: pathlib.Path, stem: str, video: bool, options: dict) -> tuple[list, list[str]]:
     """The run and its pictures: what was written, and a line for each that could not be."""
     import svkc
 
     out.mkdir(parents=True, exist_ok=True)
     written, missing = [out / f"{stem}.npz"], []
-    traj.save(written[0], chain)
+    traj.save(written[0], chain, **options)
     curves = lambda path: traj.plot(chain).savefig(path, dpi=110)
     draw = lambda path: svkc.render(chain, traj, path, azimuth=90)
     pictures = [(f"{stem}.png", draw), (f"{stem}_curves.png", curves), (f"{stem}.gif", draw), (f"{stem}.mp4", draw), (f"{stem}.html", draw)]

@@ -19,13 +19,15 @@ from svkc.unsupported import what_is_left_out
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Source:
-    """The MuJoCo model a chain was made of and its MJCF (None where only the compiled model was given), for pictures and `chain.to_mjcf`.
+    """The MuJoCo model a chain was made of and its MJCF (None where only the compiled model was given), for pictures, `chain.to_mjcf` and files; and the
+    other arguments of `load`.
 
     Chains are told apart by their numbers and topology, not by it.
     """
 
     model: Any
     text: str | None = None
+    arguments: dict[str, Any] | None = None
 
     def __eq__(self, other):
         return isinstance(other, Source)
@@ -43,7 +45,8 @@ def load(source, *, virtual_links=(), cuttable=(), spare=0, ignore=()) -> Chain:
     nor weld. "limit" leaves out joint ranges.
     Collisions between geoms are never modelled. ValueError: the source does not parse, elements not supported, unknown names.
     """
-    kept = _compiled(source)
+    arguments = {"virtual_links": tuple(virtual_links), "cuttable": cuttable, "spare": spare, "ignore": ignore}
+    kept = dataclasses.replace(_compiled(source), arguments=arguments)
     model = kept.model
     cuts = cuts_of(model, cuttable)
     if isinstance(ignore, str):

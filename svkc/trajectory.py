@@ -106,12 +106,16 @@ class Trajectory(eqx.Module):
         """Which virtual links hold at each time."""
         return self.states.structure.connected
 
-    def save(self, path, chain=None) -> None:
-        """Writes the run to one .npz, whole or not at all; `svkc.load_trajectory` gives back an equal object."""
+    def save(self, path, chain=None, **options) -> None:
+        """Writes the run to one .npz, whole or not at all, with its certificate; `svkc.load_trajectory` gives back an equal object.
+
+        chain: its model and floats are kept too, for `svkc.load_chain` and the command `svkc view`. options: what else is to be told of the run, such as
+        rtol=1e-8; numbers and text as they are, other things as they print.
+        """
         # a verb the contract puts on the noun; its room is one floor up
         from svkc.archive import save
 
-        save(self, path, chain)
+        save(self, path, chain, options)
 
     def plot(self, chain=None):
         """A matplotlib figure of joint coordinates, loop gaps, energy and mobility over time, events as lines."""

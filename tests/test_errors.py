@@ -15,6 +15,7 @@ import pytest
 import said
 
 import svkc
+from svkc import commands
 from svkc.operation import operation
 from svkc.request import _check_state
 
@@ -25,6 +26,7 @@ ROWS = [line.removeprefix("| ").split(" | ")[0].replace("&lt;", "<") for line in
 ELSEWHERE = {
     "rollout: another process": ("test_rollout.py", "another process"),
     "out: ... holds another": ("test_rollout.py", "holds another rollout"),
+    "expected NAME@TIME": ("test_commands.py", "expected NAME@TIME"),
 }
 
 
@@ -97,7 +99,24 @@ def twice(s):
     svkc.load(spec).to_mjcf()
 
 
+def without_ffmpeg(s):
+    with mock.patch.dict("sys.modules", {"imageio_ffmpeg": None}):
+        svkc.render(s.four, s.simulate(t1=1e-3, dt=1e-3), s.folder / "x.mp4")
+
+
+def nameless(s):
+    path = s.folder / "nameless.npz"
+    s.simulate(t1=1e-3, dt=1e-3).save(path)
+    svkc.load_chain(path)
+
+
 CASES = {
+    "... holds no model": nameless,
+    "camera: no": lambda s: svkc.render(s.four, s.simulate(t1=1e-3, dt=1e-3), s.folder / "x.gif", camera="nobody's"),
+    "mp4 needs": without_ffmpeg,
+    "run: no scene": lambda s: commands._scene("nowhere", ()),
+    "run: no virtual": lambda s: commands._asked(s.four, [("release", "nobody", 0.1)]),
+    "trails: no": lambda s: svkc.render(s.four, s.simulate(t1=1e-3, dt=1e-3), s.folder / "x.gif", trails=("nobody",)),
     "... is not linear": lambda s: jax.linear_transpose(operation("odd", jnp.sin, lambda p, t: (p[0], t[0])), jnp.ones(2))(jnp.ones(2)),
     "no library to draw with": undrawn,
     "state and chain are float64": single,

@@ -1,5 +1,7 @@
 """Runs: the high bar end to end, events, batches, steps, results."""
 
+import json
+
 import diffrax
 import equinox as eqx
 import jax
@@ -259,6 +261,23 @@ def test_save_and_load(tmp_path, pendulum):
         with pytest.raises(ValueError, match="not a whole trajectory"):
             svkc.load_trajectory(tmp_path / name)
     assert [p.name for p in tmp_path.glob("*.part")] == []
+
+
+def test_a_saved_run_goes_on(tmp_path, pendulum):
+    """Chain and state from the file, the chain's floats no longer those of its model: on bit for bit. What else is told of the run."""
+    heavier = eqx.tree_at(lambda c: c.mass, pendulum, pendulum.mass * 1.1)
+    traj = svkc.simulate(heavier, pendulum.state({"arm": 1.2}), 1.0)
+    traj.save(tmp_path / "run.npz", heavier, rtol=1e-8, solver=diffrax.Tsit5())
+    chain = svkc.load_chain(tmp_path / "run.npz")
+    assert bool(eqx.tree_equal(chain, heavier))
+    assert chain.model.text == pendulum.model.text
+    again = svkc.simulate(chain, svkc.load_trajectory(tmp_path / "run.npz").final, 1.0)
+    assert bool(eqx.tree_equal(again, svkc.simulate(heavier, traj.final, 1.0)))
+    with np.load(tmp_path / "run.npz") as file:
+        told = json.loads(str(file["metadata"]))
+    assert told["options"] == {"rtol": 1e-8, "solver": "Tsit5()"}
+    assert told["certificate"]["gap"] == float(traj.report().gap)
+    assert "<mujoco" in told["model"]
 
 
 def test_guards_that_jump(pendulum):
