@@ -7,11 +7,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc.chain import Chain, State
-from svkc.closure import Coordinates, constrained, scales
+from svkc.closure import constrained, open_coordinates, scales
 from svkc.forward_dynamics import constraint_forces, with_links
+from svkc.given import arrayed, concrete, numbers
 from svkc.inverse_dynamics import generalized_forces, passive_forces
 from svkc.kinematics import kinematics, twists
 from svkc.selection import Selection, count_rank, select
+from svkc.verb import check_state
 
 
 class Actuation(eqx.Module):
@@ -46,8 +48,8 @@ def actuation(chain: Chain, state: State, vdot_G, weight=None, *, actuated=None,
     bounds: (lower, upper) torques, scalars or [dofs]: the least within them, by scipy's SLSQP on the host (not under jit); where they leave no exact
     solution, the one of least residual. Springs and dampers are counted. ValueError: wrong sizes, weights that are not positive, crossed bounds.
     """
-    independent = None
-    vdot_G = jnp.asarray(vdot_G, state.v.dtype)
+    check_state(chain, state)
+    independent, vdot_G = None, numbers("vdot_G", vdot_G, state.v.dtype)
     if vdot_G.shape != (chain.dofs,):
         independent = np.asarray(_coordinates(chain, state)[0].independent) if not isinstance(state.q, jax.core.Tracer) else None
         if independent is None or vdot_G.shape != (independent.sum(),):
@@ -55,17 +57,18 @@ def actuation(chain: Chain, state: State, vdot_G, weight=None, *, actuated=None,
             raise ValueError(f"vdot_G: got shape {vdot_G.shape}, expected ({chain.dofs},), every joint coordinate, or ({count},), theta_G")
         vdot_G = jnp.zeros(chain.dofs, vdot_G.dtype).at[np.flatnonzero(independent)].set(vdot_G)
     weight = _per_dof(chain, "weight", weight, 1.0, state)
-    if not isinstance(weight, jax.core.Tracer) and not np.all(np.asarray(weight) > 0):
+    if concrete(weight) and not np.all((np.asarray(weight) > 0) & np.isfinite(np.asarray(weight))):
         raise ValueError(f"weight: expected positive numbers, got {np.asarray(weight)}")
-    actuated = chain.actuated if actuated is None else jnp.asarray(actuated)
+    actuated = chain.actuated if actuated is None else arrayed(actuated)
     if actuated.shape != (chain.dofs,) or actuated.dtype != bool:
         raise ValueError(f"actuated: expected {chain.dofs} Booleans, got {actuated.dtype} of shape {actuated.shape}")
+    actuated = jnp.asarray(actuated)
     done, problem = _solve(chain, state, vdot_G, weight, actuated)
     return done if bounds is None else _within(chain, state, done, problem, weight, bounds)
 
 
 def _per_dof(chain: Chain, name: str, value, default, state: State) -> Float[Array, " dofs"]:
-    value = jnp.asarray(default if value is None else value, state.v.dtype)
+    value = numbers(name, default if value is None else value, state.v.dtype)
     if value.shape not in ((), (chain.dofs,)):
         raise ValueError(f"{name}: got shape {value.shape}, expected a number or ({chain.dofs},)")
     return jnp.broadcast_to(value, (chain.dofs,))
@@ -76,17 +79,8 @@ def _coordinates(chain: Chain, state: State):
     kin = kinematics(chain, state.q)
     V = twists(chain, kin, state.v)
     if not len(chain.link_names):
-        free = jnp.ones(chain.dofs, bool) if state.structure.locked is None else ~state.structure.locked
-        W = jnp.diag(jnp.where(free, 1, 0).astype(state.q.dtype))
-        return _open(W, free, chain), kin, V
+        return open_coordinates(chain, state.structure), kin, V
     return constrained(chain, state.structure, state.q, state.v, kin, V), kin, V
-
-
-def _open(W, free, chain: Chain) -> Coordinates:
-    """The coordinates of a chain without virtual links: every joint that is not locked is independent."""
-    n, none = chain.dofs, jnp.zeros(0, bool)
-    selection = Selection(jnp.zeros((0, 0), W.dtype), jnp.zeros((0, n), W.dtype), jnp.zeros(0, W.dtype), none)
-    return Coordinates(W, jnp.zeros(n, W.dtype), free, jnp.zeros(n, bool), chain.actuated, selection, jnp.zeros((0, n), W.dtype))
 
 
 def _basis(B: Float[Array, "rows dofs"], rank=None) -> tuple[Selection, Int[Array, ""], Float[Array, "dofs dofs"]]:
@@ -150,6 +144,8 @@ def _within(chain: Chain, state: State, done: Actuation, problem, weight, bounds
     """The least weighted torques within the bounds that give what is wanted, or come nearest to it."""
     if isinstance(done.tau, jax.core.Tracer):
         raise ValueError("bounds: the bounded problem is solved on the host; call actuation with bounds outside of jit, vmap and grad")
+    if not isinstance(bounds, tuple | list | np.ndarray | jax.Array) or len(bounds) != 2:
+        raise ValueError(f"bounds: expected (lower, upper), got {bounds!r}")
     lower, upper = (np.asarray(_per_dof(chain, "bounds", b, 0.0, state), float) for b in bounds)
     if not np.all(lower <= upper):
         raise ValueError(f"bounds: expected lower at or below upper, got {lower} and {upper}")
@@ -157,7 +153,9 @@ def _within(chain: Chain, state: State, done: Actuation, problem, weight, bounds
     drives, lower, upper = np.any(B != 0, 0), lower * column, upper * column
     y = np.where(drives, np.clip(0, lower, upper), 0.0)
     used = drives & (upper > lower)
-    if used.any():
+    if not (np.isfinite(B).all() and np.isfinite(wanted).all()):
+        y[:] = np.nan
+    elif used.any():
         cost = (np.asarray(weight, float) / column**2)[used]
         y[used] = _least_within(B[:, used], wanted - B[:, ~used] @ y[~used], cost, (lower[used], upper[used]))
     tau = jnp.asarray(y / column, done.tau.dtype)

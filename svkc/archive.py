@@ -5,7 +5,6 @@ import json
 import os
 import pathlib
 import tempfile
-import zipfile
 from typing import Any
 
 import equinox as eqx
@@ -89,13 +88,34 @@ def _complete(arrays: dict[str, np.ndarray], schema: int) -> None:
         arrays[f"{part}.structure.margin"] = np.zeros_like(arrays[f"{part}.structure.rank"], dtype)
 
 
+# what every file has had from the first
+_FIRST = {"ts", "gaps", "states.q", "states.structure.rank", "final.q", "final.structure.rank", "events.time", "phases.start"}
+
+
+def _named(cls, prefix: str = "") -> set[str]:
+    """The names of all arrays that `_build` looks for, but for those that may be None."""
+    out = set()
+    for field in dataclasses.fields(cls):
+        if field.name in _PARTS:
+            out |= _named(_PARTS[field.name], prefix + field.name + ".")
+        elif field.name not in (*_CODES, "locked", "independent"):
+            out.add(prefix + field.name)
+    return out
+
+
+def _check_whole(path, arrays: dict[str, Any], names: set[str]) -> None:
+    missing = names - set(arrays)
+    if missing:
+        raise ValueError(f"{path} lacks {', '.join(sorted(missing))}; it is not a trajectory written by svkc")
+
+
 def _plain(value):
     """What load was given, as JSON has it."""
     if isinstance(value, VirtualLink):
-        return {key: _plain(x) for key, x in dataclasses.asdict(value).items()}
+        value = dataclasses.asdict(value)
     if isinstance(value, dict):
         return {key: _plain(x) for key, x in value.items()}
-    if isinstance(value, (list, tuple, np.ndarray, jax.Array)):
+    if isinstance(value, (list, tuple, set, frozenset, np.ndarray, jax.Array)):
         return [_plain(x) for x in value]
     return value.item() if isinstance(value, np.generic) else value
 
@@ -105,43 +125,49 @@ def load_chain(path) -> Chain:
 
     ValueError: saved without a chain, or with one that came from a compiled model, which says not what it was compiled from; no whole file (as above).
     """
-    arrays, meta = _read(path)
+    arrays, meta, _ = _read(path)
     if not meta.get("model"):
         raise ValueError(f"{path} holds no model; save with traj.save(path, chain), the chain loaded from a path, text or MjSpec")
     given = meta["arguments"]
     given["virtual_links"] = [VirtualLink(**link) for link in given["virtual_links"]]
-    chain = load(meta["model"], **given)
-    leaves, how = jax.tree.flatten(chain)
+    leaves, how = jax.tree.flatten(load(meta["model"], **given))
     return jax.tree.unflatten(how, [jnp.asarray(arrays[f"chain.{i}"]) for i in range(len(leaves))])
 
 
 def load_trajectory(path) -> Trajectory:
-    """The trajectory that `Trajectory.save` wrote. ValueError: not such a file, cut short, or of a newer schema."""
-    arrays, meta = _read(path)
-    missing = {"ts", "states.q", "final.q", "events.time"} - set(arrays)
-    if missing:
-        raise ValueError(f"{path} lacks {', '.join(sorted(missing))}; it is not a trajectory written by svkc")
-    if meta["schema"] < 4:
-        _complete(arrays, meta["schema"])
+    """The trajectory that `Trajectory.save` wrote. ValueError: not such a file, cut short, or of a newer schema. FileNotFoundError: no file."""
+    arrays, meta, codes = _read(path)
+    arrays = {name: x for name, x in arrays.items() if not name.startswith("chain.")}
+    _check_whole(path, arrays, _FIRST)
+    schema = int(meta["schema"])
+    if schema < 4:
+        _complete(arrays, schema)
+    _check_whole(path, arrays, _named(Trajectory) if schema > 1 else _FIRST)
     code = lambda value: eqx.tree_at(lambda item: item._value, RESULTS.successful, value)
     build = lambda arrays, codes: _build(Trajectory, arrays, **{name: code(value) for name, value in codes.items()})
-    arrays = {name: x for name, x in arrays.items() if not name.startswith("chain.")}
     for _ in range(arrays["ts"].ndim - 1):
         # lanes
         build = jax.vmap(build)
-    return build(arrays, {name: jnp.asarray(meta.get(name, 0), jnp.int32) for name in _CODES})
+    try:
+        return build(arrays, {name: jnp.asarray(code) for name, code in codes.items()})
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path} is not a whole trajectory written by svkc: {error}") from error
 
 
-def _read(path) -> tuple[dict[str, np.ndarray], dict]:
-    """Arrays and metadata of a file of ours."""
+def _read(path) -> tuple[dict[str, np.ndarray], dict, dict[str, np.ndarray]]:
+    """Arrays, metadata and result codes of a file of ours."""
+    if not isinstance(path, str | bytes | os.PathLike):
+        raise ValueError(f"load_trajectory: expected a path, got {path!r}")
     try:
         with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         meta = json.loads(str(arrays.pop("metadata")))
-    except (KeyError, ValueError, EOFError, OSError, zipfile.BadZipFile) as error:
-        if isinstance(error, FileNotFoundError):
-            raise
+        schema, codes = int(meta["schema"]), {name: np.asarray(meta.get(name, 0), np.int32) for name in _CODES}
+    except FileNotFoundError:
+        raise
+    # whatever the readers of zip, npy and JSON say of what is none
+    except Exception as error:
         raise ValueError(f"{path} is not a whole trajectory written by svkc: {error}") from error
-    if meta["schema"] > SCHEMA:
-        raise ValueError(f"{path} has schema {meta['schema']}, this version reads up to {SCHEMA}; use a newer svkc")
-    return arrays, meta
+    if schema > SCHEMA:
+        raise ValueError(f"{path} has schema {schema}, this version reads up to {SCHEMA}; use a newer svkc")
+    return arrays, meta, codes

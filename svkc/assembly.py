@@ -9,10 +9,12 @@ import numpy as np
 
 from svkc.chain import Chain, State, Structure
 from svkc.closure import loop_gaps
+from svkc.given import arrayed, finite
 from svkc.kinematics import kinematics, normalize
 from svkc.loops import active_dofs, joint_coordinates, with_coordinates
 from svkc.projection import agree, close, decide_rank
 from svkc.topology import Q_SIZE, V_SIZE
+from svkc.verb import check_state
 
 _NEWTON = 30
 
@@ -29,7 +31,7 @@ def connection_mask(chain: Chain, connected) -> np.ndarray | jax.Array:
     names = (connected,) if isinstance(connected, str) else connected
     if isinstance(names, (tuple, list, set, frozenset)) and all(isinstance(n, str) for n in names):
         return np.isin(chain.link_names, [chain.link_names[link_index(chain, n)] for n in names])
-    mask = connected if isinstance(connected, jax.Array) else np.asarray(connected)
+    mask = arrayed(connected)
     if mask.shape != (len(chain.link_names),) or mask.dtype != bool:
         raise ValueError(f"connected: expected names of virtual links or {len(chain.link_names)} Booleans, got {mask.dtype} of shape {mask.shape}")
     return mask
@@ -37,7 +39,7 @@ def connection_mask(chain: Chain, connected) -> np.ndarray | jax.Array:
 
 def link_index(chain: Chain, name: str) -> int:
     """The slot of a virtual link; ValueError naming those there are."""
-    if name not in chain.link_names:
+    if not isinstance(name, str) or name not in chain.link_names:
         raise ValueError(f"no virtual link {name!r}; virtual links: {', '.join(chain.link_names) or 'none'}")
     return chain.link_names.index(name)
 
@@ -53,7 +55,7 @@ def joint_slice(chain: Chain, name: str, sizes, start) -> slice:
                 return slice(int(first), int(first) + (3 if ball else 1))
             first = top.links.quat[link, 0] if ball else np.concatenate([top.links.angle, top.links.slide], 1)[link, freedom]
             return slice(int(first), int(first) + (4 if ball else 1))
-    if name not in top.joint_names:
+    if not isinstance(name, str) or name not in top.joint_names:
         raise ValueError(f"no joint {name!r}; joints: {', '.join(top.joint_names)}")
     row = top.joint_row[top.joint_names.index(name)]
     return slice(start[row], start[row] + sizes[top.kind[row]])
@@ -64,6 +66,7 @@ def prefer(chain: Chain, state: State, *names: str) -> State:
 
     names: of joints, virtual links, or single coordinates (`chain.dof_names`). The motion does not depend on it. ValueError: unknown names.
     """
+    check_state(chain, state)
     asked = np.zeros(chain.dofs, bool)
     for name in names:
         here = np.array([n == name or n.rpartition(".")[0] == name for n in chain.dof_names])
@@ -83,14 +86,14 @@ def _filled(chain: Chain, what: str, value, default, tree: int, sizes, start):
         out = default
         for name, number in value.items():
             at = joint_slice(chain, name, sizes, start)
-            number = _numbers(f"{what}[{name!r}]", number, default.dtype)
+            number = finite(f"{what}[{name!r}]", number, default.dtype)
             if number.size != at.stop - at.start:
                 raise ValueError(f"{what}[{name!r}]: got {number.size} numbers, the joint has {at.stop - at.start}")
             out = out.at[at].set(number.reshape(-1))
             if what == "v" or at.stop - at.start == 1:
                 named[at] = True
         return out, named
-    value = _numbers(what, value, default.dtype)
+    value = finite(what, value, default.dtype)
     of_model = np.array(chain.topology.model_q if what == "q" else chain.topology.model_v, int)
     if chain.topology.cut_joints and value.shape == of_model.shape:
         # as for the plain tree
@@ -100,16 +103,6 @@ def _filled(chain: Chain, what: str, value, default, tree: int, sizes, start):
     if value.shape != default.shape:
         raise ValueError(f"{what}: got shape {value.shape}, expected ({tree},) for the tree or {default.shape} for every coordinate")
     return value, named
-
-
-def _numbers(what: str, value, dtype):
-    """As floats of the chain's type, finite where that can be seen."""
-    value = value if isinstance(value, jax.Array) else np.asarray(value)
-    if not np.issubdtype(value.dtype, np.number) or np.issubdtype(value.dtype, np.complexfloating):
-        raise ValueError(f"{what}: expected real numbers, got {value.dtype}")
-    if not isinstance(value, jax.core.Tracer) and not np.isfinite(np.asarray(value)).all():
-        raise ValueError(f"{what}: expected finite numbers, got {np.asarray(value)}")
-    return jnp.asarray(value, dtype)
 
 
 def _check_quaternions(chain: Chain, q):

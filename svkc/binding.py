@@ -9,7 +9,13 @@ from jaxtyping import Array, Bool
 
 from svkc.assembly import link_index
 from svkc.chain import Chain, State, Structure
+from svkc.given import finite
 from svkc.topology import joint_freedoms
+from svkc.verb import check_state
+
+
+def _listed(x):
+    return tuple(x) if np.iterable(x) else x
 
 
 class Grip(eqx.Module):
@@ -22,7 +28,7 @@ class Grip(eqx.Module):
     parent: str = eqx.field(static=True)
     real: str = eqx.field(static=True)
     joint: Any = eqx.field(static=True, default="weld")
-    axis: Any = eqx.field(static=True, default=(0.0, 0.0, 1.0), converter=tuple)
+    axis: Any = eqx.field(static=True, default=(0.0, 0.0, 1.0), converter=_listed)
     real_pos: Any = (0.0, 0.0, 0.0)
     slot: str | None = eqx.field(static=True, default=None)
 
@@ -30,7 +36,7 @@ class Grip(eqx.Module):
 def rows_of(chain: Chain, *bodies: str) -> list[int]:
     """Rows of bodies by name; ValueError naming those there are."""
     for body in bodies:
-        if body not in chain.body_names:
+        if not isinstance(body, str) or body not in chain.body_names:
             raise ValueError(f"bind: no body {body!r}; bodies: {', '.join(chain.body_names)}")
     return [chain.topology.body_row[chain.body_names.index(b)] for b in bodies]
 
@@ -54,12 +60,20 @@ def checked_freedoms(joint) -> tuple[bool, ...]:
 
 def to_axis(axis) -> np.ndarray:
     """The shortest turn of z onto an axis, wxyz; ValueError for no axis."""
-    axis = np.asarray(axis, float)
-    if axis.shape != (3,) or not np.linalg.norm(axis) > 0:
+    axis = np.asarray(finite("bind: axis", axis), float)
+    if axis.shape != (3,) or not 0 < np.linalg.norm(axis) < np.inf:
         raise ValueError(f"bind: axis: expected three numbers that are not all zero, got {axis}")
     x, y, z = axis / np.linalg.norm(axis)
     quat = np.array([1 + z, -y, x, 0.0]) if z > -1 + 1e-12 else np.array([0.0, 1, 0, 0])
     return quat / np.linalg.norm(quat)
+
+
+def placed(name: str, value, dtype):
+    """A place: three numbers, finite where that can be seen."""
+    place = finite(f"bind: {name}", value, dtype)
+    if place.shape != (3,):
+        raise ValueError(f"bind: {name}: expected three numbers (m), got shape {place.shape}")
+    return place
 
 
 def put(structure: Structure, at: Bool[Array, " links"], rows, freedoms, quat, pos, real_pos) -> Structure:
@@ -115,5 +129,7 @@ def bind(
     joint: any but universal and pairs of turns, whose coordinates a spare slot has no room for. axis: of the joint, in the parent. pos, real_pos (m): in
     the two bodies. ValueError: not a spare slot, unknown bodies. In a run: `svkc.at(t, bind=svkc.Grip(...))`.
     """
+    check_state(chain, state)
     at = jnp.asarray(np.arange(len(chain.link_names)) == spare_slot(chain, name))
+    pos, real_pos = (placed(what, x, state.q.dtype) for what, x in (("pos", pos), ("real_pos", real_pos)))
     return State(state.q, state.v, put(state.structure, at, rows_of(chain, parent, real), checked_freedoms(joint), to_axis(axis), pos, real_pos))

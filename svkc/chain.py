@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from svkc.given import numbers, yes_or_no
 from svkc.topology import FREE, Topology, joint_freedoms
 
 
@@ -34,17 +35,22 @@ class VirtualLink:
     actuated: bool = False
 
     def __post_init__(self):
+        for name in ("name", "parent", "real"):
+            if not isinstance(getattr(self, name), str):
+                raise ValueError(f"virtual link: {name} must be a name, got {getattr(self, name)!r}")
         joint_freedoms(self.joint)
+        for name in ("connected", "actuated"):
+            yes_or_no(f"virtual link {self.name!r}: {name}", getattr(self, name))
         for name, size in (("pos", 3), ("quat", 4), ("real_pos", 3), ("real_quat", 4), ("axis", 3)):
             value = getattr(self, name)
             if value is None and name.startswith("real"):
                 continue
-            value = np.asarray(value, float)
+            value = np.asarray(numbers(f"virtual link {self.name!r}: {name}", value), float)
             if value.shape != (size,) or not np.isfinite(value).all():
                 raise ValueError(f"virtual link {self.name!r}: {name} must be {size} finite numbers, got {value}")
             if size == 4 and abs(np.linalg.norm(value) - 1) > 1e-6:
                 raise ValueError(f"virtual link {self.name!r}: {name} must be a unit quaternion, got one of norm {np.linalg.norm(value):.6g}")
-        if np.linalg.norm(np.asarray(self.axis, float)) == 0:
+        if not 0 < np.linalg.norm(np.asarray(self.axis, float)) < np.inf:
             raise ValueError(f"virtual link {self.name!r}: axis must not be zero")
 
 
@@ -183,8 +189,9 @@ class Chain(eqx.Module):
         mask[table[table < self.dofs]] = True
         return mask
 
-    def motors(self, u: Float[Array, " motors"]) -> Float[Array, " dofs"]:
+    def motors(self, u) -> Float[Array, " dofs"]:
         """Joint torques (N m, N) of the model's actuators for the controls u: gear times u, each clipped to its range."""
+        u = numbers("u", u, self.gear.dtype)
         if u.shape != self.gear.shape[:1]:
             raise ValueError(f"u: got shape {u.shape}, the model has {self.gear.shape[0]} actuators")
         force = jnp.clip(u, self.control_range[:, 0], self.control_range[:, 1])

@@ -15,6 +15,7 @@ from svkc.kinematics import Kinematics, bias_accelerations, kinematics, twists
 from svkc.loops import active_dofs, ends, gap, loop_bias, loop_jacobian
 from svkc.selection import Selection, held_part, select, select_again, solve_frozen, square, weakest, without_weak
 from svkc.topology import FREE, SLIDE
+from svkc.verb import verb
 
 # part of the phase's own margin below which a configuration is near a singular one; elsewhere the motion depends on no choice of pivots
 NEAR = 0.1
@@ -125,9 +126,20 @@ def constrained(chain: Chain, structure: Structure, q, v, kin: Kinematics, V) ->
     return constrain(chain, structure, choose(structure, J), J, bias)
 
 
-@jax.jit
+def open_coordinates(chain: Chain, structure: Structure) -> Coordinates:
+    """The coordinates of a chain without virtual links: every joint that is not locked is independent."""
+    n, none, dtype = chain.dofs, jnp.zeros(0, bool), chain.q_load.dtype
+    free = jnp.ones(n, bool) if structure.locked is None else ~structure.locked
+    selection = Selection(jnp.zeros((0, 0), dtype), jnp.zeros((0, n), dtype), jnp.zeros(0, dtype), none)
+    W = jnp.diag(jnp.where(free, 1, 0).astype(dtype))
+    return Coordinates(W, jnp.zeros(n, dtype), free, jnp.zeros(n, bool), chain.actuated, selection, jnp.zeros((0, n), dtype))
+
+
+@verb
 def coordinates(chain: Chain, state: State) -> Coordinates:
     """H, W, S, Hdot v and the selection, as the paper names them (section II)."""
+    if not len(chain.link_names):
+        return open_coordinates(chain, state.structure)
     kin = kinematics(chain, state.q)
     return constrained(chain, state.structure, state.q, state.v, kin, twists(chain, kin, state.v))
 
@@ -154,13 +166,13 @@ def largest_gaps(chain: Chain, state: State) -> tuple[Float[Array, "2"], Float[A
     return largest(gaps), largest(rates)
 
 
-@jax.jit
+@verb
 def loop_gaps(chain: Chain, state: State) -> Float[Array, "links 6"]:
     """How far each connected loop is open: rotation vector (rad), then distance (m), in the world; zero where not connected."""
     return gaps_and_rates(chain, state)[0]
 
 
-@jax.jit
+@verb
 def jacobian(chain: Chain, state: State) -> tuple[Float[Array, "links 3 dofs"], Float[Array, "links 3 dofs"]]:
     """J_C (paper (11)): linear (m/s) and angular (rad/s) velocity of each connected virtual link relative to its real link, for a unit rate of each
     joint coordinate, at the joint, in world axes."""
@@ -169,7 +181,7 @@ def jacobian(chain: Chain, state: State) -> tuple[Float[Array, "links 3 dofs"], 
     return J[:, 3:], J[:, :3]
 
 
-@jax.jit
+@verb
 def velocity_gaps(chain: Chain, state: State) -> Float[Array, "links 6"]:
     """J_C v: relative twist (rad/s, m/s) across each connected virtual link."""
     return gaps_and_rates(chain, state)[1]

@@ -29,7 +29,7 @@ def cuts_of(model, cuttable) -> list[Cut]:
     """The cuts asked for by joint names; ValueError: unknown names, joints that no virtual joint is like."""
     names = [name_of(model, "joint", j) for j in range(model.njnt)]
     cuts: dict[int, Cut] = {}
-    for name in (cuttable,) if isinstance(cuttable, str) else tuple(cuttable):
+    for name in cuttable:
         if name not in names:
             raise ValueError(f"cuttable: no joint {name!r}; joints: {', '.join(names) or 'none'}")
         body = int(model.jnt_bodyid[names.index(name)])

@@ -10,7 +10,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from svkc.chain import Chain
+from svkc.given import function, positive, whole
 from svkc.kinematics import integrate
+from svkc.verb import check_chain, vector
 
 
 class Check(eqx.Module):
@@ -45,6 +47,9 @@ def check_grad(f: Callable, x, mode: str = "both", directions: int = 2, step: fl
     a part of the direction; it is halved seven times and the best estimate taken. float64, or the differences are worth little.
     ValueError: no floats in x, an unknown mode, or f not finite.
     """
+    function("f", f, optional=False)
+    whole("directions", directions, 1)
+    positive("step", step)
     if mode not in ("forward", "reverse", "both"):
         raise ValueError(f"mode: got {mode!r}, expected 'forward', 'reverse' or 'both'")
     free, rest = eqx.partition(jax.tree.map(lambda leaf: jnp.asarray(leaf) if isinstance(leaf, float) else leaf, x), eqx.is_inexact_array)
@@ -148,9 +153,11 @@ def _compare(derivative, difference, doubt, modes: float, output: str, input: st
     return Check(float(off[at] / size), entry, input, pick(derivative), pick(difference), pick(doubt) / float(size), modes)
 
 
-def tangent(chain: Chain, q: Float[Array, " q"], gradient: Float[Array, " q"]) -> Float[Array, " dofs"]:
+def tangent(chain: Chain, q, gradient) -> Float[Array, " dofs"]:
     """A gradient by q as one in the tangent of the configuration: of f(integrate(chain, q, dv)) by dv at dv = 0.
 
     What an optimiser should step along: q <- integrate(chain, q, -rate * tangent(chain, q, gradient)) keeps quaternions at unit length.
     """
+    check_chain(chain)
+    q, gradient = (vector(chain, name, x, chain.topology.nq_all) for name, x in (("q", q), ("gradient", gradient)))
     return jax.vjp(lambda dv: integrate(chain, q, dv), jnp.zeros(chain.dofs, q.dtype))[1](gradient)[0]

@@ -1,6 +1,5 @@
 """F3: energy and momentum of the tree; virtual links have no mass."""
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -8,6 +7,7 @@ from svkc.chain import Chain, State
 from svkc.kinematics import Kinematics, difference, kinematics, twists
 from svkc.loops import active_dofs
 from svkc.spatial import cross, rotate
+from svkc.verb import verb
 
 
 def _bodies(chain: Chain, kin: Kinematics, v):
@@ -39,19 +39,19 @@ def _both(chain: Chain, state: State) -> tuple[Float[Array, ""], Float[Array, ""
     return _energies(chain, state, kin, _bodies(chain, kin, state.v))
 
 
-@jax.jit
+@verb
 def kinetic_energy(chain: Chain, state: State) -> Float[Array, ""]:
     """Kinetic energy (J), armature included: v^T M v / 2."""
     return _both(chain, state)[0]
 
 
-@jax.jit
+@verb
 def potential_energy(chain: Chain, state: State) -> Float[Array, ""]:
     """Gravity's potential (J), zero at the world's origin, and that of the joints' springs."""
     return _both(chain, state)[1]
 
 
-@jax.jit
+@verb
 def energy(chain: Chain, state: State) -> Float[Array, ""]:
     """Mechanical energy (J): kinetic, gravity's and the joint springs'."""
     kinetic, potential = _both(chain, state)
@@ -69,7 +69,7 @@ def energy_and_momentum(chain: Chain, state: State) -> tuple[Float[Array, ""], F
     return kinetic + potential, jnp.sum(p, 0), jnp.sum(spin + cross(place - centre[None], p), 0)
 
 
-@jax.jit
+@verb
 def momentum(chain: Chain, state: State) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
     """Linear momentum (N s) and angular momentum about the world's origin (N m s), in world axes."""
     kin = kinematics(chain, state.q)

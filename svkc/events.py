@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc.assembly import joint_slice, link_index
-from svkc.binding import Grip, checked_freedoms, holding, rows_of, spare_slot, to_axis
+from svkc.binding import Grip, checked_freedoms, holding, placed, rows_of, spare_slot, to_axis
 from svkc.chain import Chain, Structure
+from svkc.given import numbers, texts, yes_or_no
 from svkc.topology import V_SIZE
 
 
@@ -49,13 +50,6 @@ def _several(value) -> tuple:
     return tuple(value) if isinstance(value, Iterable) and not isinstance(value, str) else (value,)
 
 
-def _names(value) -> tuple[str, ...]:
-    names = _several(value)
-    if not all(isinstance(n, str) for n in names):
-        raise ValueError(f"expected names, got {value!r}")
-    return names
-
-
 def _action(connect, cut, lock, unlock, here, stop, bind, unbind) -> Action:
     bind = _several(bind)
     if not all(isinstance(g, Grip) for g in bind):
@@ -65,11 +59,12 @@ def _action(connect, cut, lock, unlock, here, stop, bind, unbind) -> Action:
         unbind = (unbind,)
     if not all(isinstance(u, str) or (isinstance(u, tuple) and len(u) == 2) for u in unbind):
         raise ValueError(f"unbind: expected names of spare slots or pairs of body names (parent, real), got {unbind!r}")
-    connect = _names(connect)
-    here = connect if here is True else () if here is False else _names(here)
+    connect = texts("connect", connect)
+    here = (connect if here else ()) if isinstance(here, bool | np.bool_) else texts("here", here)
     if not set(here) <= set(connect):
         raise ValueError(f"here: {here} must be among the links to connect, {connect}")
-    return Action(connect, _names(cut), _names(lock), _names(unlock), here, stop, unbind, bind)
+    cut, lock, unlock = texts("cut", cut), texts("lock", lock), texts("unlock", unlock)
+    return Action(connect, cut, lock, unlock, here, yes_or_no("stop", stop), unbind, bind)
 
 
 def at(time, connect=(), cut=(), *, lock=(), unlock=(), here=False, stop=False, bind=(), unbind=()) -> At:
@@ -78,6 +73,7 @@ def at(time, connect=(), cut=(), *, lock=(), unlock=(), here=False, stop=False, 
     here: True, or names: grip where the bodies are. stop: end the run then. bind: `svkc.Grip`s to make with spare slots, where the bodies are; where all
     are taken the run ends with a code. unbind: spare slots by name, or all between a pair (parent, real) of bodies, cut and emptied.
     """
+    numbers("time", time)
     return At(time, _action(connect, cut, lock, unlock, here, stop, bind, unbind))
 
 
@@ -92,8 +88,9 @@ def when(guard, connect=(), cut=(), direction=None, *, lock=(), unlock=(), here=
     """
     if not callable(guard):
         raise ValueError(f"when: guard must be a function of (t, state, args), got {guard!r}")
-    if direction not in (None, True, False):
+    if direction is not None and not isinstance(direction, bool | np.bool_):
         raise ValueError(f"when: direction must be True, False or None, got {direction!r}")
+    direction = None if direction is None else bool(direction)
     return When(guard, _action(connect, cut, lock, unlock, here, stop, bind, unbind), direction)
 
 
@@ -170,11 +167,17 @@ class Plan(eqx.Module):
         return jnp.where(either, up | down, jnp.where(upward, up, down))
 
 
-def plan(chain: Chain, events, dtype) -> Plan:
-    """Tables of the events; ValueError for anything that is not one, and for names the chain does not have."""
+def listed(events) -> tuple:
+    """The events of a list; ValueError for anything that is not one."""
+    events = tuple(events) if isinstance(events, Iterable) else (events,)
     for event in events:
         if not isinstance(event, At | When):
             raise ValueError(f"events: expected svkc.at(...) and svkc.when(...), got {event!r}")
+    return events
+
+
+def plan(chain: Chain, events: tuple, dtype) -> Plan:
+    """Tables of the events; ValueError for names the chain does not have."""
     timed = tuple(i for i, e in enumerate(events) if isinstance(e, At))
     guarded = tuple(i for i, e in enumerate(events) if isinstance(e, When))
     times = [jnp.asarray(events[i].time, dtype) for i in timed]
@@ -206,10 +209,7 @@ def _checked_grip(chain: Chain, wish: Grip, dtype) -> Grip:
         spare_slot(chain, wish.slot)
     elif not any(chain.topology.link_spare):
         raise ValueError("bind: the chain has no spare slots; load it with spare=n")
-    place = jnp.asarray(wish.real_pos, dtype)
-    if place.shape != (3,):
-        raise ValueError(f"bind: real_pos: expected three numbers (m), got shape {place.shape}")
-    return dataclasses.replace(wish, real_pos=place)
+    return dataclasses.replace(wish, real_pos=placed("real_pos", wish.real_pos, dtype))
 
 
 # how often a bracket may be narrowed

@@ -13,10 +13,12 @@ from svkc.articulated import accelerations, articulate, by_bodies
 from svkc.chain import Chain, State, Structure
 from svkc.closure import NEAR, Coordinates, agreeing, choose, constrain, loop_rates, scaled_jacobian, scales
 from svkc.delassus import by_loop_forces
+from svkc.given import function, one
 from svkc.inverse_dynamics import generalized_forces, inertia_by_composites, inertia_by_unit_vectors, inertia_times, passive_forces
 from svkc.kinematics import LEVELS_UNROLLED, Kinematics, kinematics, twists
 from svkc.loops import active_dofs, ends
 from svkc.selection import Selection, rank_tolerance, square, weakest
+from svkc.verb import verb
 
 
 class Dynamics(eqx.Module):
@@ -33,14 +35,19 @@ class Dynamics(eqx.Module):
     inertia: Callable | None = eqx.field(static=True, default=None)
     hold: float | None = eqx.field(static=True, default=0.3)
 
+    def __check_init__(self):
+        function("dynamics.inertia", self.inertia)
+        if self.hold is not None and not 0 <= one("dynamics.hold", self.hold) <= 1:
+            raise ValueError(f"dynamics.hold: got {self.hold}, expected None or a part between 0 and 1")
 
-def joint_torques(chain: Chain, tau: Float[Array, " torques"]) -> Float[Array, " dofs"]:
+
+def joint_torques(chain: Chain, tau) -> Float[Array, " dofs"]:
     """Torques over every coordinate; those of virtual joints are zero where only the tree's are given. ValueError: another size."""
-    if tau.shape[0] == chain.dofs:
+    if tau.shape == (chain.dofs,):
         return tau
-    if tau.shape[0] == chain.nv:
+    if tau.shape == (chain.nv,):
         return jnp.concatenate([tau, jnp.zeros(chain.dofs - chain.nv, tau.dtype)])
-    raise ValueError(f"tau: got {tau.shape[0]} numbers, expected {chain.dofs} joint torques (or {chain.nv}, the tree's)")
+    raise ValueError(f"tau: got shape {tau.shape}, expected {chain.dofs} joint torques (or {chain.nv}, the tree's)")
 
 
 def reduced_inertia(chain: Chain, co: Coordinates, M: Float[Array, "nv nv"]) -> Float[Array, "dofs dofs"]:
@@ -160,7 +167,7 @@ def acceleration(chain: Chain, structure: Structure, q, v, tau: Float[Array, " d
     return moving(chain, structure, q, v, tau, inertia)[1]
 
 
-@jax.jit
+@verb
 def forward_dynamics(chain: Chain, state: State, tau: Float[Array, " torques"]) -> Float[Array, " dofs"]:
     """Accelerations (rad/s^2, m/s^2) of every joint coordinate for the joint torques tau (N m, N), loops kept (paper, section III-B).
 
@@ -169,7 +176,7 @@ def forward_dynamics(chain: Chain, state: State, tau: Float[Array, " torques"]) 
     return acceleration(chain, state.structure, state.q, state.v, joint_torques(chain, tau))
 
 
-@jax.jit
+@verb
 def forward_dynamics_by_unit_vectors(chain: Chain, state: State, tau: Float[Array, " torques"]) -> Float[Array, " dofs"]:
     """The same with the inertia matrix column by column from inverse dynamics: the paper's own way."""
     return acceleration(chain, state.structure, state.q, state.v, joint_torques(chain, tau), inertia_by_unit_vectors)
@@ -197,11 +204,13 @@ class LoopForces(eqx.Module):
         return iter((self.force, self.torque))
 
 
-@jax.jit
+@verb
 def loop_forces(chain: Chain, state: State, tau: Float[Array, " torques"]) -> LoopForces:
     """Force (N) and torque (N m) that each connected virtual link carries for the joint torques tau: on `real` from `parent`, at the joint, in
     world axes, and whether the motion alone decides it."""
     tau = joint_torques(chain, tau)
+    if not len(chain.link_names):
+        return LoopForces(jnp.zeros((0, 3), state.v.dtype), jnp.zeros((0, 3), state.v.dtype), jnp.zeros(0, bool))
     q, v, s, nv = state.q, state.v, state.structure, chain.nv
     kin = kinematics(chain, q)
     V = twists(chain, kin, v)

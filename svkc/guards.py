@@ -10,9 +10,11 @@ from jaxtyping import Array, Float
 from svkc.assembly import link_index
 from svkc.chain import Chain, State
 from svkc.forward_dynamics import joint_torques, loop_forces
+from svkc.given import finite, one, positive
 from svkc.kinematics import kinematics
 from svkc.loops import ends
 from svkc.spatial import quat_conjugate, quat_rotate
+from svkc.verb import check_chain
 
 
 class Sensor(eqx.Module):
@@ -48,7 +50,7 @@ class Touch(Sensor):
         if len(self.axes) == 1:
             return away[0] - self.distance
         square = jnp.sum(away * away)
-        return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0) - self.distance
+        return jnp.where(square == 0, 0, jnp.sqrt(jnp.where(square == 0, 1, square))) - self.distance
 
 
 class Leaves(Sensor):
@@ -85,22 +87,25 @@ def touch(chain: Chain, link: str, distance=0.01, axes: str | None = None) -> To
     axes: those of the joint's frame in the parent that count, such as "xy" for a bar along z; by default the ones the joint does not slide along. With one
     axis alone, "z", the height over that plane, with its sign. Use with direction=False, and with a distance that is not passed within one step.
     """
+    check_chain(chain)
     slot = link_index(chain, link)
     if axes is None:
         axes = "".join(a for a, free in zip("xyz", chain.topology.link_freedoms[slot][3:], strict=True) if not free) or "xyz"
-    if not axes or set(axes) - set("xyz") or len(set(axes)) < len(axes):
+    if not isinstance(axes, str) or not axes or set(axes) - set("xyz") or len(set(axes)) < len(axes):
         raise ValueError(f"touch: axes: expected some of 'xyz', got {axes!r}")
-    distance = jnp.asarray(distance, chain.q_load.dtype)
+    distance = jnp.asarray(one("touch: distance", finite("touch: distance", distance)), chain.q_load.dtype)
     return Touch(chain, slot, distance, tuple("xyz".index(a) for a in axes))
 
 
 def leaves(chain: Chain, link: str, axis=(0.0, 0.0, 1.0)) -> Leaves:
     """A guard: the force (N) with which a virtual link's parent pushes its real link along `axis` (in the joint's frame in the parent). It falls
     through zero where the parent would have to pull: with direction=False and cut=link the link holds in one direction only."""
-    size = float(np.linalg.norm(np.asarray(axis, float)))
-    if np.shape(axis) != (3,) or not size > 0:
+    check_chain(chain)
+    axis = np.asarray(finite("leaves: axis", axis), float)
+    size = float(np.linalg.norm(axis))
+    if axis.shape != (3,) or not 0 < size < np.inf:
         raise ValueError(f"leaves: axis: expected three numbers that are not all zero, got {axis}")
-    return Leaves(chain, link_index(chain, link), jnp.asarray(np.asarray(axis, float) / size, chain.q_load.dtype))
+    return Leaves(chain, link_index(chain, link), jnp.asarray(axis / size, chain.q_load.dtype))
 
 
 def overload(chain: Chain, link: str, force=None, torque=None) -> Overload:
@@ -108,5 +113,7 @@ def overload(chain: Chain, link: str, force=None, torque=None) -> Overload:
     with direction=True and cut=link. Where loops are redundant the load is the least one (`loop_forces`)."""
     if force is None and torque is None:
         raise ValueError("overload: give the largest force (N), the largest torque (N m), or both")
-    limits = [jnp.asarray(np.inf if x is None else x, chain.q_load.dtype) for x in (force, torque)]
+    check_chain(chain)
+    given = (("overload: force", force), ("overload: torque", torque))
+    limits = [jnp.asarray(np.inf if x is None else positive(name, x), chain.q_load.dtype) for name, x in given]
     return Overload(chain, link_index(chain, link), *limits)

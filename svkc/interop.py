@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from svkc.chain import Chain, State
 from svkc.reading import matrix, name_of
 from svkc.topology import JOINTS
+from svkc.verb import check_chain, check_state, vector
 
 
 def _equalities(chain: Chain) -> list[tuple[int, int]]:
@@ -96,8 +97,10 @@ def _joint_of(freedoms: tuple[bool, ...]):
 
 def _checked(chain: Chain, data) -> None:
     nq, nv = len(chain.topology.model_q), len(chain.topology.model_v)
-    if data.qpos.shape != (nq,) or data.qvel.shape != (nv,):
-        raise ValueError(f"data: got {data.qpos.shape[0]} qpos and {data.qvel.shape[0]} qvel, the chain's model has {nq} and {nv}; make it of the same model")
+    sizes = [np.shape(getattr(data, name, None)) for name in ("qpos", "qvel")]
+    if sizes != [(nq,), (nv,)]:
+        got = [size[0] if size else "no" for size in sizes]
+        raise ValueError(f"data: got {got[0]} qpos and {got[1]} qvel, the chain's model has {nq} and {nv}; make it of the same model")
 
 
 def to_mujoco(chain: Chain, state: State, data) -> None:
@@ -105,6 +108,7 @@ def to_mujoco(chain: Chain, state: State, data) -> None:
 
     Of a joint that was cut, the coordinates that it would have. ValueError: the data is another model's.
     """
+    check_state(chain, state)
     _checked(chain, data)
     data.qpos[:] = np.asarray(state.q)[np.array(chain.topology.model_q, int)]
     data.qvel[:] = np.asarray(state.v)[np.array(chain.topology.model_v, int)]
@@ -115,6 +119,7 @@ def to_mujoco(chain: Chain, state: State, data) -> None:
 def from_mujoco(chain: Chain, data) -> State:
     """The state in a `mujoco.MjData` of the chain's model, by copy: its loops are closed and velocities made consistent, as by `chain.state`; links that
     were <equality> hold where it says so, others as in the chain. ValueError: the data is another model's, a loop cannot be closed."""
+    check_chain(chain)
     _checked(chain, data)
     connected = np.array(chain.structure.connected)
     for link, equality in _equalities(chain):
@@ -122,8 +127,10 @@ def from_mujoco(chain: Chain, data) -> State:
     return chain.state(np.array(data.qpos), np.array(data.qvel), connected)
 
 
-def xyzw(chain: Chain, q: Float[Array, " q"]) -> Float[Array, " q"]:
+def xyzw(chain: Chain, q) -> Float[Array, " q"]:
     """Q with the scalar of every quaternion last, as Pinocchio, ROS and scipy have it."""
+    check_chain(chain)
+    q = vector(chain, "q", q, chain.topology.nq_all)
     starts, _ = chain.topology.quaternions
     if not len(starts):
         return q

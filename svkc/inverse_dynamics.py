@@ -7,6 +7,7 @@ from jaxtyping import Array, Float
 from svkc.chain import Chain, State
 from svkc.kinematics import Kinematics, difference, down, kinematics, to_rows, twists, up, velocity_products
 from svkc.spatial import cross, halves, rotate
+from svkc.verb import verb
 
 
 def newton_euler(chain: Chain, kin: Kinematics, V: Float[Array, "rows 6"] | None, A: Float[Array, "rows 6"]) -> Float[Array, " nv"]:
@@ -102,13 +103,13 @@ def limit_forces(chain: Chain, q: Float[Array, " q"], v: Float[Array, " dofs"]) 
     return tau.at[at_v].set(-(k[at_v] * out + c[at_v] * v[at_v]) * jnp.abs(out) / (jnp.abs(out) + 0.01))
 
 
-@jax.jit
+@verb
 def mass_matrix(chain: Chain, state: State) -> Float[Array, "nv nv"]:
     """Joint-space inertia of the tree (kg, kg m, kg m^2), armature included, by composite bodies."""
     return inertia_by_composites(chain, kinematics(chain, state.q))
 
 
-@jax.jit
+@verb
 def bias_force(chain: Chain, state: State) -> Float[Array, " nv"]:
     """Velocity-product and gravity forces of the tree: ID(q, v, 0) (MuJoCo's qfrc_bias)."""
     kin = kinematics(chain, state.q)
@@ -116,14 +117,14 @@ def bias_force(chain: Chain, state: State) -> Float[Array, " nv"]:
     return generalized_forces(chain, kin, V, state.v, jnp.zeros(chain.nv, state.v.dtype))
 
 
-@jax.jit
+@verb
 def inverse_dynamics(chain: Chain, state: State, vdot: Float[Array, " accelerations"]) -> Float[Array, " nv"]:
     """Torques (N m, N) the tree's joints must be given for vdot (over the tree, or over every coordinate): recursive Newton-Euler.
 
     What springs and dampers of the joints give by themselves is taken off, so that this is the inverse of `forward_dynamics` on a tree.
     """
-    if vdot.shape[0] not in (chain.nv, chain.dofs):
-        raise ValueError(f"vdot: got {vdot.shape[0]} numbers, expected {chain.nv} (the tree's) or {chain.dofs} (all)")
+    if vdot.shape not in ((chain.nv,), (chain.dofs,)):
+        raise ValueError(f"vdot: got shape {vdot.shape}, expected ({chain.dofs},), every joint coordinate, or ({chain.nv},), the tree's")
     kin = kinematics(chain, state.q)
     V = twists(chain, kin, state.v)
     tau = generalized_forces(chain, kin, V, state.v, vdot[: chain.nv])

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from svkc.chain import Chain, State
 from svkc.spatial import cross, motion_cross, quat_about, quat_conjugate, quat_exp, quat_log, quat_matrix, quat_multiply, quat_normalize, quat_rate, rotate
 from svkc.topology import BALL, FREE, HINGE, SLIDE, Topology
+from svkc.verb import verb
 
 # deeper trees sum by one product with the table of ancestors: compile time would grow with every level
 LEVELS_UNROLLED = 24
@@ -199,7 +200,7 @@ def rates(chain: Chain, q: Float[Array, " q"], v: Float[Array, " dofs"]) -> Floa
     return jnp.concatenate([v[scalar_v], turn.ravel()])[order]
 
 
-@jax.jit
+@verb
 def integrate(chain: Chain, q: Float[Array, " q"], dv: Float[Array, " dofs"]) -> Float[Array, " q"]:
     """Q moved by the tangent vector dv (m, rad; body axes for rotations): the exponential map, Rodrigues' formula (39)."""
     quat_q, quat_v = chain.topology.quaternions
@@ -210,7 +211,7 @@ def integrate(chain: Chain, q: Float[Array, " q"], dv: Float[Array, " dofs"]) ->
     return jnp.concatenate([q[scalar_q] + dv[scalar_v], turned.ravel()])[order]
 
 
-@jax.jit
+@verb
 def difference(chain: Chain, q1: Float[Array, " q"], q2: Float[Array, " q"]) -> Float[Array, " dofs"]:
     """The tangent vector that takes q1 to q2: integrate(q1, difference(q1, q2)) = q2."""
     quat_q, quat_v = chain.topology.quaternions
@@ -230,7 +231,7 @@ def normalize(chain: Chain, q: Float[Array, " q"]) -> Float[Array, " q"]:
     return put(q, at.ravel(), quat_normalize(q[at]).ravel())
 
 
-@jax.jit
+@verb
 def poses(chain: Chain, state: State) -> tuple[Float[Array, "bodies 3"], Float[Array, "bodies 4"]]:
     """Positions (m) and quaternions (wxyz, body to world) of the body frames in the world; row 0 is the world."""
     rows = np.array(chain.topology.body_row)
@@ -238,7 +239,7 @@ def poses(chain: Chain, state: State) -> tuple[Float[Array, "bodies 3"], Float[A
     return (kin.root + kin.r)[rows], kin.quat[rows]
 
 
-@jax.jit
+@verb
 def velocities(chain: Chain, state: State) -> tuple[Float[Array, "bodies 3"], Float[Array, "bodies 3"]]:
     """Linear velocity of each body's origin (m/s) and angular velocity (rad/s), both in world axes; row 0 is the world."""
     rows = np.array(chain.topology.body_row)

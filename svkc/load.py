@@ -6,11 +6,13 @@ import pathlib
 import warnings
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from svkc.chain import Chain, Structure, VirtualLink
 from svkc.cuttable import cuts_of, placed_in
+from svkc.given import texts, whole
 from svkc.interop import text_of
 from svkc.reading import bodies_of, by_dof, joint_forces_of, motors_of, name_of, rows_of
 from svkc.topology import Topology, joint_freedoms
@@ -45,21 +47,25 @@ def load(source, *, virtual_links=(), cuttable=(), spare=0, ignore=()) -> Chain:
     nor weld. "limit" leaves out joint ranges.
     Collisions between geoms are never modelled. ValueError: the source does not parse, elements not supported, unknown names.
     """
-    arguments = {"virtual_links": tuple(virtual_links), "cuttable": cuttable, "spare": spare, "ignore": ignore}
+    declared = tuple(virtual_links) if np.iterable(virtual_links) else (virtual_links,)
+    arguments = {"virtual_links": declared, "cuttable": cuttable, "spare": spare, "ignore": ignore}
     kept = dataclasses.replace(_compiled(source), arguments=arguments)
     model = kept.model
-    cuts = cuts_of(model, cuttable)
-    if isinstance(ignore, str):
-        ignore = (ignore,)
+    cuts = cuts_of(model, texts("cuttable", cuttable))
+    ignore, spare = texts("ignore", ignore), whole("spare", spare, 0)
     left_out = what_is_left_out(model, ignore)
     rows, topology = rows_of(model, {cut.body: cut.link.name for cut in cuts})
-    links = [*_equalities(model), *virtual_links]
+    if not topology.joint_names:
+        raise ValueError("source: the model has no joints, so that nothing in it can move")
+    _told_apart("bodies", topology.body_names)
+    _told_apart("joints", [*topology.joint_names, *(name_of(model, "joint", j) for cut in cuts for j in cut.joints)])
+    links = [*_equalities(model), *declared]
     first = len(links)
     for link in links:
         if not isinstance(link, VirtualLink):
             raise ValueError(f"virtual_links: expected svkc.VirtualLink objects, got {link!r}")
     links += [cut.link for cut in cuts]
-    links += [VirtualLink(f"spare_{i}", "world", "world", "free") for i in range(int(spare))]
+    links += [VirtualLink(f"spare_{i}", "world", "world", "free") for i in range(spare)]
     names = [link.name for link in links]
     if len(set(names)) < len(names):
         raise ValueError(f"virtual_links: names must differ, got {names}")
@@ -67,12 +73,27 @@ def load(source, *, virtual_links=(), cuttable=(), spare=0, ignore=()) -> Chain:
         topology,
         link_names=tuple(names),
         link_freedoms=tuple(joint_freedoms(link.joint) for link in links),
-        link_spare=tuple(i >= len(links) - int(spare) for i in range(len(links))),
+        link_spare=tuple(i >= len(links) - spare for i in range(len(links))),
         link_actuated=tuple(bool(link.actuated) for link in links),
     )
     topology = placed_in(model, topology, cuts, first)
-    structure = _structure(model, topology, links, int(spare))
-    return _chain(kept, topology, rows, structure, ignore, left_out)
+    structure = _structure(model, topology, links, spare)
+    return _finite(_chain(kept, topology, rows, structure, ignore, left_out))
+
+
+def _told_apart(what: str, names) -> None:
+    """ValueError where a name that svkc gives to what has none is one that the model uses."""
+    if len(set(names)) < len(names):
+        raise ValueError(f"source: names of {what} must differ, those given to what has none included; got {names}")
+
+
+def _finite(chain: Chain) -> Chain:
+    """The chain; ValueError for numbers that are not finite in the precision it is kept in."""
+    for path, leaf in jax.tree_util.tree_leaves_with_path(chain):
+        name, leaf = jax.tree_util.keystr(path), np.asarray(leaf)
+        if np.isnan(leaf).any() or (np.isinf(leaf).any() and name not in (".control_range", ".force_range", ".limit")):
+            raise ValueError(f"source: the model has numbers that are not finite, or too large for {leaf.dtype}: {name[1:]}")
+    return chain
 
 
 def _compiled(source) -> Source:
@@ -83,15 +104,15 @@ def _compiled(source) -> Source:
         return Source(source)
     if not isinstance(source, (mujoco.MjSpec, str, os.PathLike)):
         raise ValueError(f"source: expected MJCF or URDF text, a path, MjSpec or MjModel, got {type(source).__name__}")
-    text = "<" if isinstance(source, mujoco.MjSpec) else os.fspath(source)
-    if "<" not in text and not pathlib.Path(text).is_file():
-        raise ValueError(f"source: no such file: {text}")
+    text = "<" if isinstance(source, mujoco.MjSpec) else os.fsdecode(source)
+    if "<" not in text and not os.path.isfile(text):
+        raise ValueError(f"source: no such file: {text!r}")
     try:
         spec = source.copy() if isinstance(source, mujoco.MjSpec) else _read(text)
         model = spec.compile()
         with warnings.catch_warnings(action="ignore"):
             return Source(model, text_of(spec))
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, mujoco.FatalError) as error:
         raise ValueError(f"source: the model cannot be read: {error}") from error
 
 

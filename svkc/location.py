@@ -8,6 +8,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from svkc.chain import State
 from svkc.events import Plan
+from svkc.given import one
 from svkc.guards import Sensor
 from svkc.operation import operation
 from svkc.stepping import Field, Motion, Scene, filled
@@ -27,7 +28,7 @@ class Reading(eqx.Module):
         guards = self.made.guards
         tau = self.field.torques(t, y, scene)[0] if any(isinstance(g, Sensor) and g.loaded for g in guards) else jnp.zeros_like(y.v)
         values = [g.measure(scene.chain, state, tau) if isinstance(g, Sensor) else g(t, state, scene.args) for g in guards]
-        return jnp.stack([jnp.asarray(x, y.q.dtype).reshape(()) for x in values])
+        return jnp.stack([jnp.asarray(one("guard", x), y.q.dtype) for x in values])
 
 
 class Found(eqx.Module):

@@ -10,6 +10,7 @@ from svkc.closure import coordinates, scaled_jacobian
 from svkc.kinematics import kinematics
 from svkc.loops import active_dofs, ends
 from svkc.selection import count_rank, select, weakest
+from svkc.verb import verb
 
 
 class Mobility(eqx.Module):
@@ -42,7 +43,7 @@ class Mobility(eqx.Module):
         return "\n".join(lines)
 
 
-@jax.jit
+@verb
 def mobility(chain: Chain, state: State) -> Mobility:
     """Freedoms of the structure that the state is under, with the rank its phase decided on."""
     active = active_dofs(chain, state.structure)

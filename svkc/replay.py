@@ -10,6 +10,7 @@ import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 
+from svkc.given import whole
 from svkc.location import carried
 from svkc.marching import How, Path, World, march
 from svkc.operation import operation
@@ -27,6 +28,9 @@ class Replay(eqx.Module):
     """
 
     every: int = eqx.field(static=True, default=16)
+
+    def __check_init__(self):
+        whole("every", self.every, 1)
 
 
 def _grid(t0, at, path: Path):

@@ -13,10 +13,12 @@ from jaxtyping import Array, Float
 
 from svkc.assembly import gap_tolerance
 from svkc.chain import Chain, State
-from svkc.events import At, Plan, plan
+from svkc.events import At, Plan, listed, plan
 from svkc.forward_dynamics import Dynamics
+from svkc.given import concrete, finite, function, one, positive, whole
 from svkc.replay import Replay
 from svkc.stepping import Baumgarte, Drift, Field, FixedSteps, Projection, motion_norm
+from svkc.verb import check_state
 
 
 class Options(eqx.Module):
@@ -50,34 +52,31 @@ class Options(eqx.Module):
         return self.controller, None if isinstance(self.controller, diffrax.StepTo) else self.first_step
 
 
-def _concrete(*values) -> bool:
-    return not any(isinstance(x, jax.core.Tracer) for v in values for x in jax.tree.leaves(v))
-
-
 def checked(
     chain: Chain, state: State, t0, t1, ts, events, control, dt, rtol, atol, solver, stepsize_controller, stabilization, dynamics, adjoint,
     max_events, max_steps, progress_meter,
 ) -> tuple[Options, Float[Array, " times"], Plan]:  # fmt: skip
     """The call's options, save times and plan of events; ValueError for what cannot be right."""
-    dtype = state.q.dtype
     _check_state(chain, state)
+    dtype, events = state.q.dtype, listed(events)
     _check_times(t0, t1, ts, events)
     for name, value in (("dt", dt), ("rtol", rtol), ("atol", atol)):
-        if value is not None and _concrete(value) and not np.all(np.asarray(value) > 0):
-            raise ValueError(f"{name}: got {value}, expected a positive number")
+        if value is not None:
+            positive(name, value)
     if dt is not None and (rtol is not None or atol is not None or stepsize_controller is not None):
         raise ValueError("dt asks for fixed steps, rtol, atol and stepsize_controller for others; give one of them")
     if stepsize_controller is not None and (rtol is not None or atol is not None):
         raise ValueError("rtol and atol belong inside the stepsize_controller that is given")
-    if control is not None and not callable(control):
-        raise ValueError(f"control: expected a function of (t, state, args), got {control!r}")
+    function("control", control)
     if stabilization is not None and not isinstance(stabilization, Projection | Baumgarte | Drift):
         raise ValueError(f"stabilization: expected svkc.Projection, svkc.Baumgarte or svkc.Drift, got {stabilization!r}")
     if dynamics is not None and not isinstance(dynamics, Dynamics):
         raise ValueError(f"dynamics: expected svkc.Dynamics, got {dynamics!r}")
-    if dynamics is not None and dynamics.hold is not None and not 0 <= dynamics.hold <= 1:
-        raise ValueError(f"dynamics.hold: got {dynamics.hold}, expected None or a part between 0 and 1")
-    made = plan(chain, tuple(events), dtype)
+    if stepsize_controller is not None and not isinstance(stepsize_controller, diffrax.AbstractStepSizeController):
+        raise ValueError(f"stepsize_controller: expected a diffrax one, got {stepsize_controller!r}")
+    if progress_meter is not None and not isinstance(progress_meter, diffrax.AbstractProgressMeter):
+        raise ValueError(f"progress_meter: expected a diffrax one, got {progress_meter!r}")
+    made = plan(chain, events, dtype)
     span = jnp.asarray(t1, dtype) - jnp.asarray(t0, dtype)
     double = np.finfo(dtype).eps < 1e-10
     controller = stepsize_controller
@@ -140,48 +139,38 @@ def _adjoint(adjoint, controller) -> diffrax.AbstractAdjoint | Replay:
 def _capacity(max_events, made: Plan) -> int:
     if max_events is None:
         return len(made.timed) + 4 * len(made.guarded)
-    if int(max_events) != max_events or max_events < 0:
-        raise ValueError(f"max_events: got {max_events}, expected a whole number, 0 or more")
-    return int(max_events) if made.actions else 0
+    most = whole("max_events", max_events, 0)
+    return most if made.actions else 0
 
 
 def _step_bound(max_steps, span, dt) -> int:
     if max_steps is not None:
-        if int(max_steps) != max_steps or max_steps < 1:
-            raise ValueError(f"max_steps: got {max_steps}, expected a whole number, 1 or more")
-        return int(max_steps)
+        return whole("max_steps", max_steps, 1)
     # room for every fixed step, and for those that save times and events make shorter
-    fixed = dt is not None and _concrete(span, dt)
+    fixed = dt is not None and concrete(span, dt)
     return max(65536, int(1.1 * float(np.max(np.asarray(span / dt)))) + 1024) if fixed else 65536
 
 
 def _check_state(chain: Chain, state: State):
-    if not isinstance(state, State):
-        raise ValueError(f"state: expected what chain.state(...) gives, got {type(state).__name__}")
-    for name, size in (("q", chain.topology.nq_all), ("v", chain.dofs)):
-        shape = getattr(state, name).shape
-        if shape != (size,):
-            raise ValueError(f"state.{name}: got shape {shape}, expected ({size},); for many states use vmap or svkc.rollout")
-    if state.q.dtype != chain.q_load.dtype:
-        raise ValueError(f"state.q is {state.q.dtype}, the chain is {chain.q_load.dtype}; load and state must be made with the same precision")
+    check_state(chain, state)
     if state.q.dtype == np.float64 and not jax.config.read("jax_enable_x64"):
         raise ValueError("state and chain are float64, but jax_enable_x64 is off now; make them in the precision that simulate is to compute in")
-    if _concrete(state) and not (np.isfinite(np.asarray(state.q)).all() and np.isfinite(np.asarray(state.v)).all()):
+    if concrete(state) and not (np.isfinite(np.asarray(state.q)).all() and np.isfinite(np.asarray(state.v)).all()):
         raise ValueError("state: q and v must be finite")
 
 
 def _check_times(t0, t1, ts, events):
     for name, value in (("t0", t0), ("t1", t1)):
-        if np.shape(value) != ():
-            raise ValueError(f"{name}: got shape {np.shape(value)}, expected one number; for a time in each lane use vmap")
-    if not _concrete(t0, t1):
+        one(name, value)
+    times = None if ts is None else finite("ts", ts)
+    if not concrete(t0, t1):
         return
-    if not t1 >= t0 or not np.isfinite(t1):
+    if not t1 >= t0 or not np.isfinite(t1) or not np.isfinite(t0):
         raise ValueError(f"t1: got {t1}, expected a time at or after t0 = {t0}")
-    if ts is not None and _concrete(ts):
-        times = np.asarray(ts)
-        if times.ndim != 1 or np.any(np.diff(times) < 0) or np.any((times < t0) | (times > t1)):
+    if ts is not None and concrete(ts):
+        times = np.asarray(times)
+        if times.ndim != 1 or not times.size or np.any(np.diff(times) < 0) or np.any((times < t0) | (times > t1)):
             raise ValueError(f"ts: expected times in order from t0 = {t0} to t1 = {t1}, got {times}")
     for event in events:
-        if isinstance(event, At) and _concrete(event.time) and not np.all((np.asarray(event.time) >= t0) & np.isfinite(np.asarray(event.time))):
+        if isinstance(event, At) and concrete(event.time) and not np.all((np.asarray(event.time) >= t0) & np.isfinite(np.asarray(event.time))):
             raise ValueError(f"at: got time {event.time}, before the start of the run at {t0}")

@@ -18,9 +18,11 @@ from jax.sharding import Mesh, PartitionSpec
 
 from svkc.archive import load_trajectory
 from svkc.chain import Chain, State
+from svkc.given import finite, function, one, whole
 from svkc.replay import Replay
 from svkc.simulate import simulate
 from svkc.trajectory import Trajectory
+from svkc.verb import check_chain
 
 
 def rollout(
@@ -40,8 +42,15 @@ def rollout(
     options: of `simulate`, for all lanes; `throw` is False by default: lanes that fail say so in `result`.
     ValueError: leading axes that differ, or a folder of another rollout. RuntimeError: another process is gone; the chunks that were finished are kept.
     """
+    check_chain(chain)
     lanes = _count(states, data, cost)
+    one("t1", t1)
+    function("lane", lane)
+    if chunk is not None:
+        chunk = whole("chunk", chunk, 1)
     devices = list(jax.local_devices() if devices is None else devices)
+    if not devices or not all(isinstance(device, jax.Device) for device in devices):
+        raise ValueError(f"devices: expected some of jax.local_devices(), got {devices!r}")
     most = max(1, lanes // (len(devices) * jax.process_count()))
     size = min(chunk or min(64 if devices[0].platform == "cpu" else 4096, _fitting(states, options.get("ts"), devices)), most) * len(devices)
     order = np.arange(lanes) if cost is None else np.argsort(np.asarray(cost), kind="stable")
@@ -70,6 +79,8 @@ def _count(states, data, cost) -> int:
     lanes = next(iter(sizes))
     if len(sizes) != 1 or not lanes or states.q.ndim != 2:
         raise ValueError(f"states, data, cost: expected one leading axis of lanes, got sizes {sorted(map(str, sizes))} and q of shape {states.q.shape}")
+    if cost is not None and finite("cost", cost).ndim != 1:
+        raise ValueError(f"cost: got shape {np.shape(cost)}, expected one number for each lane")
     return lanes
 
 
@@ -101,7 +112,10 @@ def _piece(common, lanes, lane: Callable | None, mesh: Mesh) -> Trajectory:
 
     def one(fixed, state, data):
         chain, t1, options = eqx.combine(fixed, static)
-        own = {} if lane is None else dict(lane(chain, data))
+        own = {} if lane is None else lane(chain, data)
+        if not isinstance(own, dict):
+            raise ValueError(f"lane: expected a dict of arguments of simulate from it, got {own!r}")
+        own = dict(own)
         return simulate(own.pop("chain", chain), state, own.pop("t1", t1), **{**options, **own})
 
     every, spec = PartitionSpec(), PartitionSpec("lanes")

@@ -4,17 +4,18 @@ from typing import ClassVar
 
 import diffrax
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from svkc.articulated import by_bodies
 from svkc.chain import Chain, State
 from svkc.forward_dynamics import joint_torques, moving
+from svkc.given import one
 from svkc.inverse_dynamics import limit_forces
 from svkc.kinematics import LEVELS_UNROLLED, integrate
 from svkc.lanes import with_lanes_last
 from svkc.loops import active_dofs
+from svkc.verb import verb
 
 
 class RodriguesEuler(diffrax.AbstractSolver):
@@ -59,7 +60,7 @@ class SemiImplicitEuler(RodriguesEuler):
         return after
 
 
-@jax.jit
+@verb
 def step(chain: Chain, state: State, tau: Float[Array, " torques"], dt: Float[Array, ""] | float) -> State:
     """One step of symplectic Euler of dt (s), for loops of one's own: v + vdot dt, then q moved by that along the exponential map.
 
@@ -67,7 +68,7 @@ def step(chain: Chain, state: State, tau: Float[Array, " torques"], dt: Float[Ar
     Each step takes away a quarter of what loops are open by (Baumgarte's rate 1 / (2 dt)). First order; structure, events, other orders and error
     control: `svkc.simulate`. ValueError: tau has another size.
     """
-    return _step(chain, state, joint_torques(chain, tau), jnp.asarray(dt, state.q.dtype))
+    return _step(chain, state, joint_torques(chain, tau), jnp.asarray(one("dt", dt), state.q.dtype))
 
 
 @with_lanes_last

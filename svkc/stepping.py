@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from svkc.chain import Chain, State, Structure
 from svkc.forward_dynamics import Dynamics, joint_torques, moving
+from svkc.given import function, numbers, one, whole
 from svkc.inverse_dynamics import limit_forces
 from svkc.kinematics import normalize, rates
 from svkc.loops import active_dofs
@@ -65,6 +66,10 @@ class Projection(eqx.Module):
     iterations: int = eqx.field(static=True, default=2)
     change: Callable = eqx.field(static=True, default=inertia_change)
 
+    def __check_init__(self):
+        whole("iterations", self.iterations, 0)
+        function("change", self.change, optional=False)
+
 
 class Exact(Projection):
     """Dependent coordinates are functions of the independent ones, solved for at every evaluation of the field as well as after every step: what is
@@ -77,6 +82,9 @@ class Baumgarte(eqx.Module):
     """Loop drift is pulled back while integrating, as by a critically damped spring of this rate (1/s); nothing is projected."""
 
     rate: Float[Array, ""] | float = 20.0
+
+    def __check_init__(self):
+        one("rate", self.rate)
 
 
 class Drift(eqx.Module):
@@ -106,7 +114,7 @@ class Field(eqx.Module):
         if self.control is not None:
             # traced once for all the places that call it
             asked = eqx.filter_jit(self.control)(t, State(y.q, y.v, scene.structure), scene.args)
-            tau = tau + joint_torques(chain, jnp.asarray(asked, y.v.dtype))
+            tau = tau + joint_torques(chain, numbers("control", asked, y.v.dtype))
         if chain.limit is not None:
             tau = tau + limit_forces(chain, y.q, y.v)
         if y.work is None:

@@ -27,8 +27,8 @@ def joint_freedoms(joint) -> tuple[bool, ...]:
     if isinstance(joint, str):
         if joint in JOINTS:
             return JOINTS[joint]
-    elif len(tuple(joint)) == 6:
-        return tuple(bool(x) for x in joint)
+    elif np.iterable(joint) and len(six := list(joint)) == 6 and all(isinstance(x, bool | np.bool_ | int) and x in (0, 1) for x in six):
+        return tuple(bool(x) for x in six)
     raise ValueError(f"joint: got {joint!r}, expected one of {', '.join(JOINTS)} or six Booleans (three rotations, three translations)")
 
 

@@ -14,12 +14,14 @@ from svkc.binding import emptied, spare_slot
 from svkc.chain import Chain, State, Structure
 from svkc.closure import choose, constrained, scaled_jacobian, scales
 from svkc.forward_dynamics import constraint_forces, reduced_inertia, solve_free_motion, solve_motion, with_links
+from svkc.given import yes_or_no
 from svkc.inverse_dynamics import inertia_by_composites, inertia_times
 from svkc.kinematics import kinematics, twists
 from svkc.loops import active_dofs, ends, gap, joint_coordinates, loop_jacobian, with_coordinates
 from svkc.projection import close, decide_rank
 from svkc.spatial import quat_conjugate, quat_multiply, quat_rotate
 from svkc.topology import V_SIZE
+from svkc.verb import check_state
 
 
 class Change(eqx.Module):
@@ -119,6 +121,7 @@ def lock_projection(chain: Chain, structure: Structure, q, v):
 
 def transition(chain: Chain, state: State, connected) -> State:
     """The state with exactly these virtual links connected (mask, or names): new ones with their impact, the others cut."""
+    check_state(chain, state)
     mask = jnp.asarray(connection_mask(chain, connected))
     return _checked(chain, change(chain, state, mask))
 
@@ -129,9 +132,10 @@ def connect(chain: Chain, state: State, *names: str, here: bool = False) -> Stat
     At their declared placement, where the bodies must already be; here=True: the joint is made where the real link is. ValueError: unknown
     names, or bodies that are not at the placement (says by how much).
     """
+    check_state(chain, state)
     chosen = np.isin(np.arange(len(chain.link_names)), [link_index(chain, n) for n in names])
     mask = state.structure.connected | jnp.asarray(chosen)
-    return _checked(chain, change(chain, state, mask, here=jnp.asarray(chosen) if here else None))
+    return _checked(chain, change(chain, state, mask, here=jnp.asarray(chosen) if yes_or_no("here", here) else None))
 
 
 def _checked(chain: Chain, done: Change) -> State:
@@ -153,11 +157,13 @@ connect_tolerance = 1e-2
 
 def cut(chain: Chain, state: State, *names: str) -> State:
     """Cuts virtual links: q and v stay as they are, bit for bit (paper, section V-C)."""
+    check_state(chain, state)
     chosen = np.isin(np.arange(len(chain.link_names)), [link_index(chain, n) for n in names])
     return change(chain, state, state.structure.connected & ~jnp.asarray(chosen)).state
 
 
 def _locked(chain: Chain, state: State, joints, value: bool) -> State:
+    check_state(chain, state)
     locked = jnp.zeros(chain.dofs, bool) if state.structure.locked is None else state.structure.locked
     for name in joints:
         locked = locked.at[joint_slice(chain, name, V_SIZE, chain.topology.v_start)].set(value)
@@ -176,6 +182,7 @@ def unlock(chain: Chain, state: State, *joints: str) -> State:
 
 def unbind(chain: Chain, state: State, *names: str) -> State:
     """Cuts spare virtual links and empties their slots for other bodies; q and v stay as they are."""
+    check_state(chain, state)
     slots = np.isin(np.arange(len(chain.link_names)), [spare_slot(chain, n) for n in names])
     after = change(chain, state, state.structure.connected & ~jnp.asarray(slots)).state
     return State(after.q, after.v, emptied(after.structure, jnp.asarray(slots)))

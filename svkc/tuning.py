@@ -11,11 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from svkc.chain import Chain, State
+from svkc.given import one, positive, whole
 from svkc.kinematics import difference
 from svkc.simulate import simulate
 from svkc.solvers import RodriguesEuler, SemiImplicitEuler
 from svkc.stepping import Drift, Projection
 from svkc.trajectory import RESULTS, Trajectory
+from svkc.verb import check_state
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,8 +94,8 @@ def tune(chain: Chain, state: State, t1, target: float = 1e-6, options: Sequence
     call: ts, events, control, args and whatever else of `simulate` all runs share. Seconds are those of computing alone, the least of `repeats`
     runs; what takes ten times the best so far is not repeated. ValueError: a target that is not positive, or no reference that holds.
     """
-    if not target > 0:
-        raise ValueError(f"target: got {target}, expected a positive number")
+    check_state(chain, state)
+    target, t1, repeats = positive("target", target), one("t1", t1), whole("repeats", repeats, 1)
     dtype, span = state.q.dtype, float(t1) - float(call.get("t0", 0.0))
     tight = float(max(target * 1e-3, 50 * np.finfo(dtype).eps))
     call = {"ts": jnp.linspace(call.get("t0", 0.0), t1, 11, dtype=dtype), **call, "throw": False}

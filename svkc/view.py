@@ -1,9 +1,14 @@
 """F7: pictures of a run. matplotlib, Pillow and mujoco's renderer are imported where they are used."""
 
+import os
 import pathlib
 
+import numpy as np
+
 from svkc.chain import Chain
+from svkc.given import positive, whole
 from svkc.trajectory import Trajectory
+from svkc.verb import check_chain
 
 
 def render(
@@ -18,7 +23,10 @@ def render(
     """
     from svkc import animation, figures
 
-    path = pathlib.Path(path)
+    check_chain(chain)
+    if not isinstance(traj, Trajectory) or np.ndim(traj.ts) != 1:
+        raise ValueError(f"traj: expected one run of svkc.simulate, got {type(traj).__name__}")
+    frames, fps, path = whole("frames", frames, 1), positive("fps", fps), pathlib.Path(os.fspath(path))
     if path.suffix == ".png":
         return figures.strobe(chain, traj, path, frames)
     write = {".gif": animation.gif, ".mp4": animation.mp4}.get(path.suffix)

@@ -1,7 +1,11 @@
-"""What the library raises, read from its sources."""
+"""What the library raises, read from its sources and from the page that lists it, and what a call looks like without the tests' own type checks."""
 
 import ast
+import contextlib
 import pathlib
+import re
+
+import jaxtyping
 
 import svkc
 
@@ -25,3 +29,23 @@ def messages() -> set[str]:
             if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call) and node.exc.args:
                 found.add(" ".join(_text(node.exc.args[0]).split()))
     return found
+
+
+PAGE = (pathlib.Path(__file__).parent.parent / "docs" / "errors.md").read_text()
+_LINES = PAGE.split("| message | raised by | what to do |\n|---|---|---|\n")[1].splitlines()
+ROWS = [line.removeprefix("| ").split(" | ")[0].replace("&lt;", "<") for line in _LINES]
+
+
+def pattern(row: str) -> str:
+    """A regular expression for the messages that a row of the page stands for, on one line."""
+    return r"[\s\S]*".join(map(re.escape, re.split(r"\.{3,}", row)))
+
+
+@contextlib.contextmanager
+def as_users_see():
+    """Annotations are not checked, as outside of the tests."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    try:
+        yield
+    finally:
+        jaxtyping.config.update("jaxtyping_disable", False)

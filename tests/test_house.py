@@ -13,8 +13,9 @@ import pytest
 ROOT = pathlib.Path(__file__).parent.parent
 # the house floor by floor, the ground first
 HOUSE = [
-    "spatial topology unsupported operation",
+    "spatial topology unsupported operation given",
     "chain reading selection lanes",
+    "verb",
     "kinematics trajectory cuttable interop",
     "inverse_dynamics loops load",
     "energy closure articulated archive",

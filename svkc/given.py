@@ -1,0 +1,79 @@
+"""F1: plain arguments as callers give them: numbers that must be whole, positive, or real; what cannot be right is said by name."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+def concrete(*values) -> bool:
+    """Whether the values can be looked at: none of them is traced."""
+    return not any(isinstance(x, jax.core.Tracer) for v in values for x in jax.tree.leaves(v))
+
+
+def arrayed(value):
+    """As an array; of objects, where it is none."""
+    try:
+        return value if isinstance(value, jax.Array) else np.asarray(value) if concrete(value) else jnp.asarray(value)
+    except (TypeError, ValueError, OverflowError):
+        return np.asarray(None)
+
+
+def numbers(name: str, value, dtype=None):
+    """As an array of real numbers, of type dtype where it is given. ValueError: strings, objects, complex numbers, ragged lists."""
+    array = arrayed(value)
+    if not any(jnp.issubdtype(array.dtype, kind) for kind in (np.integer, np.floating)):
+        raise ValueError(f"{name}: expected real numbers, got {repr(value) if array.dtype == object else array.dtype}")
+    return array if dtype is None else jnp.asarray(array, dtype)
+
+
+def finite(name: str, value, dtype=None):
+    """The same, finite where that can be seen."""
+    array = numbers(name, value, dtype)
+    if concrete(array) and not np.isfinite(np.asarray(array)).all():
+        raise ValueError(f"{name}: expected finite numbers, got {np.asarray(array)}")
+    return array
+
+
+def one(name: str, value):
+    """One real number."""
+    array = numbers(name, value)
+    if array.shape != ():
+        raise ValueError(f"{name}: got shape {array.shape}, expected one number; for another in each lane use vmap")
+    return value
+
+
+def positive(name: str, value):
+    """One number above zero, where that can be seen."""
+    one(name, value)
+    if concrete(value) and not np.asarray(value) > 0:
+        raise ValueError(f"{name}: got {value}, expected a positive number")
+    return value
+
+
+def whole(name: str, value, least: int) -> int:
+    """A whole number, `least` or more."""
+    number = np.asarray(value) if concrete(value) else np.asarray(None)
+    if number.shape != () or number.dtype.kind not in "iuf" or not np.isfinite(number) or number != np.floor(number) or number < least:
+        raise ValueError(f"{name}: got {value!r}, expected a whole number, {least} or more")
+    return int(number)
+
+
+def function(name: str, value, optional: bool = True) -> None:
+    """A function, or, where it is optional, None."""
+    if not callable(value) and not (optional and value is None):
+        raise ValueError(f"{name}: expected a function, got {value!r}")
+
+
+def yes_or_no(name: str, value) -> bool:
+    """A Boolean."""
+    if not isinstance(value, bool | np.bool_):
+        raise ValueError(f"{name}: got {value!r}, expected True or False")
+    return bool(value)
+
+
+def texts(name: str, value) -> tuple[str, ...]:
+    """A name, or several."""
+    several = (value,) if isinstance(value, str) else tuple(value) if np.iterable(value) else (None,)
+    if not all(isinstance(x, str) for x in several):
+        raise ValueError(f"{name}: expected names, got {value!r}")
+    return several
