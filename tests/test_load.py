@@ -1,5 +1,8 @@
 """Models in: everything read, everything else named."""
 
+import pathlib
+import re
+
 import jax.numpy as jnp
 import models
 import mujoco
@@ -7,6 +10,8 @@ import numpy as np
 import pytest
 
 import svkc
+
+ROOT = pathlib.Path(__file__).parent.parent
 
 PENDULUM = models.MJCF.format(models.bar("arm", models.Y, "0 0 -1"))
 
@@ -197,6 +202,40 @@ def test_a_scene_written_in_python():
     # a change of the caller's afterwards is not the chain's
     spec.worldbody.add_body(name="late").add_geom(size=[0.1, 0, 0])
     assert svkc.load(chain.to_mjcf()).body_names == chain.body_names
+
+
+def test_the_example_of_the_gallery_runs():
+    page = (ROOT / "docs" / "gallery.md").read_text()
+    code, names = re.search(r"```python\n(.*?)```", page, re.S).group(1), {"print": lambda x: None}
+    exec(code, names)
+    assert int(svkc.mobility(names["chain"], names["chain"].state()).freedoms) == 2
+    for picture in re.findall(r"\]\((.*?\.png)\)", page):
+        assert (ROOT / "docs" / picture).stat().st_size < 150_000
+
+
+def test_a_robot_of_others():
+    """Minitaur's URDF, loops as virtual links: balls find its axes parallel to five digits only, balls that slide along them leave each leg its two motors."""
+    feet = {}
+    for slide in (False, True):
+        feet[slide] = [
+            svkc.VirtualLink(
+                f"foot_{leg}", f"lower_leg_{leg}R_link", f"lower_leg_{leg}L_link", (True, True, True, False, slide, False),
+                pos=(0, 0.005, 0.2), real_pos=(0, 0.01, 0.2), connected=True,
+            )
+            for leg in ("front_left", "back_left", "front_right", "back_right")
+        ]  # fmt: skip
+    angles = {"motor": -np.pi / 2, "knee": 2.1834}
+    sign = lambda name: -1 if "right" in name else 1
+    for slide, freedoms, least in ((False, 4, 1e-5), (True, 8, 0.1)):
+        chain = svkc.load(ROOT / "tests" / "robots" / "minitaur_v1.urdf", virtual_links=feet[slide])
+        assert (len(chain.body_names), chain.nv) == (28, 16)
+        state = chain.state({name: sign(name) * angles[name.split("_")[0]] for name in chain.joint_names})
+        mobility = svkc.mobility(chain, state)
+        assert int(mobility.freedoms) == freedoms
+        assert least < float(mobility.margin) < 10 * least
+        again = svkc.load(chain.to_mjcf())
+        assert (again.body_names, again.joint_names) == (chain.body_names, chain.joint_names)
+        assert len(again.link_names) == (0 if slide else 4)
 
 
 @pytest.mark.parametrize(
