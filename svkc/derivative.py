@@ -77,8 +77,8 @@ def check_grad(f: Callable, x, mode: str = "both", directions: int = 2, step: fl
                 back = None if mode == "forward" else sum(float(jnp.vdot(g, d)) for g, d in zip(gradients[name], jax.tree.leaves(direction), strict=True))
                 if ahead is None:
                     # one number for the whole leaf: reverse mode has no more for one pass
-                    weighed = [np.asarray(np.sum(weight * x)) for x in (difference[name], doubt[name])]
-                    found.append(_compare(np.asarray(back), *weighed, 0.0, *pair))
+                    weighed = lambda x, weight=weight: np.asarray(np.sum(weight * x))
+                    found.append(_compare(np.asarray(back), weighed(difference[name]), weighed(doubt[name]), 0.0, *pair))
                     continue
                 size = np.linalg.norm(weight) * np.linalg.norm(ahead[name])
                 apart = 0.0 if back is None else abs(back - np.sum(weight * np.asarray(ahead[name]))) / (size if size > 1e-9 else 1.0)

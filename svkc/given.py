@@ -73,7 +73,7 @@ def yes_or_no(name: str, value) -> bool:
 
 def texts(name: str, value) -> tuple[str, ...]:
     """A name, or several."""
-    several = (value,) if isinstance(value, str) else tuple(value) if np.iterable(value) else (None,)
+    several = (value,) if isinstance(value, str) or not np.iterable(value) else tuple(value)
     if not all(isinstance(x, str) for x in several):
         raise ValueError(f"{name}: expected names, got {value!r}")
     return several

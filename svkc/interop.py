@@ -97,7 +97,7 @@ def _joint_of(freedoms: tuple[bool, ...]):
 
 def _checked(chain: Chain, data) -> None:
     nq, nv = len(chain.topology.model_q), len(chain.topology.model_v)
-    sizes = [np.shape(getattr(data, name, None)) for name in ("qpos", "qvel")]
+    sizes = [np.asarray(getattr(data, name, None)).shape for name in ("qpos", "qvel")]
     if sizes != [(nq,), (nv,)]:
         got = [size[0] if size else "no" for size in sizes]
         raise ValueError(f"data: got {got[0]} qpos and {got[1]} qvel, the chain's model has {nq} and {nv}; make it of the same model")

@@ -130,7 +130,7 @@ def _one(primitive, inputs: list, params: dict, shape: tuple[int, ...], lanes: i
     if name in MOVING and alone:
         return MOVING[name](inputs[0].x, lanes, **params)
     if name == "gather":
-        return _gather(*inputs, lanes, **params)
+        return _gather(inputs[0], inputs[1], lanes, **params)
     if name == "dot_general":
         return _dot(*inputs, **params)
     return _as_jax_does(primitive, inputs, params, lanes)

@@ -22,9 +22,9 @@ def operation(name: str, function: Callable, jvp: Callable, transpose: Callable 
     def not_linear(*_, **__):
         raise NotImplementedError(f"{name} is not linear")
 
-    defined = [eqxi.filter_primitive_def(f) for f in (function, shapes)]
+    defined, shaped_like = eqxi.filter_primitive_def(function), eqxi.filter_primitive_def(shapes)
     backwards = not_linear if transpose is None else eqxi.filter_primitive_transpose(transpose, materialise_zeros=True)
-    primitive = eqxi.create_vprim(name, *defined, eqxi.filter_primitive_jvp(jvp), backwards)
+    primitive = eqxi.create_vprim(name, defined, shaped_like, eqxi.filter_primitive_jvp(jvp), backwards)
     return lambda *args: eqxi.filter_primitive_bind(primitive, *args)
 
 

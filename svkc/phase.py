@@ -71,7 +71,8 @@ def _path(start: Motion, times, world: World, watched: Watched | None, options: 
     ours, adjoint = isinstance(options.adjoint, Replay), options.adjoint
     every = min(adjoint.every, options.max_steps) if isinstance(adjoint, Replay) else options.max_steps
     meter = options.progress_meter if ours else diffrax.NoProgressMeter()
-    how = How(*frozen((staged(options.solver, "lax"), watched, *options.steps())), meter, options.gap, options.max_steps, every)
+    solver, looked_for, (controller, first_step) = frozen((staged(options.solver, "lax"), watched, options.steps()))
+    how = How(solver, looked_for, controller, first_step, meter, options.gap, options.max_steps, every)
     if ours:
         path = integrated(start, times, world, how)
         return path, frozen(path.found)
@@ -79,7 +80,8 @@ def _path(start: Motion, times, world: World, watched: Watched | None, options: 
     found = None
     if watched is not None:
         # where a guard is zero first, found once before
-        first = march(*frozen((start, times, world)), how)
+        begin, fixed_times, still = frozen((start, times, world))
+        first = march(begin, fixed_times, still, how)
         stop = jnp.where(first.found.hit, first.t, stop)
         at, found = jnp.where(at > stop, stop, at), first.found
     controller, first_step = options.steps(at)

@@ -52,16 +52,17 @@ def recorded(chain: Chain, p: Phases, row: Bool[Array, " phases"], began: tuple,
     (start, first), (stop, last) = began, ended
     s = first.structure
     both = jax.tree.map(lambda *x: jnp.stack(x), (first.q, first.v), (last.q, last.v))
-    energies, *momenta = jax.checkpoint(jax.vmap(lambda q, v: energy_and_momentum(chain, State(q, v, s))))(*both)
+    energies, linear, angular = jax.checkpoint(jax.vmap(lambda q, v: energy_and_momentum(chain, State(q, v, s))))(*both)
     gaps = jax.vmap(lambda q, v: largest_gaps(*jax.lax.stop_gradient((chain, State(q, v, s)))))(*both)
     gap, gap_rate = (jnp.max(x, 0) for x in gaps)
+    linear, angular = jax.lax.stop_gradient((linear, angular))
     free = _free(chain, s)
     written = {
         "start": start, "stop": stop, "connected": s.connected, "rank": s.rank, "joint_freedoms": jnp.sum(active_dofs(chain, s), dtype=jnp.int32),
         "energy": energies, "work": work, "margin": jnp.minimum(margin, path.tally.margin), "accepted": path.accepted, "rejected": path.rejected,
         "evaluations": stages * path.tally.tries, "swaps": path.tally.swaps, "loop": path.tally.loop, "error": path.tally.error,
         "gap": gap, "gap_rate": gap_rate, "free": free,
-        "momentum_drift": jnp.where(free, _momentum_drift(chain, *jax.lax.stop_gradient(momenta), stop - start), 0),
+        "momentum_drift": jnp.where(free, _momentum_drift(chain, linear, angular, stop - start), 0),
     }  # fmt: skip
     new = {name: jnp.where(row.reshape(-1, *(1,) * jnp.ndim(x)), jnp.asarray(x)[None], getattr(p, name)) for name, x in written.items()}
     return Phases(**new, count=p.count + jnp.any(row).astype(jnp.int32))

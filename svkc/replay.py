@@ -45,7 +45,7 @@ def _block(y: Motion, times, world: World, solver) -> tuple[Motion, Motion]:
     """The steps of one block, from times[0] to times[1]: the state after it, and after each step."""
 
     def step(y, ends):
-        y = step_alone(solver, world.field, *ends, y, world.scene)
+        y = step_alone(solver, world.field, ends[0], ends[1], y, world.scene)
         return y, y
 
     return jax.lax.scan(step, y, times)
