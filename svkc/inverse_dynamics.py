@@ -124,7 +124,7 @@ def inverse_dynamics(chain: Chain, state: State, vdot: Float[Array, " accelerati
     What springs and dampers of the joints give by themselves is taken off, so that this is the inverse of `forward_dynamics` on a tree.
     """
     if vdot.shape not in ((chain.nv,), (chain.dofs,)):
-        raise ValueError(f"vdot: got shape {vdot.shape}, expected ({chain.dofs},), every joint coordinate, or ({chain.nv},), the tree's")
+        raise ValueError(f"vdot: got shape {vdot.shape}, expected {chain.nv} (the tree's) or {chain.dofs} (all)")
     kin = kinematics(chain, state.q)
     V = twists(chain, kin, state.v)
     tau = generalized_forces(chain, kin, V, state.v, vdot[: chain.nv])

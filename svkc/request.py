@@ -111,6 +111,8 @@ def _solving(solver, controller, dtype) -> diffrax.AbstractSolver:
         return diffrax.Dopri8() if np.finfo(dtype).eps < 1e-10 and controller is not None else diffrax.Tsit5()
     if not isinstance(solver, diffrax.AbstractSolver):
         raise ValueError(f"solver: expected a diffrax solver, got {solver!r}")
+    if isinstance(controller, diffrax.AbstractAdaptiveStepSizeController) and not isinstance(solver, diffrax.AbstractAdaptiveSolver):
+        raise ValueError(f"solver: {type(solver).__name__} does not estimate the errors of its steps; give dt, or another solver")
     if not isinstance(solver, diffrax.AbstractImplicitSolver):
         return solver
     finder = solver.root_finder

@@ -48,7 +48,7 @@ def rollout(
     function("lane", lane)
     if chunk is not None:
         chunk = whole("chunk", chunk, 1)
-    devices = list(jax.local_devices() if devices is None else devices)
+    devices = jax.local_devices() if devices is None else list(devices) if np.iterable(devices) else [devices]
     if not devices or not all(isinstance(device, jax.Device) for device in devices):
         raise ValueError(f"devices: expected some of jax.local_devices(), got {devices!r}")
     most = max(1, lanes // (len(devices) * jax.process_count()))

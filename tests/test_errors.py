@@ -188,6 +188,7 @@ CASES = {
     "render: ...": lambda s: svkc.render(s.four, s.simulate(t1=1e-3, dt=1e-3), "x.bmp"),
     "rtol and atol": lambda s: s.simulate(rtol=1e-3, stepsize_controller=diffrax.PIDController(rtol=1e-3, atol=1e-6)),
     "simulate stopped": lambda s: s.simulate(t1=1e-2, dt=1e-3, max_steps=2),
+    "solver: ... does not": lambda s: s.simulate(solver=diffrax.Euler()),
     "solver: expected": lambda s: s.simulate(solver="euler"),
     "source: expected": lambda s: svkc.load(3),
     "source: names of": lambda s: s.load(models.MJCF.format(models.bar("joint_1", models.Y, "0 0 -1", inside=models.bar("", models.Y, "0 0 -1")))),
