@@ -54,7 +54,7 @@ def check_grad(f: Callable, x, mode: str = "both", directions: int = 2, step: fl
         raise ValueError(f"mode: got {mode!r}, expected 'forward', 'reverse' or 'both'")
     free, rest = eqx.partition(jax.tree.map(lambda leaf: jnp.asarray(leaf) if isinstance(leaf, float) else leaf, x), eqx.is_inexact_array)
     named = jax.tree_util.tree_flatten_with_path(free)[0]
-    if not named:
+    if not any(leaf.size for _, leaf in named):
         raise ValueError("check_grad: x has no floating-point arrays to differentiate by")
 
     value = lambda free: _outputs(f, free, rest)
@@ -62,6 +62,8 @@ def check_grad(f: Callable, x, mode: str = "both", directions: int = 2, step: fl
     for name, leaf in base.items():
         if not np.isfinite(leaf).all():
             raise ValueError(f"check_grad: f(x){name} is not finite: {leaf}")
+    if not any(leaf.size for leaf in base.values()):
+        raise ValueError("check_grad: f(x) has no floating-point arrays to be differentiated")
     rng, found = np.random.default_rng(seed), []
     weights = {name: rng.normal(size=leaf.shape) for name, leaf in base.items()}
     gradients = {} if mode == "forward" else _gradients(f, free, rest, weights)

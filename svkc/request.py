@@ -149,8 +149,12 @@ def _step_bound(max_steps, span, dt) -> int:
     if max_steps is not None:
         return whole("max_steps", max_steps, 1)
     # room for every fixed step, and for those that save times and events make shorter
-    fixed = dt is not None and concrete(span, dt)
-    return max(65536, int(1.1 * float(np.max(np.asarray(span / dt)))) + 1024) if fixed else 65536
+    if dt is None or not concrete(span, dt):
+        return 65536
+    steps = float(np.max(np.asarray(span / dt)))
+    if not steps < 1e9:
+        raise ValueError(f"dt: got {dt}, with which a run of {float(span):g} s has more than 1e9 steps; give a larger one, or max_steps")
+    return max(65536, int(1.1 * steps) + 1024)
 
 
 def _check_state(chain: Chain, state: State):

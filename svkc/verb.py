@@ -6,7 +6,6 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from svkc.chain import Chain, State, Structure
 from svkc.given import numbers
@@ -25,8 +24,9 @@ def check_state(chain, state) -> None:
         raise ValueError(f"state: expected what chain.state(...) gives, got {type(state).__name__}")
     sizes = (("q", state.q, chain.topology.nq_all), ("v", state.v, chain.dofs), ("connected", state.structure.connected, len(chain.link_names)))
     for name, value, size in sizes:
-        if np.shape(value) != (size,):
-            raise ValueError(f"state.{name}: got shape {np.shape(value)}, expected ({size},); for many states use vmap or svkc.rollout")
+        shape = getattr(value, "shape", None)
+        if shape != (size,):
+            raise ValueError(f"state.{name}: got shape {shape}, expected ({size},); for many states use vmap or svkc.rollout")
     for value in (state.q, state.v):
         dtype = numbers("state", value).dtype
         if dtype != chain.q_load.dtype:
