@@ -12,6 +12,14 @@ from svkc.trajectory import Trajectory
 COLORS = ("#1f5fa8", "#d9822b", "#2f8f4e", "#8e3b8e", "#b03030")
 
 
+def one_run(traj) -> None:
+    """ValueError for what is no trajectory, or one of many lanes."""
+    if not isinstance(traj, Trajectory):
+        raise ValueError(f"traj: expected one run of svkc.simulate, got {type(traj).__name__}")
+    if np.ndim(traj.ts) != 1:
+        raise ValueError(f"render: a picture shows one run, got a batch of {traj.ts.shape[:-1]}; give one lane: jax.tree.map(lambda x: x[0], traj)")
+
+
 def color(i: int) -> str:
     """As #rrggbb."""
     return COLORS[i % len(COLORS)]
@@ -63,13 +71,16 @@ def held(chain: Chain, traj: Trajectory, positions, R) -> list[dict[int, np.ndar
 
 
 def happened(traj: Trajectory, chain: Chain | None = None) -> list[tuple[float, str]]:
-    """(time in s, what was connected and cut) of each event in order; by the links' numbers where no chain is given."""
-    p, connected, out = traj.phases, np.asarray(traj.phases.connected), []
+    """(time in s, what was connected and cut) of each instant at which there were events; by the links' numbers where no chain is given."""
+    p, e, out = traj.phases, traj.events, []
+    starts, connected = np.asarray(p.start)[: int(p.count)], np.asarray(p.connected)[: int(p.count)]
+    times = np.asarray(e.time)[: int(e.count)]
     name = (lambda k: chain.link_names[k]) if chain is not None else (lambda k: f"link {k}")
-    for i in range(int(traj.events.count)):
-        words = [f"event {int(traj.events.which[i])}"]
-        if i + 1 < int(p.count):
-            before, after = connected[i], connected[i + 1]
-            words = [f"connect {name(k)}" for k in np.flatnonzero(after & ~before)] + [f"cut {name(k)}" for k in np.flatnonzero(before & ~after)] or words
-        out.append((float(traj.events.time[i]), ", ".join(words)))
+    for time in np.unique(times):
+        before = connected[max(int(np.sum(starts < time)) - 1, 0)]
+        # what an event at the very end leaves is no phase any more
+        after = connected[int(np.sum(starts <= time)) - 1] if np.any(starts >= time) else np.asarray(traj.final.structure.connected)
+        words = [f"connect {name(k)}" for k in np.flatnonzero(after & ~before)] + [f"cut {name(k)}" for k in np.flatnonzero(before & ~after)]
+        numbers = ", ".join(str(int(k)) for k in np.asarray(e.which)[: int(e.count)][times == time])
+        out.append((float(time), ", ".join(words) or f"event {numbers}"))
     return out

@@ -3,10 +3,10 @@
 import os
 import pathlib
 
-import numpy as np
-
 from svkc.chain import Chain
+from svkc.drawing import one_run
 from svkc.given import positive, whole
+from svkc.page import write_page
 from svkc.trajectory import Trajectory
 from svkc.verb import check_chain
 
@@ -15,23 +15,25 @@ def render(
     chain: Chain, traj: Trajectory, path, *, fps: float = 25, frames: int = 10, size=(640, 480), trails=(), camera: str | None = None, lookat=None,
     distance=None, azimuth: float = 90, elevation: float = -8,
 ) -> pathlib.Path:  # fmt: skip
-    """Writes a picture of the run by the ending of `path`: .png a strobe of `frames` poses seen from the side, .gif and .mp4 an animation of `fps` frames
-    a second of size (width, height) in pixels, with a strip below that names the time, what holds and the events.
+    """Writes a picture of the run by the ending of `path`: .png a strobe of `frames` poses seen from the side; .gif and .mp4 an animation of `fps` frames
+    a second of size (width, height) in pixels, with a strip below that names the time, what holds and the events; .html a page of its own to turn, play
+    and go through (`svkc.page.show` in a notebook).
 
-    trails: names of bodies whose paths are drawn. camera: the model's own of that name; else lookat (m), distance (m), azimuth and elevation (deg) place one.
-    ValueError: another ending, no such body or camera. RuntimeError: no GL library, no imageio-ffmpeg (names the packages).
+    Of animations: trails: names of bodies whose paths are drawn; camera: the model's own of that name, else lookat (m), distance (m), azimuth and elevation
+    (deg) place one. ValueError: another ending, a batch, no such body or camera. RuntimeError: no GL library, no imageio-ffmpeg (names the packages).
     """
     from svkc import animation, figures
 
     check_chain(chain)
-    if not isinstance(traj, Trajectory) or np.ndim(traj.ts) != 1:
-        raise ValueError(f"traj: expected one run of svkc.simulate, got {type(traj).__name__}")
+    one_run(traj)
     frames, fps, path = whole("frames", frames, 1), positive("fps", fps), pathlib.Path(os.fspath(path))
     if path.suffix == ".png":
         return figures.strobe(chain, traj, path, frames)
+    if path.suffix == ".html":
+        return write_page(chain, traj, path)
     write = {".gif": animation.gif, ".mp4": animation.mp4}.get(path.suffix)
     if write is None:
-        raise ValueError(f"render: {path.name} should end in .png, .gif or .mp4")
+        raise ValueError(f"render: {path.name} should end in .png, .gif, .mp4 or .html")
     seen = {"camera": camera, "lookat": lookat, "distance": distance, "azimuth": azimuth, "elevation": elevation}
     write(path, animation.frames(chain, traj, fps=fps, size=size, trails=tuple(trails), **seen), fps)
     return path
@@ -41,4 +43,5 @@ def plot(traj: Trajectory, chain: Chain | None = None):
     """A matplotlib figure: coordinates, energy, loop gaps, mobility over time, events as lines; names and energies in full where the chain is given."""
     from svkc.figures import curves
 
+    one_run(traj)
     return curves(traj, chain)

@@ -31,7 +31,7 @@ HOUSE = [
     "replay",
     "request records",
     "phase drawing derivative",
-    "simulate animation figures",
+    "simulate animation figures page",
     "tuning rollout view",
     "commands bench ahead",
     "__main__",
@@ -203,7 +203,7 @@ def test_pictures_say_what_they_cannot_draw(high_bar, tmp_path, monkeypatch):
         patch.setattr(importlib, "import_module", missing)
         with pytest.raises(RuntimeError, match="libegl1 libgl1"):
             svkc.render(high_bar[0], traj, tmp_path / "x.gif")
-    with pytest.raises(ValueError, match=r"\.png, \.gif or"):
+    with pytest.raises(ValueError, match=r"\.png, \.gif, \.mp4 or \.html"):
         svkc.render(high_bar[0], traj, tmp_path / "x.bmp")
 
 
