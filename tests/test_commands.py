@@ -24,7 +24,7 @@ def test_a_model_of_ones_own(tmp_path):
     assert "events at 0.100000 s, 0.200000 s" in done.stdout, done.stdout
     assert {"rod.npz", "rod.png", "rod_curves.png"} <= {path.name for path in out.iterdir()}
     traj = svkc.load_trajectory(out / "rod.npz")
-    assert traj.phases.rank[:3].tolist() == [2, 0, 2]
+    assert traj.phases.freedoms[:3].tolist() == [0, 2, 0]
     for name in ("rod.png", "rod_curves.png"):
         test_house._looks_drawn(out / name)
     assert ("libegl1" in done.stdout) or {"rod.gif", "rod.mp4"} <= {path.name for path in out.iterdir()}

@@ -187,7 +187,7 @@ CASES = {
     "no virtual link": lambda s: svkc.cut(s.four, s.state, "nobody"),
     "overload: give": lambda s: svkc.overload(s.four, "pin"),
     "q: the quaternion": lambda s: s.load(models.MJCF.format(models.bar("b", 'type="ball"', "0 0 1"))).state([1.0, 1.0, 0, 0]),
-    "render: a page": lambda s: svkc.render(s.four, jax.tree.map(lambda x: x[None], s.simulate(t1=1e-3, dt=1e-3)), s.folder / "x.html"),
+    "render: a picture": lambda s: svkc.render(s.four, jax.tree.map(lambda x: x[None], s.simulate(t1=1e-3, dt=1e-3)), s.folder / "x.html"),
     "render: ... should": lambda s: svkc.render(s.four, s.simulate(t1=1e-3, dt=1e-3), "x.bmp"),
     "rtol and atol": lambda s: s.simulate(rtol=1e-3, stepsize_controller=diffrax.PIDController(rtol=1e-3, atol=1e-6)),
     "simulate stopped": lambda s: s.simulate(t1=1e-2, dt=1e-3, max_steps=2),
