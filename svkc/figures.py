@@ -13,9 +13,6 @@ from svkc.trajectory import Trajectory
 
 def strobe(chain: Chain, traj: Trajectory, path: pathlib.Path, frames: int) -> pathlib.Path:
     """Poses over one another in the plane of x and z, a colour for each phase, links that hold as dots."""
-    import matplotlib
-
-    matplotlib.use("Agg", force=False)
     from matplotlib.figure import Figure
 
     ts = np.asarray(traj.ts)

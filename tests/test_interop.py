@@ -1,8 +1,15 @@
 """States and scenes to and from MuJoCo, and quaternions with the scalar last."""
 
+import os
+import pathlib
 import re
+import runpy
+import subprocess
+import sys
+import types
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import models
 import mujoco
@@ -174,3 +181,52 @@ def test_names_that_are_taken():
 def test_a_compiled_model_has_no_text():
     with pytest.raises(ValueError, match="MjModel"):
         svkc.load(mujoco.MjModel.from_xml_string(XML)).to_mjcf()
+
+
+VIEWER = pathlib.Path(__file__).parent.parent / "examples" / "08_mujoco_viewer.py"
+
+
+def test_the_viewer_without_a_display():
+    """Says so, and is no failure."""
+    if not sys.platform.startswith("linux"):
+        pytest.skip("other systems have a display")
+    env = {name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    done = subprocess.run([sys.executable, VIEWER], capture_output=True, text=True, timeout=300, check=False, env=env)
+    assert (done.returncode, done.stdout) == (0, "no display to open a window on\n"), done.stderr
+
+
+def test_the_viewer_is_shown_every_state(monkeypatch, capsys):
+    """The example as it stands, but for the window: what a window would draw is where svkc has the bodies, at each saved time."""
+    glfw, shown = pytest.importorskip("glfw"), []
+
+    class Window:
+        def __init__(self, model, data, **kw):
+            self.data, self.cam = data, mujoco.MjvCamera()
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+        def sync(self):
+            shown.append(self.data.xpos.copy())
+
+        def is_running(self):
+            return True
+
+    viewer = types.ModuleType("mujoco.viewer")
+    viewer.launch_passive = Window
+    monkeypatch.setattr(glfw, "init", lambda: True)
+    monkeypatch.setattr(mujoco, "viewer", viewer, raising=False)
+    monkeypatch.setitem(sys.modules, "mujoco.viewer", viewer)
+    monkeypatch.setattr("time.sleep", lambda _: None)
+    done = runpy.run_path(str(VIEWER))
+    assert "played 108 of 108 states" in capsys.readouterr().out
+    places = jax.vmap(lambda s: svkc.poses(done["chain"], s)[0])(jax.tree.map(jnp.asarray, done["states"]))
+    np.testing.assert_allclose(shown, places, atol=1e-12)
+    assert np.ptp(places, 0).max() > 1
+    # no longer than an example may be, and of public names alone
+    text = VIEWER.read_text()
+    assert len(text.splitlines()) < 80
+    assert "from svkc." not in text.replace("from svkc.scenes", "")
