@@ -69,7 +69,7 @@ def prefer(chain: Chain, state: State, *names: str) -> State:
     check_state(chain, state)
     asked = np.zeros(chain.dofs, bool)
     for name in names:
-        here = np.array([isinstance(name, str) and name in (n, n.rpartition(".")[0]) for n in chain.dof_names])
+        here = np.array([isinstance(name, str) and name in (n, n.rpartition(".")[0] or n) for n in chain.dof_names])
         if not here.any():
             raise ValueError(f"no joint coordinate {name!r}; coordinates: {', '.join(chain.dof_names)}")
         asked |= here
