@@ -4,7 +4,7 @@ import dataclasses
 import json
 import os
 import pathlib
-import tempfile
+import threading
 from typing import Any
 
 import equinox as eqx
@@ -60,13 +60,14 @@ def save(traj: Trajectory, path, chain=None, options=None) -> None:
         meta |= {"model": chain.model.text, "arguments": _plain(chain.model.arguments)}
         arrays |= {f"chain.{i}": np.asarray(x) for i, x in enumerate(jax.tree.leaves(chain))}
     path = pathlib.Path(path)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".part")
+    # beside it, as readable as any file that the user makes
+    temporary = path.with_name(f"{path.name}.{os.getpid()}.{threading.get_ident()}.part")
     try:
-        with os.fdopen(handle, "wb") as file:
+        with open(temporary, "wb") as file:
             np.savez_compressed(file, metadata=np.array(json.dumps(meta, default=str)), **arrays)
         os.replace(temporary, path)
     except BaseException:
-        os.unlink(temporary)
+        temporary.unlink(missing_ok=True)
         raise
 
 

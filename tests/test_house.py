@@ -144,6 +144,8 @@ def test_main_job(tmp_path):
     for word in ("24     12        12", "23      6        17", "22      0        22", "largest loop gap", "energy drift", "compilation"):
         assert word in done.stdout, done.stdout
     _looks_drawn(tmp_path / "high_bar.png")
+    _looks_drawn(tmp_path / "high_bar_curves.png")
+    assert "high_bar.html" in done.stdout
     import svkc
 
     traj = svkc.load_trajectory(tmp_path / "high_bar.npz")
