@@ -1,5 +1,7 @@
 """The tour: every cell runs headless, and prints what is stored with it. `python tests/test_notebook.py` stores what it prints and draws anew."""
 
+import base64
+import io
 import os
 import pathlib
 import re
@@ -14,8 +16,8 @@ import pytest
 ROOT = pathlib.Path(__file__).parent.parent
 TOUR = ROOT / "examples" / "tour.ipynb"
 NUMBER = re.compile(r"(?<![A-Za-z_])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?|\binf\b")
-# numbers that depend on the machine: how many steps were tried, what was rounded, how good differences are
-ROUND_OFF = re.compile(r"^(largest loop gap|momentum|errors|work|rank margin)|worst relative error [^:]*:|^energy .* drift \S+")
+# what another machine rounds otherwise: how good differences are, how many steps were tried; and round-off itself is below 1e-6
+ROUGH = re.compile(r"worst relative error .*?:|^work .*|^errors of steps.*|^rank margin.*")
 
 
 def executed():
@@ -53,6 +55,15 @@ def drawn(cell):
     return sum("image/png" in out.get("data", ()) for out in cell.get("outputs", ()))
 
 
+def smaller(picture):
+    """With 64 colours: a third of the size."""
+    from PIL import Image
+
+    file = io.BytesIO()
+    Image.open(io.BytesIO(base64.b64decode(picture))).convert("RGB").quantize(64).save(file, "PNG", optimize=True)
+    return base64.b64encode(file.getvalue()).decode()
+
+
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:jupyter_client", "ignore::DeprecationWarning:jupyter_core", "ignore::DeprecationWarning:zmq")
 def test_the_tour_runs_and_prints_what_is_stored():
     stored = nbformat.read(TOUR, 4)
@@ -65,7 +76,7 @@ def test_the_tour_runs_and_prints_what_is_stored():
         assert not [out for out in new.get("outputs", ()) if out.get("name") == "stderr"], printed(new)
         for line, again in zip(printed(old).split("\n"), printed(new).split("\n"), strict=True):
             assert NUMBER.sub("#", line) == NUMBER.sub("#", again)
-            line, again = (NUMBER.findall(ROUND_OFF.sub("", x)) if not x.startswith(("work", "rank")) else [] for x in (line, again))
+            line, again = (NUMBER.findall(ROUGH.sub("", x)) for x in (line, again))
             np.testing.assert_allclose(np.array(again, float), np.array(line, float), rtol=1e-5, atol=1e-6)
             numbers += len(line)
     assert numbers > 30
@@ -74,7 +85,7 @@ def test_the_tour_runs_and_prints_what_is_stored():
 
 def test_the_tour_is_small_and_says_nothing_of_a_machine():
     text = TOUR.read_text()
-    assert len(text) < 400_000
+    assert len(text) < 300_000
     # (a picture may have any letters)
     assert not re.search(r'/tmp|/home|/root|/usr|site-packages|"stderr"', re.sub(r'"image/png": "[^"]*"', "", text))
     assert all(not out.output_type == "error" for cell in nbformat.read(TOUR, 4).cells for out in cell.get("outputs", ()))
@@ -82,5 +93,9 @@ def test_the_tour_is_small_and_says_nothing_of_a_machine():
 
 if __name__ == "__main__":
     made, _ = executed()
+    for cell in made.cells:
+        for out in cell.get("outputs", ()):
+            if "image/png" in out.get("data", ()):
+                out.data["image/png"] = smaller(out.data["image/png"])
     made.metadata = nbformat.read(TOUR, 4).metadata
     nbformat.write(made, TOUR)
