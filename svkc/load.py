@@ -52,7 +52,7 @@ def load(source, *, virtual_links=(), cuttable=(), spare=0, ignore=()) -> Chain:
     kept = dataclasses.replace(_compiled(source), arguments=arguments)
     model = kept.model
     cuts = cuts_of(model, texts("cuttable", cuttable))
-    ignore, spare = texts("ignore", ignore), whole("spare", spare, 0)
+    ignore, spare = texts("ignore", ignore), whole("spare", spare, 0, 1000)
     left_out = what_is_left_out(model, ignore)
     rows, topology = rows_of(model, {cut.body: cut.link.name for cut in cuts})
     if not topology.joint_names:

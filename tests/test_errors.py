@@ -134,7 +134,7 @@ CASES = {
     "...: expected real": lambda s: s.four.state(["a", "b", "c"]),
     "...: expected names": lambda s: svkc.at(0.5, connect=3),
     "...: got ..., expected True": lambda s: link(connected="no"),
-    "...: got ..., expected a whole": lambda s: s.simulate(max_steps=0),
+    "...: got ..., expected a whole": lambda s: s.load(spare=1e300),
     "...: got shape ..., expected (...,); for many use": lambda s: svkc.xyzw(s.four, jnp.zeros(9)),
     "...: got ..., expected a positive": lambda s: s.simulate(dt=-1.0),
     "...: got shape ..., expected (...,) for the tree": lambda s: s.four.state(np.zeros(7)),
