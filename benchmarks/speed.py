@@ -1,11 +1,12 @@
 """Steps of the 40-freedom figure on a free base (46 freedoms), open and with two grips, and of the high bar's, beside MuJoCo, MJX and Pinocchio.
 
-`python benchmarks/speed.py [case ...]` (extra `bench`) prints and writes results/speed.csv and draws results/speed.png. One step is symplectic Euler of 2 ms
-with all that it needs; microseconds per step and lane, the median of rounds in which all that are compared take turns, and the least and most;
-`times svkc`: of svkc on as many cores.
+`python benchmarks/speed.py [case ...] [--dtype ..] [--batch ..]` (extra `bench`) prints its rows, puts them into results/speed.csv and draws
+results/speed.png. One step is symplectic Euler of 2 ms with all that it needs; microseconds per step and lane, the median of rounds in which all that are
+compared take turns, and the least and most; `times svkc`: of svkc on as many cores.
 XLA is told to make one kernel of a loop (README). svkc on one core is `vmap` of `svkc.step` in one program, on all cores each device has its own lanes.
 Grips are hard in svkc, soft in MuJoCo and MJX. Compile seconds: trace, lower, XLA."""
 
+import argparse
 import csv
 import json
 import os
@@ -252,26 +253,42 @@ def machine() -> dict:
     return versions | {"backend": jax.default_backend(), "processor": cpu[0], "cores": os.cpu_count()}
 
 
-def main(cases):
-    """Measures, prints, writes."""
-    said, table = set(), []
+def main(cases, dtypes, batches):
+    """Measures, prints, writes: rows of a case, a dtype and a number of lanes in place of their old ones."""
+    said = set()
     print("| " + " | ".join(HEAD) + " |")
     for name in cases:
-        for dtype in ("float64", "float32"):
+        for dtype in dtypes:
             with jax.enable_x64(dtype == "float64"):
-                for batch in BATCHES:
+                for batch in batches:
+                    rows = []
                     for row in compared(name, dtype, batch, said):
-                        table.append(row)
+                        rows.append(row)
                         print("| " + " | ".join(map(str, row)) + " |", flush=True)
+                    save((name, dtype, str(batch)), rows)
                     jax.clear_caches()
-    with (RESULTS / "speed.csv").open("w", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows([[*HEAD, *machine()], *([*row, *machine().values()] for row in table)])
-    draw(table)
     print(machine())
+
+
+def save(key: tuple, rows):
+    """In the file of all, and in its picture."""
+    path = RESULTS / "speed.csv"
+    with path.open() as file:
+        kept = [row for row in list(csv.reader(file))[1:] if tuple(row[:3]) != key]
+    kept += [[*map(str, row), *map(str, machine().values())] for row in rows]
+    kept.sort(key=lambda row: (figures.CASES.index(row[0]), row[1] != "float64", int(row[2])))
+    with path.open("w", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows([[*HEAD, *machine()], *kept])
+    draw([[row[0], row[1], int(row[2]), *row[3:]] for row in kept])
 
 
 if __name__ == "__main__":
     if sys.argv[1:2] == [WORKER]:
         mjx_worker(*sys.argv[2:4], *map(int, sys.argv[4:]))
     else:
-        main(sys.argv[1:] or figures.CASES)
+        parser = argparse.ArgumentParser()
+        parser.add_argument("cases", nargs="*", metavar="case", help=f"of {', '.join(figures.CASES)}; none: all")
+        parser.add_argument("--dtype", nargs="+", default=["float64", "float32"])
+        parser.add_argument("--batch", nargs="+", type=int, default=BATCHES, help="lanes")
+        options = parser.parse_args()
+        main(options.cases or figures.CASES, options.dtype, options.batch)
