@@ -64,7 +64,6 @@ def smaller(picture):
     return base64.b64encode(file.getvalue()).decode()
 
 
-@pytest.mark.filterwarnings("ignore::DeprecationWarning:jupyter_client", "ignore::DeprecationWarning:jupyter_core", "ignore::DeprecationWarning:zmq")
 def test_the_tour_runs_and_prints_what_is_stored():
     stored = nbformat.read(TOUR, 4)
     fresh, (python, package) = executed()
