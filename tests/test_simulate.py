@@ -313,3 +313,14 @@ def test_one_step_by_itself():
         assert 0.8 < np.log2(coarse / fine) < 1.2
     with pytest.raises(ValueError, match="expected 4 joint torques"):
         svkc.step(chain, state, jnp.zeros(2), dt)
+
+
+def test_a_step_that_would_be_too_small(pendulum):
+    """A controller that may not go below its bound gives up where it would have to: a code, the state it came to, and an error when asked to throw."""
+    controller = diffrax.PIDController(rtol=1e-12, atol=1e-14, dtmin=0.02, force_dtmin=False)
+    traj = quarter(pendulum, stepsize_controller=controller, solver=diffrax.Tsit5(), throw=False)
+    assert traj.result == svkc.RESULTS.step_too_small
+    assert float(traj.t_final) < 1.0
+    assert np.isfinite(traj.final.q).all()
+    with pytest.raises(RuntimeError, match="lower bound"):
+        quarter(pendulum, stepsize_controller=controller, solver=diffrax.Tsit5())
