@@ -51,7 +51,11 @@ def save(traj: Trajectory, path, chain=None, options=None) -> None:
 
     meta = {"schema": SCHEMA, "svkc": svkc.__version__, "jax": jax.__version__, "units": "SI, rad, wxyz"}
     meta |= {name: np.asarray(getattr(traj, name)._value).tolist() for name in _CODES}
-    report = traj.report()
+    certify = Trajectory.report
+    for _ in range(np.ndim(traj.ts) - 1):
+        # lanes
+        certify = jax.vmap(certify)
+    report = certify(jax.tree.map(jnp.asarray, traj))
     meta["certificate"] = {f.name: np.asarray(getattr(report, f.name)).tolist() for f in dataclasses.fields(report) if f.name not in _CODES}
     meta["options"] = options or {}
     arrays = _flatten(traj)

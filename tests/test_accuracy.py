@@ -133,9 +133,9 @@ def test_held_pivots_leave_derivatives_as_they_are(swinging):
 
 def test_bad_dynamics():
     chain = models.four_bar()
-    for given, said in ((svkc.Exact(), "dynamics: expected svkc.Dynamics"), (svkc.Dynamics(hold=2.0), r"dynamics.hold: got 2.0")):
+    for given, said in ((svkc.Exact, "dynamics: expected svkc.Dynamics"), (lambda: svkc.Dynamics(hold=2.0), r"dynamics.hold: got 2.0")):
         with pytest.raises(ValueError, match=said):
-            svkc.simulate(chain, chain.state(), 1.0, dynamics=given)
+            svkc.simulate(chain, chain.state(), 1.0, dynamics=given())
 
 
 def test_the_certificate(tmp_path):

@@ -26,6 +26,8 @@ URDF = """<robot name="arm">
 <joint name="elbow" type="continuous"><parent link="upper"/><child link="lower"/><origin xyz="0 0 0.3"/><axis xyz="1 1 0"/></joint>
 <joint name="wrist" type="prismatic"><parent link="lower"/><child link="tool"/><origin xyz="0 0 0.2"/><axis xyz="0 0 1"/>
 <limit lower="-0.1" upper="0.1" effort="50" velocity="5"/></joint></robot>"""
+# MuJoCo says it of gymnasium's half_cheetah.xml
+pytestmark = pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass' is deprecated")
 SOURCES = {name: str(ASSETS / f"{name}.xml") for name in ("humanoid", "ant", "half_cheetah", "hopper", "walker2d")}
 SOURCES |= {f"random_{n}": models.random_tree(n, seed=n) for n in (2, 7, 25, 60)} | {"urdf": URDF, "figure40": str(svkc.scenes.FOLDER / "figure40.xml")}
 
