@@ -53,6 +53,8 @@ def check_grad(f: Callable, x, mode: str = "both", directions: int = 2, step: fl
     if mode not in ("forward", "reverse", "both"):
         raise ValueError(f"mode: got {mode!r}, expected 'forward', 'reverse' or 'both'")
     free, rest = eqx.partition(jax.tree.map(lambda leaf: jnp.asarray(leaf) if isinstance(leaf, float) else leaf, x), eqx.is_inexact_array)
+    # (without weak types, which would compile the same program again for every parameter)
+    free = jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype), free)
     named = jax.tree_util.tree_flatten_with_path(free)[0]
     if not any(leaf.size for _, leaf in named):
         raise ValueError("check_grad: x has no floating-point arrays to differentiate by")
