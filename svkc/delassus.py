@@ -76,7 +76,7 @@ def joints(chain: Chain, J: Float[Array, "rows dofs"]) -> Joints:
 
 
 def by_loop_forces(chain: Chain, kin: Kinematics, J: Float[Array, "rows dofs"], free: Bool[Array, " nv"] | None) -> Callable:
-    """(force, rate) -> (x, mu) with M x = force + J^T mu and J x = rate, of rows that need not be independent. free: joints not locked (None: all).
+    """(force, rate) -> (x, mu) with M x + J^T mu = force and J x = rate, of rows that need not be independent. free: joints not locked (None: all).
 
     D + a little is factored, and the forces refined against D (the proximal form): where rows repeat one another, or nearly so, the forces stay finite and the
     motion is that of the others.
@@ -118,6 +118,6 @@ def by_loop_forces(chain: Chain, kin: Kinematics, J: Float[Array, "rows dofs"], 
         x = accelerations(top, bodies, force[:nv] + mu @ tree)
         turning = jnp.zeros_like(applied) if own.heavy is None else given(applied, mu)
         seen = tree @ x if own.heavy is None else tree @ x + rotate(own.heavy, turning).ravel()
-        return jnp.concatenate([x, own.order(turning + own.along(rate - seen))]), mu
+        return jnp.concatenate([x, own.order(turning + own.along(rate - seen))]), -mu
 
     return solve

@@ -141,7 +141,7 @@ def _begin(start: Motion, times, world: World, how: How) -> Step:
     term, no, zero = diffrax.ODETerm(world.field), jnp.zeros((), bool), jnp.zeros((), jnp.int32)
     first, controller = how.controller.init(term, t0, stop, start, how.first_step, world.scene, how.solver.func, how.solver.error_order(term))
     rows = lambda n: jax.tree.map(lambda x: jnp.broadcast_to(x[None], (n, *x.shape)), start)
-    values, search = None, None
+    values, search, seen = None, None, Seen.first(world.field, world.scene, start.q)
     if how.watched is not None:
         values = how.watched.values
         search = Search(t0, jnp.zeros_like(values), values, Bracket.around(t0, t0, t0, t0), start, values, values, no, no, no)
@@ -162,8 +162,8 @@ def _begin(start: Motion, times, world: World, how: How) -> Step:
         accepted=zero,
         rejected=zero,
         result=jnp.asarray(SUCCESSFUL, jnp.int32),
-        tally=Tally.none(t0.dtype, projects(world.field.stabilization, world.scene)),
-        seen=Seen.first(world.scene, start.q) if projects(world.field.stabilization, world.scene) else None,
+        tally=Tally.none(t0.dtype, seen is not None and seen.pivots is not None),
+        seen=seen,
     )
 
 
@@ -203,7 +203,7 @@ def _try(s: Step, t1, world: World, how: How) -> Tried:
 def _step(s: Step, times, world: World, how: How) -> Step:
     """One try: kept, or to be made shorter; or one more look at the step in which a guard went through zero."""
     t0, stop, at = times
-    if s.seen is not None and world.field.dynamics.hold is not None:
+    if s.seen is not None and s.seen.pivots is not None and world.field.dynamics.hold is not None:
         world = eqx.tree_at(lambda w: w.scene.pivots, world, s.seen.pivots, is_leaf=lambda x: x is None)
     if s.search is None:
         tried = _try(s, s.next, world, how)
@@ -253,7 +253,7 @@ def _counted(s: Step, tried: Tried, result: Int[Array, ""]) -> Tally:
     """With one more try. result: how the run stands after it."""
     old, kept = s.tally, tried.keep
     margin, swaps = old.margin, old.swaps
-    if tried.seen is not None:
+    if tried.seen is not None and tried.seen.pivots is not None:
         margin = jnp.where(kept, jnp.minimum(margin, tried.seen.margin), margin)
         swaps = swaps + (kept & jnp.any(s.seen.dependent != tried.seen.dependent)).astype(jnp.int32)
     loop = old.loop if tried.seen is None else jnp.where(result == OPEN, jnp.argmax(tried.seen.gap).astype(jnp.int32), old.loop)

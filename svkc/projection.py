@@ -10,6 +10,7 @@ import numpy as np
 from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
+from svkc.articulated import by_bodies
 from svkc.chain import Chain, State, Structure
 from svkc.closure import scaled_jacobian, scales
 from svkc.forward_dynamics import solve_motion
@@ -116,10 +117,10 @@ def close(chain: Chain, structure: Structure, q: Float[Array, " q"], iterations:
 @functools.partial(jax.jit, static_argnames=("iterations", "change", "hold"))
 def settle_loops(
     chain: Chain, structure: Structure, q, v, iterations: int, change: Callable = inertia_change, pivots=None, hold: float = 0.0
-) -> tuple[Float[Array, " q"], Float[Array, " dofs"], Float[Array, ""], Float[Array, "steps dofs"], Float[Array, " links"]]:
+) -> tuple[Float[Array, " q"], Float[Array, " dofs"], Float[Array, " links"], Float[Array, ""], Float[Array, "steps dofs"]]:
     """`close`, then `agree`: one body for both, the last turn of the loop being the velocities', so that it is compiled once.
 
-    And what the loops show: |R_mm| / |R_11|, the pivots to go on with, and the gap (rad, `chain.length`s) that each loop is left with. pivots: those held
+    And what the loops show: the gap (rad, `chain.length`s) that each loop is left with, |R_mm| / |R_11|, and the pivots to go on with. pivots: those held
     so far (None: none are), which go on until their |R_mm| / |R_11| is below `hold` times that of new ones.
     """
     row, column = scales(chain)
@@ -140,11 +141,33 @@ def settle_loops(
         open_ = jnp.stack([row * gap(structure, end).ravel(), J @ jnp.where(active, v / column, 0)], 1)
         step = -change(chain, structure, kin, selection, J, open_)
         last = i == iterations
-        seen = jax.lax.stop_gradient((weakest(full), chosen, jnp.max(jnp.abs(open_[:, 0]).reshape(-1, 6), 1)))
+        seen = jax.lax.stop_gradient((jnp.max(jnp.abs(open_[:, 0]).reshape(-1, 6), 1), weakest(full), chosen))
         return integrate(chain, q, jnp.where(last, 0, step[:, 0])), jnp.where(last, v + step[:, 1], v), *seen
 
-    none = jnp.ones((), q.dtype), jnp.zeros((min(row.shape[0], chain.dofs), chain.dofs), q.dtype), jnp.zeros(len(chain.link_names), q.dtype)
+    none = jnp.zeros(len(chain.link_names), q.dtype), jnp.ones((), q.dtype), jnp.zeros((min(row.shape[0], chain.dofs), chain.dofs), q.dtype)
     return jax.lax.fori_loop(0, iterations + 1, turn, (normalize(chain, q), v, *none))
+
+
+@functools.partial(jax.jit, static_argnames="iterations")
+def settle_by_bodies(chain: Chain, structure: Structure, q, v, iterations: int) -> tuple[Float[Array, " q"], Float[Array, " dofs"], Float[Array, " links"]]:
+    """`settle_loops` with `inertia_change`, by articulated bodies and the forces of the loops: no pivots are chosen. And the gap (rad,
+    `chain.length`s) that each loop is left with."""
+    row, column = scales(chain)
+    active, none = active_dofs(chain, structure), jnp.zeros(chain.dofs, q.dtype)
+
+    @functools.partial(jax.checkpoint, prevent_cse=False)
+    def turn(i, both):
+        q, v, _ = both
+        kin = kinematics(chain, q)
+        end = ends(chain, structure, kin, q)
+        J = scaled_jacobian(chain, structure, kin, end)
+        last, open_ = i == iterations, row * gap(structure, end).ravel()
+        apart = jnp.where(last, J @ jnp.where(active, v / column, 0), open_)
+        step = solve_motion(chain, structure, kin, None, J, none, apart, by_bodies)
+        left = jax.lax.stop_gradient(jnp.max(jnp.abs(open_).reshape(-1, 6), 1))
+        return integrate(chain, q, jnp.where(last, 0, step)), jnp.where(last, v + step, v), left
+
+    return jax.lax.fori_loop(0, iterations + 1, turn, (normalize(chain, q), v, jnp.zeros(len(chain.link_names), q.dtype)))
 
 
 @jax.jit

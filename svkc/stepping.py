@@ -11,13 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from svkc.articulated import by_bodies
 from svkc.chain import Chain, State, Structure
 from svkc.forward_dynamics import Dynamics, joint_torques, moving
 from svkc.given import function, numbers, one, whole
 from svkc.inverse_dynamics import limit_forces
 from svkc.kinematics import normalize, rates
 from svkc.loops import active_dofs
-from svkc.projection import dependent_change, first_pivots, inertia_change, settle_loops
+from svkc.projection import dependent_change, first_pivots, inertia_change, settle_by_bodies, settle_loops
 
 # a step that would leave less than this part of itself before a time to be met goes all the way
 REST = 1e-6
@@ -98,13 +99,18 @@ class Field(eqx.Module):
     stabilization: Projection | Baumgarte | Drift
     dynamics: Dynamics
 
+    @property
+    def pivotless(self) -> bool:
+        """Whether steps are put back onto the loops by the loops' forces, without pivots."""
+        return self.dynamics.inertia is by_bodies and isinstance(self.stabilization, Projection) and self.stabilization.change is inertia_change
+
     def __call__(self, t, y: Motion, scene: Scene) -> Motion:
         chain, structure, held = scene.chain, scene.structure, self.stabilization
         if isinstance(held, Exact):
             y, _ = settle(self, scene, y)
         tau, power = self.torques(t, y, scene)
-        rate = held.rate if isinstance(held, Baumgarte) else None
-        v, vdot = moving(chain, structure, y.q, y.v, tau, self.dynamics.inertia, rate, isinstance(held, Projection), scene.pivots)
+        rate, agree = held.rate if isinstance(held, Baumgarte) else None, isinstance(held, Projection) and not self.pivotless
+        v, vdot = moving(chain, structure, y.q, y.v, tau, self.dynamics.inertia, rate, agree, scene.pivots)
         return Motion(rates(chain, y.q, jnp.where(active_dofs(chain, structure), v, 0)), vdot, power)
 
     def torques(self, t, y: Motion, scene: Scene):
@@ -129,17 +135,20 @@ def projects(stabilization, scene: Scene) -> bool:
 
 
 class Seen(eqx.Module):
-    """What the loops show as a step is put back onto them: |R_mm| / |R_11|, the pivots to go on with, how far each loop is open yet."""
+    """What the loops show as a step is put back onto them: how far each loop is open yet and, where pivots are chosen, |R_mm| / |R_11| and those to go
+    on with."""
 
-    margin: Float[Array, ""]
-    pivots: Float[Array, "steps dofs"]
     gap: Float[Array, " links"]
+    margin: Float[Array, ""] | None = None
+    pivots: Float[Array, "steps dofs"] | None = None
 
     @classmethod
-    def first(cls, scene: Scene, q) -> "Seen":
+    def first(cls, field: Field, scene: Scene, q) -> "Seen | None":
         """Before the first step."""
-        dtype = q.dtype
-        return cls(jnp.ones((), dtype), first_pivots(scene.chain, scene.structure, q), jnp.zeros(len(scene.chain.link_names), dtype))
+        if not projects(field.stabilization, scene):
+            return None
+        gap = jnp.zeros(len(scene.chain.link_names), q.dtype)
+        return cls(gap) if field.pivotless else cls(gap, jnp.ones((), q.dtype), first_pivots(scene.chain, scene.structure, q))
 
     @property
     def dependent(self) -> Bool[Array, " dofs"]:
@@ -152,7 +161,10 @@ def settle(field: Field, scene: Scene, y: Motion) -> tuple[Motion, Seen | None]:
     chain, structure, held = scene.chain, scene.structure, field.stabilization
     if not projects(held, scene):
         return eqx.tree_at(lambda y: y.q, y, normalize(chain, y.q)), None
-    q, v, *seen = settle_loops(chain, structure, y.q, y.v, held.iterations, held.change, scene.pivots, field.dynamics.hold or 0.0)
+    if field.pivotless:
+        q, v, *seen = settle_by_bodies(chain, structure, y.q, y.v, held.iterations)
+    else:
+        q, v, *seen = settle_loops(chain, structure, y.q, y.v, held.iterations, held.change, scene.pivots, field.dynamics.hold or 0.0)
     return eqx.tree_at(lambda y: (y.q, y.v), y, (q, v)), Seen(*seen)
 
 

@@ -71,6 +71,8 @@ def algebra(chain, state):
         c = changed(chain, x)
         s = start(state, x)
         out = {"forward": svkc.forward_dynamics(c, s, x["tau"]), "inverse": svkc.inverse_dynamics(c, s, moving), "energy": svkc.energy(c, s)}
+        stepped = svkc.step(c, s, x["tau"], 0.01)
+        out |= {"stepped_q": stepped.q, "stepped_v": stepped.v}
         driven = svkc.actuation(c, s, moving)
         out |= {"actuation": driven.tau, "residual": driven.residual}
         if len(chain.link_names):

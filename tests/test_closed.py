@@ -39,13 +39,15 @@ def test_acceleration_is_that_of_the_multipliers(case):
 
 
 def test_articulated_bodies_carry_what_acts_on_virtual_joints(case):
-    """The same with torques at the joints of the loops, and with a joint of the tree locked; and its derivative by masses, on each side."""
+    """The same with torques at the joints of the loops, and with a joint of the tree locked; and its derivative by masses and along the loops, on each side."""
     name, chain, state, tau = case
     locked = svkc.lock(chain, state, chain.joint_names[-1]) if name in ("stewart", "two_hands") else state
+    along = svkc.coordinates(chain, locked).W @ jnp.linspace(-1.0, 1.0, chain.dofs)
 
     def both(scale):
         c = eqx.tree_at(lambda c: c.mass, chain, chain.mass * (1 + scale * jnp.linspace(0.0, 3.0, chain.mass.shape[0])))
-        return [accelerated(c, locked.structure, locked.q, locked.v, tau, way) for way in (None, svkc.by_bodies)]
+        q = svkc.integrate(chain, locked.q, scale * along)
+        return [accelerated(c, locked.structure, q, locked.v, tau, way) for way in (None, svkc.by_bodies)]
 
     for usual, bodies in (both(0.0), jax.jvp(both, (0.0,), (1.0,))[1]):
         assert np.abs(bodies - usual).max() < 1e-9 * np.abs(usual).max()
