@@ -29,6 +29,10 @@ import svkc.scenes
 
 hook.uninstall()
 
+# tracing makes very many small objects that stay: to look through all of them again and again took a tenth of the suite's time
+gc.freeze()
+gc.set_threshold(100_000, 20, 50)
+
 
 # the longest first, so that no worker is left with one of them in the end
 LONGEST = ("test_house", "test_transformations", "test_gradients", "test_extremes", "test_reference", "test_cuttable", "test_accuracy")
