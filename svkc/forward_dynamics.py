@@ -16,6 +16,7 @@ from svkc.delassus import by_loop_forces
 from svkc.given import function, one
 from svkc.inverse_dynamics import generalized_forces, inertia_by_composites, inertia_by_unit_vectors, inertia_times, passive_forces
 from svkc.kinematics import LEVELS_UNROLLED, Kinematics, kinematics, twists
+from svkc.lanes import with_lanes_last
 from svkc.loops import active_dofs, ends
 from svkc.selection import Selection, rank_tolerance, square, weakest
 from svkc.verb import verb
@@ -160,6 +161,12 @@ def moving(
         return v, solve_free_motion(chain, structure, kin, force, inertia)
     rates = loop_rates(chain, structure, v, kin, V, end, J, baumgarte)
     return v, solve_motion(chain, structure, kin, selection, J, force, rates, inertia)
+
+
+@with_lanes_last
+def moving_in_lanes(chain: Chain, structure: Structure, q, v, tau, baumgarte) -> tuple[Float[Array, " dofs"], Float[Array, " dofs"]]:
+    """`moving` by articulated bodies, without pivots, under a `vmap` that keeps its lanes last."""
+    return moving(chain, structure, q, v, tau, by_bodies, baumgarte)
 
 
 def acceleration(chain: Chain, structure: Structure, q, v, tau: Float[Array, " dofs"], inertia=None) -> Float[Array, " dofs"]:

@@ -3,6 +3,7 @@
 One loop does both, so that a program holds the field, the solver's stages and the way back onto the loops once. Nothing here is differentiated.
 """
 
+import dataclasses
 from typing import Any
 
 import diffrax
@@ -116,6 +117,7 @@ class Tried(eqx.Module):
 def march(start: Motion, times, world: World, how: How) -> Path:
     """From times = (t0, stop, save times) to `stop`, or to where a guard was zero first."""
     _, stop, at = times
+    world = World(world.scene, dataclasses.replace(world.field, differentiated=False))
 
     def going(s: Step):
         more = (s.t < stop) & (s.accepted + s.rejected < how.max_steps)

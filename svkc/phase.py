@@ -13,7 +13,8 @@ from svkc.marching import EVENT, MAX_STEPS, NON_FINITE, OPEN, SUCCESSFUL, How, P
 from svkc.replay import Replay, integrated
 from svkc.request import Options
 from svkc.searching import Watched
-from svkc.stepping import Motion, Scene, Settled, finite, frozen, staged
+from svkc.settled import Settled
+from svkc.stepping import Motion, Scene, finite, frozen, staged
 from svkc.trajectory import RESULTS, Events, Phases
 
 

@@ -8,13 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.ad_checkpoint import checkpoint_name
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from svkc.articulated import by_bodies
 from svkc.chain import Chain, State, Structure
 from svkc.closure import scaled_jacobian, scales
 from svkc.forward_dynamics import solve_motion
 from svkc.kinematics import Kinematics, integrate, kinematics, normalize
+from svkc.lanes import with_lanes_last
 from svkc.loops import active_dofs, ends, gap
 from svkc.selection import Selection, count_rank, held_part, rank_tolerance, select, select_again, solve_frozen, solve_positive, square, weakest, without_weak
 
@@ -148,26 +149,32 @@ def settle_loops(
     return jax.lax.fori_loop(0, iterations + 1, turn, (normalize(chain, q), v, *none))
 
 
-@functools.partial(jax.jit, static_argnames="iterations")
-def settle_by_bodies(chain: Chain, structure: Structure, q, v, iterations: int) -> tuple[Float[Array, " q"], Float[Array, " dofs"], Float[Array, " links"]]:
+@functools.partial(jax.jit, static_argnames=("iterations", "differentiated"))
+def settle_by_bodies(
+    chain: Chain, structure: Structure, q, v, iterations: int, differentiated: bool = True
+) -> tuple[Float[Array, " q"], Float[Array, " dofs"], Float[Array, " links"]]:
     """`settle_loops` with `inertia_change`, by articulated bodies and the forces of the loops: no pivots are chosen. And the gap (rad,
-    `chain.length`s) that each loop is left with."""
-    row, column = scales(chain)
-    active, none = active_dofs(chain, structure), jnp.zeros(chain.dofs, q.dtype)
+    `chain.length`s) that each loop is left with. differentiated: as `Field`'s."""
+    one_turn = _turn_by_bodies if differentiated else with_lanes_last(_turn_by_bodies)
 
     @functools.partial(jax.checkpoint, prevent_cse=False)
     def turn(i, both):
         q, v, _ = both
-        kin = kinematics(chain, q)
-        end = ends(chain, structure, kin, q)
-        J = scaled_jacobian(chain, structure, kin, end)
-        last, open_ = i == iterations, row * gap(structure, end).ravel()
-        apart = jnp.where(last, J @ jnp.where(active, v / column, 0), open_)
-        step = solve_motion(chain, structure, kin, None, J, none, apart, by_bodies)
-        left = jax.lax.stop_gradient(jnp.max(jnp.abs(open_).reshape(-1, 6), 1))
-        return integrate(chain, q, jnp.where(last, 0, step)), jnp.where(last, v + step, v), left
+        step, left = one_turn(chain, structure, q, v, i == iterations)
+        return integrate(chain, q, jnp.where(i == iterations, 0, step)), jnp.where(i == iterations, v + step, v), left
 
     return jax.lax.fori_loop(0, iterations + 1, turn, (normalize(chain, q), v, jnp.zeros(len(chain.link_names), q.dtype)))
+
+
+def _turn_by_bodies(chain: Chain, structure: Structure, q, v, last: Bool[Array, ""]) -> tuple[Float[Array, " dofs"], Float[Array, " links"]]:
+    """The least change, in the metric of the inertia, of q that closes the loops or, in the last turn, of v that keeps them; and the gaps at q."""
+    row, column = scales(chain)
+    kin = kinematics(chain, q)
+    end = ends(chain, structure, kin, q)
+    J, open_ = scaled_jacobian(chain, structure, kin, end), row * gap(structure, end).ravel()
+    apart = jnp.where(last, J @ jnp.where(active_dofs(chain, structure), v / column, 0), open_)
+    step = solve_motion(chain, structure, kin, None, J, jnp.zeros(chain.dofs, q.dtype), apart, by_bodies)
+    return step, jax.lax.stop_gradient(jnp.max(jnp.abs(open_).reshape(-1, 6), 1))
 
 
 @jax.jit

@@ -1,8 +1,7 @@
 """F5: what is integrated, one step of it, and how steps are kept on the loops."""
 
-import functools
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -13,10 +12,10 @@ from jaxtyping import Array, Bool, Float
 
 from svkc.articulated import by_bodies
 from svkc.chain import Chain, State, Structure
-from svkc.forward_dynamics import Dynamics, joint_torques, moving
+from svkc.forward_dynamics import Dynamics, joint_torques, moving, moving_in_lanes
 from svkc.given import function, numbers, one, whole
 from svkc.inverse_dynamics import limit_forces
-from svkc.kinematics import normalize, rates
+from svkc.kinematics import LEVELS_UNROLLED, normalize, rates
 from svkc.loops import active_dofs
 from svkc.projection import dependent_change, first_pivots, inertia_change, settle_by_bodies, settle_loops
 
@@ -93,11 +92,12 @@ class Drift(eqx.Module):
 
 
 class Field(eqx.Module):
-    """The vector field of one phase: qdot, vdot, power."""
+    """The vector field of one phase: qdot, vdot, power. differentiated: or in a loop that nothing differentiates, where a `vmap` keeps lanes last."""
 
     control: Callable | None
     stabilization: Projection | Baumgarte | Drift
     dynamics: Dynamics
+    differentiated: bool = eqx.field(static=True, default=True)
 
     @property
     def pivotless(self) -> bool:
@@ -110,8 +110,16 @@ class Field(eqx.Module):
             y, _ = settle(self, scene, y)
         tau, power = self.torques(t, y, scene)
         rate, agree = held.rate if isinstance(held, Baumgarte) else None, isinstance(held, Projection) and not self.pivotless
-        v, vdot = moving(chain, structure, y.q, y.v, tau, self.dynamics.inertia, rate, agree, scene.pivots)
+        if self._in_lanes(chain) and not agree:
+            v, vdot = moving_in_lanes(chain, structure, y.q, y.v, tau, rate)
+        else:
+            v, vdot = moving(chain, structure, y.q, y.v, tau, self.dynamics.inertia, rate, agree, scene.pivots)
         return Motion(rates(chain, y.q, jnp.where(active_dofs(chain, structure), v, 0)), vdot, power)
+
+    def _in_lanes(self, chain: Chain) -> bool:
+        """Whether it is for speed alone, and accelerations are had by articulated bodies, level by level."""
+        ways = (by_bodies,) if chain.topology.link_names else (by_bodies, None)
+        return not self.differentiated and self.dynamics.inertia in ways and len(chain.topology.levels) <= LEVELS_UNROLLED
 
     def torques(self, t, y: Motion, scene: Scene):
         """Joint torques of the control and the limits, and the power of all that is not conservative (None: there is none)."""
@@ -162,7 +170,7 @@ def settle(field: Field, scene: Scene, y: Motion) -> tuple[Motion, Seen | None]:
     if not projects(held, scene):
         return eqx.tree_at(lambda y: y.q, y, normalize(chain, y.q)), None
     if field.pivotless:
-        q, v, *seen = settle_by_bodies(chain, structure, y.q, y.v, held.iterations)
+        q, v, *seen = settle_by_bodies(chain, structure, y.q, y.v, held.iterations, field.differentiated)
     else:
         q, v, *seen = settle_loops(chain, structure, y.q, y.v, held.iterations, held.change, scene.pivots, field.dynamics.hold or 0.0)
     return eqx.tree_at(lambda y: (y.q, y.v), y, (q, v)), Seen(*seen)
@@ -171,68 +179,6 @@ def settle(field: Field, scene: Scene, y: Motion) -> tuple[Motion, Seen | None]:
 def finite(y: Motion) -> Bool[Array, ""]:
     """Whether every number is."""
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(y)]))
-
-
-class _Interpolation(diffrax.AbstractLocalInterpolation):
-    """The inner solver's dense output, drawn to the settled end of the step."""
-
-    t0: Any
-    t1: Any
-    inner: Any
-    shift: Motion
-
-    def evaluate(self, t0, t1=None, left=True):
-        def at(t):
-            part = (t - self.t0) / (self.t1 - self.t0)
-            return jax.tree.map(lambda y, s: y + part * s, self.inner.evaluate(t, left=left), self.shift)
-
-        if t1 is None:
-            return at(t0)
-        return jax.tree.map(lambda a, b: b - a, at(t0), at(t1))
-
-
-def _interpolation(cls, *, t0, t1, inner, shift):
-    return _Interpolation(t0, t1, cls(t0=t0, t1=t1, **inner), shift)
-
-
-class Settled(diffrax.AbstractWrappedSolver):
-    """Any diffrax solver, its steps settled, for diffrax's own adjoints."""
-
-    # diffrax takes a wrapper for what it wraps and asks for it; the inner solver has its own
-    scan_kind: ClassVar[str] = "inner"
-
-    solver: diffrax.AbstractSolver
-    field: Field
-
-    @property
-    def term_structure(self):  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.solver.term_structure
-
-    @property
-    def interpolation_cls(self):  # pyright: ignore[reportIncompatibleVariableOverride]
-        return functools.partial(_interpolation, self.solver.interpolation_cls)
-
-    def order(self, terms):
-        return self.solver.order(terms)
-
-    def strong_order(self, terms):
-        return self.solver.strong_order(terms)
-
-    def error_order(self, terms):
-        return self.solver.error_order(terms)
-
-    def init(self, terms, t0, t1, y0, args):
-        return self.solver.init(terms, t0, t1, y0, args)
-
-    def func(self, terms, t0, y0, args):
-        return self.solver.func(terms, t0, y0, args)
-
-    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        fresh = True if projects(self.field.stabilization, args) else made_jump
-        raw, error, dense, solver_state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, fresh)
-        y1, _ = settle(self.field, args, raw)
-        shift = jax.tree.map(lambda a, b: a - b, y1, raw)
-        return y1, error, {"inner": dense, "shift": shift}, solver_state, result
 
 
 def staged(solver: diffrax.AbstractSolver, kind: str | None) -> diffrax.AbstractSolver:

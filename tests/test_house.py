@@ -25,7 +25,7 @@ HOUSE = [
     "assembly mobility",
     "binding actuation guards solvers",
     "transition events stepping",
-    "location scenes",
+    "location scenes settled",
     "searching",
     "marching",
     "replay",
