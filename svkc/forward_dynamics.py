@@ -27,7 +27,8 @@ class Dynamics(eqx.Module):
 
     inertia: None (default), articulated bodies where the scene has no loops, else composite ones; `svkc.inertia_by_composites` always;
     `svkc.inertia_by_unit_vectors`, the paper's columns by inverse dynamics; or `svkc.by_bodies`, articulated bodies and the forces of the loops, which
-    square the loops' conditioning near singular configurations.
+    square the loops' conditioning near singular configurations. With it `Projection()` too does without pivots: the fastest, and the one for batches;
+    the certificate then has the margin of the phases' ends alone, and counts no swaps.
     hold: dependent coordinates are chosen at every evaluation (None), or held until, at the end of a step, the least |R_kk| / |R_11| of their columns is
     below this part of what a new choice has (default 0.3); 0 holds them until the structure changes. Held only where steps are projected; near a
     singular configuration, and in what is differentiated, they are chosen at every evaluation, as the motion does not depend on the choice.

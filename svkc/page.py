@@ -12,7 +12,7 @@ import numpy as np
 
 from svkc.chain import Chain, State, Structure
 from svkc.closure import largest_gaps
-from svkc.drawing import one_run
+from svkc.drawing import happened, one_run
 from svkc.energy import energy
 from svkc.kinematics import poses
 from svkc.loops import active_dofs
@@ -86,7 +86,7 @@ def _run(chain: Chain, traj: Trajectory) -> dict:
         "energy": _numbers(energies),
         "gaps": _numbers(gaps),
         "phases": phases,
-        "events": _events(traj, phases, ts[0]),
+        "events": _events(chain, traj, ts[0]),
         "geoms": geoms,
         "meshes": meshes,
         "size": float(chain.length),
@@ -132,23 +132,14 @@ def _ends(s: Structure, link: int, body: dict) -> list:
     return [[body[int(row[link])], _numbers(pos[link])] for row, pos in ((s.parent, s.pos), (s.real, s.real_pos))]
 
 
-def _events(traj: Trajectory, phases: list[dict], begin: float) -> list[dict]:
-    """What happened, one line an instant."""
-    e, out = traj.events, []
+def _events(chain: Chain, traj: Trajectory, begin: float) -> list[dict]:
+    """What happened, one line an instant, and the energy (J) that it cost."""
+    e = traj.events
     times, lost = (np.asarray(x[: int(e.count)], float) for x in (e.time, e.energy_lost))
     # what rounding leaves of a cut is no loss
     rounding = 100 * float(jnp.finfo(traj.ts.dtype).eps * jnp.max(jnp.abs(traj.phases.energy)))
-    for time in np.unique(times[times >= begin]):
-        before = [p for p in phases if p["start"] < time] or phases[:1]
-        after = [p for p in phases if p["start"] <= time]
-        had, has = ({link["name"] for link in side[-1]["links"]} for side in (before, after))
-        what = [f"{verb} {', '.join(sorted(names))}" for verb, names in (("cut", had - has), ("connected", has - had)) if names]
-        if not what:
-            # something was locked, bound anew, or the run was stopped
-            what = ["event " + ", ".join(str(int(k)) for k in e.which[: len(times)][times == time])]
-        loss = float(lost[times == time].sum())
-        out.append({"time": float(time), "text": "; ".join(what), "lost": loss if abs(loss) > rounding else 0.0})
-    return out
+    instants = [(time, text, float(lost[times == time].sum())) for time, text in happened(traj, chain) if time >= begin]
+    return [{"time": time, "text": text, "lost": loss if abs(loss) > rounding else 0.0} for time, text, loss in instants]
 
 
 def _geoms(model) -> tuple[list[dict], list[dict]]:

@@ -174,7 +174,7 @@ def test_a_run_that_stopped_ends_where_it_did(stopped, tmp_path):
     run = contents(svkc.render(chain, traj, tmp_path / "stopped.html"))
     np.testing.assert_allclose(run["times"], [0, 0.01, 0.02, 0.03, 0.035])
     assert [p["mobility"] for p in run["phases"]] == [1, 3, 1]
-    assert [e["text"] for e in run["events"]] == ["cut pin", "connected pin"]
+    assert [e["text"] for e in run["events"]] == ["cut pin", "connect pin"]
     assert run["events"][1]["lost"] == float(traj.events.energy_lost[1])
     assert run["phases"][2]["links"][0]["ends"] is not None
     broken = eqx.tree_at(lambda t: (t.ts, t.gaps), traj, (traj.ts.at[4:].set(jnp.nan), traj.gaps.at[1].set(jnp.inf)))
