@@ -1,0 +1,114 @@
+"""Whole runs of the high bar, events and certificate and all: one run of 10 s, and thousands whose hands let go at times of their own.
+
+`python benchmarks/runs.py [--lanes 4096]` (two hands until 8 s, one until 9 s, then flight; in lanes 1.8 s, the right hand until 0.3 to 0.9 s, the left
+0.2 s longer) prints its rows and puts them into results/runs.csv. Joint ranges are left out. Medians of rounds in which all that are compared take turns;
+XLA is told to make one kernel of a loop (README). MuJoCo: steps of 5 ms of the same figure by symplectic Euler, its grips soft and never let go. Error:
+root mean square over the tree's coordinates, at the end, against Dopri8 at rtol 1e-11; in lanes the median of some of them.
+"""
+
+import argparse
+import csv
+
+import speed  # first: it tells XLA what to do
+
+# isort: split
+import diffrax
+import figures
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import svkc
+
+BODIES = {"dynamics": svkc.Dynamics(inertia=svkc.by_bodies)}
+EULER = {"solver": svkc.SemiImplicitEuler(), "stabilization": svkc.Projection(iterations=1), **BODIES}
+ALONE = {"default": {}, "articulated bodies": BODIES}
+LANES = {
+    "symplectic Euler, 5 ms": {"dt": 5e-3, **EULER},
+    "Tsit5, 10 ms": {"dt": 1e-2, **BODIES},
+    "Tsit5, rtol 1e-4": {"solver": diffrax.Tsit5(), "rtol": 1e-4, "atol": 1e-6, **BODIES},
+}
+HEAD = ["runs", "by", "s", "least", "most", "simulated s per s", "error", "energy drift J", "steps", "rejected"]
+EXACT = {"rtol": 1e-11, "atol": 1e-13, "max_steps": 100000}
+TRIED, ROUNDS, END = 8, 3, 1.8
+speed.ROUNDS = ROUNDS
+
+
+def events(right, left):
+    """The hands let go."""
+    return [svkc.at(right, cut="right_hand_grip"), svkc.at(left, cut="left_hand_grip")]
+
+
+def apart(chain, traj, exact) -> float:
+    """Root mean square at the end, over the tree."""
+    moved = svkc.difference(chain, exact.final.q, traj.final.q)[: chain.nv]
+    return float(jnp.sqrt(jnp.mean(moved**2)))
+
+
+def row(label, who, seconds, simulated, error, phases):
+    """What a run, or the runs of a batch, took and gave."""
+    drift, steps, rejected = (np.asarray(x) for x in (jnp.abs(jnp.sum(phases.energy_drift, -1)), phases.accepted.sum(-1), phases.rejected.sum(-1)))
+    times = [f"{f(seconds):.3g}" for f in (np.median, min, max)]
+    return [label, who, *times, f"{simulated / np.median(seconds):.3g}", f"{error:.1e}", f"{np.median(drift):.1e}", int(np.mean(steps)), int(np.mean(rejected))]
+
+
+def beside(chain, state, lanes: int, steps: int):
+    """MuJoCo's steps, alone or on all cores."""
+    model, q, v = figures.in_mujoco("high bar", chain, state)
+    model.opt.timestep = 5e-3
+    return next(speed.by_mujoco(model, q, np.broadcast_to(v, (lanes, len(v))), lanes, steps))
+
+
+def alone(chain, state):
+    """10 s at rtol 1e-8."""
+    made = lambda **how: jax.jit(lambda s: svkc.simulate(chain, s, 10.0, events=events(8.0, 9.0), **how))
+    programs = {who: made(rtol=1e-8, atol=1e-8, **how) for who, how in ALONE.items()}
+    exact = made(**EXACT)(state)
+    runs = {who: (lambda f=f: jax.block_until_ready(f(state))) for who, f in programs.items()}
+    seconds = speed.timed(runs | dict([beside(chain, state, 1, 2000)]))
+    for who, f in programs.items():
+        traj = f(state)
+        yield row("one", who, seconds[who], 10.0, apart(chain, traj, exact), traj.phases)
+    yield ["one", "MuJoCo", *(f"{f(seconds['MuJoCo']):.3g}" for f in (np.median, min, max)), f"{10 / np.median(seconds['MuJoCo']):.3g}", "", "", 2000, 0]
+
+
+def batch(chain, state, lanes: int):
+    """Lanes by `svkc.rollout`, whose first call compiles."""
+    states = jax.tree.map(lambda x: jnp.broadcast_to(x, (lanes, *x.shape)), state)
+    times = 0.3 + 0.6 * jax.random.uniform(jax.random.key(1), (lanes,))
+    lane = lambda chain, time: {"events": events(time, time + 0.2)}
+    common = {"data": times, "lane": lane, "progress": False, "max_steps": 2048}
+    rolled = {who: (lambda how=how: svkc.rollout(chain, states, END, **common, **how)) for who, how in LANES.items()}
+    runs = {who: (lambda f=f: jax.block_until_ready(f())) for who, f in rolled.items()}
+    name, peer = beside(chain, state, lanes, round(END / 5e-3))
+    seconds = speed.timed(runs | {name: peer})
+    exact = jax.jit(lambda time: svkc.simulate(chain, state, END, **lane(chain, time), **EXACT))
+    references = [exact(time) for time in times[:TRIED]]
+    for who, f in rolled.items():
+        traj = f()
+        assert bool(jnp.all(traj.result == svkc.RESULTS.successful)), who
+        errors = [apart(chain, jax.tree.map(lambda x, i=i: x[i], traj), references[i]) for i in range(TRIED)]
+        yield row(lanes, who, seconds[who], lanes * END, np.median(errors), traj.phases)
+    x = seconds[name]
+    yield [lanes, name, *(f"{f(x):.3g}" for f in (np.median, min, max)), f"{lanes * END / np.median(x):.3g}", "", "", round(END / 5e-3), 0]
+
+
+def main(lanes: int):
+    """Measures, prints, writes."""
+    chain, state = figures.case("high bar")
+    table = []
+    print("| " + " | ".join(HEAD) + " |")
+    for rows in (alone(chain, state), batch(chain, state, lanes)):
+        for line in rows:
+            table.append(line)
+            print("| " + " | ".join(map(str, line)) + " |", flush=True)
+    with (speed.RESULTS / "runs.csv").open("w", newline="") as file:
+        machine = speed.machine()
+        csv.writer(file, lineterminator="\n").writerows([[*HEAD, *machine], *([*line, *machine.values()] for line in table)])
+    print(machine)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--lanes", type=int, default=4096)
+    main(parser.parse_args().lanes)
