@@ -3,7 +3,8 @@
 `python benchmarks/runs.py [--lanes 4096]` (two hands until 8 s, one until 9 s, then flight; in lanes 1.8 s, the right hand until 0.3 to 0.9 s, the left
 0.2 s longer) prints its rows and puts them into results/runs.csv. Joint ranges are left out. Medians of rounds in which all that are compared take turns;
 XLA is told to make one kernel of a loop (README). MuJoCo: steps of 5 ms of the same figure by symplectic Euler, its grips soft and never let go. Error:
-root mean square over the tree's coordinates, at the end, against Dopri8 at rtol 1e-11; in lanes the median of some of them.
+root mean square over the tree's coordinates, at the end, against Dopri8 at rtol 1e-11; in lanes the median of some of them. Ten seconds of limbs that
+nothing damps are chaotic: there the error says no more than that, and the energy is what to look at.
 """
 
 import argparse
@@ -73,11 +74,11 @@ def alone(chain, state):
 
 
 def batch(chain, state, lanes: int):
-    """Lanes by `svkc.rollout`, whose first call compiles."""
+    """Lanes by `svkc.rollout`, whose first call compiles; on one device: two of one process have been seen to wait for each other for ever."""
     states = jax.tree.map(lambda x: jnp.broadcast_to(x, (lanes, *x.shape)), state)
     times = 0.3 + 0.6 * jax.random.uniform(jax.random.key(1), (lanes,))
     lane = lambda chain, time: {"events": events(time, time + 0.2)}
-    common = {"data": times, "lane": lane, "progress": False, "max_steps": 2048}
+    common = {"data": times, "lane": lane, "progress": False, "max_steps": 2048, "devices": jax.local_devices()[:1]}
     rolled = {who: (lambda how=how: svkc.rollout(chain, states, END, **common, **how)) for who, how in LANES.items()}
     runs = {who: (lambda f=f: jax.block_until_ready(f())) for who, f in rolled.items()}
     name, peer = beside(chain, state, lanes, round(END / 5e-3))
@@ -96,15 +97,14 @@ def batch(chain, state, lanes: int):
 def main(lanes: int):
     """Measures, prints, writes."""
     chain, state = figures.case("high bar")
-    table = []
+    table, machine = [], speed.machine()
     print("| " + " | ".join(HEAD) + " |")
     for rows in (alone(chain, state), batch(chain, state, lanes)):
         for line in rows:
             table.append(line)
             print("| " + " | ".join(map(str, line)) + " |", flush=True)
-    with (speed.RESULTS / "runs.csv").open("w", newline="") as file:
-        machine = speed.machine()
-        csv.writer(file, lineterminator="\n").writerows([[*HEAD, *machine], *([*line, *machine.values()] for line in table)])
+        with (speed.RESULTS / "runs.csv").open("w", newline="") as file:
+            csv.writer(file, lineterminator="\n").writerows([[*HEAD, *machine], *([*line, *machine.values()] for line in table)])
     print(machine)
 
 
