@@ -9,11 +9,12 @@ from collections.abc import Callable
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import block_diag, cho_factor, cho_solve
+from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Bool, Float
 
 from svkc.articulated import accelerations, articulate, seen_by
 from svkc.chain import Chain
+from svkc.factors import factor_positive
 from svkc.kinematics import Kinematics
 from svkc.spatial import inverse_positive, rotate
 
@@ -98,8 +99,7 @@ def by_loop_forces(chain: Chain, kin: Kinematics, J: Float[Array, "rows dofs"], 
         inverse = inverse_positive(raised)
         nearly = lambda x: rotate(inverse, x)
     else:
-        factor = cho_factor(raised)
-        nearly = lambda x: cho_solve(factor, x)
+        nearly = factor_positive(raised)
 
     def solve(force, rate):
         applied = own.of(force[nv:])

@@ -6,19 +6,19 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import cho_factor, cho_solve, solve_triangular
 from jaxtyping import Array, Bool, Float
 
 from svkc.articulated import accelerations, articulate, by_bodies
 from svkc.chain import Chain, State, Structure
 from svkc.closure import NEAR, Coordinates, agreeing, choose, constrain, loop_rates, scaled_jacobian, scales
 from svkc.delassus import by_loop_forces
+from svkc.factors import factor_positive, solve_triangle
 from svkc.given import function, one
 from svkc.inverse_dynamics import generalized_forces, inertia_by_composites, inertia_by_unit_vectors, inertia_times, passive_forces
 from svkc.kinematics import LEVELS_UNROLLED, Kinematics, kinematics, twists
 from svkc.lanes import with_lanes_last
 from svkc.loops import active_dofs, ends
-from svkc.selection import Selection, rank_tolerance, square, weakest
+from svkc.selection import Selection, rank_tolerance, solve_frozen, square, weakest
 from svkc.verb import verb
 
 
@@ -105,14 +105,14 @@ def _by_independent(chain: Chain, kin: Kinematics, structure: Structure, chosen:
     nv, (_, column) = chain.nv, scales(chain)
     co = constrain(chain, structure, chosen, J, jnp.zeros(J.shape[0], J.dtype))
     tree, W = inertia(chain, kin), co.W
-    A = cho_factor(reduced_inertia(chain, co, tree))
+    A_inverse = factor_positive(reduced_inertia(chain, co, tree))
     _, JS = square(chosen, J)
 
     def solve(force, rate):
-        x = column * (chosen.P.T @ solve_triangular(JS, rate))
-        x = x + W @ cho_solve(A, W.T @ (force - with_links(chain, tree @ x[:nv], x)))
+        x = column * (chosen.P.T @ solve_triangle(JS, rate))
+        x = x + W @ A_inverse(W.T @ (force - with_links(chain, tree @ x[:nv], x)))
         rest = column * (force - with_links(chain, tree @ x[:nv], x))
-        return x, jnp.where(chosen.used, solve_triangular(JS, chosen.P @ rest, trans=1), rate)
+        return x, jnp.where(chosen.used, solve_triangle(JS, chosen.P @ rest, trans=True), rate)
 
     return solve
 
@@ -128,8 +128,8 @@ def solve_free_motion(chain: Chain, structure: Structure, kin: Kinematics, force
         M = (inertia or inertia_by_composites)(*frozen)
         if locked is not None:
             M = jnp.where(free[:, None] & free[None], M, jnp.eye(chain.nv, dtype=M.dtype))
-        factor = cho_factor(M)
-        solve = lambda _, x: cho_solve(factor, x)
+        inverse = factor_positive(M)
+        solve = lambda _, x: inverse(x)
 
     def equations(x):
         return jnp.where(free, inertia_times(chain, kin, jnp.where(free, x, 0)), x)
@@ -194,7 +194,7 @@ def constraint_forces(chain: Chain, selection: Selection, J: Float[Array, "rows 
     """Lambda with J_C^T lambda = excess, of least norm where loops are redundant: wrench (N m, N) on the virtual link, at the joint."""
     row, column = scales(chain)
     _, JS = square(selection, J)
-    mu = jnp.linalg.solve(JS.T, selection.P @ (column * excess))
+    mu = solve_frozen(JS, selection.P @ (column * excess), trans=True)
     return (row * (selection.Q.T @ mu)).reshape(-1, 6)
 
 

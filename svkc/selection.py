@@ -7,9 +7,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import cho_factor, cho_solve, solve_triangular
+from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
+from svkc.factors import factor_positive, solve_triangle
 from svkc.operation import operation
 
 
@@ -119,21 +120,21 @@ def weakest(selection: Selection) -> Float[Array, ""]:
     return jnp.min(jnp.where(used, size, jnp.inf), initial=1, where=used) / jnp.where(jnp.any(used), jnp.max(size), 1)
 
 
-def solve_frozen(B: Float[Array, "steps steps"], x: Float[Array, "steps *n"]) -> Float[Array, "steps *n"]:
-    """B^-1 x for a B that the frozen choice leaves upper triangular in value but not in derivative."""
+def solve_frozen(B: Float[Array, "steps steps"], x: Float[Array, "steps *n"], trans: bool = False) -> Float[Array, "steps *n"]:
+    """B^-1 x, or B^-T x, for a B that the frozen choice leaves upper triangular in value but not in derivative."""
     triangle = jax.lax.stop_gradient(B)
     return jax.lax.custom_linear_solve(
-        lambda y: B @ y,
+        lambda y: (B.T if trans else B) @ y,
         x,
-        solve=lambda _, y: solve_triangular(triangle, y),
-        transpose_solve=lambda _, y: solve_triangular(triangle, y, trans=1),
+        solve=lambda _, y: solve_triangle(triangle, y, trans),
+        transpose_solve=lambda _, y: solve_triangle(triangle, y, not trans),
     )
 
 
 def solve_positive(A: Float[Array, "n n"], x: Float[Array, "n *m"]) -> Float[Array, "n *m"]:
     """A^-1 x by Cholesky for a symmetric positive A; the derivative is one more solve with the same factor."""
-    factor = cho_factor(jax.lax.stop_gradient(A))
-    return jax.lax.custom_linear_solve(lambda y: A @ y, x, solve=lambda _, y: cho_solve(factor, y), symmetric=True)
+    inverse = factor_positive(jax.lax.stop_gradient(A))
+    return jax.lax.custom_linear_solve(lambda y: A @ y, x, solve=lambda _, y: inverse(y), symmetric=True)
 
 
 def square(selection: Selection, J: Float[Array, "rows dofs"]) -> tuple[Float[Array, "steps dofs"], Float[Array, "steps steps"]]:
