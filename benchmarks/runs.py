@@ -80,7 +80,7 @@ def batch(chain, state, lanes: int, ways: dict, peers=()):
     states = jax.tree.map(lambda x: jnp.broadcast_to(x, (lanes, *x.shape)), state)
     times = 0.3 + 0.6 * jax.random.uniform(jax.random.key(1), (lanes,))
     lane = lambda chain, time: {"events": events(time, time + 0.2)}
-    common = {"data": times, "lane": lane, "progress": False, "max_steps": 2048}
+    common = {"data": times, "lane": lane, "cost": times, "progress": False, "max_steps": 2048}
     rolled = {who: (lambda how=how: svkc.rollout(chain, states, END, **common, **how)) for who, how in ways.items()}
     runs = {who: (lambda f=f: jax.block_until_ready(f())) for who, f in rolled.items()}
     seconds = speed.timed(runs | dict(peers))

@@ -26,7 +26,7 @@ from svkc.projection import rank_margin
 from svkc.records import no_events, no_phases, recorded, stages
 from svkc.request import Options, checked
 from svkc.selection import rank_tolerance
-from svkc.stepping import Motion, Scene, frozen
+from svkc.stepping import Motion, Scene, finite, frozen
 from svkc.trajectory import RESULTS, Events, Trajectory
 from svkc.transition import change, connect_tolerance
 
@@ -212,7 +212,9 @@ def _apply(chain: Chain, run: Run, ended: State, solved: Solved, fired: Bool[Arr
         return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), eqx.filter_eval_shape(changed))
 
     done = jax.lax.cond(eqxi.unvmap_any(happened), changed, same)
-    after = jax.tree.map(lambda new, old: jnp.where(happened, new, old), done.state, ended)
+    # what a change makes of numbers that are not is not taken
+    sound = finite(Motion(done.state.q, done.state.v)) & ~jnp.isnan(done.gap)
+    after = jax.tree.map(lambda new, old: jnp.where(happened & sound, new, old), done.state, ended)
     r, count = run.events, jnp.sum(fired, dtype=jnp.int32)
     place = r.count + jnp.cumsum(fired, dtype=jnp.int32) - 1
     rows = jnp.arange(r.time.shape[0], dtype=jnp.int32)
@@ -231,6 +233,7 @@ def _apply(chain: Chain, run: Run, ended: State, solved: Solved, fired: Bool[Arr
     stops = jnp.any(fired & np.array([a.stop for a in made.actions], bool))
     result = RESULTS.where(stops, RESULTS.stopped, solved.result)
     result = RESULTS.where(happened & (done.gap > connect_tolerance), RESULTS.not_in_place, result)
+    result = RESULTS.where(sound, result, RESULTS.non_finite)
     result = RESULTS.where(full, RESULTS.no_slot, result)
     result = RESULTS.where(r.count + count > r.time.shape[0], RESULTS.max_events, result)
     return after, events, result

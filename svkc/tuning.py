@@ -1,6 +1,7 @@
 """F7: the dial turned on a scene of one's own: which integrator, step and way against drift is the fastest that holds an error."""
 
 import dataclasses
+import sys
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -10,7 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from svkc.articulated import by_bodies
 from svkc.chain import Chain, State
+from svkc.forward_dynamics import Dynamics
 from svkc.given import one, positive, whole
 from svkc.kinematics import difference
 from svkc.simulate import simulate
@@ -52,7 +55,7 @@ class Tuning:
 
 
 def candidates(dtype, span: float) -> list[Candidate]:
-    """From fast to exact: fixed steps of low order, adaptive ones of higher order, with and without projection."""
+    """From fast to exact: fixed steps of low order, adaptive ones of higher order, with and without projection, by articulated bodies; an implicit one."""
     found = []
     for steps in (1e-2, 1e-3):
         for solver in (SemiImplicitEuler(), RodriguesEuler(), diffrax.Heun(), diffrax.Tsit5()):
@@ -61,9 +64,12 @@ def candidates(dtype, span: float) -> list[Candidate]:
     double = np.finfo(dtype).eps < 1e-10
     for rtol in (1e-4, 1e-6, 1e-8, 1e-10) if double else (1e-3, 1e-4, 1e-5):
         for solver in (diffrax.Tsit5(), diffrax.Dopri8()):
-            for held in (Projection(), Drift()):
-                name = f"{type(solver).__name__}, rtol {rtol:g}" + (", drift" if isinstance(held, Drift) else "")
-                found.append(Candidate(name, {"solver": solver, "rtol": rtol, "atol": rtol / 100, "stabilization": held}))
+            name, how = f"{type(solver).__name__}, rtol {rtol:g}", {"solver": solver, "rtol": rtol, "atol": rtol / 100}
+            found.append(Candidate(name, how | {"stabilization": Projection()}))
+            found.append(Candidate(f"{name}, drift", how | {"stabilization": Drift()}))
+            found.append(Candidate(f"{name}, by bodies", how | {"dynamics": Dynamics(inertia=by_bodies)}))
+        if rtol >= 1e-8:
+            found.append(Candidate(f"Kvaerno5, rtol {rtol:g}", {"solver": diffrax.Kvaerno5(), "rtol": rtol, "atol": rtol / 100}))
     return found
 
 
@@ -87,10 +93,13 @@ def halved(chain: Chain, state: State, t1, **options) -> float:
     return error_between(chain, run, simulate(chain, state, t1, **finer))
 
 
-def tune(chain: Chain, state: State, t1, target: float = 1e-6, options: Sequence[Candidate] | None = None, repeats: int = 3, **call) -> Tuning:
+def tune(
+    chain: Chain, state: State, t1, target: float = 1e-6, options: Sequence[Candidate] | None = None, repeats: int = 3, show: bool = True, **call
+) -> Tuning:
     """Runs candidates on this scene and tells the fastest whose configuration stays within `target` (rad, m; root mean square over the coordinates,
     largest over the save times) of a run with much smaller tolerances.
 
+    options: the candidates (None: fixed and adaptive steps of several orders, `candidates`). show: print each as it is found, and the table in the end.
     call: ts, events, control, args and whatever else of `simulate` all runs share. Seconds are those of computing alone, the least of `repeats`
     runs; what takes ten times the best so far is not repeated. ValueError: a target that is not positive, or no reference that holds.
     """
@@ -107,8 +116,13 @@ def tune(chain: Chain, state: State, t1, target: float = 1e-6, options: Sequence
         tried.append(_tried(chain, state, t1, candidate, call, reference, repeats, 10 * best))
         if tried[-1].error <= target:
             best = min(best, tried[-1].seconds)
+        if show:
+            print(f"\r{len(tried)} tried, {candidate.name:<40}", end="", file=sys.stderr, flush=True)
     table = sorted(tried, key=lambda c: (not c.error <= target, c.seconds))
-    return Tuning(target, table[0].options if table and table[0].error <= target else None, tuple(table))
+    found = Tuning(target, table[0].options if table and table[0].error <= target else None, tuple(table))
+    if show:
+        print(f"\r{found}", flush=True)
+    return found
 
 
 def _tried(chain: Chain, state: State, t1, candidate: Candidate, call, reference: Trajectory, repeats: int, limit: float) -> Candidate:

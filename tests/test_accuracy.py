@@ -219,6 +219,19 @@ def test_what_is_not_finite_ends_its_lane_where_it_appears(arm):
         alone = run(jnp.asarray(1.0), **kw)
         np.testing.assert_allclose(lanes.final.q[0], alone.final.q, atol=1e-12)
     control = lambda t, s, args: jnp.where(t > 0.25, jnp.nan, 0.0) * jnp.ones(chain.dofs)
+
+    # made by an event, at the very end: the state before it is kept
+    def late(place):
+        start = eqx.tree_at(lambda s: s.structure.pos, hanging, hanging.structure.pos * place)
+        return svkc.simulate(four, start, 1e-5, events=[svkc.at(1e-5, connect="pin")], throw=False)
+
+    four = models.four_bar()
+    hanging = four.state(connected=())
+    for place, code in ((1.0, svkc.RESULTS.successful), (jnp.nan, svkc.RESULTS.non_finite)):
+        traj = jax.jit(late)(place)
+        assert traj.result == code
+        assert np.isfinite(traj.final.q).all()
+        assert float(traj.t_final) == 1e-5
     with pytest.raises(RuntimeError, match=r"t = 0\.2\d* s, in phase 2: A number that is not finite"):
         svkc.simulate(chain, state, 0.4, events=[svkc.at(0.1, cut=())], control=control, dt=0.01)
     blind = svkc.when(lambda t, s, args: jnp.where(t > 0.2, jnp.nan, 1.0), stop=True)
@@ -227,7 +240,7 @@ def test_what_is_not_finite_ends_its_lane_where_it_appears(arm):
     assert float(traj.t_final) == pytest.approx(0.2, abs=0.011)
 
 
-def test_tune():
+def test_tune(capsys):
     """The fastest of those that hold the target on this scene; a target that nobody holds; bad ones."""
     chain = models.four_bar()
     state = chain.state(v={"crank": 4.0})
@@ -237,6 +250,7 @@ def test_tune():
         Candidate("loose", {"rtol": 1e-3, "atol": 1e-5}),
     ]
     found = svkc.tune(chain, state, 0.5, target=1e-6, options=given, repeats=1)
+    assert str(found) in capsys.readouterr().out
     assert found.best is given[1].options
     assert found.table[0].name == "fine"
     assert found.table[0].error <= 1e-6 < min(c.error for c in found.table[1:])
@@ -244,8 +258,9 @@ def test_tune():
     for word in ("* fine", "  rough", "loop gap", "* the fastest"):
         assert word in str(found)
     svkc.simulate(chain, state, 0.5, **found.best)
-    none = svkc.tune(chain, state, 0.5, target=1e-9, options=given[:1], repeats=1)
+    none = svkc.tune(chain, state, 0.5, target=1e-9, options=given[:1], repeats=1, show=False)
     assert none.best is None
+    assert not capsys.readouterr().out
     assert "no candidate holds the target" in str(none)
     with pytest.raises(ValueError, match=r"target: got 0"):
         svkc.tune(chain, state, 0.5, target=0.0)

@@ -72,15 +72,16 @@ def n_four_bar(windows):
     return problem | {"bodies": bodies, "joints": joints}
 
 
-def test_n_four_bar_through_its_singular_configurations():
-    """20 s, some forty times through configurations where the rank drops: the angle where it is known, the energy, the loops; coordinates are swapped."""
-    case = next(case for case in given("n_four_bar")["cases"] if case["N"] == 2)
-    chain, state = maximal.load(n_four_bar(2))
-    ts = jnp.array([*case["t"], 20.0])
-    run = jax.jit(lambda state, tolerance: svkc.simulate(chain, state, 20.0, ts=ts, **tight(tolerance)))
-    for tolerance, error in ((1e-9, 1e-5), (1e-12, 1e-8)):
+@pytest.mark.parametrize("windows", [1, 2, 5])
+def test_n_four_bar_through_its_singular_configurations(windows):
+    """10 s, two windows 20 s, some forty times through configurations where the rank drops: angle, energy, loops; coordinates are swapped."""
+    case = next(case for case in given("n_four_bar")["cases"] if case["N"] == windows)
+    chain, state = maximal.load(n_four_bar(windows))
+    ts = jnp.array([*case["t"], 20.0] if windows == 2 else case["t"])
+    run = jax.jit(lambda state, tolerance: svkc.simulate(chain, state, ts[-1], ts=ts, **tight(tolerance)))
+    for tolerance, error in ((1e-9, 1e-5), (1e-12, 1e-8))[: 1 if windows == 5 else 2]:
         traj = run(state, tolerance)
-        found = 2 * places(chain, traj, "vert0")[:-1, :2]
+        found = 2 * places(chain, traj, "vert0")[: len(case["t"]), :2]
         np.testing.assert_allclose(found, case["B0"], atol=error)
         energy = jax.vmap(lambda s: svkc.energy(chain, s))(traj.states)
         assert np.max(np.abs(energy - energy[0])) <= 1e-6 * case["energy"]
@@ -90,7 +91,7 @@ def test_n_four_bar_through_its_singular_configurations():
 
 
 def test_n_four_bar_of_forty_windows():
-    """Through the first of its singular configurations. (20 s of it, relative energy 1.7e-7: README.)"""
+    """Through the first of its singular configurations. (20 s of it, relative energy 2.0e-7: README.)"""
     case = next(case for case in given("n_four_bar")["cases"] if case["N"] == 40)
     chain, state = maximal.load(n_four_bar(40))
     assert svkc.mobility(chain, state).freedoms == 1

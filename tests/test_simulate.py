@@ -136,7 +136,8 @@ def test_direction_and_rearming(pendulum):
     which = traj.events.which[: int(traj.events.count)].tolist()
     assert which.count(0) == 2 * which.count(1) or which.count(0) == 2 * which.count(1) + 1
     assert which.count(1) >= 1
-    assert which.count(2) <= 1
+    # (at the top of the swing it is touched again, by a hair or not)
+    assert all(time > 1 for time, i in zip(traj.events.time.tolist(), traj.events.which.tolist(), strict=True) if i == 2)
 
 
 def test_events_at_the_ends_and_together(pendulum):
