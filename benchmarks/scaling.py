@@ -7,12 +7,14 @@ megabytes of temporary memory. `mj_step` of MuJoCo beside the links."""
 import csv
 import sys
 
+import speed  # first: it tells XLA what to do, and where the tests' models are
+
+# isort: split
 import figures
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-import speed  # (sets precision and devices)
 from speed import RESULTS, Program, scanned
 
 import svkc
