@@ -4,36 +4,88 @@ In world axes about the root's origin articulated inertias add up along the tree
 than its level's widest has freedoms that are nothing: no motion, an inertia of one.
 """
 
-import equinox as eqx
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from svkc.chain import Chain
 from svkc.inverse_dynamics import central_inertias
-from svkc.kinematics import Kinematics, from_children
+from svkc.kinematics import LEVELS_UNROLLED, Kinematics
 from svkc.spatial import inverse_positive, skew
 from svkc.topology import V_SIZE, Topology
 
 
-class Articulated(eqx.Module):
-    """What `accelerations` needs, for each level below the world's: joint axes S [n, d, 6], U = S I^A [n, d, 6], (S I^A S^T)^-1 [n, d, d]."""
+class Body(NamedTuple):
+    """What `accelerations` needs of the bodies of one level: joint axes S, U = S I^A, (S I^A S^T)^-1."""
 
-    S: list[Float[Array, "n d 6"]]
-    U: list[Float[Array, "n d 6"]]
-    inverse: list[Float[Array, "n d d"]]
+    S: Float[Array, "*levels n d 6"]
+    U: Float[Array, "*levels n d 6"]
+    inverse: Float[Array, "*levels n d d"]
 
 
-def tables(top: Topology) -> list[np.ndarray]:
-    """[n, d] for each level below the world's: the coordinates of each row's joint, nv where it has fewer than d."""
+class Level(NamedTuple):
+    """The rows of one level below the world's; where there are fewer than n: one past the last row. Coordinates of each row's joint, nv where it has fewer
+    than d; its children in the level below, as many as that has where there are fewer; its parent in the level above."""
+
+    rows: np.ndarray
+    dofs: np.ndarray
+    children: np.ndarray
+    parent: np.ndarray
+
+
+@functools.cache
+def levels(top: Topology) -> list[Level] | Level:
+    """One for each level, as small as it can be; in deep trees all as large as the largest, stacked, for a loop over them."""
+    deep, parents = len(top.levels) > LEVELS_UNROLLED, np.array(top.parent)
+    bounds = [*top.levels[1:], (len(parents), len(parents))]
+    families = [[np.flatnonzero(parents[lo:hi] == i) for i in range(first, last)] for (first, last), (lo, hi) in zip(bounds[:-1], bounds[1:], strict=True)]
+    sizes = [[V_SIZE[top.kind[i]] for i in range(first, last)] for first, last in bounds[:-1]]
+    widest, freest, most = max(map(len, sizes)), max(max(x) for x in sizes), max((len(x) for family in families for x in family), default=0)
     found = []
-    for first, last in top.levels[1:]:
-        sizes = [V_SIZE[top.kind[i]] for i in range(first, last)]
-        table = np.full((last - first, max(1, *sizes)), top.nv)
-        for n, size in enumerate(sizes):
-            table[n, :size] = np.arange(top.v_start[first + n], top.v_start[first + n] + size)
-        found.append(table)
-    return found
+    for level, (first, last) in enumerate(bounds[:-1]):
+        n, below = (widest, widest) if deep else (last - first, len(parents[slice(*bounds[level + 1])]))
+        d = max(1, freest if deep else max(sizes[level]))
+        of = Level(np.full(n, len(parents)), np.full((n, d), top.nv), np.full((n, most if deep else max(map(len, families[level]))), below), np.zeros(n, int))
+        of.rows[: last - first] = np.arange(first, last)
+        of.parent[: last - first] = parents[first:last] - top.levels[level][0]
+        for i, (size, children) in enumerate(zip(sizes[level], families[level], strict=True)):
+            of.dofs[i, :size] = np.arange(top.v_start[first + i], top.v_start[first + i] + size)
+            of.children[i, : len(children)] = children
+        found.append(of)
+    return Level(*map(np.stack, zip(*found, strict=True))) if deep else found
+
+
+def sweep(step: Callable, start, over, reverse: bool = False):
+    """What `step(carried, level)` leaves level by level: unrolled over a list, a loop over what is stacked."""
+    if not isinstance(over, list):
+        return jax.lax.scan(step, start, over, reverse=reverse)[1]
+    found, carried = [], start
+    for level in reversed(over) if reverse else over:
+        carried, out = step(carried, level)
+        found.append(out)
+    return found[::-1] if reverse else found
+
+
+def _zeros(top: Topology, *shape: int, dtype) -> Array | None:
+    """What a sweep starts with where levels are stacked; else it starts with nothing."""
+    found = levels(top)
+    return None if isinstance(found, list) else jnp.zeros((found.rows.shape[1], *shape), dtype)
+
+
+def _from(children: Int[Array, "m c"] | np.ndarray, below: Float[Array, "n *k"]) -> Float[Array, "m *k"]:
+    """For each row of a level, the sum of its children's in the level below: a gather and a sum, no scatter."""
+    return jnp.sum(jnp.concatenate([below, jnp.zeros_like(below[:1])])[children], 1)
+
+
+def _beside(top: Topology, *given: Callable):
+    """Levels, and beside each what the functions give of them."""
+    found = levels(top)
+    return [(level, *(f(level) for f in given)) for level in found] if isinstance(found, list) else (found, *(f(found) for f in given))
 
 
 def body_inertias(chain: Chain, kin: Kinematics) -> Float[Array, "rows 6 6"]:
@@ -46,74 +98,78 @@ def body_inertias(chain: Chain, kin: Kinematics) -> Float[Array, "rows 6 6"]:
     return jnp.concatenate([upper, lower], -2)
 
 
-def articulate(chain: Chain, kin: Kinematics, free: Bool[Array, " nv"] | None = None) -> Articulated:
+def articulate(chain: Chain, kin: Kinematics, free: Bool[Array, " nv"] | None = None) -> list[Body] | Body:
     """Articulated inertias from the leaves to the roots. free: coordinates that are not locked (None: all)."""
     top, own = chain.topology, body_inertias(chain, kin)
+    own = jnp.concatenate([own, jnp.zeros_like(own[:1])])
     S = kin.S if free is None else jnp.where(free[:, None], kin.S, 0)
     S = jnp.concatenate([S, jnp.zeros_like(S[:1])])
     more = jnp.zeros(chain.nv, S.dtype) if chain.armature is None else chain.armature
     more = more if free is None else jnp.where(free, more, 1)
     more = jnp.concatenate([more, jnp.ones(1, S.dtype)])
-    out, below = Articulated([], [], []), None
-    for level, table in reversed(list(enumerate(tables(top), 1))):
-        first, last = top.levels[level]
-        A = own[first:last] if below is None else own[first:last] + from_children(top, level, below)
-        s = S[table]
+
+    def step(below, given):
+        level, A, s, m = given
+        A = A if below is None else A + _from(level.children, below)
         U = jnp.sum(s[:, :, :, None] * A[:, None], 2)
-        D = jnp.sum(U[:, :, None] * s[:, None], -1) + more[table][:, :, None] * np.eye(table.shape[1])[None]
+        D = jnp.sum(U[:, :, None] * s[:, None], -1) + m[:, :, None] * np.eye(s.shape[1])[None]
         inverse = inverse_positive(D)
         along = jnp.sum(inverse[..., None] * U[:, None], 2)
-        below = A - jnp.sum(U[:, :, :, None] * along[:, :, None, :], 1)
-        for kept, x in zip((out.S, out.U, out.inverse), (s, U, inverse), strict=True):
-            kept.insert(0, x)
-    return out
+        return A - jnp.sum(U[:, :, :, None] * along[:, :, None, :], 1), Body(s, U, inverse)
+
+    given = _beside(top, lambda x: own[x.rows], lambda x: S[x.dofs], lambda x: more[x.dofs])
+    return sweep(step, _zeros(top, 6, 6, dtype=S.dtype), given, reverse=True)
 
 
 def _apply(A: Float[Array, "n i j"], x: Float[Array, "n j *k"]) -> Float[Array, "n i *k"]:
     return jnp.sum(A.reshape(*A.shape, *(1,) * (x.ndim - 2)) * x[:, None], 2)
 
 
-def _carried(top: Topology, bodies: Articulated, f: Float[Array, "nv *k"]) -> list[tuple[Float[Array, "n d *k"], Float[Array, "n d *k"]]]:
+def _carried(top: Topology, bodies, f: Float[Array, "nv *k"]):
     """For each level the forces that its joints are left with, those from below taken off, and the accelerations that these give each joint alone."""
-    index = tables(top)
     f = jnp.concatenate([f, jnp.zeros_like(f[:1])])
-    found, below = [], None
-    for level in range(len(index), 0, -1):
-        S, U, inverse, table = bodies.S[level - 1], bodies.U[level - 1], bodies.inverse[level - 1], index[level - 1]
-        p = None if below is None else from_children(top, level, below)
-        u = f[table] if p is None else f[table] - _apply(S, p)
-        x = _apply(inverse, u)
-        passed = _apply(jnp.swapaxes(U, 1, 2), x)
-        below = passed if p is None else passed + p
-        found.insert(0, (u, x))
-    return found
+
+    def step(below, given):
+        (level, force), body = given
+        p = None if below is None else _from(level.children, below)
+        u = force if p is None else force - _apply(body.S, p)
+        x = _apply(body.inverse, u)
+        passed = _apply(jnp.swapaxes(body.U, 1, 2), x)
+        return passed if p is None else passed + p, (u, x)
+
+    return sweep(step, _zeros(top, 6, *f.shape[1:], dtype=f.dtype), _paired(_beside(top, lambda x: f[x.dofs]), bodies), reverse=True)
 
 
-def seen_by(top: Topology, bodies: Articulated, J: Float[Array, "rows nv"]) -> Float[Array, "rows rows"]:
+def _paired(a, b):
+    return list(zip(a, b, strict=True)) if isinstance(a, list) else (a, b)
+
+
+def seen_by(top: Topology, bodies, J: Float[Array, "rows nv"]) -> Float[Array, "rows rows"]:
     """J M^-1 J^T. M = L D L^T with a joint's block of D for each (Featherstone section 6.5), so that half the way to M^-1 J^T is enough."""
     parts = _carried(top, bodies, J.T)
+    parts = parts if isinstance(parts, list) else [parts]
     u, x = (jnp.concatenate([part[i].reshape(-1, J.shape[0]) for part in parts]) for i in (0, 1))
     # a sum, not a `dot`, which XLA's CPU backend would not put into one kernel with what is around it
     return jnp.sum(u[:, :, None] * x[:, None], 0)
 
 
-def accelerations(top: Topology, bodies: Articulated, f: Float[Array, " nv"]) -> Float[Array, " nv"]:
+def accelerations(top: Topology, bodies, f: Float[Array, " nv"]) -> Float[Array, " nv"]:
     """M^-1 f: the joints' accelerations at rest, without gravity (Featherstone table 7.1)."""
-    index, forces = tables(top), [x for _, x in _carried(top, bodies, f)]
-    found, above = [], None
-    for level in range(1, len(index) + 1):
-        S, U, inverse, x = bodies.S[level - 1], bodies.U[level - 1], bodies.inverse[level - 1], forces[level - 1]
+
+    def step(above, given):
+        (level, body), (_, x) = given
         if above is not None:
-            start, (first, last) = top.levels[level - 1][0], top.levels[level]
-            a = above[np.array(top.parent)[first:last] - start]
-            x = x - jnp.sum(inverse * jnp.sum(U * a[:, None], -1)[:, None], -1)
-        moved = jnp.sum(S * x[..., None], 1)
-        above = moved if above is None else a + moved
-        found.append(x.ravel())
-    order = np.concatenate([table.ravel() for table in index])
-    return jnp.concatenate(found)[np.argsort(order, kind="stable")[: top.nv]]
+            a = above[level.parent]
+            x = x - jnp.sum(body.inverse * jnp.sum(body.U * a[:, None], -1)[:, None], -1)
+        moved = jnp.sum(body.S * x[..., None], 1)
+        return moved if above is None else a + moved, x
+
+    found = levels(top)
+    x = sweep(step, _zeros(top, 6, dtype=f.dtype), _paired(_paired(found, bodies), _carried(top, bodies, f)))
+    x, order = (jnp.concatenate([y.ravel() for y in x]), [y.dofs for y in found]) if isinstance(found, list) else (x.ravel(), [found.dofs])
+    return x[np.argsort(np.concatenate([y.ravel() for y in order]), kind="stable")[: top.nv]]
 
 
-def by_bodies(chain: Chain, kin: Kinematics) -> Articulated:
+def by_bodies(chain: Chain, kin: Kinematics) -> list[Body] | Body:
     """Names articulated bodies as the way to accelerations, for `svkc.Dynamics(inertia=...)`."""
     return articulate(chain, kin)

@@ -15,7 +15,7 @@ from svkc.delassus import by_loop_forces
 from svkc.factors import factor_positive, solve_triangle
 from svkc.given import function, one
 from svkc.inverse_dynamics import generalized_forces, inertia_by_composites, inertia_by_unit_vectors, inertia_times, passive_forces
-from svkc.kinematics import LEVELS_UNROLLED, Kinematics, kinematics, twists
+from svkc.kinematics import Kinematics, kinematics, twists
 from svkc.lanes import with_lanes_last
 from svkc.loops import active_dofs, ends
 from svkc.selection import Selection, rank_tolerance, solve_frozen, square, weakest
@@ -121,7 +121,7 @@ def solve_free_motion(chain: Chain, structure: Structure, kin: Kinematics, force
     """The same on an open chain: M x = force, zero for locked joints."""
     locked, frozen = structure.locked, jax.lax.stop_gradient((chain, kin))
     free = jnp.ones(chain.nv, bool) if locked is None else ~locked
-    if inertia in (None, by_bodies) and len(chain.topology.levels) <= LEVELS_UNROLLED:
+    if inertia in (None, by_bodies):
         bodies = articulate(*frozen, None if locked is None else free)
         solve = lambda _, x: accelerations(chain.topology, bodies, x)
     else:

@@ -4,6 +4,8 @@ All vectors are in world axes about the origin of the tree's root body, so that 
 (Featherstone section 2.8 with X = 1) and keep their digits far from the world's origin.
 """
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -15,14 +17,18 @@ from svkc.spatial import cross, motion_cross, quat_about, quat_conjugate, quat_e
 from svkc.topology import BALL, FREE, HINGE, SLIDE, Topology
 from svkc.verb import verb
 
-# deeper trees sum by one product with the table of ancestors: compile time would grow with every level
+# deeper trees sum by doubling along the ancestors: compile time would grow with every level
 LEVELS_UNROLLED = 24
+# children's children and so on that a row may have side by side there; with more the table of ancestors is smaller
+WIDEST = 4
 
 
 def down(top: Topology, x: Float[Array, "rows *n"]) -> Float[Array, "rows *n"]:
     """Sum of x over each row and its ancestors, level by level."""
     if len(top.levels) > LEVELS_UNROLLED:
-        return jnp.tensordot(jnp.asarray(top.ancestor, x.dtype), x, 1)
+        for above, _ in _doublings(top):
+            x = x + jnp.concatenate([x, jnp.zeros_like(x[:1])])[above]
+        return x
     parent, levels = np.array(top.parent), [x[:1]]
     for (start, _), (first, last) in zip(top.levels[:-1], top.levels[1:], strict=True):
         levels.append(x[first:last] + levels[-1][parent[first:last] - start])
@@ -32,12 +38,32 @@ def down(top: Topology, x: Float[Array, "rows *n"]) -> Float[Array, "rows *n"]:
 def up(top: Topology, x: Float[Array, "rows *n"]) -> Float[Array, "rows *n"]:
     """Sum of x over each row and its descendants, level by level."""
     if len(top.levels) > LEVELS_UNROLLED:
-        return jnp.tensordot(jnp.asarray(top.ancestor.T, x.dtype), x, 1)
+        if any(below.shape[1] > WIDEST for _, below in _doublings(top)):
+            return jnp.tensordot(jnp.asarray(top.ancestor.T, x.dtype), x, 1)
+        for _, below in _doublings(top):
+            x = x + jnp.sum(jnp.concatenate([x, jnp.zeros_like(x[:1])])[below], 1)
+        return x
     levels, below = [], None
     for level, (first, last) in reversed(list(enumerate(top.levels))):
         below = x[first:last] if below is None else x[first:last] + from_children(top, level, below)
         levels.append(below)
     return jnp.concatenate(levels[::-1])
+
+
+@functools.cache
+def _doublings(top: Topology) -> list[tuple[np.ndarray, np.ndarray]]:
+    """For 1, 2, 4, ... generations: each row's ancestor so far up, and its descendants so far down; one past the last row where there is none."""
+    parent = np.array(top.parent)
+    none, above = len(parent), np.append(np.where(parent < 0, len(parent), parent), len(parent))
+    found = []
+    while np.any(above < none):
+        below = [np.flatnonzero(above[:-1] == i) for i in range(none)]
+        table = np.full((none, max(map(len, below))), none)
+        for row, own in zip(table, below, strict=True):
+            row[: len(own)] = own
+        found.append((above[:-1], table))
+        above = above[above]
+    return found
 
 
 def from_children(top: Topology, level: int, below: Float[Array, "below *n"]) -> Float[Array, "here *n"]:

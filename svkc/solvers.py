@@ -12,7 +12,7 @@ from svkc.chain import Chain, State
 from svkc.forward_dynamics import joint_torques, moving
 from svkc.given import one
 from svkc.inverse_dynamics import limit_forces
-from svkc.kinematics import LEVELS_UNROLLED, integrate
+from svkc.kinematics import integrate
 from svkc.lanes import with_lanes_last
 from svkc.loops import active_dofs
 from svkc.verb import verb
@@ -74,7 +74,6 @@ def step(chain: Chain, state: State, tau: Float[Array, " torques"], dt: Float[Ar
 @with_lanes_last
 def _step(chain: Chain, state: State, tau: Float[Array, " dofs"], dt: Float[Array, ""]) -> State:
     tau = tau + limit_forces(chain, state.q, state.v)
-    way = by_bodies if len(chain.topology.levels) <= LEVELS_UNROLLED else None
-    v, vdot = moving(chain, state.structure, state.q, state.v, tau, way, 0.5 / dt if chain.link_names else None)
+    v, vdot = moving(chain, state.structure, state.q, state.v, tau, by_bodies, 0.5 / dt if chain.link_names else None)
     v = v + dt * vdot
     return State(integrate(chain, state.q, dt * jnp.where(active_dofs(chain, state.structure), v, 0)), v, state.structure)

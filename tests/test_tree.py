@@ -136,16 +136,34 @@ def test_open_chain_has_nothing_of_the_closure():
     assert text.count("custom_linear_solve[") == 1
 
 
-def test_deep_chain_agrees_with_mujoco():
-    """40 levels: past the depth that is unrolled."""
-    xml = ""
+@pytest.mark.parametrize("twigs", [0, 1, 6])
+def test_deep_chain_agrees_with_mujoco(twigs):
+    """40 levels, past the depth that is unrolled: a chain, one with a twig on every third link, one with a ball and as many twigs there as make it wide."""
+    xml, rod = "", '<geom type="capsule" fromto="0 0 0 0 0 -0.1" size="0.02" contype="0"/>'
     for i in range(40):
-        rod = '<geom type="capsule" fromto="0 0 0 0 0 -0.1" size="0.02" contype="0"/>'
+        for k in range(twigs if i % 3 == 1 else 0):
+            joint, tip = "ball" if k == 1 else "hinge", f'<body pos="0 0 -0.1"><joint axis="1 0 0"/>{rod}</body>'
+            xml += f'<body name="t{i}_{k}" pos="0 {k} 0"><joint type="{joint}"/>{rod}{tip}</body>'
         xml = f'<body name="l{i}" pos="0 0 -0.1"><joint axis="{i % 2} {1 - i % 2} 0"/>{rod}{xml}</body>'
     chain = svkc.load(models.MJCF.format(xml))
     model = chain.model.model
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
-    data.qpos[:], data.qvel[:] = 0.3 * rng.normal(size=40), rng.normal(size=40)
+    data.qpos[:], data.qvel[:] = data.qpos + 0.3 * rng.normal(size=model.nq), rng.normal(size=model.nv)
+    mujoco.mj_normalizeQuat(model, data.qpos)
     mujoco.mj_forward(model, data)
-    vdot = svkc.forward_dynamics(chain, chain.state(data.qpos, data.qvel), jnp.zeros(40))
+    state = chain.state(data.qpos, data.qvel)
+    vdot = svkc.forward_dynamics(chain, state, jnp.zeros(model.nv))
     np.testing.assert_allclose(vdot, data.qacc, rtol=1e-8, atol=1e-8 * np.abs(data.qacc).max())
+    by_composites = acceleration(chain, state.structure, state.q, state.v, jnp.zeros(model.nv), svkc.inertia_by_composites)
+    np.testing.assert_allclose(vdot, by_composites, rtol=1e-9, atol=1e-10 * np.abs(data.qacc).max())
+
+
+def test_derivatives_of_a_deep_chain():
+    """Forward and reverse against differences, through loops over levels."""
+    xml = ""
+    for i in range(30):
+        xml = f'<body name="l{i}" pos="0 0 -0.1"><joint axis="{i % 2} {1 - i % 2} 0"/><geom size="0.02" contype="0"/>{xml}</body>'
+    chain = svkc.load(models.MJCF.format(xml))
+    q = jnp.asarray(np.random.default_rng(0).normal(size=30) * 0.3)
+    out = svkc.check_grad(lambda q: jnp.sum(svkc.forward_dynamics(chain, chain.state(q), jnp.zeros(30))[:3]), q)
+    assert out.error < 1e-7, out
