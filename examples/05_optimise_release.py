@@ -23,7 +23,7 @@ limb = jnp.diag(svkc.mass_matrix(chain, start))[6:22]  # kg m^2
 driven = jnp.array([joints.index(f"{side}_{name}") for side in ("right", "left") for name in ("shoulder_flexion", "hip_flexion", "knee")])
 bumps = jnp.linspace(0.1, 0.9, 5)  # s: when each bump of a joint's torque is at its top
 MAT, PRICE, STEPS, END = 1.0, 0.3, 25, 1.9  # m: the centre of mass on landing; m per (100 N m)^2; of the optimiser; s
-EXACT = {"solver": diffrax.Dopri8(), "rtol": 1e-9, "atol": 1e-11}
+EXACT = {"solver": diffrax.Dopri8(), "rtol": 1e-9, "atol": 1e-11, "dynamics": svkc.Dynamics(inertia=svkc.by_bodies)}
 
 
 def control(t, state, torques):
