@@ -28,8 +28,10 @@ def _gl_context():
 
 
 def gif(path: pathlib.Path, images: Iterator, fps: float):
-    """An animation that repeats, 64 colours a frame."""
-    first, *others = (image.quantize(64) for image in images)
+    """An animation that repeats, 96 colours a frame, rare ones too."""
+    from PIL import Image
+
+    first, *others = (image.quantize(96, Image.Quantize.MAXCOVERAGE) for image in images)
     first.save(path, save_all=True, append_images=others, duration=round(1000 / fps), loop=0)
 
 
@@ -68,7 +70,7 @@ def frames(chain: Chain, traj: Trajectory, *, fps: float, size, trails, camera, 
     model.vis.global_.offwidth, model.vis.global_.offheight = np.maximum(size, (model.vis.global_.offwidth, model.vis.global_.offheight))
     data = mujoco.MjData(model)
     ts, (positions, R) = np.asarray(traj.ts), world_poses(chain, traj.states)
-    holding, events = held(chain, traj, positions, R), happened(traj, chain)
+    holding, events = held(chain, traj.states, positions, R), happened(traj, chain)
     eye = _camera(model, positions, camera, lookat, distance, azimuth, elevation)
     shapes = [matrix(quat) for quat in model.geom_quat]
     context = _gl_context()

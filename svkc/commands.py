@@ -62,14 +62,17 @@ def run(name: str, t1: float | None, events, ignore, out: pathlib.Path, video: b
     import jax.numpy as jnp
 
     import svkc
+    from svkc.given import positive
 
     begin = time.perf_counter()
     stages = tqdm(total=4, desc="loading", bar_format="{l_bar}{bar:20}| {elapsed}", disable=True if quiet else None, leave=False)
     try:
         chain, state, own, end = _scene(name, ignore)
         end = end if t1 is None else t1
+        positive("--t1", end)
         events = _asked(chain, events) or own
-    except ValueError as error:
+        out.mkdir(parents=True, exist_ok=True)
+    except (ValueError, OSError) as error:
         stages.close()
         print(error)
         return 1
@@ -84,7 +87,12 @@ def run(name: str, t1: float | None, events, ignore, out: pathlib.Path, video: b
         return jax.block_until_ready(svkc.simulate(chain, state, end, ts=ts, events=events, throw=False, progress_meter=meter, **numbers))
 
     _next(stages, "compiling, and the first run")
-    once()
+    try:
+        once()
+    except ValueError as error:
+        stages.close()
+        print(error)
+        return 1
     compiled = time.perf_counter()
     _next(stages, "a run")
     traj = once()
@@ -133,7 +141,6 @@ def _write(chain, traj, out: pathlib.Path, stem: str, video: bool, options: dict
     """The run and its pictures: what was written, and a line for each that could not be."""
     import svkc
 
-    out.mkdir(parents=True, exist_ok=True)
     written, missing = [out / f"{stem}.npz"], []
     traj.save(written[0], chain, **options)
     curves = lambda path: traj.plot(chain).savefig(path, dpi=110)

@@ -8,7 +8,7 @@ from svkc.kinematics import poses
 from svkc.reading import matrix
 from svkc.trajectory import Trajectory
 
-# one for each phase, or each virtual link
+# one for each structure, or each body that leaves a trail
 COLORS = ("#1f5fa8", "#d9822b", "#2f8f4e", "#8e3b8e", "#b03030")
 
 
@@ -62,9 +62,9 @@ def world_poses(chain: Chain, states: State) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(positions, float), np.moveaxis(R, (0, 1), (-2, -1))
 
 
-def held(chain: Chain, traj: Trajectory, positions, R) -> list[dict[int, np.ndarray]]:
-    """At each saved time, where each connected virtual link holds: {link: place in the world (m)}."""
-    rows, s = {row: body for body, row in enumerate(chain.topology.body_row)}, traj.states.structure
+def held(chain: Chain, states: State, positions, R) -> list[dict[int, np.ndarray]]:
+    """At each of these states, where each connected virtual link holds: {link: place in the world (m)}."""
+    rows, s = {row: body for body, row in enumerate(chain.topology.body_row)}, states.structure
     connected, real, place = np.asarray(s.connected), np.asarray(s.real), np.asarray(s.real_pos, float)
     at = lambda i, link, body: positions[i, body] + R[i, body] @ place[i, link]
     return [{int(k): at(i, k, rows[int(real[i, k])]) for k in np.flatnonzero(connected[i])} for i in range(len(positions))]

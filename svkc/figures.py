@@ -6,23 +6,27 @@ import jax
 import numpy as np
 
 from svkc.chain import Chain
-from svkc.drawing import color, happened, segments, world_poses
+from svkc.drawing import color, happened, held, segments, world_poses
 from svkc.energy import kinetic_energy, potential_energy
 from svkc.trajectory import Trajectory
 
 
 def strobe(chain: Chain, traj: Trajectory, path: pathlib.Path, frames: int) -> pathlib.Path:
-    """Poses over one another in the plane of x and z, a colour for each phase, links that hold as dots."""
+    """Poses over one another in the plane of x and z, a colour for each structure, links that hold as rings."""
     from matplotlib.figure import Figure
+    from matplotlib.transforms import ScaledTranslation
 
     ts = np.asarray(traj.ts)
     pick = np.unique(np.searchsorted(ts, np.linspace(ts[0], ts[-1], frames)).clip(0, len(ts) - 1))
-    positions, R = world_poses(chain, jax.tree.map(lambda x: x[pick], traj.states))
+    states = jax.tree.map(lambda x: x[pick], traj.states)
+    positions, R = world_poses(chain, states)
+    holding = held(chain, states, positions, R)
     p = traj.phases
     # phases of no length, between events of one instant, are not seen
     phases = [i for i in range(int(p.count)) if p.stop[i] > p.start[i]] or [0]
-    starts = np.asarray(p.start)[phases]
-    figure = Figure(figsize=(10, 7.5), layout="constrained")
+    starts, structures = np.asarray(p.start)[phases], [tuple(np.flatnonzero(p.connected[i])) for i in phases]
+    colors = {s: color(n) for n, s in enumerate(dict.fromkeys(structures))}
+    figure = Figure(figsize=(10, 7.5))
     axes = figure.add_subplot(aspect="equal", xlabel="x (m)", ylabel="z (m)")
     shapes = segments(chain)
     shown = np.concatenate([positions[:, 1:].reshape(-1, 3)] + [np.array([p, q]) for b, p, q, _ in shapes if b == 0])[:, [0, 2]]
@@ -37,20 +41,24 @@ def strobe(chain: Chain, traj: Trajectory, path: pathlib.Path, frames: int) -> p
             if body == 0 and frame:
                 continue
             ends = np.array([positions[frame, body] + R[frame, body] @ x for x in (a, b)])
-            paint = "#9a9aa2" if body == 0 else color(phase)
+            paint = "#9a9aa2" if body == 0 else colors[structures[phase]]
             if np.hypot(*(ends[1] - ends[0])[[0, 2]]) * scale < 1:
                 # seen end-on: a line of no length would not be drawn
                 ends[1, 0] = ends[0, 0] + 1 / scale
             width = max(1.0, 1.3 * radius * scale)
             axes.plot(ends[:, 0], ends[:, 2], color=paint, alpha=0.8 if body == 0 else shade, solid_capstyle="round", linewidth=width)
-    for phase, i in enumerate(phases):
-        held = [n for n, on in zip(chain.link_names, np.asarray(p.connected[i]), strict=True) if on]
-        axes.plot([], [], color=color(phase), linewidth=5, label=f"from {starts[phase]:.2f} s: {', '.join(held) or 'free'}")
+        rings = np.array([place[[0, 2]] for place in holding[frame].values()]).reshape(-1, 2)
+        axes.plot(*rings.T, "o", color="#202020", alpha=shade, markersize=7, fillstyle="none")
+    for structure, paint in colors.items():
+        since = [f"{start:.2f}" for start, s in zip(starts, structures, strict=True) if s == structure]
+        since = ", ".join(since[:6]) + ", ..." * (len(since) > 6)
+        axes.plot([], [], color=paint, linewidth=5, label=f"{', '.join(chain.link_names[k] for k in structure) or 'nothing'} from {since} s")
     # below the picture: inside it would hide limbs
-    figure.legend(loc="outside lower center", ncols=2, fontsize=9, title="held by")
+    below = axes.transAxes + ScaledTranslation(0, -0.6, figure.dpi_scale_trans)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, 0), bbox_transform=below, ncols=2, fontsize=9, title="held (rings) by")
     axes.grid(alpha=0.2)
     axes.set_title(f"{len(pick)} poses, {ts[pick[0]]:.2f} s to {ts[pick[-1]]:.2f} s")
-    figure.savefig(path, dpi=110)
+    figure.savefig(path, dpi=110, bbox_inches="tight")
     return path
 
 

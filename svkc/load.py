@@ -7,13 +7,13 @@ import warnings
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from svkc.chain import Chain, Structure, VirtualLink
+from svkc.chain import Chain, VirtualLink
 from svkc.cuttable import cuts_of, placed_in
 from svkc.given import texts, whole
 from svkc.interop import text_of
+from svkc.joining import equalities, floats, structure_of
 from svkc.reading import bodies_of, by_dof, joint_forces_of, motors_of, name_of, rows_of
 from svkc.topology import Topology, joint_freedoms
 from svkc.unsupported import what_is_left_out
@@ -59,7 +59,7 @@ def load(source, *, virtual_links=(), cuttable=(), spare=0, ignore=()) -> Chain:
         raise ValueError("source: the model has no joints, so that nothing in it can move")
     _told_apart("bodies", topology.body_names)
     _told_apart("joints", [*topology.joint_names, *(name_of(model, "joint", j) for cut in cuts for j in cut.joints)])
-    links = [*_equalities(model), *declared]
+    links = [*equalities(model), *declared]
     first = len(links)
     for link in links:
         if not isinstance(link, VirtualLink):
@@ -77,7 +77,7 @@ def load(source, *, virtual_links=(), cuttable=(), spare=0, ignore=()) -> Chain:
         link_actuated=tuple(bool(link.actuated) for link in links),
     )
     topology = placed_in(model, topology, cuts, first)
-    structure = _structure(model, topology, links, spare)
+    structure = structure_of(model, topology, links)
     return _finite(_chain(kept, topology, rows, structure, ignore, left_out))
 
 
@@ -139,97 +139,6 @@ def _found(file: str, folder: pathlib.Path) -> str:
     return next((str(place) for place in places if place.is_file()), file)
 
 
-def _equalities(model) -> list[VirtualLink]:
-    """<equality> connect and weld as virtual links: ball and weld, child of the first body, under their own names."""
-    import mujoco
-
-    links = []
-    for i in range(model.neq):
-        kind, data = int(model.eq_type[i]), model.eq_data[i]
-        if kind not in (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)):
-            continue
-        weld = kind == int(mujoco.mjtEq.mjEQ_WELD)
-        ends = [int(model.eq_obj1id[i]), int(model.eq_obj2id[i])]
-        if int(model.eq_objtype[i]) == int(mujoco.mjtObj.mjOBJ_SITE):
-            places = [(model.site_pos[s], model.site_quat[s]) for s in ends]
-            ends = [int(model.site_bodyid[s]) for s in ends]
-        elif weld:
-            places = [(data[3:6], data[6:10]), (data[:3], (1, 0, 0, 0))]
-        else:
-            # a ball's coordinates start at the identity in the load pose
-            places = [(data[:3], (1, 0, 0, 0)), (data[3:6], None)]
-        links.append(
-            VirtualLink(
-                name=name_of(model, "equality", i),
-                parent=name_of(model, "body", ends[0]),
-                real=name_of(model, "body", ends[1]),
-                joint="weld" if weld else "ball",
-                pos=tuple(places[0][0]),
-                quat=_unit(places[0][1]),
-                real_pos=tuple(places[1][0]),
-                real_quat=None if places[1][1] is None or not weld else _unit(places[1][1]),
-                connected=bool(model.eq_active0[i]),
-            )
-        )
-    return links
-
-
-def _unit(quat):
-    return tuple(np.asarray(quat, float) / np.linalg.norm(quat))
-
-
-def _structure(model, topology: Topology, links: list[VirtualLink], spare: int) -> Structure:
-    """The links' declared placements, their axis turned to z of the joint's frame; what is not given is taken from the load pose."""
-    import mujoco
-
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    ids = {name: i for i, name in enumerate(topology.body_names)}
-
-    def multiply(a, b):
-        out = np.zeros(4)
-        mujoco.mju_mulQuat(out, np.asarray(a, float), np.asarray(b, float))
-        return out
-
-    def turn(quat, x):
-        out = np.zeros(3)
-        mujoco.mju_rotVecQuat(out, np.asarray(x, float), np.asarray(quat, float))
-        return out
-
-    frames = {"pos": [], "quat": [], "real_pos": [], "real_quat": []}
-    ends = []
-    for link in links:
-        for side in ("parent", "real"):
-            if getattr(link, side) not in ids:
-                raise ValueError(f"virtual link {link.name!r}: {side} is {getattr(link, side)!r}, not a body; bodies: {', '.join(ids)}")
-        p, r = ids[link.parent], ids[link.real]
-        to_z = np.zeros(4)
-        mujoco.mju_quatZ2Vec(to_z, np.asarray(link.axis, float) / np.linalg.norm(link.axis))
-        quat = _unit(multiply(_unit(link.quat), to_z))
-        world = data.xpos[p] + turn(data.xquat[p], link.pos)
-        back = data.xquat[r] * np.array([1, -1, -1, -1])
-        real_pos = turn(back, world - data.xpos[r]) if link.real_pos is None else link.real_pos
-        real_quat = multiply(back, multiply(data.xquat[p], quat)) if link.real_quat is None else multiply(_unit(link.real_quat), to_z)
-        ends.append((topology.body_row[p], topology.body_row[r]))
-        for name, value in (("pos", link.pos), ("quat", quat), ("real_pos", real_pos), ("real_quat", _unit(real_quat))):
-            frames[name].append(np.asarray(value, float))
-    count = len(links)
-    return Structure(
-        connected=jnp.asarray(np.array([link.connected for link in links], bool)),
-        parent=jnp.asarray(np.array([e[0] for e in ends], np.int32)),
-        real=jnp.asarray(np.array([e[1] for e in ends], np.int32)),
-        **{name: _floats(np.array(value).reshape(count, 4 if "quat" in name else 3)) for name, value in frames.items()},
-        freedoms=jnp.asarray(np.array([joint_freedoms(link.joint) for link in links], bool).reshape(count, 6)),
-        rank=jnp.asarray(np.int32(0)),
-        margin=jnp.zeros((), jnp.result_type(float)),
-    )
-
-
-def _floats(x):
-    """The default float type's array: float64 where jax has it enabled, else float32."""
-    return jnp.asarray(np.asarray(x, np.float64), dtype=jnp.result_type(float))
-
-
 def _load_pose(model, topology: Topology) -> np.ndarray:
     """[q] the model's qpos0, bodies that may be cut where that puts them, virtual joints at zero."""
     import mujoco
@@ -265,17 +174,17 @@ def _chain(source: Source, topology, rows, structure, ignore, left_out) -> Chain
     nv = topology.nv
 
     def unless(empty, value):
-        return None if empty else _floats(value)
+        return None if empty else floats(value)
 
     return Chain(
         topology=topology,
-        **{name: _floats(bodies[name]) for name in ("pos", "quat", "axis", "mass", "com", "inertia")},
-        gravity=_floats(gravity),
-        q_load=_floats(q_load),
-        length=_floats(np.sqrt(np.mean(offsets**2)) if len(offsets) else 1.0),
-        gear=_floats(gear),
-        control_range=_floats(control),
-        force_range=_floats(force),
+        **{name: floats(bodies[name]) for name in ("pos", "quat", "axis", "mass", "com", "inertia")},
+        gravity=floats(gravity),
+        q_load=floats(q_load),
+        length=floats(np.sqrt(np.mean(offsets**2)) if len(offsets) else 1.0),
+        gear=floats(gear),
+        control_range=floats(control),
+        force_range=floats(force),
         structure=structure,
         anchor=unless(not bodies["anchor"].any(), bodies["anchor"]),
         armature=unless(not np.any(armature[:nv]), armature[:nv]),

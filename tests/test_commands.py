@@ -43,6 +43,8 @@ def test_what_is_wrong_is_said(tmp_path):
         "no scene and no file 'nowhere'": ("run", "nowhere"),
         "no virtual link 'pen'": ("run", tmp_path / "rod.xml", "--release", "pen@0.1"),
         "expected NAME@TIME": ("run", "--release", "pin"),
+        "--t1: got -1.0, expected a positive number": ("run", tmp_path / "rod.xml", "--t1", "-1"),
+        "no.npz": ("run", tmp_path / "rod.xml", "--out", tmp_path / "no.npz"),
         "is not a whole trajectory": ("view", tmp_path / "no.npz"),
         "No such file": ("view", tmp_path / "nothing.npz"),
         "invalid choice": ("dance",),

@@ -16,7 +16,7 @@ HOUSE = [
     "spatial topology unsupported operation given factors",
     "chain reading selection lanes",
     "verb",
-    "kinematics trajectory cuttable interop",
+    "kinematics trajectory cuttable interop joining",
     "inverse_dynamics loops load",
     "energy closure articulated archive",
     "delassus",

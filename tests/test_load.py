@@ -38,6 +38,23 @@ def test_pointers():
     assert chain.real[at["crank"]] == -1
 
 
+def test_ends_of_virtual_links_by_sites():
+    """The same links by bodies and by sites, turned ones too; a site without a placement is the placement."""
+    sites = '<site name="tip" pos="0.1 0.2 -0.3" quat="0.6 0.8 0 0"/>', '<site name="foot" pos="0 0.1 0" quat="0.8 0 0.6 0"/>'
+    model = models.MJCF.format(
+        f'<body name="a"><joint/><geom size="0.1"/>{sites[0]}</body><body name="b" pos="1 0 0"><freejoint/><geom size="0.1"/>{sites[1]}</body>'
+    )
+    by_sites = svkc.load(model, virtual_links=[svkc.VirtualLink("x", "tip", "foot", "hinge", pos=(0, 0, 0.5)), svkc.VirtualLink("y", "tip", "b")]).structure
+    # 0.5 along the z of a frame turned about x by the angle of cosine 0.28
+    place, turned = (0.1, 0.2 - 0.48, -0.3 - 0.14), (0.6, 0.8, 0, 0)
+    links = [svkc.VirtualLink("x", "a", "b", "hinge", place, turned, (0, 0.1, 0)), svkc.VirtualLink("y", "a", "b", "weld", (0.1, 0.2, -0.3), turned)]
+    by_bodies = svkc.load(model, virtual_links=links).structure
+    assert by_sites.parent.tolist() == by_bodies.parent.tolist()
+    assert by_sites.real.tolist() == by_bodies.real.tolist()
+    for name in ("pos", "quat", "real_pos", "real_quat"):
+        np.testing.assert_allclose(getattr(by_sites, name), getattr(by_bodies, name), atol=1e-12)
+
+
 def test_equalities_become_virtual_links():
     xml = """<mujoco><worldbody><body name="a" pos="0 0 1"><joint name="a" axis="0 1 0"/><geom size="0.1"/></body>
     <body name="b" pos="1 0.2 1" quat="0.8 0 0.6 0"><freejoint/><geom size="0.1"/></body></worldbody>
@@ -245,7 +262,7 @@ def test_a_robot_of_others():
         (lambda: svkc.load("/no/such/file.xml"), "no such file"),
         (lambda: svkc.load(3), "expected MJCF or URDF"),
         (lambda: svkc.load(PENDULUM, ignore=("tendons!",)), "ignore"),
-        (lambda: svkc.load(PENDULUM, virtual_links=[svkc.VirtualLink("a", "arm", "leg")]), "'leg', not a body"),
+        (lambda: svkc.load(PENDULUM, virtual_links=[svkc.VirtualLink("a", "arm", "leg")]), "'leg', neither a body nor a site"),
         (lambda: svkc.load(PENDULUM, virtual_links=["a"]), "VirtualLink"),
         (lambda: svkc.load(PENDULUM, virtual_links=[svkc.VirtualLink("a", "world", "arm")] * 2), "differ"),
         (lambda: svkc.VirtualLink("a", "world", "arm", "rubber"), "rubber"),
