@@ -96,6 +96,7 @@ GROWTH = {f.__name__: f for f in (links, loops, lanes, time, events)}
 def draw(table):
     """A panel for each of what grows."""
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import NullFormatter
 
     names = list(dict.fromkeys(row[0] for row in table))
     figure, axes = plt.subplots(1, len(names), figsize=(3.2 * len(names), 3), layout="constrained", squeeze=False)
@@ -105,7 +106,9 @@ def draw(table):
         if rows[0][6]:
             ax.loglog([float(row[1]) for row in rows], [float(row[6]) for row in rows], "s:", label="MuJoCo")
             ax.legend(fontsize=8)
-        ax.set(xlabel=name, ylabel=rows[0][2])
+        low, high = ax.get_ylim()
+        ax.set(xlabel=name, ylabel=rows[0][2], ylim=(min(low, high / 10), high * 1.1))
+        ax.xaxis.set_minor_formatter(NullFormatter())
         ax.grid(alpha=0.3)
     figure.savefig(RESULTS / "scaling.png", dpi=110)
 

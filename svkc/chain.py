@@ -119,10 +119,12 @@ class Chain(eqx.Module):
 
     @property
     def body_names(self) -> tuple[str, ...]:
+        """Bodies in the model's order; the first is the world."""
         return self.topology.body_names
 
     @property
     def joint_names(self) -> tuple[str, ...]:
+        """Joints of the tree in the model's order."""
         return self.topology.joint_names
 
     @property
@@ -137,10 +139,12 @@ class Chain(eqx.Module):
 
     @property
     def nq(self) -> int:
+        """Coordinates q of the tree (m, rad; wxyz of a ball), MuJoCo's."""
         return self.topology.nq
 
     @property
     def nv(self) -> int:
+        """Freedoms v of the tree (m/s, rad/s), MuJoCo's."""
         return self.topology.nv
 
     @property

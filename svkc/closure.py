@@ -137,7 +137,7 @@ def open_coordinates(chain: Chain, structure: Structure) -> Coordinates:
 
 @verb
 def coordinates(chain: Chain, state: State) -> Coordinates:
-    """H, W, S, Hdot v and the selection, as the paper names them (section II)."""
+    """H, W, S (without units, rad or m per rad or m), Hdot v (rad/s^2, m/s^2) and the selection, as the paper names them (section II)."""
     if not len(chain.link_names):
         return open_coordinates(chain, state.structure)
     kin = kinematics(chain, state.q)

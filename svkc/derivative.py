@@ -158,7 +158,7 @@ def _compare(derivative, difference, doubt, modes: float, output: str, input: st
 
 
 def tangent(chain: Chain, q, gradient) -> Float[Array, " dofs"]:
-    """A gradient by q as one in the tangent of the configuration: of f(integrate(chain, q, dv)) by dv at dv = 0.
+    """A gradient by q as one in the tangent of the configuration (per m, rad): of f(integrate(chain, q, dv)) by dv at dv = 0.
 
     What an optimiser should step along: q <- integrate(chain, q, -rate * tangent(chain, q, gradient)) keeps quaternions at unit length.
     """

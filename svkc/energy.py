@@ -53,7 +53,7 @@ def potential_energy(chain: Chain, state: State) -> Float[Array, ""]:
 
 @verb
 def energy(chain: Chain, state: State) -> Float[Array, ""]:
-    """Mechanical energy (J): kinetic, gravity's and the joint springs'."""
+    """Mechanical energy (J): kinetic, gravity's and the joint springs' (Featherstone section 2.13)."""
     kinetic, potential = _both(chain, state)
     return kinetic + potential
 
@@ -71,7 +71,7 @@ def energy_and_momentum(chain: Chain, state: State) -> tuple[Float[Array, ""], F
 
 @verb
 def momentum(chain: Chain, state: State) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-    """Linear momentum (N s) and angular momentum about the world's origin (N m s), in world axes."""
+    """Linear momentum (N s) and angular momentum about the world's origin (N m s), in world axes (Featherstone section 2.12)."""
     kin = kinematics(chain, state.q)
     c, u, _, spin = _bodies(chain, kin, state.v)
     p = chain.mass[:, None] * u

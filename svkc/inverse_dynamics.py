@@ -107,13 +107,13 @@ def limit_forces(chain: Chain, q: Float[Array, " q"], v: Float[Array, " dofs"]) 
 
 @verb
 def mass_matrix(chain: Chain, state: State) -> Float[Array, "nv nv"]:
-    """Joint-space inertia of the tree (kg, kg m, kg m^2), armature included, by composite bodies."""
+    """Joint-space inertia of the tree (kg, kg m, kg m^2), armature included, by composite bodies (Featherstone section 6.2)."""
     return inertia_by_composites(chain, kinematics(chain, state.q))
 
 
 @verb
 def bias_force(chain: Chain, state: State) -> Float[Array, " nv"]:
-    """Velocity-product and gravity forces of the tree: ID(q, v, 0) (MuJoCo's qfrc_bias)."""
+    """Velocity-product and gravity forces (N, N m) of the tree: ID(q, v, 0) (MuJoCo's qfrc_bias; Featherstone section 6.1)."""
     kin = kinematics(chain, state.q)
     V = twists(chain, kin, state.v)
     return generalized_forces(chain, kin, V, state.v, jnp.zeros(chain.nv, state.v.dtype))

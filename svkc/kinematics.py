@@ -239,7 +239,7 @@ def integrate(chain: Chain, q: Float[Array, " q"], dv: Float[Array, " dofs"]) ->
 
 @verb
 def difference(chain: Chain, q1: Float[Array, " q"], q2: Float[Array, " q"]) -> Float[Array, " dofs"]:
-    """The tangent vector that takes q1 to q2: integrate(q1, difference(q1, q2)) = q2."""
+    """The tangent vector (m, rad, in the coordinates of v) that takes q1 to q2: integrate(q1, difference(q1, q2)) = q2."""
     quat_q, quat_v = chain.topology.quaternions
     scalar_q, scalar_v = chain.topology.scalars
     at = quat_q[:, None] + np.arange(4)
@@ -259,7 +259,7 @@ def normalize(chain: Chain, q: Float[Array, " q"]) -> Float[Array, " q"]:
 
 @verb
 def poses(chain: Chain, state: State) -> tuple[Float[Array, "bodies 3"], Float[Array, "bodies 4"]]:
-    """Positions (m) and quaternions (wxyz, body to world) of the body frames in the world; row 0 is the world."""
+    """Positions (m) and quaternions (wxyz, body to world) of the body frames in the world; row 0 is the world (Featherstone section 4.4)."""
     rows = np.array(chain.topology.body_row)
     kin = kinematics(chain, state.q)
     return (kin.root + kin.r)[rows], kin.quat[rows]
@@ -267,7 +267,7 @@ def poses(chain: Chain, state: State) -> tuple[Float[Array, "bodies 3"], Float[A
 
 @verb
 def velocities(chain: Chain, state: State) -> tuple[Float[Array, "bodies 3"], Float[Array, "bodies 3"]]:
-    """Linear velocity of each body's origin (m/s) and angular velocity (rad/s), both in world axes; row 0 is the world."""
+    """Linear velocity of each body's origin (m/s) and angular velocity (rad/s), in world axes; row 0 is the world (Featherstone section 5.3)."""
     rows = np.array(chain.topology.body_row)
     kin = kinematics(chain, state.q)
     V = twists(chain, kin, state.v)

@@ -69,20 +69,20 @@ def first_pivots(chain: Chain, structure: Structure, q) -> Float[Array, "steps d
 
 
 def least_change(chain: Chain, structure: Structure, kin: Kinematics, selection: Selection, J, x: Float[Array, "rows n"]) -> Float[Array, "dofs n"]:
-    """The y with J y = x whose sum of squares, in coordinates without units, is least."""
+    """The y (m, rad, or their rates) with J y = x whose sum of squares, in coordinates without units, is least. For `svkc.Projection(change=...)`."""
     Jm, _ = square(selection, J)
     gram = Jm @ Jm.T + jnp.diag(jnp.where(selection.used, 0, 1).astype(J.dtype))
     return scales(chain)[1][:, None] * (Jm.T @ solve_positive(gram, selection.Q @ x))
 
 
 def dependent_change(chain: Chain, structure: Structure, kin: Kinematics, selection: Selection, J, x: Float[Array, "rows n"]) -> Float[Array, "dofs n"]:
-    """The y with J y = x that moves dependent coordinates only."""
+    """The y (m, rad, or their rates) with J y = x that moves dependent coordinates only (16). For `svkc.Projection(change=...)`."""
     _, JS = square(selection, J)
     return scales(chain)[1][:, None] * (selection.P.T @ solve_frozen(JS, selection.Q @ x))
 
 
 def inertia_change(chain: Chain, structure: Structure, kin: Kinematics, selection: Selection, J, x: Float[Array, "rows n"]) -> Float[Array, "dofs n"]:
-    """The y with J y = x whose y^T M y is least."""
+    """The y (m, rad, or their rates) with J y = x whose y^T M y is least: that of an impulse of the loops (29). For `svkc.Projection(change=...)`."""
     none = jnp.zeros(chain.dofs, J.dtype)
     return jax.vmap(lambda x: solve_motion(chain, structure, kin, selection, J, none, -x), 1, 1)(x)
 

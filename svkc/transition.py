@@ -120,7 +120,7 @@ def lock_projection(chain: Chain, structure: Structure, q, v):
 
 
 def transition(chain: Chain, state: State, connected) -> State:
-    """The state with exactly these virtual links connected (mask, or names): new ones with their impact, the others cut."""
+    """The state with exactly these virtual links connected (mask, or names): new ones with their impact (paper, (29)-(38)), the others cut."""
     check_state(chain, state)
     mask = jnp.asarray(connection_mask(chain, connected))
     return _checked(chain, change(chain, state, mask))
@@ -171,12 +171,12 @@ def _locked(chain: Chain, state: State, joints, value: bool) -> State:
 
 
 def lock(chain: Chain, state: State, *joints: str) -> State:
-    """Holds joints of the tree still from now on, with the impact of stopping them."""
+    """Holds joints of the tree still from now on, with the impact of stopping them: velocities (rad/s, m/s) as by (29)-(38) for connecting."""
     return _locked(chain, state, joints, True)
 
 
 def unlock(chain: Chain, state: State, *joints: str) -> State:
-    """Lets locked joints move again."""
+    """Lets locked joints move again; q (m, rad) and v (m/s, rad/s) stay as they are."""
     return _locked(chain, state, joints, False)
 
 

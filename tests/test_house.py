@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 import tempfile
+import types
 
 import pytest
 
@@ -100,6 +101,22 @@ def test_readme_example_runs():
     done = run("-c", code)
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("[0."), done.stdout
+
+
+DOOR = """
+Baumgarte Chain Check Drift Dynamics Exact Grip Program Projection RESULTS Replay RodriguesEuler SemiImplicitEuler State Structure Trajectory VirtualLink
+actuation at bias_force bind by_bodies check_grad compile connect coordinates cut dependent_change difference energy error_between forward_dynamics
+from_mujoco halved inertia_by_composites inertia_by_unit_vectors inertia_change integrate inverse_dynamics jacobian kinetic_energy least_change leaves load
+load_chain load_trajectory lock loop_forces loop_gaps mass_matrix mobility momentum overload plot poses potential_energy prefer render rollout simulate step
+tangent to_mujoco touch transition tune unbind unlock velocities velocity_gaps when xyzw
+"""
+
+
+def test_the_door_is_what_is_listed():
+    import svkc
+
+    names = [name for name in dir(svkc) if not name.startswith("_") and not isinstance(getattr(svkc, name), types.ModuleType)]
+    assert sorted(names) == sorted(DOOR.split())
 
 
 EXAMPLES = {
