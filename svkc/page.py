@@ -65,7 +65,9 @@ def _script(data) -> str:
 def _numbers(x):
     """Lists of numbers; null for what is not finite."""
     x = np.asarray(x, float)
-    return np.where(np.isfinite(x), x.astype(object), None).tolist()
+    told = x.astype(object)
+    told[~np.isfinite(x)] = None
+    return told.tolist()
 
 
 def _packed(x, dtype) -> str:
