@@ -23,7 +23,7 @@ def _in_parts(function: Callable, cost: Callable) -> Callable:
     @jax.custom_batching.custom_vmap
     def batch(*matrices):
         lanes = matrices[0].shape[:-2]
-        many, most = math.prod(lanes), max(1, FEW // cost(*(x.shape[-2:] for x in matrices)))
+        many, most = math.prod(lanes), max(1, FEW // max(1, cost(*(x.shape[-2:] for x in matrices))))
         if many <= most or jax.default_backend() != "cpu" or jax.local_device_count() == 1:
             return function(*matrices)
         size = max(n for n in range(1, most + 1) if many % n == 0)

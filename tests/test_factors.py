@@ -11,11 +11,12 @@ import pytest
 from svkc.factors import factor_positive, solve_triangle
 
 
+@pytest.mark.parametrize("size", [1, 6])
 @pytest.mark.parametrize("lanes", [(), (5,), (3, 4)])
-def test_batches_are_their_single_solves(lanes):
+def test_batches_are_their_single_solves(lanes, size):
     rng = np.random.default_rng(0)
-    A, x = rng.normal(size=(*lanes, 6, 6)), rng.normal(size=(*lanes, 6))
-    A, x = jnp.asarray(A @ np.swapaxes(A, -1, -2) + np.eye(6)), jnp.asarray(x)
+    A, x = rng.normal(size=(*lanes, size, size)), rng.normal(size=(*lanes, size))
+    A, x = jnp.asarray(A @ np.swapaxes(A, -1, -2) + np.eye(size)), jnp.asarray(x)
     positive = lambda A, x: factor_positive(A)(x)
     triangle = lambda trans: lambda A, x: solve_triangle(A, x, trans)
     for _ in lanes:
