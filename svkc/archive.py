@@ -15,6 +15,7 @@ import numpy as np
 from svkc.chain import Chain, State, Structure, VirtualLink
 from svkc.load import load
 from svkc.trajectory import RESULTS, Events, Phases, Trajectory
+from svkc.verb import check_chain
 
 # 2: with `derivative` and the phases' `margin`; 3: with the structures' `margin` and the rest of the certificate; 4: with the phases' gaps
 SCHEMA = 4
@@ -49,6 +50,8 @@ def save(traj: Trajectory, path, chain=None, options=None) -> None:
     """Writes one .npz: every array by name, and a JSON line of metadata (schema, result, versions, certificate, options; names and model of the chain)."""
     import svkc
 
+    if chain is not None:
+        check_chain(chain)
     meta = {"schema": SCHEMA, "svkc": svkc.__version__, "jax": jax.__version__, "units": "SI, rad, wxyz"}
     meta |= {name: np.asarray(getattr(traj, name)._value).tolist() for name in _CODES}
     certify = Trajectory.report

@@ -42,6 +42,14 @@ def one(name: str, value):
     return value
 
 
+def several(name: str, value, count: int):
+    """So many finite numbers."""
+    array = finite(name, value)
+    if array.shape != (count,):
+        raise ValueError(f"{name}: got shape {array.shape}, expected {count} numbers")
+    return array
+
+
 def positive(name: str, value):
     """One number above zero, where that can be seen."""
     one(name, value)

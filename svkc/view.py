@@ -5,7 +5,7 @@ import pathlib
 
 from svkc.chain import Chain
 from svkc.drawing import one_run
-from svkc.given import positive, whole
+from svkc.given import one, positive, several, texts, whole
 from svkc.page import write_page
 from svkc.trajectory import Trajectory
 from svkc.verb import check_chain
@@ -20,13 +20,18 @@ def render(
     and go through (`svkc.page.show` in a notebook).
 
     Of animations: trails: names of bodies whose paths are drawn; camera: the model's own of that name, else lookat (m), distance (m), azimuth and elevation
-    (deg) place one. ValueError: another ending, a batch, no such body or camera. RuntimeError: no GL library, no imageio-ffmpeg (names the packages).
+    (deg) place one. ValueError: another ending, a batch, no such body or camera, what is no number. RuntimeError: no GL library, no
+    imageio-ffmpeg (names the packages).
     """
     from svkc import animation, figures
 
     check_chain(chain)
     one_run(traj)
     frames, fps, path = whole("frames", frames, 1), positive("fps", fps), pathlib.Path(os.fspath(path))
+    size, trails = tuple(whole("size", n, 16, 8192) for n in several("size", size, 2)), texts("trails", trails)
+    lookat = lookat if lookat is None else several("lookat", lookat, 3)
+    distance = distance if distance is None else positive("distance", distance)
+    azimuth, elevation = one("azimuth", azimuth), one("elevation", elevation)
     if path.suffix == ".png":
         return figures.strobe(chain, traj, path, frames)
     if path.suffix == ".html":
@@ -35,7 +40,7 @@ def render(
     if write is None:
         raise ValueError(f"render: {path.name} should end in .png, .gif, .mp4 or .html")
     seen = {"camera": camera, "lookat": lookat, "distance": distance, "azimuth": azimuth, "elevation": elevation}
-    write(path, animation.frames(chain, traj, fps=fps, size=size, trails=tuple(trails), **seen), fps)
+    write(path, animation.frames(chain, traj, fps=fps, size=size, trails=trails, **seen), fps)
     return path
 
 
@@ -44,4 +49,6 @@ def plot(traj: Trajectory, chain: Chain | None = None):
     from svkc.figures import curves
 
     one_run(traj)
+    if chain is not None:
+        check_chain(chain)
     return curves(traj, chain)

@@ -139,6 +139,7 @@ CASES = {
     "...: got ..., expected a positive": lambda s: s.simulate(dt=-1.0),
     "...: got shape ..., expected (...,) for the tree": lambda s: s.four.state(np.zeros(7)),
     "...: got shape ..., expected a number or": lambda s: svkc.actuation(s.four, s.state, jnp.zeros(4), bounds=(np.zeros(2), np.ones(2))),
+    "...: got shape ..., expected ... numbers": lambda s: svkc.render(s.four, s.simulate(t1=1e-3, dt=1e-3), s.folder / "x.gif", lookat=(1, 2)),
     "...: got shape ..., expected one number": lambda s: s.simulate(t1=jnp.ones(2)),
     "...[...]: got": lambda s: s.four.state({"crank": [1.0, 2.0]}),
     "actuated: expected": lambda s: svkc.actuation(s.four, s.state, jnp.zeros(4), actuated=np.ones(2, bool)),

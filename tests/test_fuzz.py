@@ -661,14 +661,20 @@ def test_rollouts_and_tuning(only_traced, t1, options, states):
     outcome(lambda: svkc.rollout(chain, lanes, t1, progress=False, **options), Asked)
 
 
-calls = st.sampled_from(["tune", "halved", "check_grad", "to_mujoco", "from_mujoco", "render", "motors", "bounds", "weight", "actuated", "load_trajectory"])
+SEEN = ["size", "lookat", "distance", "azimuth", "camera", "trails"]
+calls = st.sampled_from(
+    ["tune", "halved", "check_grad", "to_mujoco", "from_mujoco", "render", "motors", "bounds", "weight", "actuated", "load_trajectory", "save", "plot", *SEEN]
+)
 
 
 @examples(0.045)
 @hypothesis.given(call=calls, value=anything, other=anything)
-def test_other_calls(only_traced, tmp_path_factory, call, value, other):
+def test_other_calls(only_traced, place, call, value, other):
     chain, state = scenes()["spare"]
-    zero = np.zeros(chain.dofs)
+    zero, path = np.zeros(chain.dofs), place.with_name("seen.gif")
+    traj = svkc.load_trajectory(place)
+    # (what is no fault is drawn)
+    seen = {name: lambda name=name: svkc.render(chain, traj, path, **({"size": (64, 48)} | {name: value})) for name in SEEN}
     made = {
         "tune": lambda: svkc.tune(chain, state, value, target=other),
         "halved": lambda: svkc.halved(chain, state, value, dt=other),
@@ -681,7 +687,9 @@ def test_other_calls(only_traced, tmp_path_factory, call, value, other):
         "weight": lambda: svkc.actuation(chain, state, zero, weight=value),
         "actuated": lambda: svkc.actuation(chain, state, zero, actuated=value),
         "load_trajectory": lambda: svkc.load_trajectory(value),
-    }
+        "save": lambda: traj.save(place.with_name("saved.npz"), value),
+        "plot": lambda: traj.plot(value),
+    } | seen
     outcome(made[call], Asked, FileNotFoundError)
 
 
@@ -699,6 +707,12 @@ def kept(tmp_path_factory):
     chain, state = scenes()["spare"]
     svkc.simulate(chain, state, 0.1, dt=0.05).save(path, chain)
     return path.read_bytes(), path
+
+
+@pytest.fixture(scope="module")
+def place(kept):
+    """Of that file. (What a test is given is printed whole where it fails.)"""
+    return kept[1]
 
 
 @examples(0.015)
