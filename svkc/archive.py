@@ -92,6 +92,7 @@ def _complete(arrays: dict[str, np.ndarray], schema: int) -> None:
     }
     unknown |= {"free": np.zeros(rows, bool), "momentum_drift": np.zeros((*rows, 2), dtype)}
     arrays |= {f"phases.{name}": value for name, value in unknown.items()} | {"gap_rates": np.full_like(arrays["gaps"], np.inf)}
+    arrays.setdefault("phases.margin", np.full(rows, np.inf, dtype))
     for part in ("states", "final"):
         arrays[f"{part}.structure.margin"] = np.zeros_like(arrays[f"{part}.structure.rank"], dtype)
 
@@ -150,7 +151,7 @@ def load_trajectory(path) -> Trajectory:
     schema = int(meta["schema"])
     if schema < 4:
         _complete(arrays, schema)
-    _check_whole(path, arrays, _named(Trajectory) if schema > 1 else _FIRST)
+    _check_whole(path, arrays, _named(Trajectory))
     code = lambda value: eqx.tree_at(lambda item: item._value, RESULTS.successful, value)
     build = lambda arrays, codes: _build(Trajectory, arrays, **{name: code(value) for name, value in codes.items()})
     for _ in range(arrays["ts"].ndim - 1):

@@ -151,6 +151,11 @@ def gaps_and_rates(chain: Chain, state: State) -> tuple[Float[Array, "links 6"],
     return gap(state.structure, end), (loop_jacobian(chain, state.structure, kin, end) @ state.v).reshape(-1, 6)
 
 
+def sizes(rows: Float[Array, " rows"]) -> Float[Array, "links 2"]:
+    """Of each loop's rows: how long its rotation vector is, and how long the distance."""
+    return jnp.sqrt(jnp.sum(rows.reshape(-1, 2, 3) ** 2, -1))
+
+
 def largest_gaps(chain: Chain, state: State) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
     """The largest over the loops: of the gaps (rad, m) and of their rates (rad/s, m/s)."""
 

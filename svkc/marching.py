@@ -13,6 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from svkc.chain import State
+from svkc.closure import largest_gaps
 from svkc.events import Bracket
 from svkc.location import Found
 from svkc.searching import Search, Watched, found, watch
@@ -44,20 +46,21 @@ class How(eqx.Module):
 
 class Tally(eqx.Module):
     """What a run has cost and shown: tries, and of the steps that were kept the sum of their estimated errors (root mean square over q and v; inf: the
-    solver gives none), the least |R_mm| / |R_11| of the loops, how often the dependent coordinates changed (-1: not looked at), and the loop that could
-    not be closed (-1: none)."""
+    solver gives none), the least |R_mm| / |R_11| of the loops, how often the dependent coordinates changed (-1: not looked at), the loop that could
+    not be closed (-1: none), and the largest of the loops' gaps (rad, m)."""
 
     tries: Int[Array, ""]
     error: Float[Array, ""]
     margin: Float[Array, ""]
     swaps: Int[Array, ""]
     loop: Int[Array, ""]
+    gap: Float[Array, "2"]
 
     @classmethod
     def none(cls, dtype, looked: bool) -> "Tally":
         """Before the first step."""
         zero = jnp.zeros((), jnp.int32)
-        return cls(zero, jnp.zeros((), dtype), jnp.ones((), dtype), zero if looked else zero - 1, zero - 1)
+        return cls(zero, jnp.zeros((), dtype), jnp.ones((), dtype), zero if looked else zero - 1, zero - 1, jnp.zeros(2, dtype))
 
 
 class Path(eqx.Module):
@@ -246,20 +249,29 @@ def _step(s: Step, times, world: World, how: How) -> Step:
         accepted=accepted,
         rejected=s.rejected + (~tried.keep & ~still).astype(jnp.int32),
         result=next_(tried.result, s.result),
-        tally=_counted(s, tried, next_(tried.result, s.result)),
+        tally=_counted(s, tried, next_(tried.result, s.result), world.scene),
         seen=moved(tried.seen, s.seen),
     )
 
 
-def _counted(s: Step, tried: Tried, result: Int[Array, ""]) -> Tally:
+def _counted(s: Step, tried: Tried, result: Int[Array, ""], scene: Scene) -> Tally:
     """With one more try. result: how the run stands after it."""
     old, kept = s.tally, tried.keep
-    margin, swaps = old.margin, old.swaps
+    margin, swaps, gap = old.margin, old.swaps, old.gap
     if tried.seen is not None and tried.seen.pivots is not None:
         margin = jnp.where(kept, jnp.minimum(margin, tried.seen.margin), margin)
         swaps = swaps + (kept & jnp.any(s.seen.dependent != tried.seen.dependent)).astype(jnp.int32)
-    loop = old.loop if tried.seen is None else jnp.where(result == OPEN, jnp.argmax(tried.seen.gap).astype(jnp.int32), old.loop)
-    return Tally(old.tries + 1, old.error + jnp.where(kept, tried.error, 0), margin, swaps, loop)
+    loop = old.loop if tried.seen is None else jnp.where(result == OPEN, jnp.argmax(jnp.max(tried.seen.gap, 1)).astype(jnp.int32), old.loop)
+    if len(scene.chain.link_names):
+        gap = jnp.where(kept, jnp.maximum(gap, _open(tried, scene)), gap)
+    return Tally(old.tries + 1, old.error + jnp.where(kept, tried.error, 0), margin, swaps, loop, gap)
+
+
+def _open(tried: Tried, scene: Scene) -> Float[Array, "2"]:
+    """The largest of the loops' gaps (rad, m) at the end of a try."""
+    if tried.seen is None:
+        return largest_gaps(scene.chain, State(tried.y.q, tried.y.v, scene.structure))[0]
+    return jnp.max(tried.seen.gap, 0) * jnp.stack([jnp.ones_like(scene.chain.length), scene.chain.length])
 
 
 def _written(rows, i, new, pred):

@@ -95,11 +95,12 @@ def _path(start: Motion, times, world: World, watched: Watched | None, options: 
         adjoint=adjoint, max_steps=options.max_steps, throw=False, progress_meter=options.progress_meter,
     )  # fmt: skip
     (end, saved), t, result = sol.ys, sol.ts[0][0], sol.result._value
+    result = jnp.where(result == diffrax.RESULTS.internal_error._value, NON_FINITE, result)
     if found is not None:
         result = jnp.where((result == SUCCESSFUL) & found.hit, EVENT, result)
     accepted, rejected = (jnp.asarray(sol.stats[name], jnp.int32) for name in ("num_accepted_steps", "num_rejected_steps"))
     # diffrax tells the number of tries alone
-    tally = Tally(accepted + rejected, jnp.asarray(jnp.inf, t0.dtype), jnp.ones((), t0.dtype), *[jnp.asarray(-1, jnp.int32)] * 2)
+    tally = Tally(accepted + rejected, jnp.asarray(jnp.inf, t0.dtype), jnp.ones((), t0.dtype), *[jnp.asarray(-1, jnp.int32)] * 2, jnp.zeros(2, t0.dtype))
     return Path(t, jax.tree.map(lambda x: x[0], end), saved, jnp.zeros(0, t0.dtype), saved, accepted, rejected, result, tally, found), found
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from svkc.articulated import by_bodies
 from svkc.chain import Chain, State, Structure
-from svkc.closure import scaled_jacobian, scales
+from svkc.closure import scaled_jacobian, scales, sizes
 from svkc.forward_dynamics import solve_motion
 from svkc.kinematics import Kinematics, integrate, kinematics, normalize
 from svkc.lanes import with_lanes_last
@@ -29,7 +29,7 @@ def decide_rank(chain: Chain, structure: Structure, q: Float[Array, " q"]) -> St
     chain, structure, q = jax.lax.stop_gradient((chain, structure, q))
     row, column = scales(chain)
 
-    def sizes(q):
+    def shown(q):
         kin = kinematics(chain, q)
         end = ends(chain, structure, kin, q)
         return select(scaled_jacobian(chain, structure, kin, end)).size, jnp.max(jnp.abs(row * gap(structure, end).ravel()))
@@ -39,7 +39,7 @@ def decide_rank(chain: Chain, structure: Structure, q: Float[Array, " q"]) -> St
     near = jnp.where(active_dofs(chain, structure), 0.05 * direction * column, 0).astype(q.dtype)
     full = eqx.tree_at(lambda s: (s.rank, s.margin), structure, (jnp.asarray(min(row.shape[0], chain.dofs), jnp.int32), jnp.zeros_like(structure.margin)))
     moved = close(chain, full, integrate(chain, q, near), iterations=12)
-    size, open_ = jax.lax.map(sizes, jnp.stack([q, moved]))
+    size, open_ = jax.lax.map(shown, jnp.stack([q, moved]))
     closed = open_[1] < jnp.finfo(q.dtype).eps ** 0.75
     rank = jnp.where(closed, jnp.maximum(count_rank(size[0]), count_rank(size[1])), count_rank(size[0]))
     last = jnp.arange(size.shape[1], dtype=jnp.int32) == rank - 1
@@ -118,10 +118,10 @@ def close(chain: Chain, structure: Structure, q: Float[Array, " q"], iterations:
 @functools.partial(jax.jit, static_argnames=("iterations", "change", "hold"))
 def settle_loops(
     chain: Chain, structure: Structure, q, v, iterations: int, change: Callable = inertia_change, pivots=None, hold: float = 0.0
-) -> tuple[Float[Array, " q"], Float[Array, " dofs"], Float[Array, " links"], Float[Array, ""], Float[Array, "steps dofs"]]:
+) -> tuple[Float[Array, " q"], Float[Array, " dofs"], Float[Array, "links 2"], Float[Array, ""], Float[Array, "steps dofs"]]:
     """`close`, then `agree`: one body for both, the last turn of the loop being the velocities', so that it is compiled once.
 
-    And what the loops show: the gap (rad, `chain.length`s) that each loop is left with, |R_mm| / |R_11|, and the pivots to go on with. pivots: those held
+    And what the loops show: the gaps (rad, `chain.length`s) that each loop is left with, |R_mm| / |R_11|, and the pivots to go on with. pivots: those held
     so far (None: none are), which go on until their |R_mm| / |R_11| is below `hold` times that of new ones.
     """
     row, column = scales(chain)
@@ -142,18 +142,18 @@ def settle_loops(
         open_ = jnp.stack([row * gap(structure, end).ravel(), J @ jnp.where(active, v / column, 0)], 1)
         step = -change(chain, structure, kin, selection, J, open_)
         last = i == iterations
-        seen = jax.lax.stop_gradient((jnp.max(jnp.abs(open_[:, 0]).reshape(-1, 6), 1), weakest(full), chosen))
+        seen = jax.lax.stop_gradient((sizes(open_[:, 0]), weakest(full), chosen))
         return integrate(chain, q, jnp.where(last, 0, step[:, 0])), jnp.where(last, v + step[:, 1], v), *seen
 
-    none = jnp.zeros(len(chain.link_names), q.dtype), jnp.ones((), q.dtype), jnp.zeros((min(row.shape[0], chain.dofs), chain.dofs), q.dtype)
+    none = jnp.zeros((len(chain.link_names), 2), q.dtype), jnp.ones((), q.dtype), jnp.zeros((min(row.shape[0], chain.dofs), chain.dofs), q.dtype)
     return jax.lax.fori_loop(0, iterations + 1, turn, (normalize(chain, q), v, *none))
 
 
 @functools.partial(jax.jit, static_argnames=("iterations", "differentiated"))
 def settle_by_bodies(
     chain: Chain, structure: Structure, q, v, iterations: int, differentiated: bool = True
-) -> tuple[Float[Array, " q"], Float[Array, " dofs"], Float[Array, " links"]]:
-    """`settle_loops` with `inertia_change`, by articulated bodies and the forces of the loops: no pivots are chosen. And the gap (rad,
+) -> tuple[Float[Array, " q"], Float[Array, " dofs"], Float[Array, "links 2"]]:
+    """`settle_loops` with `inertia_change`, by articulated bodies and the forces of the loops: no pivots are chosen. And the gaps (rad,
     `chain.length`s) that each loop is left with. differentiated: as `Field`'s."""
     one_turn = _turn_by_bodies if differentiated else with_lanes_last(_turn_by_bodies)
 
@@ -163,10 +163,10 @@ def settle_by_bodies(
         step, left = one_turn(chain, structure, q, v, i == iterations)
         return integrate(chain, q, jnp.where(i == iterations, 0, step)), jnp.where(i == iterations, v + step, v), left
 
-    return jax.lax.fori_loop(0, iterations + 1, turn, (normalize(chain, q), v, jnp.zeros(len(chain.link_names), q.dtype)))
+    return jax.lax.fori_loop(0, iterations + 1, turn, (normalize(chain, q), v, jnp.zeros((len(chain.link_names), 2), q.dtype)))
 
 
-def _turn_by_bodies(chain: Chain, structure: Structure, q, v, last: Bool[Array, ""]) -> tuple[Float[Array, " dofs"], Float[Array, " links"]]:
+def _turn_by_bodies(chain: Chain, structure: Structure, q, v, last: Bool[Array, ""]) -> tuple[Float[Array, " dofs"], Float[Array, "links 2"]]:
     """The least change, in the metric of the inertia, of q that closes the loops or, in the last turn, of v that keeps them; and the gaps at q."""
     row, column = scales(chain)
     kin = kinematics(chain, q)
@@ -174,7 +174,7 @@ def _turn_by_bodies(chain: Chain, structure: Structure, q, v, last: Bool[Array, 
     J, open_ = scaled_jacobian(chain, structure, kin, end), row * gap(structure, end).ravel()
     apart = jnp.where(last, J @ jnp.where(active_dofs(chain, structure), v / column, 0), open_)
     step = solve_motion(chain, structure, kin, None, J, jnp.zeros(chain.dofs, q.dtype), apart, by_bodies)
-    return step, jax.lax.stop_gradient(jnp.max(jnp.abs(open_).reshape(-1, 6), 1))
+    return step, jax.lax.stop_gradient(sizes(open_))
 
 
 @jax.jit

@@ -61,7 +61,7 @@ def recorded(chain: Chain, p: Phases, row: Bool[Array, " phases"], began: tuple,
         "start": start, "stop": stop, "connected": s.connected, "rank": s.rank, "joint_freedoms": jnp.sum(active_dofs(chain, s), dtype=jnp.int32),
         "energy": energies, "work": work, "margin": jnp.minimum(margin, path.tally.margin), "accepted": path.accepted, "rejected": path.rejected,
         "evaluations": stages * path.tally.tries, "swaps": path.tally.swaps, "loop": path.tally.loop, "error": path.tally.error,
-        "gap": gap, "gap_rate": gap_rate, "free": free,
+        "gap": jnp.maximum(gap, path.tally.gap), "gap_rate": gap_rate, "free": free,
         "momentum_drift": jnp.where(free, _momentum_drift(chain, linear, angular, stop - start), 0),
     }  # fmt: skip
     new = {name: jnp.where(row.reshape(-1, *(1,) * jnp.ndim(x)), jnp.asarray(x)[None], getattr(p, name)) for name, x in written.items()}

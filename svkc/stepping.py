@@ -143,10 +143,10 @@ def projects(stabilization, scene: Scene) -> bool:
 
 
 class Seen(eqx.Module):
-    """What the loops show as a step is put back onto them: how far each loop is open yet and, where pivots are chosen, |R_mm| / |R_11| and those to go
-    on with."""
+    """What the loops show as a step is put back onto them: how far each loop is open yet (rad, `chain.length`s) and, where pivots are chosen,
+    |R_mm| / |R_11| and those to go on with."""
 
-    gap: Float[Array, " links"]
+    gap: Float[Array, "links 2"]
     margin: Float[Array, ""] | None = None
     pivots: Float[Array, "steps dofs"] | None = None
 
@@ -155,7 +155,7 @@ class Seen(eqx.Module):
         """Before the first step."""
         if not projects(field.stabilization, scene):
             return None
-        gap = jnp.zeros(len(scene.chain.link_names), q.dtype)
+        gap = jnp.zeros((len(scene.chain.link_names), 2), q.dtype)
         return cls(gap) if field.pivotless else cls(gap, jnp.ones((), q.dtype), first_pivots(scene.chain, scene.structure, q))
 
     @property
@@ -223,7 +223,7 @@ def _explicit_step(tableau: diffrax.ButcherTableau, rate, t0, t1, y: Motion, sce
 
 
 class FixedSteps(diffrax.AbstractStepSizeController):
-    """Steps of dt; diffrax is told the times `ts` to shorten them for."""
+    """Steps of dt; diffrax is told the times `ts` to shorten them for. A step that is not finite is not taken: it ends the solve."""
 
     dt: Float[Array, ""]
     ts: Float[Array, " times"]
@@ -240,7 +240,9 @@ class FixedSteps(diffrax.AbstractStepSizeController):
         return self._next(t0), None
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
-        return True, t1, self._next(t1), False, controller_state, diffrax.RESULTS.successful
+        whole = finite(y1_candidate)
+        said = diffrax.RESULTS.where(whole, diffrax.RESULTS.successful, diffrax.RESULTS.internal_error)
+        return whole, jnp.where(whole, t1, t0), self._next(t1), False, controller_state, said
 
 
 def motion_norm(error: Motion) -> Float[Array, ""]:

@@ -1,11 +1,14 @@
 """F2: what a run leaves behind."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc.chain import State
+from svkc.given import one
 
 
 class RESULTS(eqx.Enumeration):
@@ -48,9 +51,9 @@ class Phases(eqx.Module):
     the phase (of its two ends where steps are not projected), how far the weakest row that counts is from being redundant; `swaps`: how often the
     choice of dependent coordinates changed from step to step (-1: not looked at); `loop`: the one that could not be closed (-1: none);
     `evaluations`: of the vector field, in steps alone; `error`: the estimated errors of the steps added up (root mean square over q and v; inf: the
-    solver estimates none); `gap`, `gap_rate`: the largest of the loops' gaps (rad, m) and of their rates (rad/s, m/s) at the phase's two ends, before
-    the event that ends it; `free`: nothing holds the bodies to the ground; `momentum_drift`: then, the change of linear momentum (N s) that gravity
-    does not explain and that of the angular momentum about the centre of mass (N m s).
+    solver estimates none); `gap`: the largest of the loops' gaps (rad, m) at the ends of steps (of the phase, with a diffrax adjoint); `gap_rate`: of
+    their rates (rad/s, m/s) at the phase's two ends, before the event that ends it; `free`: nothing holds the bodies to the ground; `momentum_drift`:
+    then, the change of linear momentum (N s) that gravity does not explain and that of the angular momentum about the centre of mass (N m s).
     """
 
     start: Float[Array, " phases"]
@@ -123,8 +126,8 @@ class Trajectory(eqx.Module):
 
         return plot(self, chain)
 
-    def report(self) -> "Report":
-        """The run's certificate."""
+    def report(self, halved=None) -> "Report":
+        """The run's certificate. halved: an error estimated by another run, such as `svkc.halved` gives, to be told with it."""
         p = self.phases
         largest = lambda x: jnp.max(jnp.where(jnp.isfinite(x), x, 0), -2)
         worst = lambda saved, ends: jnp.maximum(largest(saved), largest(ends))
@@ -151,14 +154,16 @@ class Trajectory(eqx.Module):
             t_final=self.t_final,
             result=self.result,
             derivative=self.derivative,
+            halved=None if halved is None else one("halved", halved),
         )
 
 
 class Report(eqx.Module):
-    """Largest loop gaps (m, rad) and rates (m/s, rad/s) at the saved times and the ends of phases; energy that no work or impact explains and energy lost in
-    impacts (J); over phases in which nothing holds the bodies to the ground (`free`: there is one), momentum that gravity does not explain (N s, N m s);
-    estimated errors of all steps added up (inf: the solver estimates none); the least rank margin; changes of the dependent coordinates (-1: not looked at);
-    the loop that could not be closed (-1: none); steps, evaluations of the vector field, phases; when and how the run ended, and whether it has derivatives."""
+    """Largest loop gaps (m, rad) at the ends of steps, and rates (m/s, rad/s) at the saved times and the ends of phases; energy that no work or impact
+    explains and energy lost in impacts (J); over phases in which nothing holds the bodies to the ground (`free`: there is one), momentum that gravity does
+    not explain (N s, N m s); estimated errors of all steps added up (inf: the solver estimates none); the least rank margin; changes of the dependent
+    coordinates (-1: not looked at); the loop that could not be closed (-1: none); steps, evaluations of the vector field, phases; when and how the run
+    ended, and whether it has derivatives; the error by a finer run, where one was asked for."""
 
     gap: Float[Array, ""]
     angular_gap: Float[Array, ""]
@@ -180,6 +185,7 @@ class Report(eqx.Module):
     t_final: Float[Array, ""]
     result: RESULTS
     derivative: RESULTS
+    halved: Any = None
 
     def __str__(self) -> str:
         if isinstance(self.gap, jax.core.Tracer) or self.gap.ndim:
@@ -187,6 +193,8 @@ class Report(eqx.Module):
         balance = f"{float(self.momentum_drift):.2e} N s, {float(self.angular_momentum_drift):.2e} N m s" if self.free else "held to the ground throughout"
         error = f"{float(self.error):.2e}" if jnp.isfinite(self.error) else "not estimated by this solver"
         swaps = f"{int(self.swaps)} changes of the dependent coordinates" if self.swaps >= 0 else "changes of the dependent coordinates not looked at"
+        if self.halved is not None:
+            error += f"; by a finer run {float(self.halved):.2e} rad, m"
         lines = [
             f"largest loop gap        {float(self.gap):.2e} m, {float(self.angular_gap):.2e} rad; rate {float(self.gap_rate):.2e} m/s, "
             f"{float(self.angular_gap_rate):.2e} rad/s",

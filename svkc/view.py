@@ -1,5 +1,6 @@
 """F7: pictures of a run. matplotlib, Pillow and mujoco's renderer are imported where they are used."""
 
+import importlib
 import os
 import pathlib
 
@@ -9,6 +10,15 @@ from svkc.given import one, positive, several, texts, whole
 from svkc.page import write_page
 from svkc.trajectory import Trajectory
 from svkc.verb import check_chain
+
+
+def _installed() -> None:
+    """RuntimeError: what draws is not installed."""
+    for name in ("matplotlib", "PIL"):
+        try:
+            importlib.import_module(name)
+        except ImportError as error:
+            raise RuntimeError("pictures need the packages matplotlib and pillow: pip install 'svkc[viz]'") from error
 
 
 def render(
@@ -21,7 +31,7 @@ def render(
 
     Of animations: trails: names of bodies whose paths are drawn; camera: the model's own of that name, else lookat (m), distance (m), azimuth and elevation
     (deg) place one. ValueError: another ending, a batch, no such body or camera, what is no number. RuntimeError: no GL library, no
-    imageio-ffmpeg (names the packages).
+    matplotlib, pillow or imageio-ffmpeg (names the packages).
     """
     from svkc import animation, figures
 
@@ -32,6 +42,8 @@ def render(
     lookat = lookat if lookat is None else several("lookat", lookat, 3)
     distance = distance if distance is None else positive("distance", distance)
     azimuth, elevation = one("azimuth", azimuth), one("elevation", elevation)
+    if path.suffix != ".html":
+        _installed()
     if path.suffix == ".png":
         return figures.strobe(chain, traj, path, frames)
     if path.suffix == ".html":
@@ -49,6 +61,7 @@ def plot(traj: Trajectory, chain: Chain | None = None):
     from svkc.figures import curves
 
     one_run(traj)
+    _installed()
     if chain is not None:
         check_chain(chain)
     return curves(traj, chain)

@@ -115,7 +115,13 @@ def nameless(s):
     svkc.load_chain(path)
 
 
+def undrawable(s):
+    with mock.patch.dict("sys.modules", {"matplotlib": None}):
+        s.simulate(t1=1e-3, dt=1e-3).plot()
+
+
 CASES = {
+    "pictures need": undrawable,
     "... holds no model": nameless,
     "camera: no": lambda s: svkc.render(s.four, s.simulate(t1=1e-3, dt=1e-3), s.folder / "x.gif", camera="nobody's"),
     "mp4 needs": without_ffmpeg,
@@ -262,3 +268,32 @@ def test_each_message(setting, opening):
     with said.as_users_see(), pytest.raises((ValueError, RuntimeError, NotImplementedError)) as caught:
         CASES[opening](setting)
     assert re.fullmatch(said.pattern(_row(opening)), " ".join(str(caught.value).split())), caught.value
+
+
+def test_inside_compiled_programs(setting):
+    """What cannot be known while tracing is raised by the program."""
+    assert sorted(said.COMPILED) == sorted(said.messages_of("error_if", 2))
+    apart = setting.load(virtual_links=[link(pos=(5, 0, 0), real_pos=(0, 0, 0))])
+    beyond = setting.load(virtual_links=[link(pos=(50, 0, 0), real_pos=(0, 0, 0), connected=True)])
+    calls = {
+        "connect: the bodies": lambda: jax.jit(lambda s: svkc.connect(apart, s, "x"))(apart.state()),
+        "the loops of": lambda: jax.jit(lambda q: beyond.state({"crank": q}))(0.1),
+        str(svkc.RESULTS[svkc.RESULTS.max_steps]): lambda: jax.jit(lambda t: setting.simulate(t1=t, dt=1e-3, max_steps=2).t_final)(1e-2),
+    }
+    for row in said.COMPILED:
+        assert any(row.startswith(opening) for opening in calls)
+    for opening, call in calls.items():
+        with said.as_users_see(), pytest.raises(RuntimeError, match=re.escape(opening)):
+            call()
+
+
+def test_warnings_and_what_others_raise(setting, tmp_path):
+    warned, missing = said.OTHERS
+    assert said.messages_of("warn", 0) == {warned}
+    with jax.enable_x64(False):
+        chain = models.four_bar()
+        with pytest.warns(UserWarning, match=said.pattern(warned)):
+            chain.state(v=np.array([1.0, 0.0, 0.0]))
+    for read in (svkc.load_trajectory, svkc.load_chain):
+        with pytest.raises(FileNotFoundError, match=said.pattern(missing)):
+            read(tmp_path / "none.npz")

@@ -3,11 +3,9 @@
 import diffrax
 import jax
 import jax.numpy as jnp
-import maximal
 import models
 import numpy as np
 import pytest
-from test_reference import n_four_bar
 
 import svkc
 
@@ -92,16 +90,18 @@ def test_lengths_from_a_millimetre_to_a_kilometre():
     assert drift(chain, traj) < 2e-2
 
 
-@pytest.fixture(scope="module")
-def thrown():
-    two = models.bar("a", 'type="free"', "0 0 -0.5", inside=models.bar("b", models.Y, "0.3 0 -0.3", "0 0 -.5"))
-    return svkc.load(models.MJCF.format(two))
+def two_bars():
+    """Two bars on a hinge, thrown."""
+    return svkc.load(models.MJCF.format(models.bar("a", 'type="free"', "0 0 -0.5", inside=models.bar("b", models.Y, "0.3 0 -0.3", "0 0 -.5"))))
 
 
-def test_far_away_and_fast(thrown):
+THROWN = [0.5, 0.1, 0.2, 1, 2, 3, 1.5]
+
+
+def test_far_away_and_fast():
     """1e6 m from the origin at 1e3 m/s: turned and moving as at the origin, to the digits that positions of 1e6 m leave."""
-    start = {"v": [0.5, 0.1, 0.2, 1, 2, 3, 1.5]}
-    q, v = np.array(thrown.q_load), np.array(start["v"])
+    thrown = two_bars()
+    q, v = np.array(thrown.q_load), np.array(THROWN)
     near = svkc.simulate(thrown, thrown.state(q, v), 1.0, **FINE)
     there, speed = np.array([1e6, -1e6, 1e6]), np.array([1e3, -1e3, 1e3])
     q[:3] += there
@@ -112,11 +112,14 @@ def test_far_away_and_fast(thrown):
     np.testing.assert_allclose(far.final.q[:3] - there - speed, near.final.q[:3], atol=1e-6)
 
 
-def test_fast_spin(thrown):
+WEIGHTLESS = SPACE.replace("0 0 -9.81", "0 0 0").format(models.bar("a", 'type="free"', "0.2 0.3 -0.5"))
+SPIN = [0, 0, 0, 1e3, 20, -30.0]
+
+
+def test_fast_spin():
     """1e3 rad/s for 160 turns: energy to 1e-7 and momentum to 1e-7 of themselves at rtol 1e-10."""
-    weightless = SPACE.replace("0 0 -9.81", "0 0 0").format(models.bar("a", 'type="free"', "0.2 0.3 -0.5"))
-    chain = svkc.load(weightless)
-    state = chain.state(v=np.array([0, 0, 0, 1e3, 20, -30.0]))
+    chain = svkc.load(WEIGHTLESS)
+    state = chain.state(v=np.array(SPIN))
     traj = svkc.simulate(chain, state, 1.0, ts=TIMES, rtol=1e-10, atol=1e-12, solver=diffrax.Dopri8())
     assert drift(chain, traj) < 1e-7
     linear, angular = svkc.momentum(chain, state)
@@ -130,20 +133,21 @@ def test_two_hundred_links():
     assert drift(chain, traj) < 1e-6
 
 
+def legs(count):
+    """Parallel legs under one plate, one more than `count` pins."""
+    bodies = ""
+    for i in range(count + 1):
+        plate = models.bar("plate", models.Y, "20 0 0", "0 0 1") if i == 0 else ""
+        bodies += models.bar(f"leg{i}", models.Y, "0 0 1", f"{i if count > 1 else 20 * i} 0 0", plate)
+    links = [
+        svkc.VirtualLink(f"pin{i}", "plate", f"leg{i}", "hinge", pos=(i if count > 1 else 20.0, 0, 0), real_pos=(0, 0, 1), axis=(0, 1, 0), connected=True)
+        for i in range(1, count + 1)
+    ]
+    return svkc.load(SPACE.format(bodies), virtual_links=links)
+
+
 def test_twenty_loops():
     """Twenty-one parallel legs under one plate, all loops but one redundant: one freedom, that of the two-legged one."""
-
-    def legs(count):
-        bodies = ""
-        for i in range(count + 1):
-            plate = models.bar("plate", models.Y, "20 0 0", "0 0 1") if i == 0 else ""
-            bodies += models.bar(f"leg{i}", models.Y, "0 0 1", f"{i if count > 1 else 20 * i} 0 0", plate)
-        links = [
-            svkc.VirtualLink(f"pin{i}", "plate", f"leg{i}", "hinge", pos=(i if count > 1 else 20.0, 0, 0), real_pos=(0, 0, 1), axis=(0, 1, 0), connected=True)
-            for i in range(1, count + 1)
-        ]
-        return svkc.load(SPACE.format(bodies), virtual_links=links)
-
     chain = legs(20)
     state = chain.state({"leg0": 0.3})
     assert svkc.mobility(chain, state).freedoms == 1
@@ -154,14 +158,19 @@ def test_twenty_loops():
     np.testing.assert_allclose(angles, angles[0], atol=1e-12)
 
 
-@pytest.mark.parametrize("solver", [diffrax.Tsit5(), diffrax.Kvaerno5()], ids=["explicit", "implicit"])
-def test_stiff_springs(solver):
-    """1e9 N/m under a pendulum: as on a rigid pivot, to the stretch of the spring; the implicit solver needs fewer steps."""
+def sprung_and_rigid():
+    """A pendulum on a spring of 1e9 N/m, and on a rigid pivot."""
     slide = '<joint name="a" type="slide" axis="0 0 1" stiffness="1e9" damping="1e4"/>'
     ball = '<geom size=".1" mass="1" contype="0"/>'
     pendulum = '<body name="b" pos="0 0 -1"><joint name="b" axis="0 1 0"/><geom size=".1" mass="1" pos="0 0 -.5" contype="0"/></body>'
-    chain = svkc.load(SPACE.format(f'<body name="a">{slide}{ball}{pendulum}</body>'))
-    rigid = svkc.load(SPACE.format(pendulum))
+    sprung = svkc.load(SPACE.format(f'<body name="a">{slide}{ball}{pendulum}</body>'))
+    return sprung, svkc.load(SPACE.format(pendulum))
+
+
+@pytest.mark.parametrize("solver", [diffrax.Tsit5(), diffrax.Kvaerno5()], ids=["explicit", "implicit"])
+def test_stiff_springs(solver):
+    """1e9 N/m under a pendulum: as on a rigid pivot, to the stretch of the spring; the implicit solver needs fewer steps."""
+    chain, rigid = sprung_and_rigid()
     traj = svkc.simulate(chain, chain.state({"b": 0.5}), 0.1, solver=solver)
     expected = svkc.simulate(rigid, rigid.state({"b": 0.5}), 0.1, **FINE)
     assert float(traj.final.q[1]) == pytest.approx(float(expected.final.q[0]), abs=1e-6)
@@ -212,36 +221,3 @@ def test_velocities_that_break_the_loops_are_made_to_agree():
     raw = svkc.State(state.q, state.v.at[0].add(5.0), state.structure)
     traj = svkc.simulate(chain, raw, 0.1, **FINE)
     assert float(traj.gap_rates[-1].max()) < 1e-12
-
-
-def test_single_precision():
-    """float32: the N four-bar and a chain of unlike masses, with bounds of their own; float64 input where x64 is off warns once."""
-    with jax.enable_x64(False):
-        chain, state = maximal.load(n_four_bar(2))
-        assert state.q.dtype == jnp.float32
-        traj = svkc.simulate(chain, state, 2.0, ts=2 * TIMES.astype(jnp.float32), rtol=1e-5, atol=1e-6)
-        assert float(traj.gaps.max()) < 1e-5
-        assert abs(float(traj.report().energy_drift)) < 1e-2 * 35.8
-        chain = rods([1e3, 1.0, 1e-3], [1.0] * 3)
-        traj = svkc.simulate(chain, zigzag(chain), 1.0, ts=TIMES.astype(jnp.float32))
-        assert drift(chain, traj) < 1e-3
-        chain = models.four_bar()
-        with pytest.warns(UserWarning, match="v in float64, kept in float32") as said:
-            state = chain.state(v=np.array([1.0, 0.0, 0.0]))
-        assert len(said) == 1
-        svkc.simulate(chain, state, np.float64(0.1), ts=np.linspace(0, 0.1, 3))
-    wide = models.four_bar()
-    state = wide.state()
-    with jax.enable_x64(False), pytest.raises(ValueError, match="float64, but jax_enable_x64 is off"):
-        svkc.simulate(wide, state, 0.1)
-
-
-def test_the_high_bar_in_single_precision():
-    """Ten seconds on the bar by both hands: the loops stay closed by projection."""
-    with jax.enable_x64(False):
-        chain, state = svkc.scenes.high_bar(ignore=("limit",))
-        traj = svkc.simulate(chain, state, 10.0, ts=jnp.linspace(0, 10, 101))
-        assert traj.final.structure.connected.all()
-        assert traj.states.q.dtype == jnp.float32
-        assert float(traj.gaps[:, 1].max()) < 1e-5
-        assert float(traj.gaps[:, 0].max()) < 1e-5

@@ -141,11 +141,14 @@ def test_direction_and_rearming(pendulum):
 
 
 def test_events_at_the_ends_and_together(pendulum):
-    """At t0, at t1, and a cut and a connect at one instant."""
+    """At t0, at t1, and there a guard's as well."""
     state = pendulum.state({"arm": 0.5}, {"arm": 1.0})
-    events = [svkc.at(0.0, connect="hook", here=True), svkc.at(0.5, cut="hook"), svkc.at(1.0, connect="hook", here=True)]
+    last = svkc.when(lambda t, s, args: t - 1.0, stop=True)
+    events = [svkc.at(0.0, connect="hook", here=True), svkc.at(0.5, cut="hook"), svkc.at(1.0, connect="hook", here=True), last]
     traj = svkc.simulate(pendulum, state, 1.0, ts=jnp.array([0.0, 0.25, 0.5, 1.0]), events=events)
-    assert traj.events.time.tolist() == [0, 0.5, 1.0]
+    assert traj.events.time[:4].tolist() == [0, 0.5, 1.0, 1.0]
+    assert traj.events.which[:4].tolist() == [0, 1, 2, 3]
+    assert traj.result == svkc.RESULTS.stopped
     assert traj.connected[:, 0].tolist() == [True, True, False, True]
     np.testing.assert_allclose(traj.states.q[:3, 0], 0.5, atol=1e-12)
     assert traj.final.structure.connected.tolist() == [True]
