@@ -36,9 +36,14 @@ def case(name: str):
     return held("ball" if "ball" in name else "hinge")
 
 
+def path(name: str) -> str:
+    """Of the model."""
+    return str(svkc.scenes.FOLDER / "figure16.xml") if name == "high bar" else FIGURE
+
+
 def in_mujoco(name: str, chain, state) -> tuple[mujoco.MjModel, np.ndarray, np.ndarray]:
     """MuJoCo's model with the step DT and no ranges, grips as `connect`s; qpos, qvel."""
-    spec = mujoco.MjSpec.from_file(str(svkc.scenes.FOLDER / "figure16.xml") if name == "high bar" else FIGURE)
+    spec = mujoco.MjSpec.from_file(path(name))
     model = soft_loops.figure(SimpleNamespace(chain=chain, state=state), spec, DT)
     model.opt.timestep, model.opt.jacobian = DT, mujoco.mjtJacobian.mjJAC_DENSE
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_LIMIT

@@ -15,7 +15,8 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from speed import RESULTS, Program, scanned
+from programs import Program, scanned
+from speed import RESULTS
 
 import svkc
 

@@ -1,0 +1,33 @@
+"""Compiled loops of steps, and what making them took."""
+
+import time
+
+import jax
+import numpy as np
+
+
+class Program:
+    """A compiled function of states, and what making it took. Called: all its steps."""
+
+    def __init__(self, function, states):
+        seconds = [time.perf_counter()]
+        stages = jax.jit(function).trace(states)
+        seconds.append(time.perf_counter())
+        stages = stages.lower()
+        seconds.append(time.perf_counter())
+        self.program, self.states = stages.compile(), states
+        self.made = [*np.diff([*seconds, time.perf_counter()]).tolist(), self.program.memory_analysis().temp_size_in_bytes / 1e6]
+
+    def __call__(self):
+        jax.block_until_ready(self.program(self.states))
+
+
+def scanned(step, steps: int):
+    """Many steps, in a loop that is compiled."""
+    return lambda states: jax.lax.scan(lambda s, _: (step(s), None), states, None, length=steps)[0]
+
+
+def of_lanes(step, states, steps: int) -> Program:
+    """Many steps of many lanes, or of one alone."""
+    one = jax.tree.leaves(states)[0].shape[0] == 1
+    return Program(scanned(step, steps), jax.tree.map(lambda x: x[0], states)) if one else Program(scanned(jax.vmap(step), steps), states)
