@@ -1,6 +1,5 @@
 """F7: pictures of a run. matplotlib, Pillow and mujoco's renderer are imported where they are used."""
 
-import importlib
 import os
 import pathlib
 
@@ -16,7 +15,7 @@ def _installed() -> None:
     """RuntimeError: what draws is not installed."""
     for name in ("matplotlib", "PIL"):
         try:
-            importlib.import_module(name)
+            __import__(name)
         except ImportError as error:
             raise RuntimeError("pictures need the packages matplotlib and pillow: pip install 'svkc[viz]'") from error
 

@@ -205,6 +205,16 @@ def test_info(tmp_path):
     assert "1 joint freedoms in the tree" in done.stdout
     assert "mobility (N_F = N_J - m)     1" in done.stdout
     assert "independent coordinates: j" in done.stdout
+    rod = '<body name="{0}"{2}><joint name="{0}" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 {1}" size=".03"/>{3}</body>'
+    bars = rod.format("crank", "0 0 .4", "", rod.format("coupler", "1 0 .2", ' pos="0 0 .4"', "")) + rod.format("rocker", "0 0 .6", ' pos="1 0 0"', "")
+    pin = '<equality><connect name="pin" body1="coupler" body2="rocker" anchor="1 0 .2"/></equality>'
+    (tmp_path / "m.xml").write_text(f"<mujoco><worldbody>{bars}</worldbody>{pin}</mujoco>")
+    told = run("-m", "svkc", "info", tmp_path / "m.xml").stdout
+    for line in (
+        "1 virtual links: pin", "rank of the loops (m)        5", "pin: 6 rows, 1 of them redundant", "left out: collision",
+        "joints that can be cut, load(..., cuttable=[...]): crank, coupler, rocker", "ends of the tree, which could be held: coupler, rocker",
+    ):  # fmt: skip
+        assert line in told, (line, told)
     (tmp_path / "bad.xml").write_text("<mujoco")
     assert run("-m", "svkc", "info", tmp_path / "bad.xml").returncode == 1
 
@@ -215,8 +225,12 @@ def test_pictures_say_what_they_cannot_draw(high_bar, tmp_path, monkeypatch):
 
     import svkc
 
-    def missing(name):
-        raise ImportError(name)
+    plain = importlib.import_module
+
+    def missing(name, *where):
+        if name.startswith("mujoco."):
+            raise ImportError(name)
+        return plain(name, *where)
 
     traj = svkc.simulate(*high_bar, 0.0)
     with monkeypatch.context() as patch:
@@ -225,6 +239,30 @@ def test_pictures_say_what_they_cannot_draw(high_bar, tmp_path, monkeypatch):
             svkc.render(high_bar[0], traj, tmp_path / "x.gif")
     with pytest.raises(ValueError, match=r"\.png, \.gif, \.mp4 or \.html"):
         svkc.render(high_bar[0], traj, tmp_path / "x.bmp")
+
+
+def test_cameras(tmp_path):
+    """The model's own by its name, and those that are placed, each see something else."""
+    from PIL import Image
+
+    import svkc
+
+    camera = '<camera name="above" pos="0 -1 4" xyaxes="1 0 0 0 1 0"/>'
+    body = '<body name="rod"><joint axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0.3 0.2 -1" size="0.05"/></body>'
+    chain = svkc.load(f"<mujoco><worldbody><light pos='0 0 5'/>{camera}{body}</worldbody></mujoco>")
+    traj, seen = svkc.simulate(chain, chain.state(), 0.1, ts=[0.0, 0.05, 0.1]), set()
+    ways = {"camera": "above"}, {"lookat": (0, 0, -0.5)}, {"lookat": (0, 0, -0.5), "distance": 6.0}, {"azimuth": 20.0, "elevation": -60.0}
+    for i, way in enumerate(ways):
+        try:
+            path = svkc.render(chain, traj, tmp_path / f"{i}.gif", size=(96, 64), trails=("rod",), **way)
+        except RuntimeError:
+            # without an offscreen OpenGL there is no picture: that this is said is tested above
+            return
+        with Image.open(path) as image:
+            assert image.width == 96
+            assert len(image.convert("RGB").getcolors(1 << 16)) > 10
+            seen.add(image.convert("RGB").tobytes())
+    assert len(seen) == len(ways)
 
 
 def test_ruff_is_content():
