@@ -1,10 +1,11 @@
 """F4: accelerations of a closed chain by articulated bodies and the forces of its loops: no pivots are chosen.
 
 What a force in one loop row does in all others is Delassus' matrix D = J M^-1 J^T over the tree's coordinates. Virtual joints have coordinates without
-inertia: along them nothing is carried, so the rows are seen across them alone.
+inertia: along them nothing is carried, so the rows are seen across them alone; the three rows that a ball turns in are not in D at all.
 """
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -20,6 +21,8 @@ from svkc.spatial import inverse_positive, rotate
 
 # of the forces' error, along a row with 1e-6 of the others' inverse inertia, each leaves 1e-4 (float64)
 REFINEMENTS = 2
+# the joint that turns as it likes
+BALL = (True, True, True, False, False, False)
 # rows from which LAPACK factors D: the inverse by halves is compiled for each size, and its operations grow with the rows
 LARGE = 36
 
@@ -41,6 +44,11 @@ class Joints(eqx.Module):
         rates = self.along(x)
         return x - rotate(_led(self.light, rates), rates).reshape(x.shape)
 
+    def part(self, links: np.ndarray) -> "Joints":
+        """Those of some links."""
+        heavy, armature = (None if x is None else x[links] for x in (self.heavy, self.armature))
+        return Joints(self.light[links], self.inverse[links], heavy, armature, self.place[links], self.count)
+
     def along(self, x: Float[Array, "*n rows"]) -> Float[Array, "*n links d"]:
         """The rates of virtual joints without inertia that follow the rows best."""
         x = x.reshape(*x.shape[:-1], -1, 6)
@@ -54,6 +62,31 @@ class Joints(eqx.Module):
         """The same in the order of the coordinates."""
         flat = self.place.ravel()
         return rates.ravel()[np.argsort(flat, kind="stable")[: np.sum(flat < self.count)]]
+
+
+class Rows(NamedTuple):
+    """The rows of J that are in D: all six of `whole` links, then the last three of those with a ball; where each row of J is among them (past their end:
+    nowhere)."""
+
+    whole: np.ndarray
+    kept: np.ndarray
+    back: np.ndarray
+
+    def fill(self, x: Float[Array, " kept"]) -> Float[Array, " rows"]:
+        """All rows of J, zero where they are not in D."""
+        return jnp.concatenate([x, jnp.zeros_like(x[:1])])[self.back]
+
+
+def rows_held(chain: Chain, locked: bool) -> Rows:
+    """A declared ball turns freely where none of its coordinates is locked or has inertia; what a spare slot holds is known at run time alone."""
+    top = chain.topology
+    free = np.array([tuple(f) == BALL and not spare for f, spare in zip(top.link_freedoms, top.link_spare, strict=True)], bool)
+    free = free & (not locked and chain.link_armature is None)
+    six = np.arange(6 * len(free)).reshape(-1, 6)
+    kept = np.concatenate([six[~free].ravel(), six[free][:, 3:].ravel()])
+    back = np.full(six.size, len(kept))
+    back[kept] = np.arange(len(kept))
+    return Rows(np.flatnonzero(~free), kept, back)
 
 
 def _led(A: Float[Array, "links i j"], x: Float[Array, "*n links k"]) -> Float[Array, "*m links i j"]:
@@ -83,14 +116,16 @@ def by_loop_forces(chain: Chain, kin: Kinematics, J: Float[Array, "rows dofs"], 
     motion is that of the others.
     """
     top, nv, tree = chain.topology, chain.nv, J[:, : chain.nv]
-    bodies, own = articulate(chain, kin, free), joints(chain, J)
-    D = seen_by(top, bodies, tree)
+    bodies, own, held = articulate(chain, kin, free), joints(chain, J), rows_held(chain, free is not None)
+    some, six = own.part(held.whole), 6 * len(held.whole)
+    across = lambda x: jnp.concatenate([some.across(x[..., :six]), x[..., six:]], -1) if six else x
+    D = seen_by(top, bodies, tree[held.kept])
     if own.heavy is not None:
         # virtual joints with armature add what they give way by
         weight = jnp.where(own.armature > 0, 1 / jnp.where(own.armature > 0, own.armature, 1), 0)
         given = lambda force, mu: weight * (force + rotate(jnp.swapaxes(own.heavy, -1, -2), mu.reshape(-1, 6)))
         D = D + block_diag(*jnp.sum(own.heavy[:, :, None] * own.heavy[:, None] * weight[:, None, None], -1))
-    D = own.across(own.across(D).T)
+    D = across(across(D).T)
     most = jnp.max(jnp.where(np.eye(D.shape[0], dtype=bool), D, 0))
     # (none where no loop is closed)
     little = jnp.finfo(J.dtype).eps ** 0.625 * jnp.where(most > 0, most, 1)
@@ -110,11 +145,11 @@ def by_loop_forces(chain: Chain, kin: Kinematics, J: Float[Array, "rows dofs"], 
         left = rate - tree @ alone
         if own.heavy is not None:
             left = left - rotate(own.heavy, given(applied, carried)).ravel()
-        left = own.across(left)
+        left = across(left[held.kept])
         z = nearly(left)
         for _ in range(REFINEMENTS):
             z = z + nearly(left - D @ z)
-        mu = carried + own.across(z)
+        mu = carried + held.fill(across(z))
         x = accelerations(top, bodies, force[:nv] + mu @ tree)
         turning = jnp.zeros_like(applied) if own.heavy is None else given(applied, mu)
         seen = tree @ x if own.heavy is None else tree @ x + rotate(own.heavy, turning).ravel()
