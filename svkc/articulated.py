@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from svkc.chain import Chain
 from svkc.inverse_dynamics import central_inertias
 from svkc.kinematics import LEVELS_UNROLLED, Kinematics
+from svkc.lanes import sum_by_few
 from svkc.spatial import inverse_positive, skew
 from svkc.topology import V_SIZE, Topology
 
@@ -149,8 +150,8 @@ def seen_by(top: Topology, bodies, J: Float[Array, "rows nv"]) -> Float[Array, "
     parts = _carried(top, bodies, J.T)
     parts = parts if isinstance(parts, list) else [parts]
     u, x = (jnp.concatenate([part[i].reshape(-1, J.shape[0]) for part in parts]) for i in (0, 1))
-    # a sum, not a `dot`, which XLA's CPU backend would not put into one kernel with what is around it
-    return jnp.sum(u[:, :, None] * x[:, None], 0)
+    # sums, not a `dot`, which XLA's CPU backend would not put into one kernel with what is around it
+    return sum_by_few(u[:, :, None] * x[:, None], (0,))
 
 
 def accelerations(top: Topology, bodies, f: Float[Array, " nv"]) -> Float[Array, " nv"]:

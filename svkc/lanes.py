@@ -19,7 +19,7 @@ from svkc.operation import operation
 
 # lanes that one processor takes at a time: what they need between two operations stays in its cache (benchmarks/README.md)
 TILE = 32
-# terms of a sum at a time: 46 in one loop cost a step with two grips a quarter of its time
+# terms of a sum at a time: 46 in one loop cost a step with two grips a quarter of its time, 22 one of the high bar's 16-joint figure a third
 FEW = 8
 ELEMENTWISE = set(
     "abs add add_any and atan2 ceil clamp convert_element_type copy copy_p cos div eq exp exp2 expm1 floor ge gt integer_pow is_finite le log log1p lt max min "
@@ -77,8 +77,8 @@ def _gather(x, index, lanes: int, *, dimension_numbers, slice_sizes, **rest):
     return lax.gather(x.x, index, d._replace(operand_batching_dims=of_x, start_indices_batching_dims=of_index), (*slice_sizes, 1), **rest)
 
 
-def _sum(x: Array, axes: tuple[int, ...]) -> Array:
-    """Sums of few at a time: such a loop is unrolled, and the one over lanes around it can take several in one instruction."""
+def sum_by_few(x: Array, axes: tuple[int, ...]) -> Array:
+    """Sums of few at a time: such a loop is unrolled, and the one around it, over lanes or what else is last, can take several in one instruction."""
     for axis in sorted(axes, reverse=True):
         size = x.shape[axis]
         parts = [jnp.sum(lax.slice_in_dim(x, i, min(i + FEW, size), axis=axis), axis, x.dtype) for i in range(0, max(size, 1), FEW)]
@@ -98,7 +98,7 @@ def _dot(*sides, dimension_numbers, preferred_element_type, **_):
     left, right = (jnp.transpose(x, (*b, *f, *c, x.ndim - 1)) for x, b, f, c in zip(sides, batch, free, contracted, strict=True))
     products = jnp.expand_dims(left, range(middle, end)) * jnp.expand_dims(right, range(axes, middle))
     products = products if preferred_element_type is None else products.astype(preferred_element_type)
-    return _sum(products, tuple(range(end, end + len(contracted[0]))))
+    return sum_by_few(products, tuple(range(end, end + len(contracted[0]))))
 
 
 def _solve(inputs: list, lanes: int, *, const_lengths, jaxprs, **_):
@@ -119,7 +119,7 @@ def _one(primitive, inputs: list, params: dict, shape: tuple[int, ...], lanes: i
     """What one operation makes of values of which some are `Lanes`, in arrays [..., lanes]."""
     name, alone = primitive.name, len(inputs) == 1
     if name == "reduce_sum":
-        return _sum(inputs[0].x, params["axes"])
+        return sum_by_few(inputs[0].x, params["axes"])
     if name in ALONG:
         return primitive.bind(inputs[0].x, **params)
     if name in JOINING:
