@@ -28,7 +28,7 @@ import svkc
 from svkc.scenes import FOLDER, high_bar
 
 RESULTS = pathlib.Path(__file__).parent / "results" / "gradients.csv"
-RUNS, STEPS, DT = 7, 200, 2e-3
+RUNS, STEPS, DT, LANES = 7, 200, 2e-3, 64
 KUTTA = diffrax.ButcherTableau(
     c=np.array([0.5, 0.5, 1.0]), b_sol=np.array([1, 2, 2, 1]) / 6, b_error=np.zeros(4),
     a_lower=(np.array([0.5]), np.array([0.0, 0.5]), np.array([0.0, 0.0, 1.0])),
@@ -45,8 +45,8 @@ class ClassicalRungeKutta(diffrax.AbstractERK):
         return 4
 
 
-def whole_run():
-    """The high bar, both hands let go."""
+def whole_run(**how):
+    """The high bar, both hands let go. how: options of `simulate`."""
     chain, state = high_bar()
     ts = jnp.linspace(0, 1.8, 73)
 
@@ -56,7 +56,7 @@ def whole_run():
         start = svkc.State(state.q, state.v + p["v"], state.structure)
         events = (svkc.at(p["times"][0], cut="right_hand_grip"), svkc.at(p["times"][1], cut="left_hand_grip"))
         control = lambda t, s, a: jnp.pad(a @ jnp.sin(jnp.arange(1, 7) * t), (6, chain.dofs - 22))
-        traj = svkc.simulate(c, start, 1.8, ts=ts, events=events, rtol=1e-8, atol=1e-10, control=control, args=p["torque"], throw=False)
+        traj = svkc.simulate(c, start, 1.8, ts=ts, events=events, rtol=1e-8, atol=1e-10, control=control, args=p["torque"], throw=False, **how)
         return jnp.sum(traj.final.q[:3]) + 0.1 * jnp.sum(traj.states.q[40])
 
     bodies = chain.mass.shape[0]
@@ -174,6 +174,8 @@ def main():
     loss, p = whole_run()
     count = sum(x.size for x in jax.tree.leaves(p))
     rows, _ = measured(f"high bar, {count} parameters", loss, p)
+    bodies = whole_run(dynamics=svkc.Dynamics(inertia=svkc.by_bodies))[0]
+    rows += measured("high bar, by bodies", bodies, p)[0]
     loss, p = falling()
     count = sum(x.size for x in jax.tree.leaves(p))
     try:
@@ -182,6 +184,8 @@ def main():
         peers = []
         print(f"no MJX: {missing}; pip install 'svkc[bench]'")
     more, gradients = measured(f"open chain, {count} parameters", loss, p, peers)
+    many = jax.tree.map(lambda x: x + 0.01 * jax.random.normal(jax.random.key(0), (LANES, *x.shape)), p)
+    more += measured(f"open chain, {LANES} lanes", lambda many: jnp.sum(jax.vmap(loss)(many)), many)[0]
     value, by_differences = falling_by_mujoco()
     once = timed({"run": lambda p: value(p)}, p)["run"]
     whole = timed({"gradient": lambda p: by_differences(p)}, p, runs=1)["gradient"]

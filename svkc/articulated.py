@@ -41,7 +41,10 @@ class Level(NamedTuple):
 
 @functools.cache
 def levels(top: Topology) -> list[Level] | Level:
-    """One for each level, as small as it can be; in deep trees all as large as the largest, stacked, for a loop over them."""
+    """One for each level, as small as it can be; in deep trees all as large as the largest, stacked, for a loop over them.
+
+    int32: jax (0.10) takes the same array of int64 for an index in one precision only of those that a process computes in.
+    """
     deep, parents = len(top.levels) > LEVELS_UNROLLED, np.array(top.parent)
     bounds = [*top.levels[1:], (len(parents), len(parents))]
     families = [[np.flatnonzero(parents[lo:hi] == i) for i in range(first, last)] for (first, last), (lo, hi) in zip(bounds[:-1], bounds[1:], strict=True)]
@@ -51,12 +54,14 @@ def levels(top: Topology) -> list[Level] | Level:
     for level, (first, last) in enumerate(bounds[:-1]):
         n, below = (widest, widest) if deep else (last - first, len(parents[slice(*bounds[level + 1])]))
         d = max(1, freest if deep else max(sizes[level]))
-        of = Level(np.full(n, len(parents)), np.full((n, d), top.nv), np.full((n, most if deep else max(map(len, families[level]))), below), np.zeros(n, int))
+        filled = lambda shape, value: np.full(shape, value, np.int32)
+        children = most if deep else max(map(len, families[level]))
+        of = Level(filled(n, len(parents)), filled((n, d), top.nv), filled((n, children), below), filled(n, 0))
         of.rows[: last - first] = np.arange(first, last)
         of.parent[: last - first] = parents[first:last] - top.levels[level][0]
-        for i, (size, children) in enumerate(zip(sizes[level], families[level], strict=True)):
+        for i, (size, family) in enumerate(zip(sizes[level], families[level], strict=True)):
             of.dofs[i, :size] = np.arange(top.v_start[first + i], top.v_start[first + i] + size)
-            of.children[i, : len(children)] = children
+            of.children[i, : len(family)] = family
         found.append(of)
     return Level(*map(np.stack, zip(*found, strict=True))) if deep else found
 

@@ -61,7 +61,8 @@ def _doublings(top: Topology) -> list[tuple[np.ndarray, np.ndarray]]:
         table = np.full((none, max(map(len, below))), none)
         for row, own in zip(table, below, strict=True):
             row[: len(own)] = own
-        found.append((above[:-1], table))
+        # (as small as jax has them in both precisions: `articulated.levels`)
+        found.append((above[:-1].astype(np.int32), table.astype(np.int32)))
         above = above[above]
     return found
 

@@ -126,3 +126,25 @@ def test_a_hundred_thousand_steps():
     assert int(traj.report().accepted) == pytest.approx(100_000, rel=2e-3)
     assert float(traj.report().gap) < 2e-5
     assert extremes.drift(chain, traj) < 1e-2
+
+
+@pytest.mark.parametrize("name", ["four_bar", "two_bars", "deep"])
+def test_both_precisions_in_one_process(name):
+    """One model in float64, then in float32, then in float64 again: each as if it were alone."""
+    make = {"four_bar": models.four_bar, "two_bars": extremes.two_bars, "deep": lambda: extremes.rods([0.1] * 40, [0.1] * 40)}[name]
+
+    def found():
+        chain = make()
+        state = chain.state(v=np.linspace(-1, 1, chain.nv, dtype=chain.q_load.dtype))
+        fast = svkc.Dynamics(inertia=svkc.by_bodies)
+        stepped = svkc.step(chain, state, jnp.zeros(chain.nv), 1e-3)
+        run = svkc.simulate(chain, state, 0.01, dt=2e-3, dynamics=fast)
+        return [np.asarray(x, float) for x in (svkc.forward_dynamics(chain, state, jnp.zeros(chain.nv)), stepped.v, run.final.q)]
+
+    double = found()
+    with jax.enable_x64(False):
+        single = found()
+    for a, b in zip(double, single, strict=True):
+        np.testing.assert_allclose(b, a, atol=2e-3 * np.abs(a).max())
+    for a, b in zip(double, found(), strict=True):
+        np.testing.assert_array_equal(a, b)
