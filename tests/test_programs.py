@@ -1,0 +1,53 @@
+"""What the programs are made of: no calls back to Python, float32 throughout where that is asked, no LAPACK in steps by articulated bodies."""
+
+import re
+
+import jax
+import jax.numpy as jnp
+import models
+import pytest
+
+import svkc
+
+BODIES = {"dynamics": svkc.Dynamics(inertia=svkc.by_bodies)}
+
+
+def lowered(function, *args) -> str:
+    return jax.jit(function).lower(*args).as_text()
+
+
+def calls(text: str) -> set[str]:
+    """Names of what is called that is no operation of XLA's own; those that only mark or arrange are left out."""
+    return set(re.findall(r"custom_call @(\w+)", text)) - {"Sharding", "annotate_device_placement"}
+
+
+@pytest.fixture(scope="module", params=["float64", "float32"])
+def precision(request):
+    with jax.enable_x64(request.param == "float64"):
+        yield request.param
+
+
+def run(chain, state, **how):
+    events = [svkc.at(0.02, cut="pin"), svkc.when(lambda t, s, args: s.q[0] - 0.3, connect="pin", here=True)]
+    return svkc.simulate(chain, state, 0.1, events=events, throw=False, **how)
+
+
+def test_programs(precision):
+    chain = models.four_bar()
+    state, tau = chain.state(v={"crank": 4.0}), jnp.zeros(chain.nv)
+    batch = jax.tree.map(lambda x: jnp.stack([x, x]), state)
+    gradient = lambda how: lambda v: jax.grad(lambda v: jnp.sum(run(chain, svkc.State(state.q, v, state.structure), **how).final.q))(v)
+    programs = {
+        "step": lowered(lambda s: svkc.step(chain, s, tau, 1e-3), state),
+        "steps of lanes": lowered(jax.vmap(lambda s: svkc.step(chain, s, tau, 1e-3)), batch),
+        "phase by bodies": lowered(lambda s: svkc.simulate(chain, s, 0.1, throw=False, **BODIES), state),
+        "run": lowered(lambda s: run(chain, s), state),
+        "gradient": lowered(gradient({}), state.v),
+    }
+    for name, text in programs.items():
+        found = calls(text)
+        assert not any("callback" in call for call in found), (name, found)
+        assert not found or name in ("run", "gradient"), (name, found)
+        assert ("f64" in text) == (precision == "float64"), name
+        # on a GPU these are its own library's
+        assert all(call.startswith("lapack") for call in found), (name, found)
