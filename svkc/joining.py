@@ -53,12 +53,13 @@ def _on_bodies(model, link: VirtualLink, ids: dict[str, int]) -> VirtualLink:
     """The link from body to body: an end that names a site is the site's body, its placement is in the site's frame, at the site where none is given."""
     import mujoco
 
+    sites = {name_of(model, "site", i): i for i in range(model.nsite)}
     for side, pos, quat in (("parent", "pos", "quat"), ("real", "real_pos", "real_quat")):
         name = getattr(link, side)
         if name in ids:
             continue
-        site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, name)
-        if site < 0:
+        site = sites.get(name)
+        if site is None:
             raise ValueError(f"virtual link {link.name!r}: {side} is {name!r}, neither a body nor a site; bodies: {', '.join(ids)}")
         frame, body = model.site_quat[site], name_of(model, "body", int(model.site_bodyid[site]))
         place, turn = np.zeros(3), np.zeros(4)

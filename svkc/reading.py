@@ -12,7 +12,7 @@ KINDS = {0: FREE, 1: BALL, 2: SLIDE, 3: HINGE}  # mjtJoint
 
 
 def name_of(model, kind: str, index: int) -> str:
-    """The name of a body, joint or equality, or kind_index where it has none."""
+    """The name of a body, joint, site or equality, or kind_index where it has none."""
     import mujoco
 
     name = mujoco.mj_id2name(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), index)
