@@ -178,7 +178,7 @@ def in_mujoco(problem: Problem, name: str):
             run = soft_loops.Run(problem, name, integrator, dt * min(1.0, problem.end))
             q, seconds = timed(run)
             failed = "" if np.isfinite(q).all() else "not finite"
-            yield [f"MuJoCo {integrator}", dt, seconds / problem.end, problem.error(q), run.gap, np.nan, run.steps, failed]
+            yield [f"MuJoCo {integrator}", dt, seconds / problem.end, problem.error(q), run.gap, abs(run.drift), run.steps, failed]
 
 
 def curves(name: str, loops: bool):

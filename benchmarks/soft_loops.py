@@ -67,7 +67,9 @@ MODELS = {
 
 
 class Run:
-    """MuJoCo from the problem's start to its end; links are let go when they were in the reference. Called: qpos in the order of the chain's q."""
+    """MuJoCo from the problem's start to its end; links are let go when they were in the reference. Called: qpos in the order of the chain's q.
+
+    gap: the largest of the loops at releases and the end. drift: change of energy less the work of the torques, J."""
 
     def __init__(self, problem, name: str, integrator: str, dt: float):
         chain, state = problem.chain, problem.state
@@ -82,7 +84,7 @@ class Run:
         model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_LIMIT
         self.data, self.dt, self.start = mujoco.MjData(model), dt, (np.zeros(model.nq), np.zeros(model.nv))
-        self.torque, self.gap = np.zeros(model.nv), 0.0
+        self.torque, self.gap, self.drift = np.zeros(model.nv), 0.0, 0.0
         self.order = self._places(chain)
         self.start[0][self.order[0]], self.start[1][self.order[1]] = state.q[: chain.nq], state.v[: chain.nv]
         for i in (i for i in range(model.njnt) if model.joint(i).name in chain.link_names):
@@ -102,14 +104,23 @@ class Run:
             v += range(self.model.jnt_dofadr[i], self.model.jnt_dofadr[i] + nv)
         return q, v
 
+    def _energy(self) -> float:
+        mujoco.mj_forward(self.model, self.data)
+        mujoco.mj_energyPos(self.model, self.data)
+        mujoco.mj_energyVel(self.model, self.data)
+        driven = self.model.jnt_qposadr[self.model.dof_jntid[self.torque != 0]]
+        return self.data.energy.sum() - self.torque[self.torque != 0] @ self.data.qpos[driven]
+
     def __call__(self):
         model, data = self.model, self.data
         mujoco.mj_resetData(model, data)
         data.qpos[:], data.qvel[:], data.qfrc_applied[:], self.gap = *self.start, self.torque, 0.0
+        begun_with = self._energy()
         for begun, stop in zip([0.0, *self.stops], self.stops):
             steps = max(round((stop - begun) / self.dt), 1)
             model.opt.timestep = (stop - begun) / steps
             mujoco.mj_step(model, data, steps)
             self.gap = max(self.gap, float(np.abs(data.efc_pos).max()) if data.nefc else 0.0)
             data.eq_active[self.released.get(stop, [])] = 0
+        self.drift = self._energy() - begun_with
         return data.qpos[self.order[0]].copy()
