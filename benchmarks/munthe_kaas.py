@@ -26,7 +26,7 @@ def turned(chain, u, v):
     return v.at[at].set(w + once / 2 + second * jnp.cross(x, once))
 
 
-class MuntheKaas(diffrax.AbstractSolver):
+class MuntheKaas(diffrax.AbstractAdaptiveSolver):
     """The inner solver's steps in coordinates about where each begins."""
 
     solver: diffrax.AbstractSolver

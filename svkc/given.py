@@ -60,7 +60,7 @@ def positive(name: str, value):
 
 def whole(name: str, value, least: int, most: int = 2**31 - 1) -> int:
     """A whole number from `least` to `most`."""
-    number = np.asarray(value) if concrete(value) else np.asarray(None)
+    number = np.asarray(arrayed(value) if concrete(value) else None)
     if number.shape != () or number.dtype.kind not in "iuf" or not np.isfinite(number) or number != np.floor(number) or not least <= number <= most:
         raise ValueError(f"{name}: got {value!r}, expected a whole number from {least} to {most}")
     return int(number)

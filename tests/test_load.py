@@ -264,6 +264,7 @@ def test_a_robot_of_others():
         (lambda: svkc.load(PENDULUM, ignore=("tendons!",)), "ignore"),
         (lambda: svkc.load(PENDULUM, virtual_links=[svkc.VirtualLink("a", "arm", "leg")]), "'leg', neither a body nor a site"),
         (lambda: svkc.load(PENDULUM, virtual_links=[svkc.VirtualLink("a", "\ud800", "arm")]), "neither a body nor a site"),
+        (lambda: svkc.load(PENDULUM, spare=[[1.0], [1.0, 2.0]]), "whole number"),
         (lambda: svkc.load(PENDULUM, virtual_links=["a"]), "VirtualLink"),
         (lambda: svkc.load(PENDULUM, virtual_links=[svkc.VirtualLink("a", "world", "arm")] * 2), "differ"),
         (lambda: svkc.VirtualLink("a", "world", "arm", "rubber"), "rubber"),
