@@ -18,6 +18,7 @@ from svkc.inverse_dynamics import central_inertias
 from svkc.kinematics import LEVELS_UNROLLED, Kinematics
 from svkc.lanes import sum_by_few
 from svkc.spatial import inverse_positive, skew
+from svkc.taking import take
 from svkc.topology import V_SIZE, Topology
 
 
@@ -84,8 +85,8 @@ def _zeros(top: Topology, *shape: int, dtype) -> Array | None:
 
 
 def _from(children: Int[Array, "m c"] | np.ndarray, below: Float[Array, "n *k"]) -> Float[Array, "m *k"]:
-    """For each row of a level, the sum of its children's in the level below: a gather and a sum, no scatter."""
-    return jnp.sum(jnp.concatenate([below, jnp.zeros_like(below[:1])])[children], 1)
+    """For each row of a level, the sum of its children's in the level below."""
+    return jnp.sum(take(below, children), 1)
 
 
 def _beside(top: Topology, *given: Callable):
@@ -107,9 +108,7 @@ def body_inertias(chain: Chain, kin: Kinematics) -> Float[Array, "rows 6 6"]:
 def articulate(chain: Chain, kin: Kinematics, free: Bool[Array, " nv"] | None = None) -> list[Body] | Body:
     """Articulated inertias from the leaves to the roots. free: coordinates that are not locked (None: all)."""
     top, own = chain.topology, body_inertias(chain, kin)
-    own = jnp.concatenate([own, jnp.zeros_like(own[:1])])
     S = kin.S if free is None else jnp.where(free[:, None], kin.S, 0)
-    S = jnp.concatenate([S, jnp.zeros_like(S[:1])])
     more = jnp.zeros(chain.nv, S.dtype) if chain.armature is None else chain.armature
     more = more if free is None else jnp.where(free, more, 1)
     more = jnp.concatenate([more, jnp.ones(1, S.dtype)])
@@ -123,7 +122,7 @@ def articulate(chain: Chain, kin: Kinematics, free: Bool[Array, " nv"] | None = 
         along = jnp.sum(inverse[..., None] * U[:, None], 2)
         return A - jnp.sum(U[:, :, :, None] * along[:, :, None, :], 1), Body(s, U, inverse)
 
-    given = _beside(top, lambda x: own[x.rows], lambda x: S[x.dofs], lambda x: more[x.dofs])
+    given = _beside(top, lambda x: take(own, x.rows), lambda x: take(S, x.dofs), lambda x: take(more, x.dofs))
     return sweep(step, _zeros(top, 6, 6, dtype=S.dtype), given, reverse=True)
 
 
@@ -133,7 +132,6 @@ def _apply(A: Float[Array, "n i j"], x: Float[Array, "n j *k"]) -> Float[Array, 
 
 def _carried(top: Topology, bodies, f: Float[Array, "nv *k"]):
     """For each level the forces that its joints are left with, those from below taken off, and the accelerations that these give each joint alone."""
-    f = jnp.concatenate([f, jnp.zeros_like(f[:1])])
 
     def step(below, given):
         (level, force), body = given
@@ -143,7 +141,7 @@ def _carried(top: Topology, bodies, f: Float[Array, "nv *k"]):
         passed = _apply(jnp.swapaxes(body.U, 1, 2), x)
         return passed if p is None else passed + p, (u, x)
 
-    return sweep(step, _zeros(top, 6, *f.shape[1:], dtype=f.dtype), _paired(_beside(top, lambda x: f[x.dofs]), bodies), reverse=True)
+    return sweep(step, _zeros(top, 6, *f.shape[1:], dtype=f.dtype), _paired(_beside(top, lambda x: take(f, x.dofs)), bodies), reverse=True)
 
 
 def _paired(a, b):
@@ -165,7 +163,7 @@ def accelerations(top: Topology, bodies, f: Float[Array, " nv"]) -> Float[Array,
     def step(above, given):
         (level, body), (_, x) = given
         if above is not None:
-            a = above[level.parent]
+            a = take(above, level.parent)
             x = x - jnp.sum(body.inverse * jnp.sum(body.U * a[:, None], -1)[:, None], -1)
         moved = jnp.sum(body.S * x[..., None], 1)
         return moved if above is None else a + moved, x
@@ -173,7 +171,7 @@ def accelerations(top: Topology, bodies, f: Float[Array, " nv"]) -> Float[Array,
     found = levels(top)
     x = sweep(step, _zeros(top, 6, dtype=f.dtype), _paired(_paired(found, bodies), _carried(top, bodies, f)))
     x, order = (jnp.concatenate([y.ravel() for y in x]), [y.dofs for y in found]) if isinstance(found, list) else (x.ravel(), [found.dofs])
-    return x[np.argsort(np.concatenate([y.ravel() for y in order]), kind="stable")[: top.nv]]
+    return take(x, np.argsort(np.concatenate([y.ravel() for y in order]), kind="stable")[: top.nv])
 
 
 def by_bodies(chain: Chain, kin: Kinematics) -> list[Body] | Body:

@@ -18,6 +18,7 @@ from svkc.chain import Chain
 from svkc.factors import factor_positive
 from svkc.kinematics import Kinematics
 from svkc.spatial import inverse_positive, rotate
+from svkc.taking import take
 
 # of the forces' error, along a row with 1e-6 of the others' inverse inertia, each leaves 1e-4 (float64)
 REFINEMENTS = 2
@@ -56,12 +57,12 @@ class Joints(eqx.Module):
 
     def of(self, x: Float[Array, " virtual"]) -> Float[Array, "links d"]:
         """What stands for each freedom of each link; zero for those that are none."""
-        return jnp.concatenate([x, jnp.zeros_like(self.light[0, 0, :1])])[np.minimum(self.place, self.count)]
+        return take(x, np.minimum(self.place, self.count))
 
     def order(self, rates: Float[Array, "links d"]) -> Float[Array, " virtual"]:
         """The same in the order of the coordinates."""
         flat = self.place.ravel()
-        return rates.ravel()[np.argsort(flat, kind="stable")[: np.sum(flat < self.count)]]
+        return take(rates.ravel(), np.argsort(flat, kind="stable")[: np.sum(flat < self.count)])
 
 
 class Rows(NamedTuple):
@@ -74,7 +75,7 @@ class Rows(NamedTuple):
 
     def fill(self, x: Float[Array, " kept"]) -> Float[Array, " rows"]:
         """All rows of J, zero where they are not in D."""
-        return jnp.concatenate([x, jnp.zeros_like(x[:1])])[self.back]
+        return take(x, self.back)
 
 
 def rows_held(chain: Chain, locked: bool) -> Rows:
@@ -101,7 +102,7 @@ def joints(chain: Chain, J: Float[Array, "rows dofs"]) -> Joints:
     light = jnp.swapaxes(own[np.arange(len(place))[:, None], :, np.minimum(place, count)], -1, -2)
     heavy = armature = None
     if chain.link_armature is not None:
-        armature = jnp.concatenate([chain.link_armature, jnp.zeros_like(J[0, :1])])[np.minimum(place, count)]
+        armature = take(chain.link_armature, np.minimum(place, count))
         heavy = jnp.where(armature[:, None] > 0, light, 0)
         light = light - heavy
     still = jnp.where(jnp.all(light == 0, 1), 1, 0).astype(J.dtype)
@@ -119,7 +120,7 @@ def by_loop_forces(chain: Chain, kin: Kinematics, J: Float[Array, "rows dofs"], 
     bodies, own, held = articulate(chain, kin, free), joints(chain, J), rows_held(chain, free is not None)
     some, six = own.part(held.whole), 6 * len(held.whole)
     across = lambda x: jnp.concatenate([some.across(x[..., :six]), x[..., six:]], -1) if six else x
-    D = seen_by(top, bodies, tree[held.kept])
+    D = seen_by(top, bodies, take(tree, held.kept))
     if own.heavy is not None:
         # virtual joints with armature add what they give way by
         weight = jnp.where(own.armature > 0, 1 / jnp.where(own.armature > 0, own.armature, 1), 0)
@@ -145,7 +146,7 @@ def by_loop_forces(chain: Chain, kin: Kinematics, J: Float[Array, "rows dofs"], 
         left = rate - tree @ alone
         if own.heavy is not None:
             left = left - rotate(own.heavy, given(applied, carried)).ravel()
-        left = across(left[held.kept])
+        left = across(take(left, held.kept))
         z = nearly(left)
         for _ in range(REFINEMENTS):
             z = z + nearly(left - D @ z)

@@ -5,8 +5,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from svkc.chain import Chain, State
-from svkc.kinematics import Kinematics, difference, down, kinematics, to_rows, twists, up, velocity_products
+from svkc.kinematics import Kinematics, difference, down, kinematics, put, to_rows, twists, up, velocity_products
 from svkc.spatial import cross, halves, rotate
+from svkc.taking import take
 from svkc.verb import verb
 
 
@@ -30,7 +31,7 @@ def newton_euler(chain: Chain, kin: Kinematics, V: Float[Array, "rows 6"] | None
         moment = moment + cross(w, spin(w))
     force = chain.mass[:, None] * acceleration
     F = up(chain.topology, jnp.concatenate([moment + cross(c, force), force], -1))
-    return jnp.sum(kin.S * F[chain.topology.dof_row], -1)
+    return jnp.sum(kin.S * take(F, chain.topology.dof_row), -1)
 
 
 def generalized_forces(chain: Chain, kin: Kinematics, V, v, vdot: Float[Array, " nv"]) -> Float[Array, " nv"]:
@@ -65,7 +66,7 @@ def inertia_by_composites(chain: Chain, kin: Kinematics) -> Float[Array, "nv nv"
     m = chain.mass[:, None]
     square = jnp.sum(c * c, -1)[:, None, None] * jnp.eye(3, dtype=c.dtype)[None] - c[:, :, None] * c[:, None, :]
     I = central + m[:, :, None] * square
-    total = up(top, jnp.concatenate([m, m * c, I.reshape(-1, 9)], -1))[top.dof_row]
+    total = take(up(top, jnp.concatenate([m, m * c, I.reshape(-1, 9)], -1)), top.dof_row)
     m, h, I = total[:, :1], total[:, 1:4], total[:, 4:].reshape(-1, 3, 3)
     w, u = halves(kin.S)
     # momentum of everything a joint carries, for a unit of its velocity
@@ -99,10 +100,10 @@ def limit_forces(chain: Chain, q: Float[Array, " q"], v: Float[Array, " dofs"]) 
     k, c = chain.limit_spring
     at_q, at_v = chain.topology.scalars
     lower, upper = chain.limit[:, at_v]
-    x = q[at_q]
+    x = take(q, at_q)
     out = jnp.maximum(x - upper, 0) - jnp.maximum(lower - x, 0)
     onset = jnp.where(out != 0, jnp.exp(-0.02 / jnp.where(out != 0, jnp.abs(out), 1)), 0)
-    return tau.at[at_v].set(-(k[at_v] * out + c[at_v] * v[at_v]) * onset)
+    return put(tau, at_v, -(k[at_v] * out + c[at_v] * take(v, at_v)) * onset)
 
 
 @verb

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 
 from svkc.chain import Chain, State
 from svkc.spatial import cross, motion_cross, quat_about, quat_conjugate, quat_exp, quat_log, quat_matrix, quat_multiply, quat_normalize, quat_rate, rotate
+from svkc.taking import take
 from svkc.topology import BALL, FREE, HINGE, SLIDE, Topology
 from svkc.verb import verb
 
@@ -27,11 +28,11 @@ def down(top: Topology, x: Float[Array, "rows *n"]) -> Float[Array, "rows *n"]:
     """Sum of x over each row and its ancestors, level by level."""
     if len(top.levels) > LEVELS_UNROLLED:
         for above, _ in _doublings(top):
-            x = x + jnp.concatenate([x, jnp.zeros_like(x[:1])])[above]
+            x = x + take(x, above)
         return x
     parent, levels = np.array(top.parent), [x[:1]]
     for (start, _), (first, last) in zip(top.levels[:-1], top.levels[1:], strict=True):
-        levels.append(x[first:last] + levels[-1][parent[first:last] - start])
+        levels.append(x[first:last] + take(levels[-1], parent[first:last] - start))
     return jnp.concatenate(levels)
 
 
@@ -41,7 +42,7 @@ def up(top: Topology, x: Float[Array, "rows *n"]) -> Float[Array, "rows *n"]:
         if any(below.shape[1] > WIDEST for _, below in _doublings(top)):
             return jnp.tensordot(jnp.asarray(top.ancestor.T, x.dtype), x, 1)
         for _, below in _doublings(top):
-            x = x + jnp.sum(jnp.concatenate([x, jnp.zeros_like(x[:1])])[below], 1)
+            x = x + jnp.sum(take(x, below), 1)
         return x
     levels, below = [], None
     for level, (first, last) in reversed(list(enumerate(top.levels))):
@@ -72,18 +73,17 @@ def from_children(top: Topology, level: int, below: Float[Array, "below *n"]) ->
     (first, last), (lo, hi) = top.levels[level], top.levels[level + 1]
     parent = np.array(top.parent)[lo:hi]
     children = [np.flatnonzero(parent == i) for i in range(first, last)]
-    # children padded with a row of zeros: a gather and a sum, no scatter
     table = np.full((last - first, max(map(len, children))), hi - lo)
     for i, c in enumerate(children):
         table[i, : len(c)] = c
-    return jnp.sum(jnp.concatenate([below, jnp.zeros_like(below[:1])])[table], 1)
+    return jnp.sum(take(below, table), 1)
 
 
 def put(x: Float[Array, "rows *n"], rows: np.ndarray, values: Float[Array, "some *n"]) -> Float[Array, "rows *n"]:
     """X with some of its rows replaced. (No scatter: XLA's CPU backend makes one kernel of a loop's whole body only where there is none.)"""
     source = np.arange(len(x))
     source[rows] = len(x) + np.arange(len(rows))
-    return jnp.concatenate([x, values])[source]
+    return take(jnp.concatenate([x, values]), source)
 
 
 def to_rows(top: Topology, x: Float[Array, "nv *n"]) -> Float[Array, "rows *n"]:
@@ -93,11 +93,11 @@ def to_rows(top: Topology, x: Float[Array, "nv *n"]) -> Float[Array, "rows *n"]:
         rows = top.rows_of(*kinds)
         if len(rows):
             start = np.array(top.v_start)[rows]
-            parts.append(sum(x[start + k] for k in range(size)))
+            parts.append(sum(take(x, start + k) for k in range(size)))
             order.append(rows)
     fixed = np.setdiff1d(np.arange(len(top.parent)), np.concatenate(order) if order else np.zeros(0, int))
     parts.append(jnp.zeros((len(fixed), *x.shape[1:]), x.dtype))
-    return jnp.concatenate(parts)[np.argsort(np.concatenate([*order, fixed]))]
+    return take(jnp.concatenate(parts), np.argsort(np.concatenate([*order, fixed])))
 
 
 class Kinematics(eqx.Module):
@@ -117,17 +117,17 @@ def _joint_poses(chain: Chain, q: Float[Array, " q"]):
     hinges, balls, slides = top.rows_of(HINGE), top.rows_of(BALL), top.rows_of(SLIDE)
     turn = []
     if len(hinges):
-        turn.append((hinges, quat_about(chain.axis[hinges], q[start[hinges]] - chain.q_load[start[hinges]])))
+        turn.append((hinges, quat_about(take(chain.axis, hinges), take(q, start[hinges]) - take(chain.q_load, start[hinges]))))
     if len(balls):
-        turn.append((balls, quat_normalize(q[start[balls][:, None] + np.arange(4)])))
+        turn.append((balls, quat_normalize(take(q, start[balls][:, None] + np.arange(4)))))
     for rows, joint in turn:
-        quat = put(quat, rows, quat_multiply(fixed[rows], joint))
+        quat = put(quat, rows, quat_multiply(take(fixed, rows), joint))
     free = top.rows_of(FREE)
     if len(free):
-        quat = put(quat, free, quat_normalize(q[start[free][:, None] + np.arange(3, 7)]))
+        quat = put(quat, free, quat_normalize(take(q, start[free][:, None] + np.arange(3, 7))))
     if len(slides):
-        along = q[start[slides]] - chain.q_load[start[slides]]
-        slide = put(jnp.zeros_like(chain.axis), slides, along[:, None] * chain.axis[slides])
+        along = take(q, start[slides]) - take(chain.q_load, start[slides])
+        slide = put(jnp.zeros_like(chain.axis), slides, along[:, None] * take(chain.axis, slides))
     return quat, fixed, slide
 
 
@@ -137,11 +137,11 @@ def _compose(top: Topology, quat: Float[Array, "rows 4"]) -> Float[Array, "rows 
     if len(top.levels) > LEVELS_UNROLLED:
         above = np.maximum(parent, 0)
         for _ in range(int(np.ceil(np.log2(len(top.levels))))):
-            quat, above = jnp.concatenate([quat[:1], quat_multiply(quat[above], quat)[1:]]), above[above]
+            quat, above = jnp.concatenate([quat[:1], quat_multiply(take(quat, above), quat)[1:]]), above[above]
         return quat
     levels = [quat[:1]]
     for (start, _), (first, last) in zip(top.levels[:-1], top.levels[1:], strict=True):
-        levels.append(quat_multiply(levels[-1][parent[first:last] - start], quat[first:last]))
+        levels.append(quat_multiply(take(levels[-1], parent[first:last] - start), quat[first:last]))
     return jnp.concatenate(levels)
 
 
@@ -153,7 +153,7 @@ def kinematics(chain: Chain, q: Float[Array, " q"]) -> Kinematics:
     quat = quat_normalize(_compose(top, local))
     R = quat_matrix(quat)
     parent = np.maximum(np.array(top.parent), 0)
-    above = R[parent]
+    above = take(R, parent)
     step = rotate(above, chain.pos)
     if slide is not None:
         step = step + rotate(above, rotate(quat_matrix(fixed), slide))
@@ -162,10 +162,10 @@ def kinematics(chain: Chain, q: Float[Array, " q"]) -> Kinematics:
         step = step + rotate(above, rotate(quat_matrix(fixed), chain.anchor)) - rotate(R, chain.anchor)
     free = top.rows_of(FREE)
     if len(free):
-        step = put(step, free, q[np.array(top.q_start)[free][:, None] + np.arange(3)])
+        step = put(step, free, take(q, np.array(top.q_start)[free][:, None] + np.arange(3)))
     roots = np.array(top.parent) <= 0
     r = down(top, jnp.where(roots[:, None], 0, step))
-    return Kinematics(R, quat, r, step[top.root], _axes(chain, R, r))
+    return Kinematics(R, quat, r, take(step, top.root), _axes(chain, R, r))
 
 
 def _axes(chain: Chain, R, r) -> Float[Array, "nv 6"]:
@@ -176,27 +176,27 @@ def _axes(chain: Chain, R, r) -> Float[Array, "nv 6"]:
     parts, order = [], []
 
     def turning(rows, axes):
-        return jnp.concatenate([axes, cross(point[rows], axes)], -1)
+        return jnp.concatenate([axes, cross(take(point, rows), axes)], -1)
 
     hinges, slides = top.rows_of(HINGE), top.rows_of(SLIDE)
     if len(hinges):
-        parts.append(turning(hinges, rotate(R[hinges], chain.axis[hinges])))
+        parts.append(turning(hinges, rotate(take(R, hinges), take(chain.axis, hinges))))
         order.append(np.array(top.v_start)[hinges])
     if len(slides):
-        along = rotate(R[slides], chain.axis[slides])
+        along = rotate(take(R, slides), take(chain.axis, slides))
         parts.append(jnp.concatenate([jnp.zeros_like(along), along], -1))
         order.append(np.array(top.v_start)[slides])
     for kind, offset in ((BALL, 0), (FREE, 3)):
         rows = top.rows_of(kind)
         for k in range(3) if len(rows) else ():
-            parts.append(turning(rows, R[rows][..., k]))
+            parts.append(turning(rows, take(R, rows)[..., k]))
             order.append(np.array(top.v_start)[rows] + offset + k)
             if kind == FREE:
                 parts.append(jnp.broadcast_to(jnp.concatenate([jnp.zeros_like(eye[k]), eye[k]]), (len(rows), 6)))
                 order.append(np.array(top.v_start)[rows] + k)
     if not parts:
         return jnp.zeros((0, 6), R.dtype)
-    return jnp.concatenate(parts)[np.argsort(np.concatenate(order))]
+    return take(jnp.concatenate(parts), np.argsort(np.concatenate(order)))
 
 
 def twists(chain: Chain, kin: Kinematics, v: Float[Array, " dofs"]) -> Float[Array, "rows 6"]:
@@ -222,9 +222,9 @@ def rates(chain: Chain, q: Float[Array, " q"], v: Float[Array, " dofs"]) -> Floa
     """Qdot for the velocities v: quaternions turn by qdot = q w / 2, everything else is its own rate."""
     quat_q, quat_v = chain.topology.quaternions
     scalar_q, scalar_v = chain.topology.scalars
-    turn = quat_rate(q[quat_q[:, None] + np.arange(4)], v[quat_v[:, None] + np.arange(3)])
+    turn = quat_rate(take(q, quat_q[:, None] + np.arange(4)), take(v, quat_v[:, None] + np.arange(3)))
     order = np.argsort(np.concatenate([scalar_q, (quat_q[:, None] + np.arange(4)).ravel()]))
-    return jnp.concatenate([v[scalar_v], turn.ravel()])[order]
+    return take(jnp.concatenate([take(v, scalar_v), turn.ravel()]), order)
 
 
 @verb
@@ -233,9 +233,9 @@ def integrate(chain: Chain, q: Float[Array, " q"], dv: Float[Array, " dofs"]) ->
     quat_q, quat_v = chain.topology.quaternions
     scalar_q, scalar_v = chain.topology.scalars
     at = quat_q[:, None] + np.arange(4)
-    turned = quat_multiply(quat_normalize(q[at]), quat_exp(dv[quat_v[:, None] + np.arange(3)]))
+    turned = quat_multiply(quat_normalize(take(q, at)), quat_exp(take(dv, quat_v[:, None] + np.arange(3))))
     order = np.argsort(np.concatenate([scalar_q, at.ravel()]))
-    return jnp.concatenate([q[scalar_q] + dv[scalar_v], turned.ravel()])[order]
+    return take(jnp.concatenate([take(q, scalar_q) + take(dv, scalar_v), turned.ravel()]), order)
 
 
 @verb
@@ -244,9 +244,9 @@ def difference(chain: Chain, q1: Float[Array, " q"], q2: Float[Array, " q"]) -> 
     quat_q, quat_v = chain.topology.quaternions
     scalar_q, scalar_v = chain.topology.scalars
     at = quat_q[:, None] + np.arange(4)
-    turn = quat_log(quat_multiply(quat_conjugate(quat_normalize(q1[at])), quat_normalize(q2[at])))
+    turn = quat_log(quat_multiply(quat_conjugate(quat_normalize(take(q1, at))), quat_normalize(take(q2, at))))
     order = np.argsort(np.concatenate([scalar_v, (quat_v[:, None] + np.arange(3)).ravel()]))
-    return jnp.concatenate([q2[scalar_q] - q1[scalar_q], turn.ravel()])[order]
+    return take(jnp.concatenate([take(q2, scalar_q) - take(q1, scalar_q), turn.ravel()]), order)
 
 
 def normalize(chain: Chain, q: Float[Array, " q"]) -> Float[Array, " q"]:
@@ -255,7 +255,7 @@ def normalize(chain: Chain, q: Float[Array, " q"]) -> Float[Array, " q"]:
     if not len(quat_q):
         return q
     at = quat_q[:, None] + np.arange(4)
-    return put(q, at.ravel(), quat_normalize(q[at]).ravel())
+    return put(q, at.ravel(), quat_normalize(take(q, at)).ravel())
 
 
 @verb

@@ -129,6 +129,9 @@ def _one(primitive, inputs: list, params: dict, shape: tuple[int, ...], lanes: i
         return primitive.bind(*(jnp.broadcast_to(spread(v, lanes), (*shape, lanes)) for v in inputs), **params)
     if name in MOVING and alone:
         return MOVING[name](inputs[0].x, lanes, **params)
+    if name == "taking":
+        # (its axis is counted from the front)
+        return primitive.bind(inputs[0].x, **params)
     if name == "gather":
         return _gather(inputs[0], inputs[1], lanes, **params)
     if name == "dot_general":

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float
 from svkc.chain import Chain, Structure
 from svkc.kinematics import Kinematics
 from svkc.spatial import motion_cross, quat_about, quat_conjugate, quat_log, quat_matrix, quat_multiply, quat_normalize, quat_rotate, rotate, shift_motion
+from svkc.taking import take
 from svkc.topology import Topology
 
 
@@ -45,9 +46,9 @@ def active_dofs(chain: Chain, structure: Structure) -> Bool[Array, " dofs"]:
 
 def _coordinates(chain: Chain, q: Float[Array, " q"]):
     """Turns [L 3], slides [L 3] and quaternions [L 4] of the virtual joints."""
-    table = chain.topology.links
-    padded = jnp.concatenate([q, jnp.array([0, 1], q.dtype)])
-    return padded[table.angle], padded[table.slide], quat_normalize(padded[table.quat])
+    table, end = chain.topology.links, chain.topology.nq_all
+    quat = take(q, np.minimum(table.quat, end)) + (table.quat > end).astype(q.dtype)
+    return take(q, table.angle), take(q, table.slide), quat_normalize(quat)
 
 
 def _turns(top: Topology, angle: Float[Array, "links 3"], ball: Float[Array, "links 4"]):
@@ -130,7 +131,7 @@ def loop_jacobian(chain: Chain, structure: Structure, kin: Kinematics, end: Ends
     # of each link and coordinate the row in `own`, which is followed by zeros
     source = np.full((count, top.dofs + 1), 6 * count)
     np.put_along_axis(source, top.links.dof, np.arange(6 * count).reshape(-1, 6), 1)
-    virtual = jnp.concatenate([own.reshape(-1, 6), jnp.zeros((1, 6), own.dtype)])[source[:, top.nv : top.dofs]]
+    virtual = take(own.reshape(-1, 6), source[:, top.nv : top.dofs])
     J = jnp.concatenate([tree, virtual], 1)
     J = jnp.where(structure.connected[:, None, None] & active_dofs(chain, structure)[None, :, None], J, 0)
     return jnp.swapaxes(J, 1, 2).reshape(-1, top.dofs)
@@ -141,8 +142,7 @@ def loop_bias(
 ) -> Float[Array, " loop_rows"]:
     """Jdot_C v (paper (21)): the difference of the two ends' velocity-product accelerations; A: the tree's, with vdot = 0."""
     top = chain.topology
-    padded = jnp.concatenate([v, jnp.zeros(1, v.dtype)])
-    rate = jnp.where(structure.connected[:, None] & structure.freedoms, padded[top.links.dof], 0)
+    rate = jnp.where(structure.connected[:, None] & structure.freedoms, take(v, top.links.dof), 0)
     parts = _virtual_axes(chain, structure, end) * rate[:, :, None]
     slide = jnp.sum(parts[:, 3:], 1)
     V_parent = shift_motion(V[structure.parent], end.from_parent_root)

@@ -14,7 +14,7 @@ import pytest
 ROOT = pathlib.Path(__file__).parent.parent
 # the house floor by floor, the ground first
 HOUSE = [
-    "spatial topology unsupported operation given factors",
+    "spatial topology unsupported operation given factors taking",
     "chain reading selection lanes",
     "verb",
     "kinematics trajectory cuttable interop joining",

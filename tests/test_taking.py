@@ -1,0 +1,40 @@
+"""Rows by a known index: jax's own indexing, and the same derivatives without a scatter."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from svkc.taking import take
+
+# one past the last row, 7: zeros
+INDICES = {
+    "some": np.array([0, 3, 3, 7, 1]),
+    "a table": np.array([[0, 7, 6], [2, 2, 5]]),
+    "all": np.arange(7),
+    "one of many": np.array([4]),
+    "one row for all": np.zeros(90, int),
+    "none": np.zeros(0, int),
+}
+
+
+@pytest.mark.parametrize("index", INDICES.values(), ids=INDICES)
+def test_it_is_indexing(index):
+    x, many = jax.random.normal(jax.random.key(0), (7, 3)), jax.random.normal(jax.random.key(1), (7, 5, 3))
+    ours = lambda x: jnp.sin(take(x, index))
+    theirs = lambda x: jnp.sin(jnp.concatenate([x, jnp.zeros((1, *x.shape[1:]))])[index])
+    once, twice = jax.vmap(ours, 1, -1), jax.vmap(theirs, 1, -1)
+    for f, g, at in ((ours, theirs, x), (jax.jit(ours), theirs, x), (ours, theirs, x[:, 0]), (once, twice, many)):
+        np.testing.assert_array_equal(f(at), g(at))
+        np.testing.assert_allclose(jax.jacfwd(f)(at), jax.jacfwd(g)(at), rtol=1e-14)
+        np.testing.assert_allclose(jax.jacrev(f)(at), jax.jacrev(g)(at), rtol=1e-14)
+    second = lambda f: jax.hessian(lambda x: jnp.sum(f(x) ** 2))(x)
+    np.testing.assert_allclose(second(ours), second(theirs), rtol=1e-13, atol=1e-14)
+
+
+def test_derivatives_without_a_scatter():
+    made = lambda rows, index: jax.jit(jax.grad(lambda x: jnp.sum(jnp.sin(take(x, index))))).lower(jnp.ones((rows, 3))).as_text()
+    for name, index in INDICES.items():
+        assert "scatter" not in made(7, index), name
+    # what would be a table of 100 x 90 is left to jax
+    assert "scatter" in made(100, INDICES["one row for all"])
