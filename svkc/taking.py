@@ -52,10 +52,8 @@ def _back(ct, x, *, index: bytes, axis: int):
     back, first = np.full((n, most), len(table), np.int32), np.cumsum(count) - count
     for row in range(n):
         back[row, : count[row]] = order[first[row] : first[row] + count[row]]
-    if most == 1:
-        return [taking.bind(ct, index=back.tobytes(), axis=axis)]
     parts = taking.bind(ct, index=back.tobytes(), axis=axis)
-    return [jnp.sum(parts.reshape(*ct.shape[:axis], n, most, *ct.shape[axis + 1 :]), axis + 1)]
+    return [parts if most == 1 else jnp.sum(parts.reshape(*ct.shape[:axis], n, most, *ct.shape[axis + 1 :]), axis + 1)]
 
 
 def _lanes(args, axes, *, index: bytes, axis: int):
