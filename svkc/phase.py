@@ -100,7 +100,8 @@ def _path(start: Motion, times, world: World, watched: Watched | None, options: 
         result = jnp.where((result == SUCCESSFUL) & found.hit, EVENT, result)
     accepted, rejected = (jnp.asarray(sol.stats[name], jnp.int32) for name in ("num_accepted_steps", "num_rejected_steps"))
     # diffrax tells the number of tries alone
-    tally = Tally(accepted + rejected, jnp.asarray(jnp.inf, t0.dtype), jnp.ones((), t0.dtype), *[jnp.asarray(-1, jnp.int32)] * 2, jnp.zeros(2, t0.dtype))
+    unknown = jnp.asarray(-1, jnp.int32)
+    tally = Tally(accepted + rejected, jnp.asarray(jnp.inf, t0.dtype), jnp.ones((), t0.dtype), unknown, unknown, jnp.zeros(2, t0.dtype))
     return Path(t, jax.tree.map(lambda x: x[0], end), saved, jnp.zeros(0, t0.dtype), saved, accepted, rejected, result, tally, found), found
 
 
