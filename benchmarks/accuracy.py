@@ -44,8 +44,6 @@ INTEGRATORS = {
 }
 # no orientations in space
 LEFT_OUT = {(name, f"{solver}, Munthe-Kaas") for name in ("n_four_bar", "andrews") for solver in ("Tsit5", "Dopri8")}
-# in float32: implicit steps of whole figures come to no end, 20000 of them are not enough at 1e-3 on the high bar
-LEFT_OUT_SINGLE = {(name, "Kvaerno5") for name in ("high_bar", "swing")}
 # on what has loops: with every integrator, at some of its settings, and in float32 with Tsit5
 DRIFT = {
     "least change": {"stabilization": svkc.Projection(change=svkc.least_change)},
@@ -193,8 +191,6 @@ def curves(name: str, loops: bool):
             continue
         yield "float64", label, solver, settings, {}
         single = settings[1:3] if settings is FIXED else SINGLE if label == "Tsit5" else SINGLE[1::2]
-        if (name, label) in LEFT_OUT_SINGLE:
-            single = ()
         yield "float32", label, solver, single, {}
         for other, way in drift.items():
             yield "float32", f"{label}, {other}", solver, single, way

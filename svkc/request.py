@@ -17,6 +17,7 @@ from svkc.events import At, Plan, listed, plan
 from svkc.forward_dynamics import Dynamics
 from svkc.given import concrete, finite, function, one, positive, whole
 from svkc.replay import Replay
+from svkc.solvers import SimplifiedNewton
 from svkc.stepping import Baumgarte, Drift, Field, FixedSteps, Projection, motion_norm
 from svkc.verb import check_state
 
@@ -106,7 +107,7 @@ def checked(
 
 
 def _solving(solver, controller, dtype) -> diffrax.AbstractSolver:
-    """The solver, or the default; implicit stages are solved by Newton's method as closely as steps are controlled, or, where they are not, to sqrt(eps)."""
+    """The solver, or the default; one with implicit stages solves them as closely as steps are controlled, or, where they are not, to sqrt(eps)."""
     if solver is None:
         return diffrax.Dopri8() if np.finfo(dtype).eps < 1e-10 and controller is not None else diffrax.Tsit5()
     if not isinstance(solver, diffrax.AbstractSolver):
@@ -119,11 +120,12 @@ def _solving(solver, controller, dtype) -> diffrax.AbstractSolver:
     given = {name: getattr(controller, name, None) for name in ("rtol", "atol", "norm")}
     # diffrax marks what is to be the step-size controller's with a thing that is neither a number nor a function
     left_open = [name for name in given if not (callable(x := getattr(finder, name, 0.0)) or eqx.is_inexact_array_like(x))]
-    close = float(np.finfo(dtype).eps ** 0.5)
-    if left_open and (isinstance(finder, diffrax.VeryChord) or None in given.values()):
-        # with one Jacobian for all stages diffrax's own gives steps up far sooner: five times as many on the high bar, six on stiff dampers
-        controlled = (close, close, motion_norm) if None in given.values() else (given["rtol"], given["atol"], given["norm"])
-        return eqx.tree_at(lambda s: s.root_finder, solver, optimistix.Newton(*controlled))
+    if None in given.values() and left_open:
+        # a step that cannot be made shorter has to be solved: by Newton's method
+        close = float(np.finfo(dtype).eps ** 0.5)
+        return eqx.tree_at(lambda s: s.root_finder, solver, optimistix.Newton(close, close, norm=motion_norm))
+    if left_open and isinstance(finder, diffrax.VeryChord):
+        return eqx.tree_at(lambda s: s.root_finder, solver, SimplifiedNewton(**given))
     return eqx.tree_at(lambda s: [getattr(s.root_finder, name) for name in left_open], solver, [given[name] for name in left_open])
 
 
