@@ -125,7 +125,7 @@ def _solving(solver, controller, dtype) -> diffrax.AbstractSolver:
         close = float(np.finfo(dtype).eps ** 0.5)
         return eqx.tree_at(lambda s: s.root_finder, solver, optimistix.Newton(close, close, norm=motion_norm))
     if left_open and isinstance(finder, diffrax.VeryChord):
-        return eqx.tree_at(lambda s: s.root_finder, solver, SimplifiedNewton(**given))
+        solver = eqx.tree_at(lambda s: s.root_finder, solver, SimplifiedNewton(0.0, 0.0))
     return eqx.tree_at(lambda s: [getattr(s.root_finder, name) for name in left_open], solver, [given[name] for name in left_open])
 
 
