@@ -55,8 +55,9 @@ def select(J: Float[Array, "rows dofs"], rank: Int[Array, ""] | None = None, wan
 
     def step(k, carry):
         A, Q, P, size = carry
-        norms = jnp.sum(A * A, 0)
-        pivot = jnp.arange(dofs) == jnp.argmax(norms if weight is None else norms * weight)
+        norms = jnp.sum(A * A, 0) * (1 if weight is None else weight)
+        # the first of those that are equal but for round-off, as mirrored limbs are: the same on every machine
+        pivot = jnp.arange(dofs) == jnp.argmax(norms >= (1 - rank_tolerance(J.dtype)) * jnp.max(norms))
         column = jnp.sum(jnp.where(pivot[None], A, 0), 1)
         column = column - (Q @ column) @ Q
         r = jnp.sqrt(jnp.sum(column * column))

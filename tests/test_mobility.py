@@ -7,6 +7,7 @@ import pytest
 from kkt import acceleration
 
 import svkc
+from svkc.selection import select
 
 # model, joint freedoms, rank, what Kutzbach and Gruebler count
 OVERCONSTRAINED = {
@@ -86,3 +87,11 @@ def test_loop_forces_are_the_multipliers():
         scale = max(1.0, np.abs(wrench).max())
         np.testing.assert_allclose(carried.torque, wrench[:, :3], atol=1e-9 * scale)
         np.testing.assert_allclose(carried.force, wrench[:, 3:] / float(chain.length), atol=1e-9 * scale)
+
+
+def test_of_columns_that_are_equal_the_first_is_chosen():
+    """Limbs that mirror each other are equal but for round-off, which other machines have otherwise."""
+    rng = np.random.default_rng(0)
+    half = rng.normal(size=(6, 8))
+    J = np.concatenate([half, -half], 1) * (1 + 1e-13 * rng.normal(size=(6, 16)))
+    assert set(np.argmax(select(jnp.asarray(J)).P, 1).tolist()) <= set(range(8))
