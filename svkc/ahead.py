@@ -33,7 +33,7 @@ def compile(function: Callable, *args: Any, **kw: Any) -> Program:
     """Compiles `function` for arguments like these, without a call: arrays, chains and states, or `jax.ShapeDtypeStruct`s in place of arrays.
 
     `svkc.compile(lambda state: svkc.simulate(chain, state, 1.0), state)(state)` is the run. What is not an array is fixed. For the program to be kept
-    from one process to the next see jax's persistent cache (README).
+    from one process to the next see jax's persistent cache (docs/measured.md).
     """
     stand_in = lambda x: jnp.zeros(x.shape, x.dtype) if isinstance(x, jax.ShapeDtypeStruct) else x
     args, kw = jax.tree.map(stand_in, (args, kw))

@@ -53,6 +53,13 @@ class Options(eqx.Module):
         return self.controller, None if isinstance(self.controller, diffrax.StepTo) else self.first_step
 
 
+def tolerances(dtype, rtol=None, atol=None) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Those left open are 1e-7 (float32: 1e-4), and a hundredth of rtol, or what round-off leaves."""
+    eps = np.finfo(dtype).eps
+    rtol = jnp.asarray((1e-7 if eps < 1e-10 else 1e-4) if rtol is None else rtol, dtype)
+    return rtol, jnp.maximum(rtol * 1e-2, 8 * eps) if atol is None else jnp.asarray(atol, dtype)
+
+
 def checked(
     chain: Chain, state: State, t0, t1, ts, events, control, dt, rtol, atol, solver, stepsize_controller, stabilization, dynamics, adjoint,
     max_events, max_steps, progress_meter,
@@ -79,13 +86,11 @@ def checked(
         raise ValueError(f"progress_meter: expected a diffrax one, got {progress_meter!r}")
     made = plan(chain, events, dtype)
     span = jnp.asarray(t1, dtype) - jnp.asarray(t0, dtype)
-    double = np.finfo(dtype).eps < 1e-10
     controller = stepsize_controller
     if controller is None:
-        rtol, atol = (1e-7 if double else 1e-4) if rtol is None else rtol, (1e-9 if double else 1e-6) if atol is None else atol
-        smallest = jnp.finfo(dtype).eps * jnp.maximum(jnp.abs(span), jnp.abs(jnp.asarray(t1, dtype)))
         # as arrays: another tolerance is the same program
-        rtol, atol = jnp.asarray(rtol, dtype), jnp.asarray(atol, dtype)
+        rtol, atol = tolerances(dtype, rtol, atol)
+        smallest = jnp.finfo(dtype).eps * jnp.maximum(jnp.abs(span), jnp.abs(jnp.asarray(t1, dtype)))
         controller = diffrax.PIDController(rtol, atol, norm=motion_norm, dtmin=smallest, force_dtmin=False)
     options = Options(
         control=control,

@@ -40,7 +40,7 @@ def simulate(
     ts: times to save, stepped to exactly; None: t0 and t1. A state saved at an event's time is the one after it; times past the end of a run that
     stopped early hold its last state.
     control(t, state, args): joint torques (N m, N) over every coordinate, or the tree's.
-    dt: fixed steps (s). rtol, atol: adaptive steps, by default 1e-7 and 1e-9 (float32: 1e-4 and 1e-6).
+    dt: fixed steps (s). rtol, atol: adaptive steps, by default 1e-7 (float32: 1e-4) and a hundredth of rtol.
     solver, stepsize_controller, adjoint, progress_meter: diffrax objects, passed through; by default Dopri8 with rtol, Tsit5 with dt or in float32.
     stabilization: `svkc.Projection()` (default), `svkc.Exact()`, `svkc.Baumgarte(rate)` or `svkc.Drift()`. dynamics: `svkc.Dynamics(inertia, hold)`.
     max_events: how many events may happen (default: each timed one, four times each guard); max_steps: in one phase.

@@ -16,6 +16,7 @@ from svkc.chain import Chain, State
 from svkc.forward_dynamics import Dynamics
 from svkc.given import one, positive, whole
 from svkc.kinematics import difference
+from svkc.request import tolerances
 from svkc.simulate import simulate
 from svkc.solvers import RodriguesEuler, SemiImplicitEuler
 from svkc.stepping import Drift, Projection
@@ -88,8 +89,8 @@ def halved(chain: Chain, state: State, t1, **options) -> float:
     if "dt" in options:
         finer = options | {"dt": options["dt"] / 2}
     else:
-        double = np.finfo(state.q.dtype).eps < 1e-10
-        finer = options | {"rtol": options.get("rtol", 1e-7 if double else 1e-4) / 32, "atol": options.get("atol", 1e-9 if double else 1e-6) / 32}
+        rtol, atol = tolerances(state.q.dtype, options.get("rtol"), options.get("atol"))
+        finer = options | {"rtol": rtol / 32, "atol": atol / 32}
     return error_between(chain, run, simulate(chain, state, t1, **finer))
 
 

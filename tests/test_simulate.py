@@ -319,6 +319,15 @@ def test_one_step_by_itself():
         svkc.step(chain, state, jnp.zeros(2), dt)
 
 
+@pytest.mark.parametrize(("dtype", "rtol", "atol"), [("float64", 1e-11, 1e-13), ("float64", 1e-4, 1e-6), ("float32", 1e-5, 8 * 2.0**-23)])
+def test_the_absolute_tolerance_follows_the_relative_one(pendulum, dtype, rtol, atol):
+    """It is a hundredth, or what round-off leaves, so that rtol alone says how exact a run is."""
+    chain, start = jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, (pendulum, pendulum.state({"arm": 0.3})))
+    alone, both = svkc.simulate(chain, start, 1.0, rtol=rtol), svkc.simulate(chain, start, 1.0, rtol=rtol, atol=atol)
+    np.testing.assert_array_equal(alone.final.q, both.final.q)
+    assert int(alone.report().accepted) == int(both.report().accepted)
+
+
 def test_a_step_that_would_be_too_small(pendulum):
     """A controller that may not go below its bound gives up where it would have to: a code, the state it came to, and an error when asked to throw."""
     controller = diffrax.PIDController(rtol=1e-12, atol=1e-14, dtmin=0.02, force_dtmin=False)

@@ -1,0 +1,79 @@
+"""Bricard's rectangular mechanism, IFToMM's A04: five rods along the edges of a cube, six hinges, one row of the loop redundant wherever it is. Ten
+seconds against Lagrange's equation of its one freedom."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import svkc
+
+CORNERS = np.array([(0, 0, 0), (1, 0, 0), (1, 0, 1), (1, 1, 1), (0, 1, 1), (0, 1, 0)], float)
+AXES = [np.cross(CORNERS[k] - CORNERS[k - 1], CORNERS[(k + 1) % 6] - CORNERS[k]) for k in range(6)]
+THIN, GRAVITY = 1e-13, 9.81
+
+
+def numbers(x):
+    return " ".join(map(str, x))
+
+
+def mechanism():
+    nested = ""
+    for k in reversed(range(5)):
+        edge = CORNERS[k + 1] - CORNERS[k]
+        inertia = (1 - edge**2) / 12 + THIN
+        inertial = f'<inertial pos="{numbers(edge / 2)}" mass="1" diaginertia="{numbers(inertia)}"/>'
+        start = CORNERS[k] - CORNERS[max(k - 1, 0)]
+        nested = f'<body name="rod{k}" pos="{numbers(start)}"><joint name="hinge{k}" axis="{numbers(AXES[k])}"/>{inertial}{nested}</body>'
+    last = svkc.VirtualLink(
+        "last", parent="world", real="rod4", joint="hinge", axis=tuple(AXES[5]), pos=tuple(CORNERS[5]), real_pos=tuple(CORNERS[5] - CORNERS[4]), connected=True
+    )
+    return svkc.load(f'<mujoco><option gravity="0 {-GRAVITY} 0"/><worldbody>{nested}</worldbody></mujoco>', virtual_links=[last])
+
+
+def turned(axis, angle):
+    cross = jnp.array(np.cross(np.eye(3), axis))
+    return jnp.eye(3) + jnp.sin(angle) * cross + (1 - jnp.cos(angle)) * cross @ cross
+
+
+def angles(a):
+    """Of the hinges: sin a + sin b = sin a sin b, by Bricard's relation of angles that are counted from the cube."""
+    b = jnp.arcsin(jnp.sin(a) / (jnp.sin(a) - 1))
+    return jnp.stack([a, b, a, b, a])
+
+
+def corners(a):
+    at, frame, found = jnp.zeros(3), jnp.eye(3), [jnp.zeros(3)]
+    for k, angle in enumerate(angles(a)):
+        frame = frame @ turned(AXES[k], angle)
+        at = at + frame @ jnp.array(CORNERS[k + 1] - CORNERS[k])
+        found.append(at)
+    return jnp.stack(found)
+
+
+def by_hand(ends):
+    """The first hinge's angle at each time: a thin rod's energy is that of its ends, (x'x' + x'y' + y'y') / 6."""
+
+    def inertia(a):
+        rate = jax.jacfwd(corners)(a)
+        return sum(x @ x + x @ y + y @ y for x, y in zip(rate[:-1], rate[1:], strict=True)) / 3
+
+    def height(a):
+        return sum((corners(a)[:-1, 1] + corners(a)[1:, 1]) / 2)
+
+    @jax.jit
+    def rates(y):
+        a, rate = y
+        return jnp.stack([rate, -(jax.grad(inertia)(a) * rate**2 / 2 + GRAVITY * jax.grad(height)(a)) / inertia(a)])
+
+    return solve_ivp(lambda t, y: np.asarray(rates(y)), (0, ends[-1]), [0.0, 0.0], method="DOP853", t_eval=ends, rtol=1e-12, atol=1e-13).y[0]
+
+
+@pytest.mark.parametrize("inertia", [None, svkc.by_bodies], ids=["pivots", "by_bodies"])
+def test_bricards_mechanism(inertia):
+    chain, times = mechanism(), jnp.linspace(0, 10, 101)
+    traj = svkc.simulate(chain, chain.state(), 10.0, ts=times, rtol=1e-11, dynamics=svkc.Dynamics(inertia=inertia))
+    np.testing.assert_allclose(traj.states.q[:, :5], jax.vmap(angles)(jnp.array(by_hand(times))), atol=1e-8)
+    assert np.min(traj.states.q[:, 0]) < -3
+    assert svkc.mobility(chain, traj.final).freedoms == 1
