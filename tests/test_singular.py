@@ -97,6 +97,21 @@ def test_a_loop_that_locks():
     assert int(traj.report().swaps) > 0
 
 
+def test_without_pivots_a_singular_configuration_may_end_the_run():
+    """A slider-crank of equal bars whose slider weighs nothing: as the bars align, nothing but the choice of pivots tells where it goes."""
+    bar = '<body name="{0}" pos="{1} 0 0"><joint name="{0}" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 1 0 0" size="0.02"/>'
+    slot = svkc.VirtualLink("slot", "world", "rod", (False, True, False, True, False, False), real_pos=(1, 0, 0), connected=True)
+    chain = svkc.load(models.MJCF.format(bar.format("crank", 0) + bar.format("rod", 1) + "</body></body>"), virtual_links=[slot])
+    state = chain.state({"crank": -np.pi / 4, "rod": np.pi / 2}, {"crank": 3.0})
+    run = lambda **kw: svkc.simulate(chain, state, 3.0, throw=False, **kw)
+    through, not_through = run(), run(dynamics=svkc.Dynamics(inertia=svkc.by_bodies))
+    assert through.result == svkc.RESULTS.successful
+    assert float(through.final.q[0]) > 3 * np.pi
+    assert not_through.result == svkc.RESULTS.step_too_small
+    for traj in (through, not_through):
+        assert abs(float(traj.report().energy_drift)) < 2e-6
+
+
 @pytest.mark.parametrize("before", [1e-2, 1e-4, 1e-6, 0.0])
 def test_started_beside_a_singular_configuration(before):
     """The N four-bar as its bars align, or nearly: it goes on as the parallelogram that it moves as, the direction of its velocity kept."""
