@@ -5,6 +5,7 @@ import time
 import webbrowser
 
 RELEASE_RIGHT, RELEASE_LEFT = 0.9, 1.15  # s
+TOLERANCES = {"rtol": 1e-8, "atol": 1e-10}
 
 
 def _high_bar():
@@ -53,52 +54,31 @@ def scenes() -> int:
 
 def run(name: str, t1: float | None, events, ignore, out: pathlib.Path, video: bool, quiet: bool) -> int:
     """One scene or model: the table of its phases, the run, the pictures. events: (kind, link, time) besides the scene's own."""
-    import diffrax
     import jax
     from tqdm import tqdm
 
     # the process is the command's own, so the setting is too
     jax.config.update("jax_enable_x64", True)
-    import jax.numpy as jnp
-
     import svkc
-    from svkc.given import positive
 
     begin = time.perf_counter()
     stages = tqdm(total=4, desc="loading", bar_format="{l_bar}{bar:20}| {elapsed}", disable=True if quiet else None, leave=False)
     try:
-        chain, state, own, end = _scene(name, ignore)
-        end = end if t1 is None else t1
-        positive("--t1", end)
-        events = _asked(chain, events) or own
+        chain, state, events, end = _wanted(name, t1, events, ignore)
         out.mkdir(parents=True, exist_ok=True)
+        loaded = time.perf_counter()
+        _next(stages, "compiling, and the first run")
+        _simulated(chain, state, events, end, stages.disable)
     except (ValueError, OSError) as error:
-        stages.close()
-        print(error)
-        return 1
-    loaded = time.perf_counter()
-    ts = jnp.linspace(0, end, max(round(end / 0.025), 1) + 1)
-    # phases of long runs show how far they are
-    meter = None if stages.disable or end <= 10 else diffrax.TqdmProgressMeter()
-
-    numbers = {"rtol": 1e-8, "atol": 1e-10}
-
-    def once():
-        return jax.block_until_ready(svkc.simulate(chain, state, end, ts=ts, events=events, throw=False, progress_meter=meter, **numbers))
-
-    _next(stages, "compiling, and the first run")
-    try:
-        once()
-    except ValueError as error:
         stages.close()
         print(error)
         return 1
     compiled = time.perf_counter()
     _next(stages, "a run")
-    traj = once()
+    traj = _simulated(chain, state, events, end, stages.disable)
     done = time.perf_counter()
     _next(stages, "pictures")
-    written, missing = _write(chain, traj, out, pathlib.Path(name).stem, video, {**numbers, "t1": end, "what": name})
+    written, missing = _write(chain, traj, out, pathlib.Path(name).stem, video, {**TOLERANCES, "t1": end, "what": name})
     _next(stages, "done")
     stages.close()
     print_phases(chain, traj)
@@ -109,9 +89,32 @@ def run(name: str, t1: float | None, events, ignore, out: pathlib.Path, video: b
     return 0 if traj.result in (svkc.RESULTS.successful, svkc.RESULTS.stopped) else 1
 
 
+def _simulated(chain, state, events, end: float, quiet: bool):
+    """The run, to its end on the clock. Phases of long runs show how far they are."""
+    import diffrax
+    import jax
+    import jax.numpy as jnp
+
+    import svkc
+
+    ts = jnp.linspace(0, end, max(round(end / 0.025), 1) + 1)
+    meter = None if quiet or end <= 10 else diffrax.TqdmProgressMeter()
+    return jax.block_until_ready(svkc.simulate(chain, state, end, ts=ts, events=events, throw=False, progress_meter=meter, **TOLERANCES))
+
+
 def _next(stages, what: str):
     stages.update()
     stages.set_description(what)
+
+
+def _wanted(name: str, t1: float | None, events, ignore):
+    """Chain, state, events and end of the run that was asked for."""
+    from svkc.given import positive
+
+    chain, state, own, end = _scene(name, ignore)
+    end = end if t1 is None else t1
+    positive("--t1", end)
+    return chain, state, _asked(chain, events) or own, end
 
 
 def _scene(name: str, ignore):
