@@ -39,7 +39,7 @@ SCENES = {
     "high_bar": (_high_bar, 1.8, "two hands on a bar, one, flight (the paper's Fig. 20)"),
     "swing": (_swing, 2.0, "the seat of a swing gives way as the thighs slide off (Fig. 21)"),
     "brachiation": (_brachiation, 1.0, "hangs from the first of three bars; nobody drives it (examples/03_brachiation.py does)"),
-    "walking": (_walking, 0.6, "stands on a foot and falls; nobody drives it (examples/04_walk.py does)"),
+    "walking": (_walking, 0.6, "stands on two feet and falls, only its feet held by the ground; nobody drives it (examples/04_walk.py does)"),
 }
 
 

@@ -29,7 +29,10 @@ def strobe(chain: Chain, traj: Trajectory, path: pathlib.Path, frames: int) -> p
     figure = Figure(figsize=(10, 7.5))
     axes = figure.add_subplot(aspect="equal", xlabel="x (m)", ylabel="z (m)")
     shapes = segments(chain)
-    shown = np.concatenate([positions[:, 1:].reshape(-1, 3)] + [np.array([p, q]) for b, p, q, _ in shapes if b == 0])[:, [0, 2]]
+    # what is fixed is shown no further than a metre beyond what moves: a long floor would make the figure small
+    moving = positions[:, 1:, [0, 2]].reshape(-1, 2)
+    fixed = np.array([end for body, *ends, _ in shapes if body == 0 for end in ends]).reshape(-1, 3)[:, [0, 2]]
+    shown = np.concatenate([moving, fixed.clip(moving.min(0) - 1, moving.max(0) + 1)])
     low, high = shown.min(0) - 0.3, shown.max(0) + 0.3
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     # points a metre, limbs at two thirds of their thickness, so that poses can be told apart

@@ -1,0 +1,20 @@
+"""Flat pictures of a run."""
+
+import jax.numpy as jnp
+import matplotlib.image
+import models
+import numpy as np
+
+import svkc
+
+
+def test_a_long_floor_does_not_make_the_figure_small(tmp_path):
+    """What is fixed is shown no further than a metre beyond what moves: however long the floor, the picture is the same."""
+
+    def drawn(half: float):
+        floor = f'<geom type="capsule" size=".02" contype="0" conaffinity="0" fromto="{-half} 0 0 {half} 0 0"/>'
+        chain = svkc.load(f'<mujoco><worldbody>{floor}<body pos="0 0 1"><freejoint/>{models.BAR.format("0 0 0.3")}</body></worldbody></mujoco>')
+        traj = svkc.simulate(chain, chain.state(), 0.1, ts=jnp.linspace(0, 0.1, 3), dt=0.05)
+        return matplotlib.image.imread(svkc.render(chain, traj, tmp_path / f"{half}.png"))
+
+    np.testing.assert_array_equal(drawn(4.0), drawn(40.0))
