@@ -160,7 +160,7 @@ def main() -> None:
     options = parser.parse_args()
     if options.child:
         return child(options.child, not options.no_run)
-    folders = [HERE.parent] + [options.beside.resolve()] * bool(options.beside)
+    folders = [HERE.parent] + ([options.beside.resolve()] if options.beside else [])
     labels = [options.label or version(HERE.parent)] + [version(f) for f in folders[1:]]
     found = collections.defaultdict(list)
     print(f"{'program':28}{'version':>10}" + "".join(f"{h:>13}" for h in (*COUNTS, *SECONDS)))

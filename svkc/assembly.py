@@ -10,9 +10,10 @@ import numpy as np
 from svkc.chain import Chain, State, Structure
 from svkc.closure import loop_gaps
 from svkc.given import arrayed, finite
+from svkc.impact import decide_rank
 from svkc.kinematics import kinematics, normalize
 from svkc.loops import active_dofs, joint_coordinates, with_coordinates
-from svkc.projection import agree, close, decide_rank
+from svkc.projection import agree, close
 from svkc.topology import Q_SIZE, V_SIZE
 from svkc.verb import check_state
 

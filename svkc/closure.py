@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 from svkc.chain import Chain, State, Structure
 from svkc.kinematics import Kinematics, bias_accelerations, kinematics, twists
 from svkc.loops import active_dofs, ends, gap, loop_bias, loop_jacobian
-from svkc.selection import Selection, held_part, select, select_again, solve_frozen, square, weakest, without_weak
+from svkc.selection import Selection, held_part, select, select_again, solve_frozen, square, too_few, weakest, without_weak
 from svkc.topology import FREE, SLIDE
 from svkc.verb import verb
 
@@ -92,14 +92,14 @@ def agreeing(chain: Chain, selection: Selection, J: Float[Array, "rows dofs"], v
 def choose(structure: Structure, J: Float[Array, "rows dofs"], pivots=None) -> Selection:
     """The pivots of J_C, with the rank of the phase and the coordinates that are asked to be independent; without rows that are too weak just now.
 
-    pivots [steps, dofs]: one-hot, chosen before (None: to be chosen now); near a singular configuration new ones are.
+    pivots [steps, dofs]: one-hot, chosen before (None: to be chosen now); near a singular configuration, or where they are too few, new ones are.
     """
     new = lambda: select(J, structure.rank, structure.independent)
     if pivots is None:
         selection = new()
     else:
         held = select_again(J, pivots)
-        near = weakest(held) < NEAR * structure.margin
+        near = (weakest(held) < NEAR * structure.margin) | too_few(pivots, structure.rank)
         # (one lane near is enough to choose for all)
         selection = jax.lax.cond(eqxi.unvmap_any(near), lambda: jax.tree.map(lambda a, b: jnp.where(near, a, b), new(), held), lambda: held)
     return without_weak(selection, held_part(J.dtype) * structure.margin)
@@ -156,17 +156,18 @@ def sizes(rows: Float[Array, " rows"]) -> Float[Array, "links 2"]:
     return jnp.sqrt(jnp.sum(rows.reshape(-1, 2, 3) ** 2, -1))
 
 
+def largest(x: Float[Array, "links 6"]) -> Float[Array, "2"]:
+    """Return the largest angular and the largest linear part over the loops."""
+    if not len(x):
+        return jnp.zeros(2, x.dtype)
+    square = jnp.sum(x.reshape(-1, 2, 3) ** 2, -1)
+    closed = square == 0
+    # a root that can be differentiated where the loop is closed to the last bit
+    return jnp.max(jnp.where(closed, 0, jnp.sqrt(jnp.where(closed, 1, square))), 0)
+
+
 def largest_gaps(chain: Chain, state: State) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
     """The largest over the loops: of the gaps (rad, m) and of their rates (rad/s, m/s)."""
-
-    def largest(x):
-        if not len(x):
-            return jnp.zeros(2, x.dtype)
-        square = jnp.sum(x.reshape(-1, 2, 3) ** 2, -1)
-        closed = square == 0
-        # a root that can be differentiated where the loop is closed to the last bit
-        return jnp.max(jnp.where(closed, 0, jnp.sqrt(jnp.where(closed, 1, square))), 0)
-
     gaps, rates = gaps_and_rates(chain, state)
     return largest(gaps), largest(rates)
 

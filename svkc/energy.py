@@ -58,9 +58,8 @@ def energy(chain: Chain, state: State) -> Float[Array, ""]:
     return kinetic + potential
 
 
-def energy_and_momentum(chain: Chain, state: State) -> tuple[Float[Array, ""], Float[Array, "3"], Float[Array, "3"]]:
-    """From one pass over the tree: `energy`, and linear momentum (N s) and angular momentum about the centre of mass of all bodies (N m s), in world axes."""
-    kin = kinematics(chain, state.q)
+def energy_and_momentum(chain: Chain, state: State, kin: Kinematics) -> tuple[Float[Array, ""], Float[Array, "3"], Float[Array, "3"]]:
+    """Return `energy`, linear momentum (N s), and angular momentum about the centre of mass of all bodies (N m s), in world axes."""
     bodies = _bodies(chain, kin, state.v)
     kinetic, potential = _energies(chain, state, kin, bodies)
     c, u, _, spin = bodies

@@ -121,6 +121,10 @@ class Plan(eqx.Module):
             rows.append(row)
         return jnp.stack(rows)
 
+    def joins(self, chain: Chain) -> bool:
+        """Whether any event makes something hold that did not: a link or a joint; where none does, no impact is compiled."""
+        return bool(self.binds or self.table(chain, "connect").any() or self.table(chain, "lock").any())
+
     @property
     def locks(self) -> bool:
         return any(a.lock or a.unlock for a in self.actions)

@@ -265,7 +265,9 @@ def _counted(s: Step, tried: Tried, result: Int[Array, ""], scene: Scene) -> Tal
     margin, swaps, gap = old.margin, old.swaps, old.gap
     if tried.seen is not None and tried.seen.pivots is not None:
         margin = jnp.where(kept, jnp.minimum(margin, tried.seen.margin), margin)
-        swaps = swaps + (kept & jnp.any(s.seen.dependent != tried.seen.dependent)).astype(jnp.int32)
+        # the first choice of a phase is no change
+        swapped = jnp.any(s.seen.dependent) & jnp.any(s.seen.dependent != tried.seen.dependent)
+        swaps = swaps + (kept & swapped).astype(jnp.int32)
     loop = old.loop if tried.seen is None else jnp.where(result == OPEN, jnp.argmax(jnp.max(tried.seen.gap, 1)).astype(jnp.int32), old.loop)
     if len(scene.chain.link_names):
         gap = jnp.where(kept, jnp.maximum(gap, _open(tried, scene)), gap)

@@ -10,16 +10,17 @@ from svkc.chain import State
 from svkc.events import Plan
 from svkc.location import Found, Reading, arrived
 from svkc.marching import EVENT, MAX_STEPS, NON_FINITE, OPEN, SUCCESSFUL, How, Path, Tally, World, march
+from svkc.records import Records
 from svkc.replay import Replay, integrated
 from svkc.request import Options
 from svkc.searching import Watched
 from svkc.settled import Settled
 from svkc.stepping import Motion, Scene, finite, frozen, staged
-from svkc.trajectory import RESULTS, Events, Phases
+from svkc.trajectory import RESULTS, Events
 
 
 class Run(eqx.Module):
-    """What goes from phase to phase."""
+    """What goes from phase to phase. `count`: phases so far; `derivative`, `spoiled`: why there is none, and the first phase of which that is true."""
 
     t: Float[Array, ""]
     state: State
@@ -27,10 +28,12 @@ class Run(eqx.Module):
     guards: Float[Array, " guards"] | None
     pending: Bool[Array, " timed"]
     events: Events
-    phases: Phases
+    records: Records
+    count: Int[Array, ""]
     saved: State
     result: RESULTS
     derivative: RESULTS
+    spoiled: Int[Array, ""]
 
 
 class Solved(eqx.Module):

@@ -1,71 +1,20 @@
-"""F5: the way back onto closed loops, by the smallest change, and the rank that a phase goes by."""
+"""F5: the way back onto closed loops, by the smallest change."""
 
 import functools
 from collections.abc import Callable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Bool, Float
 
 from svkc.articulated import by_bodies
-from svkc.chain import Chain, State, Structure
+from svkc.chain import Chain, Structure
 from svkc.closure import scaled_jacobian, scales, sizes
 from svkc.forward_dynamics import solve_motion
 from svkc.kinematics import Kinematics, integrate, kinematics, normalize
 from svkc.lanes import with_lanes_last
 from svkc.loops import active_dofs, ends, gap
-from svkc.selection import Selection, count_rank, held_part, rank_tolerance, select, select_again, solve_frozen, solve_positive, square, weakest, without_weak
-
-
-@jax.jit
-def decide_rank(chain: Chain, structure: Structure, q: Float[Array, " q"]) -> Structure:
-    """The structure with its rank m: the larger of those at q and at a closed configuration nearby, for q itself may be singular."""
-    if not len(chain.topology.link_names):
-        return structure
-    given = structure
-    chain, structure, q = jax.lax.stop_gradient((chain, structure, q))
-    row, column = scales(chain)
-
-    def shown(q):
-        kin = kinematics(chain, q)
-        end = ends(chain, structure, kin, q)
-        return select(scaled_jacobian(chain, structure, kin, end)).size, jnp.max(jnp.abs(row * gap(structure, end).ravel()))
-
-    # a fixed direction without pattern, a few degrees away; left out where Newton's method does not come back onto the loops
-    direction = np.sin(1.0 + 2.3 * np.arange(chain.dofs))
-    near = jnp.where(active_dofs(chain, structure), 0.05 * direction * column, 0).astype(q.dtype)
-    full = eqx.tree_at(lambda s: (s.rank, s.margin), structure, (jnp.asarray(min(row.shape[0], chain.dofs), jnp.int32), jnp.zeros_like(structure.margin)))
-    moved = close(chain, full, integrate(chain, q, near), iterations=12)
-    size, open_ = jax.lax.map(shown, jnp.stack([q, moved]))
-    closed = open_[1] < jnp.finfo(q.dtype).eps ** 0.75
-    rank = jnp.where(closed, jnp.maximum(count_rank(size[0]), count_rank(size[1])), count_rank(size[0]))
-    last = jnp.arange(size.shape[1], dtype=jnp.int32) == rank - 1
-    margin = jnp.sum(jnp.where(last, size, 0), 1) / jnp.maximum(size[:, 0], jnp.finfo(size.dtype).tiny)
-    margin = jnp.where(closed, jnp.max(margin), margin[0])
-    return eqx.tree_at(lambda s: (s.rank, s.margin), given, (checkpoint_name(rank, "rank"), checkpoint_name(margin, "rank")))
-
-
-def rank_margin(chain: Chain, *states: State) -> Float[Array, ""]:
-    """The least |R_mm| / |R_11| at some states of one phase: how far the weakest row that counts is from being redundant; 1 where none counts."""
-    if not len(chain.topology.link_names):
-        return jnp.ones((), states[0].q.dtype)
-    chain, states = jax.lax.stop_gradient((chain, states))
-    structure = states[0].structure
-
-    def margin(q):
-        kin = kinematics(chain, q)
-        return weakest(select(scaled_jacobian(chain, structure, kin, ends(chain, structure, kin, q)), structure.rank))
-
-    return jnp.min(jax.lax.map(margin, jnp.stack([s.q for s in states])))
-
-
-def first_pivots(chain: Chain, structure: Structure, q) -> Float[Array, "steps dofs"]:
-    """The pivots of the loops' rows at q."""
-    kin = kinematics(chain, q)
-    return select(scaled_jacobian(chain, structure, kin, ends(chain, structure, kin, q)), structure.rank, structure.independent).P
+from svkc.selection import Selection, held_part, rank_tolerance, select, select_again, solve_frozen, solve_positive, square, too_few, weakest, without_weak
 
 
 def least_change(chain: Chain, structure: Structure, kin: Kinematics, selection: Selection, J, x: Float[Array, "rows n"]) -> Float[Array, "dofs n"]:
@@ -137,7 +86,7 @@ def settle_loops(
         selection, chosen = _solvable(structure, full), full.P
         if pivots is not None:
             # (asked of the last turn alone)
-            poor = lambda: weakest(select_again(J, pivots)) < hold * weakest(full)
+            poor = lambda: (weakest(select_again(J, pivots)) < hold * weakest(full)) | too_few(pivots, structure.rank)
             chosen = jax.lax.cond(i == iterations, lambda: jnp.where(poor(), full.P, pivots), lambda: pivots)
         open_ = jnp.stack([row * gap(structure, end).ravel(), J @ jnp.where(active, v / column, 0)], 1)
         step = -change(chain, structure, kin, selection, J, open_)

@@ -1,18 +1,50 @@
-"""F6: the records of a run, row by row: what its phases and events leave behind."""
+"""F6: the records of a run, row by row: what its phases and events leave behind, and the certificate that is computed from them after the run."""
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from svkc.chain import Chain, State, Structure
-from svkc.closure import largest_gaps
+from svkc.closure import largest, scales
 from svkc.energy import energy_and_momentum
-from svkc.loops import active_dofs
-from svkc.marching import Path
+from svkc.kinematics import kinematics
+from svkc.loops import active_dofs, ends, gap, loop_jacobian
+from svkc.marching import Path, Tally
+from svkc.selection import rank_tolerance, select, weakest
+from svkc.stepping import frozen
 from svkc.topology import FREE
 from svkc.trajectory import Events, Phases
+
+
+class Records(eqx.Module):
+    """One row for each phase: its times, the motion at its two ends, the structure it had, and what its steps cost and showed.
+
+    Rows that were not written hold the state that the run started from, so that whatever is computed of them is finite.
+    """
+
+    start: Float[Array, "*phases"]
+    stop: Float[Array, "*phases"]
+    q: Float[Array, "*phases 2 q"]
+    v: Float[Array, "*phases 2 dofs"]
+    structure: Structure
+    work: Float[Array, "*phases"]
+    accepted: Int[Array, "*phases"]
+    rejected: Int[Array, "*phases"]
+    tally: Tally
+
+
+class Moment(eqx.Module):
+    """What the certificate says of one state: the largest gaps of the loops and their rates, and at the ends of phases energy, momenta and rank margin."""
+
+    gap: Float[Array, "*states 2"]
+    gap_rate: Float[Array, "*states 2"]
+    energy: Float[Array, "*states"]
+    linear: Float[Array, "*states 3"]
+    angular: Float[Array, "*states 3"]
+    margin: Float[Array, "*states"]
 
 
 def no_events(rows: int, links: int, dtype) -> Events:
@@ -21,51 +53,88 @@ def no_events(rows: int, links: int, dtype) -> Events:
     return Events(jnp.full(rows, jnp.inf, dtype), jnp.full(rows, -1, jnp.int32), impulse, impulse, jnp.zeros(rows, dtype), jnp.asarray(0, jnp.int32))
 
 
-def no_phases(rows: int, links: int, dtype) -> Phases:
-    """The same for phases."""
-    number, count = jnp.zeros(rows, dtype), jnp.zeros(rows, jnp.int32)
-    return Phases(
+def no_records(rows: int, state: State) -> Records:
+    """Return the records before the first phase."""
+    dtype = state.q.dtype
+    repeat = lambda tree, *axes: jax.tree.map(lambda x: jnp.broadcast_to(x, (*axes, *jnp.shape(x))), tree)
+    return Records(
         start=jnp.full(rows, jnp.inf, dtype),
         stop=jnp.full(rows, jnp.inf, dtype),
-        connected=jnp.zeros((rows, links), bool),
-        rank=count - 1,
-        joint_freedoms=count - 1,
-        energy=jnp.zeros((rows, 2), dtype),
-        work=number,
-        margin=number + 1,
-        accepted=count,
-        rejected=count,
-        evaluations=count,
-        swaps=count,
-        loop=count - 1,
-        error=number,
-        gap=jnp.zeros((rows, 2), dtype),
-        gap_rate=jnp.zeros((rows, 2), dtype),
-        free=jnp.zeros(rows, bool),
-        momentum_drift=jnp.zeros((rows, 2), dtype),
-        count=jnp.asarray(0, jnp.int32),
+        q=repeat(state.q, rows, 2),
+        v=repeat(state.v, rows, 2),
+        structure=repeat(state.structure, rows),
+        work=jnp.zeros(rows, dtype),
+        accepted=jnp.zeros(rows, jnp.int32),
+        rejected=jnp.zeros(rows, jnp.int32),
+        tally=repeat(Tally.none(dtype, True), rows),
     )
 
 
-def recorded(chain: Chain, p: Phases, row: Bool[Array, " phases"], began: tuple, ended: tuple, work, path: Path, margin, stages: int) -> Phases:
-    """With the row of one phase written, where there is one. began, ended: time and state; stages: evaluations of the field in one try of a step."""
+def recorded(records: Records, row: Bool[Array, " phases"], began: tuple, ended: tuple, work, path: Path) -> Records:
+    """Return the records with the row of one phase written, where there is one. began, ended: time and state."""
     (start, first), (stop, last) = began, ended
-    s = first.structure
-    both = jax.tree.map(lambda *x: jnp.stack(x), (first.q, first.v), (last.q, last.v))
-    energies, linear, angular = jax.checkpoint(jax.vmap(lambda q, v: energy_and_momentum(chain, State(q, v, s))))(*both)
-    gaps = jax.vmap(lambda q, v: largest_gaps(*jax.lax.stop_gradient((chain, State(q, v, s)))))(*both)
-    gap, gap_rate = (jnp.max(x, 0) for x in gaps)
-    linear, angular = jax.lax.stop_gradient((linear, angular))
-    free = _free(chain, s)
-    written = {
-        "start": start, "stop": stop, "connected": s.connected, "rank": s.rank, "joint_freedoms": jnp.sum(active_dofs(chain, s), dtype=jnp.int32),
-        "energy": energies, "work": work, "margin": jnp.minimum(margin, path.tally.margin), "accepted": path.accepted, "rejected": path.rejected,
-        "evaluations": stages * path.tally.tries, "swaps": path.tally.swaps, "loop": path.tally.loop, "error": path.tally.error,
-        "gap": jnp.maximum(gap, path.tally.gap), "gap_rate": gap_rate, "free": free,
-        "momentum_drift": jnp.where(free, _momentum_drift(chain, linear, angular, stop - start), 0),
-    }  # fmt: skip
-    new = {name: jnp.where(row.reshape(-1, *(1,) * jnp.ndim(x)), jnp.asarray(x)[None], getattr(p, name)) for name, x in written.items()}
-    return Phases(**new, count=p.count + jnp.any(row).astype(jnp.int32))
+    new = Records(start, stop, jnp.stack([first.q, last.q]), jnp.stack([first.v, last.v]), first.structure, work, path.accepted, path.rejected, path.tally)
+    write = lambda old, new: jnp.where(row.reshape(-1, *(1,) * jnp.ndim(new)), jnp.asarray(new)[None], old)
+    return jax.tree.map(write, records, new)
+
+
+def certified(chain: Chain, records: Records, count: Int[Array, ""], saved: State, stages: int) -> tuple[Phases, Moment, Int[Array, ""]]:
+    """Return the phases of a run, what is said of its saved states, and the first phase with an end where the loops lose rank (past the last one: none).
+
+    stages: evaluations of the vector field in one try of a step. One loop looks at every state, so that kinematics and energy are compiled once.
+    """
+    r, rows, join = records, records.start.shape[0], lambda *x: jnp.concatenate(x)
+    states = State(join(r.q[:, 0], r.q[:, 1], saved.q), join(r.v[:, 0], r.v[:, 1], saved.v), jax.tree.map(join, r.structure, r.structure, saved.structure))
+    at_end = np.arange(states.q.shape[0]) < 2 * rows
+    moments = jax.lax.map(jax.checkpoint(lambda x: _moment(chain, *x)), (states, jnp.asarray(at_end)))
+    first, last, of_saved = (jax.tree.map(lambda x, part=p: x[part], moments) for p in (slice(rows), slice(rows, 2 * rows), slice(2 * rows, None)))
+    written = jnp.arange(rows, dtype=jnp.int32) < count
+    fill = lambda value, none: jnp.where(written.reshape(-1, *(1,) * (jnp.ndim(value) - 1)), value, none)
+    free, joint_freedoms = jax.vmap(lambda s: (_free(chain, s), jnp.sum(active_dofs(chain, s), dtype=jnp.int32)))(r.structure)
+    margin, gaps, rates = frozen((jnp.minimum(first.margin, last.margin), jnp.maximum(first.gap, last.gap), jnp.maximum(first.gap_rate, last.gap_rate)))
+    phases = Phases(
+        start=r.start,
+        stop=r.stop,
+        connected=fill(r.structure.connected, False),
+        rank=fill(r.structure.rank, -1),
+        joint_freedoms=fill(joint_freedoms, -1),
+        energy=fill(jnp.stack([first.energy, last.energy], 1), 0),
+        work=r.work,
+        margin=fill(jnp.minimum(margin, r.tally.margin), 1),
+        accepted=r.accepted,
+        rejected=r.rejected,
+        evaluations=stages * r.tally.tries,
+        swaps=r.tally.swaps,
+        loop=r.tally.loop,
+        error=r.tally.error,
+        gap=fill(jnp.maximum(gaps, r.tally.gap), 0),
+        gap_rate=fill(rates, 0),
+        free=fill(free, False),
+        momentum_drift=jnp.where((written & free)[:, None], frozen(_momentum_drift(chain, first, last, fill(r.stop - r.start, 0))), 0),
+        count=count,
+    )
+    lost = written & (margin < rank_tolerance(margin.dtype))
+    return phases, of_saved, jnp.where(jnp.any(lost), jnp.argmax(lost).astype(jnp.int32), rows)
+
+
+def _moment(chain: Chain, state: State, at_end: Bool[Array, ""]) -> Moment:
+    """Look at one state. at_end: of a phase; elsewhere energy, momenta and margin are left out."""
+    kin, dtype, looped = kinematics(chain, state.q), state.q.dtype, bool(chain.link_names)
+    gaps = rates = jnp.zeros(2, dtype)
+    J = jnp.zeros((0, chain.dofs), dtype)
+    if looped:
+        end = ends(chain, state.structure, kin, state.q)
+        J = loop_jacobian(chain, state.structure, kin, end)
+        gaps, rates = largest(gap(state.structure, end)), largest((J @ state.v).reshape(-1, 6))
+
+    def whole():
+        energy, *momenta = energy_and_momentum(chain, state, kin)
+        row, column = scales(chain)
+        margin = weakest(select(frozen(row[:, None] * J * column[None]), state.structure.rank)) if looped else jnp.ones((), dtype)
+        return energy, *frozen(tuple(momenta)), margin
+
+    none = jnp.zeros((), dtype), jnp.zeros(3, dtype), jnp.zeros(3, dtype), jnp.ones((), dtype)
+    return Moment(gaps, rates, *jax.lax.cond(at_end, whole, lambda: none))
 
 
 def _free(chain: Chain, s: Structure) -> Bool[Array, ""]:
@@ -77,10 +146,11 @@ def _free(chain: Chain, s: Structure) -> Bool[Array, ""]:
     return ~jnp.any(s.connected & ((s.parent == 0) | (s.real == 0)))
 
 
-def _momentum_drift(chain: Chain, linear: Float[Array, "2 3"], angular: Float[Array, "2 3"], span) -> Float[Array, "2"]:
+def _momentum_drift(chain: Chain, first: Moment, last: Moment, span: Float[Array, " phases"]) -> Float[Array, "phases 2"]:
     """Change of linear momentum (N s) that gravity does not explain, and of the angular momentum about the centre of mass (N m s)."""
-    fallen = jnp.sum(chain.mass) * chain.gravity * span
-    return jnp.stack([jnp.linalg.norm(linear[1] - linear[0] - fallen), jnp.linalg.norm(angular[1] - angular[0])])
+    fallen = jnp.sum(chain.mass) * chain.gravity[None] * span[:, None]
+    size = lambda x: jnp.linalg.norm(x, axis=-1)
+    return jnp.stack([size(last.linear - first.linear - fallen), size(last.angular - first.angular)], 1)
 
 
 def stages(solver: diffrax.AbstractSolver) -> int:

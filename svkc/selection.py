@@ -121,6 +121,11 @@ def weakest(selection: Selection) -> Float[Array, ""]:
     return jnp.min(jnp.where(used, size, jnp.inf), initial=1, where=used) / jnp.where(jnp.any(used), jnp.max(size), 1)
 
 
+def too_few(P: Float[Array, "steps dofs"], rank: Int[Array, ""]) -> Bool[Array, ""]:
+    """Whether fewer pivots are held than the rank asks for, as before the first choice."""
+    return jnp.sum(jnp.any(P > 0, 1), dtype=jnp.int32) < rank
+
+
 def solve_frozen(B: Float[Array, "steps steps"], x: Float[Array, "steps *n"], trans: bool = False) -> Float[Array, "steps *n"]:
     """B^-1 x, or B^-T x, for a B that the frozen choice leaves upper triangular in value but not in derivative."""
     triangle = jax.lax.stop_gradient(B)

@@ -12,23 +12,20 @@ import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Int
 
 from svkc.binding import emptied, grip
 from svkc.chain import Chain, State, Structure
-from svkc.closure import largest_gaps
 from svkc.events import Plan
 from svkc.guards import Sensor
 from svkc.location import Reading, event_tolerance
 from svkc.operation import Closed
 from svkc.phase import Run, Solved, solve
-from svkc.projection import rank_margin
-from svkc.records import no_events, no_phases, recorded, stages
+from svkc.records import certified, no_events, no_records, recorded, stages
 from svkc.request import Options, checked
-from svkc.selection import rank_tolerance
 from svkc.stepping import Motion, Scene, finite, frozen
 from svkc.trajectory import RESULTS, Events, Trajectory
-from svkc.transition import change, connect_tolerance
+from svkc.transition import change, connect_tolerance, release
 
 
 def simulate(
@@ -78,11 +75,11 @@ def _run(chain: Chain, state: State, t0, t1, ts, made: Plan, options: Options, a
         run, _ = jax.lax.scan(phase, run, jnp.arange(options.max_events + 1))
     short = (run.t < t1) & (run.result == RESULTS.successful)
     result = RESULTS.where(short, RESULTS.max_events, run.result)
-    saved = run.saved
-    gaps, gap_rates = jax.vmap(lambda s: largest_gaps(chain, s))(saved)
-    worst = jnp.maximum(jnp.max(gaps), jnp.max(run.phases.gap))
+    phases, saved, lost = certified(chain, run.records, run.count, run.saved, stages(options.solver))
+    worst = jnp.maximum(jnp.max(saved.gap), jnp.max(phases.gap))
     result = RESULTS.where((result == RESULTS.successful) & (worst > options.gap), RESULTS.loop_open, result)
-    return Trajectory(ts, saved, gaps, gap_rates, run.events, run.phases, run.state, run.t, result, run.derivative)
+    derivative = RESULTS.where((lost < phases.start.shape[0]) & (lost <= run.spoiled), RESULTS.rank_lost, run.derivative)
+    return Trajectory(ts, run.saved, saved.gap, saved.gap_rate, run.events, phases, run.state, run.t, result, derivative)
 
 
 def _converted(chain: Chain, state: State, t0, made: Plan, options: Options, args) -> tuple[Plan, Options]:
@@ -120,10 +117,12 @@ def _start(chain: Chain, state: State, t0, ts, made: Plan, options: Options, arg
         guards=guards,
         pending=jnp.ones(len(made.timed), bool),
         events=no_events(rows, links, dtype),
-        phases=no_phases(rows + 1, links, dtype),
+        records=no_records(rows + 1, state),
+        count=jnp.asarray(0, jnp.int32),
         saved=jax.tree.map(lambda x: jnp.broadcast_to(x[None], (ts.shape[0], *x.shape)), state),
         result=RESULTS.successful,
         derivative=RESULTS.successful,
+        spoiled=jnp.asarray(rows + 1, jnp.int32),
     )  # fmt: skip
 
 
@@ -141,24 +140,37 @@ def _phase(chain: Chain, run: Run, index, t1, ts, made: Plan, options: Options, 
     fired = jnp.zeros(len(made.actions), bool).at[np.array(made.timed + made.guarded, int)].set(jnp.concatenate([timed, solved.fired & reached]))
     ended = State(solved.motion.q, solved.motion.v, run.state.structure)
     saved = _save(run, ended, solved, ts)
-    margin = rank_margin(chain, run.state, ended)
-    row = (jnp.arange(run.phases.start.shape[0]) == index) & going
+    row = (jnp.arange(run.records.start.shape[0]) == index) & going
     work = jnp.zeros_like(run.t) if run.work is None else solved.motion.work - run.work
-    phases = recorded(chain, run.phases, row, (run.t, run.state), (solved.t, ended), work, solved.path, margin, stages(options.solver))
-    derivative = _derivative(run, solved, going, timed, margin)
+    records = recorded(run.records, row, (run.t, run.state), (solved.t, ended), work, solved.path)
+    count = run.count + going.astype(jnp.int32)
+    derivative, spoiled = _derivative(run, solved, going, timed, index)
     after, events, result = ended, run.events, solved.result
     if made.actions:
         after, events, result = _apply(chain, run, ended, solved, fired, made)
     result = RESULTS.where(run.result == RESULTS.successful, result, run.result)
     guards = _compared(chain, after, solved, jnp.any(fired), made, options, args)
-    return Run(solved.t, after, solved.motion.work, guards, run.pending & ~timed, events, phases, saved, result, derivative)
+    return Run(
+        t=solved.t,
+        state=after,
+        work=solved.motion.work,
+        guards=guards,
+        pending=run.pending & ~timed,
+        events=events,
+        records=records,
+        count=count,
+        saved=saved,
+        result=result,
+        derivative=derivative,
+        spoiled=spoiled,
+    )
 
 
-def _derivative(run: Run, solved: Solved, going, timed: Bool[Array, " timed"], margin) -> RESULTS:
-    """The first reason why the run has no derivative."""
+def _derivative(run: Run, solved: Solved, going, timed: Bool[Array, " timed"], index) -> tuple[RESULTS, Int[Array, ""]]:
+    """Return the first reason why the run has no derivative, and the phase it is of; ranks are looked at after the run."""
     code = RESULTS.where(jnp.sum(solved.fired) + jnp.sum(timed) > 1, RESULTS.together, solved.derivative)
-    code = RESULTS.where(margin < rank_tolerance(margin.dtype), RESULTS.rank_lost, code)
-    return RESULTS.where((run.derivative == RESULTS.successful) & going, code, run.derivative)
+    first = (run.derivative == RESULTS.successful) & going & (code != RESULTS.successful)
+    return RESULTS.where(first, code, run.derivative), jnp.where(first, index, run.spoiled).astype(jnp.int32)
 
 
 def _compared(chain: Chain, after: State, solved: Solved, happened, made: Plan, options: Options, args):
@@ -187,11 +199,6 @@ def _save(run: Run, ended: State, solved: Solved, ts) -> State:
     return State(q, v, jax.tree.map(write, ended.structure, run.saved.structure))
 
 
-def _keep_rank(primitive, /, *_, **params) -> bool:
-    """Of a change, only the rank is kept for the way back; jax's own policy of this kind fails on operations that have a parameter `prim`."""
-    return primitive.name == "name" and params["name"] == "rank"
-
-
 def _apply(chain: Chain, run: Run, ended: State, solved: Solved, fired: Bool[Array, " events"], made: Plan):
     """The change of structure that all events of this instant make together; one record row for each of them."""
     any_of = lambda what: jnp.any(fired[:, None] & made.table(chain, what), 0)
@@ -205,7 +212,7 @@ def _apply(chain: Chain, run: Run, ended: State, solved: Solved, fired: Bool[Arr
         connected, here = (connected | gripped) & ~emptying, here | gripped
 
     def changed():
-        done = eqx.filter_checkpoint(change, policy=_keep_rank)(chain, ended, connected, locked, here)
+        done = change(chain, ended, connected, locked, here) if made.joins(chain) else release(chain, ended, connected, locked)
         return done if emptying is None else eqx.tree_at(lambda d: d.state.structure, done, emptied(done.state.structure, emptying))
 
     def same():

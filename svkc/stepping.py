@@ -17,7 +17,7 @@ from svkc.given import function, numbers, one, whole
 from svkc.inverse_dynamics import limit_forces
 from svkc.kinematics import LEVELS_UNROLLED, normalize, rates
 from svkc.loops import active_dofs
-from svkc.projection import dependent_change, first_pivots, inertia_change, settle_by_bodies, settle_loops
+from svkc.projection import dependent_change, inertia_change, settle_by_bodies, settle_loops
 
 # a step that would leave less than this part of itself before a time to be met goes all the way
 REST = 1e-6
@@ -155,8 +155,10 @@ class Seen(eqx.Module):
         """Before the first step."""
         if not projects(field.stabilization, scene):
             return None
-        gap = jnp.zeros((len(scene.chain.link_names), 2), q.dtype)
-        return cls(gap) if field.pivotless else cls(gap, jnp.ones((), q.dtype), first_pivots(scene.chain, scene.structure, q))
+        links, dofs = len(scene.chain.link_names), scene.chain.dofs
+        gap = jnp.zeros((links, 2), q.dtype)
+        # the first evaluation of the field finds no pivots held, and chooses
+        return cls(gap) if field.pivotless else cls(gap, jnp.ones((), q.dtype), jnp.zeros((min(6 * links, dofs), dofs), q.dtype))
 
     @property
     def dependent(self) -> Bool[Array, " dofs"]:

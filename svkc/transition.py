@@ -12,13 +12,13 @@ from jaxtyping import Array, Bool, Float
 from svkc.assembly import check_closed, connection_mask, joint_slice, link_index
 from svkc.binding import emptied, spare_slot
 from svkc.chain import Chain, State, Structure
-from svkc.closure import choose, constrained, scaled_jacobian, scales
-from svkc.forward_dynamics import constraint_forces, reduced_inertia, solve_free_motion, solve_motion, with_links
+from svkc.closure import constrained
+from svkc.forward_dynamics import reduced_inertia, solve_free_motion
 from svkc.given import yes_or_no
+from svkc.impact import decide_rank, join
 from svkc.inverse_dynamics import inertia_by_composites, inertia_times
-from svkc.kinematics import kinematics, twists
-from svkc.loops import active_dofs, ends, gap, joint_coordinates, loop_jacobian, with_coordinates
-from svkc.projection import close, decide_rank
+from svkc.kinematics import Kinematics, kinematics, twists
+from svkc.loops import active_dofs, ends, joint_coordinates, loop_jacobian, with_coordinates
 from svkc.spatial import quat_conjugate, quat_multiply, quat_rotate
 from svkc.topology import V_SIZE
 from svkc.verb import check_state
@@ -34,12 +34,11 @@ class Change(eqx.Module):
     gap: Float[Array, ""]
 
 
-def gripped_here(chain: Chain, structure: Structure, q, here: Bool[Array, " links"]) -> Structure:
+def gripped_here(chain: Chain, structure: Structure, q, here: Bool[Array, " links"], kin: Kinematics) -> Structure:
     """Placements of the links in `here` taken from where the bodies are: the point is the real link's own, the axes stay the parent's.
 
     So a palm grips the bar where it touches it, about the bar's direction; floats of the placement stay differentiable.
     """
-    kin = kinematics(chain, q)
     end = ends(chain, structure, kin, q)
     p = structure.parent
     to_parent = quat_conjugate(kin.quat[p])
@@ -54,22 +53,23 @@ def gripped_here(chain: Chain, structure: Structure, q, here: Bool[Array, " link
     )
 
 
-def _project(chain: Chain, structure: Structure, q, v):
-    """v+ = W (W^T M W)^-1 W^T M v-: the projection, orthogonal in the metric of the inertia, on what the structure allows.
+def _restructured(chain: Chain, structure: Structure, connected, locked) -> tuple[Structure, Bool[Array, " links"], Bool[Array, ""]]:
+    """Return the structure with these masks, its rank not decided yet, the links that are new, and whether anything new holds."""
+    new_links = connected & ~structure.connected
+    holds, after = jnp.any(new_links), eqx.tree_at(lambda s: s.connected, structure, connected)
+    if locked is None:
+        return after, new_links, holds
+    was = jnp.zeros(chain.dofs, bool) if structure.locked is None else structure.locked
+    return eqx.tree_at(lambda s: s.locked, after, locked, is_leaf=lambda x: x is None), new_links, holds | jnp.any(locked & ~was)
 
-    The paper's (29)-(38) said shortly; it holds where loops are redundant too. Returns v+, the impulses and the energy lost.
-    """
-    nv = chain.nv
+
+@eqx.filter_checkpoint
+def _placed(chain: Chain, structure: Structure, new_links, here, q) -> tuple[Structure, Float[Array, " q"]]:
+    """Return the structure with the placements of the links in `here`, and q with the coordinates of the new joints read off from where the bodies are."""
     kin = kinematics(chain, q)
-    momentum = lambda v: with_links(chain, inertia_times(chain, kin, v[:nv]), v)
-    J = scaled_jacobian(chain, structure, kin, ends(chain, structure, kin, q))
-    selection = choose(structure, J)
-    after = solve_motion(chain, structure, kin, selection, J, momentum(v), jnp.zeros(J.shape[0], v.dtype))
-    jump = after - v
-    impulse = momentum(jump)
-    # v- and v+ differ by a vector orthogonal to v+, so that the loss is a square and cannot be negative
-    jump = jnp.where(active_dofs(chain, structure), jump, 0)
-    return after, -constraint_forces(chain, selection, J, impulse), jump @ impulse / 2
+    if here is not None:
+        structure = gripped_here(chain, structure, q, here & new_links, kin)
+    return structure, with_coordinates(chain, new_links, joint_coordinates(chain, structure, kin, q), q)
 
 
 @eqx.filter_jit
@@ -81,32 +81,28 @@ def change(
     Where links are only cut or joints only unlocked, q and v are kept bit for bit; where something new holds, coordinates of the new joints
     are read off, the remaining gap is closed by the least change, and the velocity is projected.
     """
-    old = state.structure
-    new_links = connected & ~old.connected
-    structure = old if here is None else gripped_here(chain, old, state.q, here & new_links)
-    structure = eqx.tree_at(lambda s: s.connected, structure, connected)
-    holds = jnp.any(new_links)
-    if locked is not None:
-        was = jnp.zeros(chain.dofs, bool) if old.locked is None else old.locked
-        holds = holds | jnp.any(locked & ~was)
-        structure = eqx.tree_at(lambda s: s.locked, structure, locked, is_leaf=lambda x: x is None)
+    structure, new_links, holds = _restructured(chain, state.structure, connected, locked)
     q, v, nothing = state.q, state.v, jnp.zeros((len(chain.link_names), 3), state.v.dtype)
     if not len(chain.link_names):
         after, lost = lock_projection(chain, structure, q, v)
         v = jnp.where(holds, after, v)
         return Change(State(q, v, structure), nothing, nothing, jnp.where(holds, lost, 0), jnp.zeros((), v.dtype))
-    new_q = with_coordinates(chain, new_links, joint_coordinates(chain, structure, kinematics(chain, q), q), q)
-    kin = kinematics(chain, new_q)
-    open_ = gap(structure, ends(chain, structure, kin, new_q)).ravel()
-    row, _ = scales(chain)
-    structure = decide_rank(chain, structure, new_q)
-    closed = close(chain, structure, new_q)
+    structure, new_q = _placed(chain, structure, new_links, here, q)
     # the armature of a joint that is made anew is at rest before
-    before = v if chain.link_armature is None else jnp.where(active_dofs(chain, old), v, 0)
-    after, wrench, lost = _project(chain, structure, closed, before)
-    q, v = jnp.where(holds, closed, q), jnp.where(holds, after, v)
-    wrench, lost = jnp.where(holds, wrench, 0), jnp.where(holds, lost, 0)
-    return Change(State(q, v, structure), wrench[:, 3:], wrench[:, :3], lost, jnp.where(holds, jnp.max(jnp.abs(row * open_)), 0))
+    before = v if chain.link_armature is None else jnp.where(active_dofs(chain, state.structure), v, 0)
+    joined = join(chain, structure, new_q, before)
+    structure = eqx.tree_at(lambda s: (s.rank, s.margin), structure, (joined.rank, joined.margin))
+    q, v = jnp.where(holds, joined.q, q), jnp.where(holds, joined.v, v)
+    wrench, lost = jnp.where(holds, joined.wrench, 0), jnp.where(holds, joined.lost, 0)
+    return Change(State(q, v, structure), wrench[:, 3:], wrench[:, :3], lost, jnp.where(holds, joined.gap, 0))
+
+
+@eqx.filter_jit
+def release(chain: Chain, state: State, connected: Bool[Array, " links"], locked: Bool[Array, " dofs"] | None = None) -> Change:
+    """`change` where links are only cut and joints only unlocked: q and v stay, the rank is decided anew."""
+    structure, _, _ = _restructured(chain, state.structure, connected, locked)
+    nothing, zero = jnp.zeros((len(chain.link_names), 3), state.v.dtype), jnp.zeros((), state.v.dtype)
+    return Change(State(state.q, state.v, decide_rank(chain, structure, state.q)), nothing, nothing, zero, zero)
 
 
 def lock_projection(chain: Chain, structure: Structure, q, v):
@@ -159,7 +155,7 @@ def cut(chain: Chain, state: State, *names: str) -> State:
     """Cuts virtual links: q and v stay as they are, bit for bit (paper, section V-C)."""
     check_state(chain, state)
     chosen = np.isin(np.arange(len(chain.link_names)), [link_index(chain, n) for n in names])
-    return change(chain, state, state.structure.connected & ~jnp.asarray(chosen)).state
+    return release(chain, state, state.structure.connected & ~jnp.asarray(chosen)).state
 
 
 def _locked(chain: Chain, state: State, joints, value: bool) -> State:
@@ -167,7 +163,7 @@ def _locked(chain: Chain, state: State, joints, value: bool) -> State:
     locked = jnp.zeros(chain.dofs, bool) if state.structure.locked is None else state.structure.locked
     for name in joints:
         locked = locked.at[joint_slice(chain, name, V_SIZE, chain.topology.v_start)].set(value)
-    return change(chain, state, state.structure.connected, locked).state
+    return (change if value else release)(chain, state, state.structure.connected, locked).state
 
 
 def lock(chain: Chain, state: State, *joints: str) -> State:
@@ -184,7 +180,7 @@ def unbind(chain: Chain, state: State, *names: str) -> State:
     """Cuts spare virtual links and empties their slots for other bodies; q and v stay as they are."""
     check_state(chain, state)
     slots = np.isin(np.arange(len(chain.link_names)), [spare_slot(chain, n) for n in names])
-    after = change(chain, state, state.structure.connected & ~jnp.asarray(slots)).state
+    after = release(chain, state, state.structure.connected & ~jnp.asarray(slots)).state
     return State(after.q, after.v, emptied(after.structure, jnp.asarray(slots)))
 
 
