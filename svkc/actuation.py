@@ -8,6 +8,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from svkc.chain import Chain, State
 from svkc.closure import constrained, open_coordinates, scales
+from svkc.eager import eager_jit
 from svkc.forward_dynamics import constraint_forces, with_links
 from svkc.given import arrayed, concrete, numbers
 from svkc.inverse_dynamics import generalized_forces, passive_forces
@@ -74,7 +75,7 @@ def _per_dof(chain: Chain, name: str, value, default, state: State) -> Float[Arr
     return jnp.broadcast_to(value, (chain.dofs,))
 
 
-@jax.jit
+@eager_jit
 def _coordinates(chain: Chain, state: State):
     kin = kinematics(chain, state.q)
     V = twists(chain, kin, state.v)
@@ -105,7 +106,7 @@ def _reach(chosen: Selection, B, wanted, cost):
     return y + over_cost @ jnp.linalg.solve(G, Z.T @ (wanted - B @ y))
 
 
-@jax.jit
+@eager_jit
 def _solve(chain: Chain, state: State, vdot_G, weight, actuated: Bool[Array, " dofs"]):
     nv = chain.nv
     co, kin, V = _coordinates(chain, state)

@@ -1,23 +1,27 @@
 """F4: a consistent state from what the user knows of it: names to numbers, loops closed, velocities made to agree."""
 
+import functools
 import warnings
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from svkc.chain import Chain, State, Structure
 from svkc.closure import loop_gaps
+from svkc.eager import eager_jit
 from svkc.given import arrayed, finite
-from svkc.impact import decide_rank
-from svkc.kinematics import kinematics, normalize
-from svkc.loops import active_dofs, joint_coordinates, with_coordinates
+from svkc.impact import AGREE, AGREE_HELD, CLOSE, CLOSE_HELD, RANK, READ, Held, Schedule, newton_turns
+from svkc.kinematics import normalize
+from svkc.loops import active_dofs
 from svkc.projection import agree, close
 from svkc.topology import Q_SIZE, V_SIZE
 from svkc.verb import check_state
 
 _NEWTON = 30
+_CLOSING = Schedule((READ, *(CLOSE_HELD,) * _NEWTON, *(CLOSE,) * _NEWTON, *RANK, AGREE_HELD, AGREE))
 
 
 def gap_tolerance(dtype) -> float:
@@ -130,22 +134,19 @@ def _carried(chain: Chain, structure: Structure, q, v, placed):
     return q, v
 
 
-@eqx.filter_jit
-def _close_and_agree(chain: Chain, structure: Structure, q, v, held_q, held_v, whole: bool):
-    """Loops closed with the named coordinates held, then, for what is still open, with all of them free; the same for velocities.
+@functools.partial(eager_jit, jit=eqx.filter_jit)
+def _close_and_agree(chain: Chain, structure: Structure, q, v, held_q, held_v, whole: bool) -> tuple[State, Float[Array, " links"]]:
+    """Loops closed with the named coordinates held, then, for what is still open, with all of them free; the same for velocities. And what is left open
+    (rad, or `chain.length`s).
 
     whole: q says where every body is; else those that may be cut are put where their joint's coordinates say.
     """
     placed = (np.array(chain.topology.link_child, int) >= 0) & (not whole)
     if placed.any():
         q, v = _carried(chain, structure, q, v, placed)
-    read = joint_coordinates(chain, structure, kinematics(chain, q), q)
-    q = with_coordinates(chain, jnp.asarray(~placed) | ~structure.connected, read, q)
-    full = eqx.tree_at(lambda s: s.rank, structure, jnp.asarray(min(6 * len(chain.link_names), chain.dofs), jnp.int32))
-    q = close(chain, full, q, 2 * _NEWTON, hold=held_q)
-    structure = decide_rank(chain, structure, q)
-    v = jnp.where(active_dofs(chain, structure), v, 0)
-    return State(q, agree(chain, structure, q, v, hold=held_v), structure)
+    held = Held(held_q, held_v, jnp.asarray(~placed) | ~structure.connected)
+    found = newton_turns(chain, structure, q, v, held, _CLOSING)
+    return State(found.q, found.v, eqx.tree_at(lambda s: (s.rank, s.margin), structure, (found.rank, found.margin))), found.left
 
 
 def assemble(chain: Chain, q, v, connected) -> State:
@@ -163,8 +164,7 @@ def assemble(chain: Chain, q, v, connected) -> State:
         return State(normalize(chain, q), v, structure)
     # (where no joint can be cut it is all the same, and one program)
     whole = max(top.link_child, default=-1) < 0 or (given is not None and not isinstance(given, dict) and np.shape(given) != (len(top.model_q),))
-    state = _close_and_agree(chain, structure, q, v, jnp.asarray(_as_dofs(chain, held_q)), jnp.asarray(held_v), whole)
-    return check_closed(chain, state)
+    return check_closed(chain, *_close_and_agree(chain, structure, q, v, jnp.asarray(_as_dofs(chain, held_q)), jnp.asarray(held_v), whole))
 
 
 def _as_dofs(chain: Chain, held_q: np.ndarray) -> np.ndarray:
@@ -175,15 +175,8 @@ def _as_dofs(chain: Chain, held_q: np.ndarray) -> np.ndarray:
     return held
 
 
-@eqx.filter_jit
-def _worst_gap(chain: Chain, state: State):
-    gaps = jnp.abs(loop_gaps(chain, state))
-    return jnp.maximum(jnp.max(gaps[:, :3], 1), jnp.max(gaps[:, 3:], 1) / chain.length)
-
-
-def check_closed(chain: Chain, state: State) -> State:
-    """The state; ValueError (or an error raised at run time, under jit) where a loop is open, saying which and by how much."""
-    worst = _worst_gap(chain, state)
+def check_closed(chain: Chain, state: State, worst: Float[Array, " links"]) -> State:
+    """The state; ValueError (or an error raised at run time, under jit) where a loop is open, saying which and by how much. worst: of each loop's gaps."""
     limit = gap_tolerance(state.q.dtype)
     if isinstance(worst, jax.core.Tracer):
         return eqx.error_if(state, ~(jnp.max(worst) < limit), "the loops of the initial state cannot be closed")

@@ -135,7 +135,7 @@ def open_coordinates(chain: Chain, structure: Structure) -> Coordinates:
     return Coordinates(W, jnp.zeros(n, dtype), free, jnp.zeros(n, bool), chain.actuated, selection, jnp.zeros((0, n), dtype))
 
 
-@verb
+@verb(eager=True)
 def coordinates(chain: Chain, state: State) -> Coordinates:
     """H, W, S (without units, rad or m per rad or m), Hdot v (rad/s^2, m/s^2) and the selection, as the paper names them (section II)."""
     if not len(chain.link_names):
@@ -172,13 +172,13 @@ def largest_gaps(chain: Chain, state: State) -> tuple[Float[Array, "2"], Float[A
     return largest(gaps), largest(rates)
 
 
-@verb
+@verb(eager=True)
 def loop_gaps(chain: Chain, state: State) -> Float[Array, "links 6"]:
     """How far each connected loop is open: rotation vector (rad), then distance (m), in the world; zero where not connected."""
     return gaps_and_rates(chain, state)[0]
 
 
-@verb
+@verb(eager=True)
 def jacobian(chain: Chain, state: State) -> tuple[Float[Array, "links 3 dofs"], Float[Array, "links 3 dofs"]]:
     """J_C (paper (11)): linear (m/s) and angular (rad/s) velocity of each connected virtual link relative to its real link, for a unit rate of each
     joint coordinate, at the joint, in world axes."""
@@ -187,7 +187,7 @@ def jacobian(chain: Chain, state: State) -> tuple[Float[Array, "links 3 dofs"], 
     return J[:, 3:], J[:, :3]
 
 
-@verb
+@verb(eager=True)
 def velocity_gaps(chain: Chain, state: State) -> Float[Array, "links 6"]:
     """J_C v: relative twist (rad/s, m/s) across each connected virtual link."""
     return gaps_and_rates(chain, state)[1]

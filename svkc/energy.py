@@ -39,19 +39,19 @@ def _both(chain: Chain, state: State) -> tuple[Float[Array, ""], Float[Array, ""
     return _energies(chain, state, kin, _bodies(chain, kin, state.v))
 
 
-@verb
+@verb(eager=True)
 def kinetic_energy(chain: Chain, state: State) -> Float[Array, ""]:
     """Kinetic energy (J), armature included: v^T M v / 2."""
     return _both(chain, state)[0]
 
 
-@verb
+@verb(eager=True)
 def potential_energy(chain: Chain, state: State) -> Float[Array, ""]:
     """Gravity's potential (J), zero at the world's origin, and that of the joints' springs."""
     return _both(chain, state)[1]
 
 
-@verb
+@verb(eager=True)
 def energy(chain: Chain, state: State) -> Float[Array, ""]:
     """Mechanical energy (J): kinetic, gravity's and the joint springs' (Featherstone section 2.13)."""
     kinetic, potential = _both(chain, state)
@@ -68,7 +68,7 @@ def energy_and_momentum(chain: Chain, state: State, kin: Kinematics) -> tuple[Fl
     return kinetic + potential, jnp.sum(p, 0), jnp.sum(spin + cross(place - centre[None], p), 0)
 
 
-@verb
+@verb(eager=True)
 def momentum(chain: Chain, state: State) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
     """Linear momentum (N s) and angular momentum about the world's origin (N m s), in world axes (Featherstone section 2.12)."""
     kin = kinematics(chain, state.q)

@@ -220,7 +220,7 @@ class LoopForces(eqx.Module):
         return iter((self.force, self.torque))
 
 
-@verb
+@verb(eager=True)
 def loop_forces(chain: Chain, state: State, tau: Float[Array, " torques"]) -> LoopForces:
     """Force (N) and torque (N m) that each connected virtual link carries for the joint torques tau: on `real` from `parent`, at the joint, in
     world axes, and whether the motion alone decides it."""

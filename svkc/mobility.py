@@ -3,13 +3,14 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc.chain import Chain, State
 from svkc.closure import coordinates, scaled_jacobian
 from svkc.kinematics import kinematics
 from svkc.loops import active_dofs, ends
-from svkc.selection import count_rank, select, weakest
+from svkc.selection import count_rank, select
 from svkc.verb import verb
 
 
@@ -43,7 +44,7 @@ class Mobility(eqx.Module):
         return "\n".join(lines)
 
 
-@verb
+@verb(eager=True)
 def mobility(chain: Chain, state: State) -> Mobility:
     """Freedoms of the structure that the state is under, with the rank its phase decided on."""
     active = active_dofs(chain, state.structure)
@@ -55,10 +56,15 @@ def mobility(chain: Chain, state: State) -> Mobility:
         return Mobility(joint_freedoms, joint_freedoms, zero, none, active, one, none > 0, (), chain.dof_names)
     kin = kinematics(chain, state.q)
     J = scaled_jacobian(chain, state.structure, kin, ends(chain, state.structure, kin, state.q))
-    ranks = jnp.stack([count_rank(select(J[: 6 * (i + 1)]).size) for i in range(links)])
+    # of the first loop's rows, the first two loops', and so on
+    upto = np.arange(6 * links)[None] < 6 * np.arange(1, links + 1)[:, None]
+    sizes = jax.lax.map(lambda rows: select(jnp.where(rows[:, None], J, 0)).size, jnp.asarray(upto))
+    ranks = jax.vmap(count_rank)(sizes)
     rows = jnp.where(state.structure.connected, 6, 0).astype(jnp.int32)
     redundant = rows - jnp.diff(ranks, prepend=jnp.zeros(1, jnp.int32))
     co = coordinates(chain, state)
-    rank, margin = state.structure.rank, weakest(select(J, state.structure.rank))
+    rank, size = state.structure.rank, sizes[-1]
+    counted = (jnp.arange(size.shape[0], dtype=jnp.int32) < rank) & (size > 0)
+    margin = jnp.min(jnp.where(counted, size, 1), initial=1) / jnp.where(jnp.any(counted), jnp.max(size), 1)
     on = state.structure.connected
     return Mobility(joint_freedoms - rank, joint_freedoms, rank, redundant, co.independent, margin, on, chain.link_names, chain.dof_names)

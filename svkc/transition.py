@@ -13,9 +13,10 @@ from svkc.assembly import check_closed, connection_mask, joint_slice, link_index
 from svkc.binding import emptied, spare_slot
 from svkc.chain import Chain, State, Structure
 from svkc.closure import constrained
+from svkc.eager import eager_jit
 from svkc.forward_dynamics import reduced_inertia, solve_free_motion
 from svkc.given import yes_or_no
-from svkc.impact import decide_rank, join
+from svkc.impact import JOIN, RANK, Held, Schedule, decide_rank, newton_turns
 from svkc.inverse_dynamics import inertia_by_composites, inertia_times
 from svkc.kinematics import Kinematics, kinematics, twists
 from svkc.loops import active_dofs, ends, joint_coordinates, loop_jacobian, with_coordinates
@@ -25,13 +26,17 @@ from svkc.verb import check_state
 
 
 class Change(eqx.Module):
-    """What a change of structure did: the state after it, impulses on the real links from their parents, at the joints, and energy lost (J)."""
+    """What a change of structure did: the state after it, impulses on the real links from their parents, at the joints, and energy lost (J).
+
+    `gap`: the largest gap of a loop before it was closed; `left`: of each loop after it (rad, or `chain.length`s).
+    """
 
     state: State
     impulse: Float[Array, "links 3"]
     angular_impulse: Float[Array, "links 3"]
     energy_lost: Float[Array, ""]
     gap: Float[Array, ""]
+    left: Float[Array, " links"]
 
 
 def gripped_here(chain: Chain, structure: Structure, q, here: Bool[Array, " links"], kin: Kinematics) -> Structure:
@@ -72,7 +77,7 @@ def _placed(chain: Chain, structure: Structure, new_links, here, q) -> tuple[Str
     return structure, with_coordinates(chain, new_links, joint_coordinates(chain, structure, kin, q), q)
 
 
-@eqx.filter_jit
+@functools.partial(eager_jit, jit=eqx.filter_jit)
 def change(
     chain: Chain, state: State, connected: Bool[Array, " links"], locked: Bool[Array, " dofs"] | None = None, here: Bool[Array, " links"] | None = None
 ) -> Change:
@@ -86,23 +91,24 @@ def change(
     if not len(chain.link_names):
         after, lost = lock_projection(chain, structure, q, v)
         v = jnp.where(holds, after, v)
-        return Change(State(q, v, structure), nothing, nothing, jnp.where(holds, lost, 0), jnp.zeros((), v.dtype))
+        return Change(State(q, v, structure), nothing, nothing, jnp.where(holds, lost, 0), jnp.zeros((), v.dtype), nothing[:, 0])
     structure, new_q = _placed(chain, structure, new_links, here, q)
     # the armature of a joint that is made anew is at rest before
     before = v if chain.link_armature is None else jnp.where(active_dofs(chain, state.structure), v, 0)
-    joined = join(chain, structure, new_q, before)
+    joined = newton_turns(chain, structure, new_q, before, Held(), Schedule(RANK + JOIN))
     structure = eqx.tree_at(lambda s: (s.rank, s.margin), structure, (joined.rank, joined.margin))
     q, v = jnp.where(holds, joined.q, q), jnp.where(holds, joined.v, v)
     wrench, lost = jnp.where(holds, joined.wrench, 0), jnp.where(holds, joined.lost, 0)
-    return Change(State(q, v, structure), wrench[:, 3:], wrench[:, :3], lost, jnp.where(holds, joined.gap, 0))
+    found, left = jnp.where(holds, jnp.max(joined.open[0]), 0), jnp.where(holds, joined.left, joined.open[0])
+    return Change(State(q, v, structure), wrench[:, 3:], wrench[:, :3], lost, found, left)
 
 
-@eqx.filter_jit
+@functools.partial(eager_jit, jit=eqx.filter_jit)
 def release(chain: Chain, state: State, connected: Bool[Array, " links"], locked: Bool[Array, " dofs"] | None = None) -> Change:
     """`change` where links are only cut and joints only unlocked: q and v stay, the rank is decided anew."""
     structure, _, _ = _restructured(chain, state.structure, connected, locked)
     nothing, zero = jnp.zeros((len(chain.link_names), 3), state.v.dtype), jnp.zeros((), state.v.dtype)
-    return Change(State(state.q, state.v, decide_rank(chain, structure, state.q)), nothing, nothing, zero, zero)
+    return Change(State(state.q, state.v, decide_rank(chain, structure, state.q)), nothing, nothing, zero, zero, nothing[:, 0])
 
 
 def lock_projection(chain: Chain, structure: Structure, q, v):
@@ -144,7 +150,7 @@ def _checked(chain: Chain, done: Change) -> State:
             f"connect: the bodies are {float(done.gap):.3g} (rad, or lengths of {float(chain.length):.3g} m) away from where the joint is "
             "declared; move them there, or grip where they are with here=True"
         )
-    return check_closed(chain, done.state)
+    return check_closed(chain, done.state, done.left)
 
 
 # gap, in rad or in `chain.length`s, up to which connecting may still move the bodies to their declared placement

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from svkc.chain import Chain, State, Structure
+from svkc.eager import eager_jit
 from svkc.given import numbers
 
 
@@ -51,15 +52,20 @@ def vector(chain: Chain, name: str, value, size: int | None = None):
     return array if isinstance(array, jax.Array) and jnp.issubdtype(array.dtype, jnp.floating) else jnp.asarray(array, chain.q_load.dtype)
 
 
-def verb(fn: Callable) -> Callable:
-    """`jax.jit` for a function of a chain, a state and arrays; ValueError where one of them cannot be right."""
+def verb(fn: Callable | None = None, *, eager: bool = False) -> Callable:
+    """`jax.jit` for a function of a chain, a state and arrays; ValueError where one of them cannot be right.
+
+    eager: called outside of every transformation it is compiled for compile time (`eager_jit`).
+    """
+    if fn is None:
+        return functools.partial(verb, eager=eager)
     signature = inspect.signature(fn)
 
     @functools.wraps(fn)
     def looked_at(*args, **options):
         return fn(**_looked_at(signature.bind(*args, **options).arguments))
 
-    compiled = jax.jit(looked_at)
+    compiled = eager_jit(looked_at) if eager else jax.jit(looked_at)
 
     @functools.wraps(fn)
     def call(*args, **options):

@@ -1,0 +1,48 @@
+"""F0: compilation of functions that are called eagerly, once or a few times: for compile time, not for speed."""
+
+import functools
+import re
+from collections.abc import Callable
+
+import jax
+
+try:
+    from jax.core import trace_state_clean  # pyright: ignore[reportAttributeAccessIssue]
+except ImportError:
+    # not public in every release of jax, and nothing public says whether jax is tracing
+    from jax._src.core import trace_state_clean
+
+# on a CPU LLVM and the fusion emitters take nine tenths of XLA's time; code that runs once gains nothing from them
+_OPTIONS = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
+
+
+def eager_jit(function: Callable, jit: Callable = jax.jit) -> Callable:
+    """Return the function compiled by `jit` (`jax.jit` or `equinox.filter_jit`): for compile time where it is called outside of every transformation.
+
+    jax takes compiler options at the outermost jit alone, so that under jit, grad, vmap and scan the function is compiled without them. Options that the
+    installed jaxlib does not know are left out.
+    """
+    plain, quick = jit(function), {}
+
+    @functools.wraps(function)
+    def call(*args, **kw):
+        if not trace_state_clean() or jax.default_backend() != "cpu":
+            return plain(*args, **kw)
+        while True:
+            known = tuple(_OPTIONS)
+            if known not in quick:
+                # (one wrapper for the options that are left: jax keeps programs by the wrapper)
+                quick[known] = jit(function, compiler_options=dict(_OPTIONS))
+            try:
+                return quick[known](*args, **kw)
+            except Exception as error:
+                if not _left_out(str(error)):
+                    raise
+
+    return call
+
+
+def _left_out(message: str) -> bool:
+    """Leave out the option that the message says is unknown; False where it says something else."""
+    unknown = re.search(r"[Nn]o such compile option: '?(\w+)", message)
+    return unknown is not None and _OPTIONS.pop(unknown[1], None) is not None
