@@ -179,9 +179,12 @@ def called_eagerly(model: str) -> dict:
     def report():
         return svkc.Trajectory.report(made["run"])
 
+    def cut(chain, state):
+        made["open"] = svkc.cut(chain, state, chain.link_names[0])
+        return made["open"]
+
     def connect(chain, state):
-        name = chain.link_names[0]
-        return svkc.connect(chain, svkc.cut(chain, state, name), name, here=True)
+        return svkc.connect(chain, made["open"], chain.link_names[0], here=True)
 
     return {
         "state": first_state,
@@ -190,6 +193,7 @@ def called_eagerly(model: str) -> dict:
         "mobility": on_state(svkc.mobility),
         "actuation": on_state(lambda chain, state: svkc.actuation(chain, state, jnp.zeros(chain.dofs))),
         "loop_forces": on_state(lambda chain, state: svkc.loop_forces(chain, state, jnp.zeros(chain.nv))),
+        "cut": on_state(cut),
         "connect": on_state(connect),
         "simulate": on_state(lambda chain, state: made.update(run=svkc.simulate(chain, state, 1e-3, throw=False))),
         "report": report,

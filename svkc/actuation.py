@@ -13,7 +13,7 @@ from svkc.forward_dynamics import constraint_forces, with_links
 from svkc.given import arrayed, concrete, numbers
 from svkc.inverse_dynamics import generalized_forces, passive_forces
 from svkc.kinematics import kinematics, twists
-from svkc.selection import Selection, count_rank, select
+from svkc.selection import Selection, count_rank, first_steps, select
 from svkc.verb import check_state
 
 
@@ -86,8 +86,11 @@ def _coordinates(chain: Chain, state: State):
 
 def _basis(B: Float[Array, "rows dofs"], rank=None) -> tuple[Selection, Int[Array, ""], Float[Array, "dofs dofs"]]:
     """Pivots of B, its rank (None: to be found), and a basis of its null space: for each column that is no pivot a one there, balanced by the pivots."""
-    rank = count_rank(select(B).size) if rank is None else rank
     chosen = select(B, rank)
+    if rank is None:
+        rank = count_rank(chosen.size)
+        # the steps before the rank are the same whether or not others follow
+        chosen = first_steps(chosen, rank)
     P = chosen.P
     Bm = chosen.Q @ B
     R = Bm @ P.T + jnp.diag(jnp.where(chosen.used, 0, 1).astype(B.dtype))
@@ -117,12 +120,13 @@ def _solve(chain: Chain, state: State, vdot_G, weight, actuated: Bool[Array, " d
     # without units: torques over metres, as the columns of J_C
     S = jnp.where(actuated[:, None], co.W, 0)
     B = column[:, None] * S.T / column[None]
-    chosen, rank, null = _basis(B)
+    # the null spaces of S^T and S, which are of one size, by one program
+    both, ranks, bases = jax.lax.map(_basis, jnp.stack([B, B.T]))
+    chosen, rank, null = jax.tree.map(lambda x: x[0], (both, ranks, bases))
     y = _reach(chosen, B, column * wanted, weight / column**2)
     null = column[:, None] ** -1 * jnp.where(actuated[None], null, 0)
     reachable = actuated & jnp.any(co.W != 0, 1)
-    _, _, undriven = _basis(B.T)
-    undriven = co.W @ (column[:, None] * jnp.where(co.independent[None], undriven, 0))
+    undriven = co.W @ (column[:, None] * jnp.where(co.independent[None], bases[1], 0))
     if len(chain.link_names):
         carried = jax.vmap(lambda tau: constraint_forces(chain, co.selection, co.J, tau), in_axes=1, out_axes=-1)(null)
         _, _, stress = _basis(co.J.T, state.structure.rank)

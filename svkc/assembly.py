@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from svkc.chain import Chain, State, Structure
 from svkc.closure import loop_gaps
 from svkc.eager import eager_jit
-from svkc.given import arrayed, finite
+from svkc.given import arrayed, concrete, finite
 from svkc.impact import AGREE, AGREE_HELD, CLOSE, CLOSE_HELD, RANK, READ, Held, Schedule, newton_turns
 from svkc.kinematics import normalize
 from svkc.loops import active_dofs
@@ -82,6 +82,15 @@ def prefer(chain: Chain, state: State, *names: str) -> State:
     return eqx.tree_at(lambda s: s.structure.independent, state, wanted, is_leaf=lambda x: x is None)
 
 
+def _put(array, at, values):
+    """Return the array with values at an index; on the host where nothing is traced, as each operation that jax is given eagerly is a program of its own."""
+    if not concrete(array, values):
+        return jnp.asarray(array).at[at].set(values)
+    out = np.array(array)
+    out[at] = values
+    return out
+
+
 def _filled(chain: Chain, what: str, value, default, tree: int, sizes, start):
     """The full vector of a user's array or dict, and which coordinates the dict named."""
     named = np.zeros(len(default), bool)
@@ -94,7 +103,7 @@ def _filled(chain: Chain, what: str, value, default, tree: int, sizes, start):
             number = finite(f"{what}[{name!r}]", number, default.dtype)
             if number.size != at.stop - at.start:
                 raise ValueError(f"{what}[{name!r}]: got {number.size} numbers, the joint has {at.stop - at.start}")
-            out = out.at[at].set(number.reshape(-1))
+            out = _put(out, at, number.reshape(-1))
             if what == "v" or at.stop - at.start == 1:
                 named[at] = True
         return out, named
@@ -102,9 +111,9 @@ def _filled(chain: Chain, what: str, value, default, tree: int, sizes, start):
     of_model = np.array(chain.topology.model_q if what == "q" else chain.topology.model_v, int)
     if chain.topology.cut_joints and value.shape == of_model.shape:
         # as for the plain tree
-        return default.at[of_model].set(value), named
+        return _put(default, of_model, value), named
     if value.shape == (tree,):
-        return default.at[:tree].set(value), named
+        return _put(default, slice(tree), value), named
     if value.shape != default.shape:
         raise ValueError(f"{what}: got shape {value.shape}, expected ({tree},) for the tree or {default.shape} for every coordinate")
     return value, named
@@ -158,7 +167,8 @@ def assemble(chain: Chain, q, v, connected) -> State:
     if wide and chain.q_load.dtype == np.float32:
         warnings.warn(f"state: {' and '.join(wide)} in float64, kept in float32: jax_enable_x64 was off when the chain was loaded", stacklevel=3)
     q, held_q = _filled(chain, "q", q, chain.q_load, top.nq, Q_SIZE, top.q_start)
-    v, held_v = _filled(chain, "v", v, jnp.zeros(top.dofs, chain.q_load.dtype), top.nv, V_SIZE, top.v_start)
+    v, held_v = _filled(chain, "v", v, np.zeros(top.dofs, chain.q_load.dtype), top.nv, V_SIZE, top.v_start)
+    q, v = jnp.asarray(q), jnp.asarray(v)
     _check_quaternions(chain, q)
     if not len(top.link_names):
         return State(normalize(chain, q), v, structure)

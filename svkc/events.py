@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from svkc.assembly import joint_slice, link_index
 from svkc.binding import Grip, checked_freedoms, holding, placed, rows_of, spare_slot, to_axis
 from svkc.chain import Chain, Structure
-from svkc.given import numbers, texts, yes_or_no
+from svkc.given import concrete, numbers, texts, yes_or_no
 from svkc.topology import V_SIZE
 
 
@@ -184,11 +184,13 @@ def plan(chain: Chain, events: tuple, dtype) -> Plan:
     """Tables of the events; ValueError for names the chain does not have."""
     timed = tuple(i for i, e in enumerate(events) if isinstance(e, At))
     guarded = tuple(i for i, e in enumerate(events) if isinstance(e, When))
-    times = [jnp.asarray(events[i].time, dtype) for i in timed]
-    if any(t.shape != () for t in times):
+    times = [events[i].time for i in timed]
+    if any(np.shape(t) != () for t in times):
         raise ValueError("at: time must be one number; for a time in each lane use vmap")
+    # on the host where nothing is traced, as a program of its own would be compiled to stack them
+    times = np.array(times, dtype) if concrete(*times) else jnp.stack([jnp.asarray(t, dtype) for t in times])
     made = Plan(
-        times=jnp.stack(times) if times else jnp.zeros(0, dtype),
+        times=jnp.asarray(times, dtype),
         guards=tuple(events[i].guard for i in guarded),
         timed=timed,
         guarded=guarded,

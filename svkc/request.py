@@ -56,8 +56,10 @@ class Options(eqx.Module):
 def tolerances(dtype, rtol=None, atol=None) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Those left open are 1e-7 (float32: 1e-4), and a hundredth of rtol, or what round-off leaves."""
     eps = np.finfo(dtype).eps
-    rtol = jnp.asarray((1e-7 if eps < 1e-10 else 1e-4) if rtol is None else rtol, dtype)
-    return rtol, jnp.maximum(rtol * 1e-2, 8 * eps) if atol is None else jnp.asarray(atol, dtype)
+    rtol = (1e-7 if eps < 1e-10 else 1e-4) if rtol is None else rtol
+    if atol is None:
+        atol = max(float(rtol) * 1e-2, 8 * eps) if concrete(rtol) else jnp.maximum(rtol * 1e-2, 8 * eps)
+    return jnp.asarray(rtol, dtype), jnp.asarray(atol, dtype)
 
 
 def checked(
@@ -85,13 +87,16 @@ def checked(
     if progress_meter is not None and not isinstance(progress_meter, diffrax.AbstractProgressMeter):
         raise ValueError(f"progress_meter: expected a diffrax one, got {progress_meter!r}")
     made = plan(chain, events, dtype)
-    span = jnp.asarray(t1, dtype) - jnp.asarray(t0, dtype)
+    # on the host where nothing is traced: each operation that jax is given eagerly is a program of its own
+    of = lambda x: np.asarray(x, dtype) if concrete(x) else jnp.asarray(x, dtype)
+    host = np if concrete(t0, t1) else jnp
+    span = of(t1) - of(t0)
     controller = stepsize_controller
     if controller is None:
         # as arrays: another tolerance is the same program
         rtol, atol = tolerances(dtype, rtol, atol)
-        smallest = jnp.finfo(dtype).eps * jnp.maximum(jnp.abs(span), jnp.abs(jnp.asarray(t1, dtype)))
-        controller = diffrax.PIDController(rtol, atol, norm=motion_norm, dtmin=smallest, force_dtmin=False)
+        smallest = np.finfo(dtype).eps * host.maximum(host.abs(span), host.abs(of(t1)))
+        controller = diffrax.PIDController(rtol, atol, norm=motion_norm, dtmin=jnp.asarray(smallest, dtype), force_dtmin=False)
     options = Options(
         control=control,
         solver=_solving(solver, None if dt is not None else controller, dtype),
@@ -101,14 +106,14 @@ def checked(
         adjoint=_adjoint(adjoint, controller if dt is None else None),
         progress_meter=diffrax.NoProgressMeter() if progress_meter is None else progress_meter,
         dt=None if dt is None else jnp.asarray(dt, dtype),
-        first_step=jnp.maximum(span, jnp.finfo(dtype).tiny) * 1e-3,
+        first_step=jnp.asarray(host.maximum(span, np.finfo(dtype).tiny) * 1e-3, dtype),
         max_events=_capacity(max_events, made),
         max_steps=_step_bound(max_steps, span, dt),
         has_work=control is not None or chain.limit is not None or chain.damping is not None,
         gap=1e3 * gap_tolerance(dtype),
     )
-    save_at = jnp.stack([jnp.asarray(t0, dtype), jnp.asarray(t1, dtype)]) if ts is None else jnp.asarray(ts, dtype)
-    return options, save_at, made
+    save_at = host.stack([of(t0), of(t1)]) if ts is None else ts
+    return options, jnp.asarray(save_at, dtype), made
 
 
 def _solving(solver, controller, dtype) -> diffrax.AbstractSolver:

@@ -37,10 +37,13 @@ def held_part(dtype) -> float:
     return float(np.finfo(dtype).eps ** 0.25)
 
 
+def _kept(selection: Selection, keep: Bool[Array, " steps"]) -> Selection:
+    return Selection(jnp.where(keep[:, None], selection.Q, 0), jnp.where(keep[:, None], selection.P, 0), selection.size, keep)
+
+
 def without_weak(selection: Selection, floor: Float[Array, ""]) -> Selection:
     """Steps whose |R_kk| / |R_11| is not above the floor left out: their pivots are independent."""
-    keep = selection.used & (selection.size > floor * jnp.max(selection.size))
-    return Selection(jnp.where(keep[:, None], selection.Q, 0), jnp.where(keep[:, None], selection.P, 0), selection.size, keep)
+    return _kept(selection, selection.used & (selection.size > floor * jnp.max(selection.size)))
 
 
 def select(J: Float[Array, "rows dofs"], rank: Int[Array, ""] | None = None, wanted: Bool[Array, " dofs"] | None = None) -> Selection:
@@ -119,6 +122,11 @@ def weakest(selection: Selection) -> Float[Array, ""]:
     """|R_mm| / |R_11|, 1 where no row counts."""
     size, used = selection.size, selection.used
     return jnp.min(jnp.where(used, size, jnp.inf), initial=1, where=used) / jnp.where(jnp.any(used), jnp.max(size), 1)
+
+
+def first_steps(selection: Selection, count: Int[Array, ""]) -> Selection:
+    """Return the selection with its first steps alone, the others inert."""
+    return _kept(selection, selection.used & (jnp.arange(selection.used.shape[0], dtype=jnp.int32) < count))
 
 
 def too_few(P: Float[Array, "steps dofs"], rank: Int[Array, ""]) -> Bool[Array, ""]:

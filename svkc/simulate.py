@@ -51,10 +51,9 @@ def simulate(
     traj = _run(chain, state, jnp.asarray(t0, dtype), jnp.asarray(t1, dtype), save_at, made, options, args)
     if not throw:
         return traj
-    failed = (traj.result != RESULTS.successful) & (traj.result != RESULTS.stopped)
-    if isinstance(failed, jax.core.Tracer):
-        return traj.result.error_if(traj, failed)
-    if np.any(np.asarray(failed)):
+    if isinstance(traj.result._value, jax.core.Tracer):
+        return traj.result.error_if(traj, (traj.result != RESULTS.successful) & (traj.result != RESULTS.stopped))
+    if np.any(~np.isin(np.asarray(traj.result._value), [RESULTS.successful._value, RESULTS.stopped._value])):
         phase, loop = int(traj.phases.count), int(traj.report().loop)
         where = f"phase {phase}" if loop < 0 else f"phase {phase}, loop {chain.link_names[loop]!r}"
         raise RuntimeError(f"simulate stopped at t = {float(traj.t_final):.9g} s, in {where}: {RESULTS[traj.result]}")

@@ -1,5 +1,7 @@
 """F2: what a run leaves behind."""
 
+import dataclasses
+import functools
 from typing import Any
 
 import equinox as eqx
@@ -8,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc.chain import State
+from svkc.eager import eager_jit
 from svkc.given import one
 
 
@@ -128,34 +131,39 @@ class Trajectory(eqx.Module):
 
     def report(self, halved=None) -> "Report":
         """The run's certificate. halved: an error estimated by another run, such as `svkc.halved` gives, to be told with it."""
-        p = self.phases
-        largest = lambda x: jnp.max(jnp.where(jnp.isfinite(x), x, 0), -2)
-        worst = lambda saved, ends: jnp.maximum(largest(saved), largest(ends))
-        gaps, rates, momentum = worst(self.gaps, p.gap), worst(self.gap_rates, p.gap_rate), largest(p.momentum_drift)
-        begun = jnp.isfinite(p.start)
-        return Report(
-            gap=gaps[..., 1],
-            angular_gap=gaps[..., 0],
-            gap_rate=rates[..., 1],
-            angular_gap_rate=rates[..., 0],
-            energy_drift=jnp.sum(jnp.where(begun, p.energy_drift, 0), -1),
-            energy_lost=jnp.sum(self.events.energy_lost, -1),
-            momentum_drift=momentum[..., 0],
-            angular_momentum_drift=momentum[..., 1],
-            free=jnp.any(p.free, -1),
-            error=jnp.sum(p.error, -1),
-            margin=jnp.min(p.margin, -1),
-            swaps=jnp.where(jnp.any(p.swaps < 0, -1), -1, jnp.sum(p.swaps, -1)),
-            accepted=jnp.sum(p.accepted, -1),
-            rejected=jnp.sum(p.rejected, -1),
-            evaluations=jnp.sum(p.evaluations, -1),
-            loop=jnp.max(p.loop, -1),
-            phases=p.count,
-            t_final=self.t_final,
-            result=self.result,
-            derivative=self.derivative,
-            halved=None if halved is None else one("halved", halved),
-        )
+        made = _report(self)
+        return made if halved is None else dataclasses.replace(made, halved=one("halved", halved))
+
+
+@functools.partial(eager_jit, jit=eqx.filter_jit)
+def _report(traj: Trajectory) -> "Report":
+    p = traj.phases
+    largest = lambda x: jnp.max(jnp.where(jnp.isfinite(x), x, 0), -2)
+    worst = lambda saved, ends: jnp.maximum(largest(saved), largest(ends))
+    gaps, rates, momentum = worst(traj.gaps, p.gap), worst(traj.gap_rates, p.gap_rate), largest(p.momentum_drift)
+    begun = jnp.isfinite(p.start)
+    return Report(
+        gap=gaps[..., 1],
+        angular_gap=gaps[..., 0],
+        gap_rate=rates[..., 1],
+        angular_gap_rate=rates[..., 0],
+        energy_drift=jnp.sum(jnp.where(begun, p.energy_drift, 0), -1),
+        energy_lost=jnp.sum(traj.events.energy_lost, -1),
+        momentum_drift=momentum[..., 0],
+        angular_momentum_drift=momentum[..., 1],
+        free=jnp.any(p.free, -1),
+        error=jnp.sum(p.error, -1),
+        margin=jnp.min(p.margin, -1),
+        swaps=jnp.where(jnp.any(p.swaps < 0, -1), -1, jnp.sum(p.swaps, -1)),
+        accepted=jnp.sum(p.accepted, -1),
+        rejected=jnp.sum(p.rejected, -1),
+        evaluations=jnp.sum(p.evaluations, -1),
+        loop=jnp.max(p.loop, -1),
+        phases=p.count,
+        t_final=traj.t_final,
+        result=traj.result,
+        derivative=traj.derivative,
+    )
 
 
 class Report(eqx.Module):
