@@ -73,15 +73,7 @@ def solve_motion(
     chain: Chain, structure: Structure, kin: Kinematics, selection: Selection | None, J: Float[Array, "rows dofs"], force: Float[Array, " dofs"],
     bias: Float[Array, " rows"], inertia=None,
 ) -> Float[Array, " dofs"]:  # fmt: skip
-    """The x with M x = force + J_C^T lambda and J_C x + bias = 0 (paper, section III-B)."""
-    return motion_and_multipliers(chain, structure, kin, selection, J, force, bias, inertia)[0]
-
-
-def motion_and_multipliers(
-    chain: Chain, structure: Structure, kin: Kinematics, selection: Selection | None, J: Float[Array, "rows dofs"], force: Float[Array, " dofs"],
-    bias: Float[Array, " rows"], inertia=None,
-) -> tuple[Float[Array, " dofs"], Float[Array, " steps"]]:  # fmt: skip
-    """Return the x of `solve_motion` and mu, with M x + (Q J_C)^T mu = force; Q is the selection's, or the identity by articulated bodies.
+    """The x with M x = force + J_C^T lambda and J_C x + bias = 0 (paper, section III-B).
 
     Its derivatives are those of these equations, M x by Newton-Euler: one more solve with the same factors, nothing through recursions for M or pivots.
     """
@@ -105,7 +97,7 @@ def motion_and_multipliers(
 
     # jax transposes the solve only where both sides take part in the derivative
     right = (jnp.where(active, force, 0) + 0 * jnp.sum(bias), -pick(bias) + 0 * jnp.sum(force))
-    return jax.lax.custom_linear_solve(equations, right, solve=lambda _, right: solve(*right), symmetric=True)
+    return jax.lax.custom_linear_solve(equations, right, solve=lambda _, right: solve(*right), symmetric=True)[0]
 
 
 def _by_independent(chain: Chain, kin: Kinematics, structure: Structure, chosen: Selection, J, inertia: Callable) -> Callable:

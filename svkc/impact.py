@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from svkc.chain import Chain, Structure
 from svkc.closure import scaled_jacobian, scales
-from svkc.forward_dynamics import motion_and_multipliers, with_links
+from svkc.forward_dynamics import constraint_forces, solve_motion, with_links
 from svkc.inverse_dynamics import inertia_times
 from svkc.kinematics import Kinematics, integrate, kinematics, normalize
 from svkc.loops import active_dofs, ends, gap, joint_coordinates, with_coordinates
@@ -136,11 +136,10 @@ def _impact(chain: Chain, structure: Structure, kin: Kinematics, selection: Sele
 
     It is the projection, orthogonal in the metric of the inertia, on what the structure allows, and holds where loops are redundant too.
     """
-    row, column = scales(chain)
-    jump, mu = motion_and_multipliers(chain, structure, kin, selection, J, jnp.zeros_like(v), J @ (v / column))
-    momentum = with_links(chain, inertia_times(chain, kin, jump[: chain.nv]), jump)
+    jump = solve_motion(chain, structure, kin, selection, J, jnp.zeros_like(v), J @ (v / scales(chain)[1]))
+    impulse = with_links(chain, inertia_times(chain, kin, jump[: chain.nv]), jump)
     # v- and v+ differ by a vector orthogonal to v+, so that the loss is a square and cannot be negative
-    return v + jump, (row * (selection.Q.T @ mu)).reshape(-1, 6), jump @ momentum / 2
+    return v + jump, -constraint_forces(chain, selection, J, impulse), jump @ impulse / 2
 
 
 class Schedule(eqx.Module):

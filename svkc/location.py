@@ -47,14 +47,27 @@ def event_tolerance(t: Float[Array, ""]) -> Float[Array, ""]:
     return jnp.finfo(t.dtype).eps ** 0.5 * jnp.maximum(1, jnp.abs(t))
 
 
+def field_of(guards: Reading | Field) -> Field:
+    """The field that guards are told the torques of, or the field itself where there are no guards."""
+    return guards if isinstance(guards, Field) else guards.field
+
+
 def _arrived_jvp(primals, tangents):
-    """What y changes by at its time, and its rate times the change of the end's time: that of `late`, or dt = -dg / (dg/dt), the implicit function's."""
+    end, at = arrived(*primals)
+    _, _, _, scene, guards, _ = primals
+    rate = field_of(guards)(end, at, scene)
+    return (end, at), arrival_tangent(primals, tangents, end, at, rate)
+
+
+def arrival_tangent(primals, tangents, end, at: Motion, rate: Motion):
+    """What y changes by at its time, and its rate times the change of the end's time: that of `late`, or dt = -dg / (dg/dt), the implicit function's.
+
+    primals, tangents: of `arrived`; end, at: what it gives; rate: of the motion there.
+    """
     t, y, late, scene, guards, found = primals
     d_t, dy, d_late, d_scene, d_guards, _ = tangents
-    end, at = arrived(*primals)
     field, d_field = (guards, d_guards) if isinstance(guards, Field) else (guards.field, d_guards.field)
     d_t = filled(t, d_t)
-    rate = field(end, at, scene)
     dy = carried((filled(y, dy), d_scene, d_field), rate, end - t, end, at, scene, field)
     dt = filled(late, d_late)
     if found is not None:
@@ -65,7 +78,7 @@ def _arrived_jvp(primals, tangents):
         # where a guard touches zero there is no derivative, and no number that looks like one
         implicit = jnp.where(none, 0, -change) / jnp.where(none, 1, jnp.where(found.flat, jnp.nan, slope))
         dt = jnp.where(found.hit, implicit, dt)
-    return (end, at), (d_t + dt, jax.tree.map(lambda d, r: d + r * dt, dy, rate))
+    return d_t + dt, jax.tree.map(lambda d, r: d + r * dt, dy, rate)
 
 
 # arrived(t, y, late, scene, guards or field, found or None) -> t, y: the end of a phase, where the motion y was found at the time t, a guard's zero, or,

@@ -8,14 +8,14 @@ from jaxtyping import Array, Bool, Float, Int
 
 from svkc.chain import State
 from svkc.events import Plan
-from svkc.location import Found, Reading, arrived
+from svkc.location import Reading, arrived
 from svkc.marching import EVENT, MAX_STEPS, NON_FINITE, OPEN, SUCCESSFUL, How, Path, Tally, World, march
 from svkc.records import Records
 from svkc.replay import Replay, integrated
 from svkc.request import Options
 from svkc.searching import Watched
 from svkc.settled import Settled
-from svkc.stepping import Motion, Scene, finite, frozen, staged
+from svkc.stepping import Field, Motion, Scene, finite, frozen, staged
 from svkc.trajectory import RESULTS, Events
 
 
@@ -57,11 +57,9 @@ def solve(run: Run, stop, ts, made: Plan, options: Options, scene: Scene) -> Sol
     # a save time within the phase, its ends included, moves by itself; what is saved of the others counts in another phase
     begun, ended = frozen((run.t, jnp.maximum(stop, run.t)))
     at = jnp.where(ts < begun, begun, jnp.where(ts > ended, ended, ts))
-    path, found = _path(start, (run.t, stop, at), World(scene, options.field), watched, options)
+    reading = options.field if guards is None else guards
+    path, found, t, motion = _path(start, (run.t, stop, at), World(scene, options.field), watched, options, reading)
     result = _translate(path.result, path.end)
-    # a scheduled end goes on to move with its time, where a diffrax adjoint has not seen to that
-    late = jnp.where(path.result == SUCCESSFUL, stop - path.t, 0)
-    t, motion = arrived(path.t, path.end, late, scene, options.field if guards is None else guards, found)
     if found is None:
         return Solved(t, motion, jnp.zeros(0, bool), None, path.saved, frozen(path), result, RESULTS.successful)
     code = RESULTS.where(found.jumps, RESULTS.jump, RESULTS.successful)
@@ -70,16 +68,16 @@ def solve(run: Run, stop, ts, made: Plan, options: Options, scene: Scene) -> Sol
     return Solved(t, motion, found.fired, found.values, path.saved, frozen(path), result, code)
 
 
-def _path(start: Motion, times, world: World, watched: Watched | None, options: Options) -> tuple[Path, Found | None]:
-    """The solve up to where it ends, differentiated at fixed times by replay, or by the diffrax adjoint that the user asked for."""
+def _path(start: Motion, times, world: World, watched: Watched | None, options: Options, reading: Reading | Field):
+    """The solve up to where it ends, the guard that ends it, and the time and motion there; differentiated by replay, or by the diffrax adjoint asked for."""
     ours, adjoint = isinstance(options.adjoint, Replay), options.adjoint
     every = min(adjoint.every, options.max_steps) if isinstance(adjoint, Replay) else options.max_steps
     meter = options.progress_meter if ours else diffrax.NoProgressMeter()
     solver, looked_for, (controller, first_step) = frozen((staged(options.solver, "lax"), watched, options.steps()))
     how = How(solver, looked_for, controller, first_step, meter, options.gap, options.max_steps, every)
     if ours:
-        path = integrated(start, times, world, how)
-        return path, frozen(path.found)
+        path, t, motion = integrated(start, times, world, how, reading)
+        return path, frozen(path.found), t, motion
     t0, stop, at = times
     found = None
     if watched is not None:
@@ -105,7 +103,9 @@ def _path(start: Motion, times, world: World, watched: Watched | None, options: 
     # diffrax tells the number of tries alone
     unknown = jnp.asarray(-1, jnp.int32)
     tally = Tally(accepted + rejected, jnp.asarray(jnp.inf, t0.dtype), jnp.ones((), t0.dtype), unknown, unknown, jnp.zeros(2, t0.dtype))
-    return Path(t, jax.tree.map(lambda x: x[0], end), saved, jnp.zeros(0, t0.dtype), saved, accepted, rejected, result, tally, found), found
+    path = Path(t, jax.tree.map(lambda x: x[0], end), saved, jnp.zeros(0, t0.dtype), saved, accepted, rejected, result, tally, found)
+    # the adjoint has seen to a scheduled end that moves
+    return path, found, *arrived(path.t, path.end, jnp.zeros_like(t), world.scene, reading, found)
 
 
 def _translate(result: Int[Array, ""], motion: Motion) -> RESULTS:

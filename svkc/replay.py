@@ -9,10 +9,11 @@ import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from svkc.given import whole
-from svkc.location import carried
-from svkc.marching import How, Path, World, march
+from svkc.location import arrival_tangent, carried
+from svkc.marching import SUCCESSFUL, How, Path, World, march
 from svkc.operation import operation
 from svkc.stepping import Motion, filled, frozen, step_alone
 
@@ -51,27 +52,44 @@ def _block(y: Motion, times, world: World, solver) -> tuple[Motion, Motion]:
     return jax.lax.scan(step, y, times)
 
 
+def _late(path: Path, stop) -> Float[Array, ""]:
+    """Nothing, but it changes as the scheduled end does, where that was reached."""
+    return jnp.where(path.result == SUCCESSFUL, stop - path.t, 0)
+
+
+def _integrated(start: Motion, times, world: World, how: How, guards):
+    path = march(start, times, world, how)
+    return path, path.t, path.end
+
+
 def _integrated_jvp(primals, tangents):
-    """Tangents at the times that the run has found, which stay, and what the changes of its start's time and of the save times add."""
-    start, times, world, how = primals
-    d_start, d_times, d_world, _ = tangents
-    path = integrated(start, times, world, how)
-    (t0, _, at), (d_t0, _, d_at) = times, d_times
+    """Tangents at the times that the run has found, which stay, and what the changes of the times of its start, its end and of the save times add."""
+    start, times, world, how, guards = primals
+    d_start, d_times, d_world, _, d_guards = tangents
+    path, t, end = integrated(*primals)
+    (t0, stop, at), (d_t0, d_stop, d_at) = times, d_times
+    # of both ends by one program
+    rates = jax.lax.map(lambda x: world.field(*x, world.scene), (jnp.stack([t0, t]), jax.tree.map(lambda *x: jnp.stack(x), start, end)))
+    at_start, at_end = (jax.tree.map(lambda x, i=i: x[i], rates) for i in range(2))
     grid, place = _grid(*frozen((t0, at, path)))
-    start, d_start = _from_fixed(start, filled(start, d_start), t0, d_t0, world, d_world)
+    start, d_start = _from_fixed(start, filled(start, d_start), at_start, t0, d_t0, world, d_world)
     d_end, d_saved, d_kept = _through(start, d_start, grid, place, world, d_world, path, how)
     if d_at is not None:
         d_saved = jax.vmap(lambda y, dy, t, dt: _moved_on(y, dy, t, dt, world, d_world))(path.saved, d_saved, at, d_at)
     none = jax.tree.map(lambda x: None, path)
     moving = lambda p: (p.end, p.saved, p.kept)
-    return path, eqx.tree_at(moving, none, (d_end, d_saved, d_kept), is_leaf=lambda x: x is None or isinstance(x, Motion))
+    d_path = eqx.tree_at(moving, none, (d_end, d_saved, d_kept), is_leaf=lambda x: x is None or isinstance(x, Motion))
+    late = _late(path, stop)
+    d_late = None if d_stop is None else jnp.where(path.result == SUCCESSFUL, d_stop, 0)
+    arriving = (path.t, path.end, late, world.scene, guards, frozen(path.found))
+    return (path, t, end), (d_path, *arrival_tangent(arriving, (None, d_end, d_late, d_world.scene, d_guards, None), t, end, at_end))
 
 
-def _from_fixed(y: Motion, dy: Motion, t0, d_t0, world: World, d_world) -> tuple[Motion, Motion]:
-    """The start of a run and its tangent, as of a start at a time that stays: one that comes later has less time to move."""
+def _from_fixed(y: Motion, dy: Motion, rate: Motion, t0, d_t0, world: World, d_world) -> tuple[Motion, Motion]:
+    """The start of a run and its tangent, as of a start at a time that stays: one that comes later has less time to move. rate: of the motion there."""
     if d_t0 is None:
         return y, dy
-    none, rate = jax.lax.stop_gradient(t0) - t0, world.field(t0, y, world.scene)
+    none = jax.lax.stop_gradient(t0) - t0
     dy = jax.tree.map(lambda d, r: d - r * d_t0, dy, rate)
     dy = carried((dy, d_world.scene, d_world.field), rate, none, t0, y, world.scene, world.field)
     return jax.tree.map(lambda y, r: y + none * r, y, rate), dy
@@ -141,5 +159,6 @@ def _through(start: Motion, d_start: Motion, grid, place, world: World, d_world,
     return d_end, d_saved, d_kept
 
 
-# integrated(start, times, world, how) -> Path: where the run went; in derivatives the time of its end is fixed
-integrated = operation("integrated", march, _integrated_jvp)
+# integrated(start, times, world, how, guards or field) -> Path, t, Motion: where the run went, with the time of its end fixed in derivatives; and its end,
+# whose time is a guard's zero or the scheduled one
+integrated = operation("integrated", _integrated, _integrated_jvp)

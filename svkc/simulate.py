@@ -169,7 +169,7 @@ def _derivative(run: Run, solved: Solved, going, timed: Bool[Array, " timed"], i
     """Return the first reason why the run has no derivative, and the phase it is of; ranks are looked at after the run."""
     code = RESULTS.where(jnp.sum(solved.fired) + jnp.sum(timed) > 1, RESULTS.together, solved.derivative)
     first = (run.derivative == RESULTS.successful) & going & (code != RESULTS.successful)
-    return RESULTS.where(first, code, run.derivative), jnp.where(first, index, run.spoiled).astype(jnp.int32)
+    return RESULTS.where(first, code, run.derivative), jnp.where(first, index.astype(jnp.int32), run.spoiled)
 
 
 def _compared(chain: Chain, after: State, solved: Solved, happened, made: Plan, options: Options, args):
