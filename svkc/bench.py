@@ -19,7 +19,9 @@ def bench(lanes: int) -> int:
     import mujoco
 
     import svkc
+    from svkc.cache import use_cache
 
+    use_cache()
     cases = {}
     for name in ("open", "two grips"):
         cases |= {f"{name}: {by}": case for by, case in _cases(name, lanes).items()}

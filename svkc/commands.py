@@ -60,7 +60,9 @@ def run(name: str, t1: float | None, events, ignore, out: pathlib.Path, video: b
     # the process is the command's own, so the setting is too
     jax.config.update("jax_enable_x64", True)
     import svkc
+    from svkc.cache import use_cache
 
+    kept = use_cache()
     begin = time.perf_counter()
     stages = tqdm(total=4, desc="loading", bar_format="{l_bar}{bar:20}| {elapsed}", disable=True if quiet else None, leave=False)
     try:
@@ -83,6 +85,7 @@ def run(name: str, t1: float | None, events, ignore, out: pathlib.Path, video: b
     stages.close()
     print_phases(chain, traj)
     print(f"load and close the loops {loaded - begin:.1f} s, first run with compilation {compiled - loaded:.1f} s, a run {done - compiled:.3f} s")
+    print(f"compiled programs are kept in {kept}\n" * (kept is not None), end="")
     print("\n".join(missing) + "\n" * bool(missing) + "wrote " + ", ".join(map(str, written)))
     print(f"look: open {written[-1]}" + f", or  svkc view {written[0]}" * (written[-1].suffix == ".html"))
     # what ended early is kept and said, and the shell is told
@@ -182,7 +185,9 @@ def print_phases(chain, traj):
 def info(path: str) -> int:
     """What a model is to svkc."""
     import svkc
+    from svkc.cache import use_cache
 
+    kept = use_cache()
     try:
         chain = svkc.load(path)
     except ValueError as error:
@@ -200,6 +205,7 @@ def info(path: str) -> int:
     for line in chain.left_out:
         print(f"left out: {line}")
     _suggest(chain)
+    print(f"compiled programs: {kept or 'not kept'} (SVKC_CACHE_DIR names another folder, or off)")
     return 0
 
 
@@ -236,7 +242,9 @@ def view(path: pathlib.Path, show: bool) -> int:
     # what was computed in float64 is read as such
     jax.config.update("jax_enable_x64", True)
     import svkc
+    from svkc.cache import use_cache
 
+    use_cache()
     try:
         chain, traj = svkc.load_chain(path), svkc.load_trajectory(path)
     except (ValueError, OSError) as error:

@@ -9,12 +9,13 @@ import sys
 import tempfile
 import types
 
+import jax
 import pytest
 
 ROOT = pathlib.Path(__file__).parent.parent
 # the house floor by floor, the ground first
 HOUSE = [
-    "spatial topology unsupported operation given factors taking",
+    "spatial topology unsupported operation given factors taking cache",
     "chain reading selection lanes",
     "verb",
     "kinematics trajectory cuttable interop joining",
@@ -67,12 +68,14 @@ def test_files_and_functions_are_small():
 CACHE = tempfile.TemporaryDirectory()
 
 
-def run(*args, cwd=ROOT, optimized=True):
+def run(*args, cwd=ROOT, optimized=True, settings=None):
     env = dict(os.environ)
     if optimized:
         env["XLA_FLAGS"] = env.get("XLA_FLAGS", "").replace("--xla_backend_optimization_level=0", "")
-    # an example and the command of the same scene compile the same program
-    env["JAX_COMPILATION_CACHE_DIR"] = CACHE.name
+    # an example and the command of the same scene compile the same program; jax alone, as an example uses it, may leave half an entry: not among the tests' own
+    kept = jax.config.jax_compilation_cache_dir
+    env |= {"JAX_COMPILATION_CACHE_DIR": f"{kept}/processes" if kept else CACHE.name, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+    env |= settings or {}
     return subprocess.run([sys.executable, *map(str, args)], capture_output=True, text=True, cwd=cwd, timeout=1200, check=False, env=env)
 
 
@@ -199,8 +202,10 @@ def _looks_drawn(path):
 def test_info(tmp_path):
     xml = '<mujoco><worldbody><body name="a"><joint name="j" frictionloss="1"/><geom size="0.1"/></body></worldbody></mujoco>'
     (tmp_path / "m.xml").write_text(xml)
-    done = run("-m", "svkc", "info", tmp_path / "m.xml")
+    done = run("-m", "svkc", "info", tmp_path / "m.xml", settings={"JAX_COMPILATION_CACHE_DIR": "", "SVKC_CACHE_DIR": str(tmp_path / "kept")})
     assert done.returncode == 0, done.stderr
+    assert f"compiled programs: {tmp_path / 'kept'}" in done.stdout
+    assert list(tmp_path.glob("kept/jaxlib-*/*-cache"))
     assert "friction" in done.stdout
     assert "1 joint freedoms in the tree" in done.stdout
     assert "mobility (N_F = N_J - m)     1" in done.stdout

@@ -1,0 +1,130 @@
+"""F7: compiled programs kept on disk from one process to the next, for the command line and the tests. A library user's settings stay as they are."""
+
+import contextlib
+import hashlib
+import importlib.metadata
+import os
+import pathlib
+import platform
+import re
+import sys
+import tempfile
+import threading
+
+SIZE = 512 * 2**20  # bytes, of all processors and versions together
+DESCRIBES = ("vendor_id", "cpu family", "model", "model name", "flags", "CPU implementer", "CPU part", "Features")
+# XLA asks the processor for these of LLVM's preferences, which are not features of any (openxla/xla issue 44565)
+PREFERENCE = re.compile(rb"cpu_aot_loader\.cc.*Target machine feature \+prefer-no-(gather|scatter) is not")
+_loading = threading.Lock()
+
+
+def use_cache() -> pathlib.Path | None:
+    """Sets jax's persistent cache in this process, and returns its folder: None without one. Call it before the first program is compiled.
+
+    $SVKC_CACHE_DIR names another folder than the user's usual one, or is `off`. Without it a folder of JAX_COMPILATION_CACHE_DIR stays jax's own affair.
+    """
+    import jax
+
+    if os.environ.get("SVKC_CACHE_DIR") in (None, "", "off") and jax.config.jax_compilation_cache_dir:
+        return pathlib.Path(jax.config.jax_compilation_cache_dir)
+    if not jax.config.jax_enable_compilation_cache:
+        return None
+    # without a home, or in one that is read only, programs are compiled anew
+    with contextlib.suppress(OSError, RuntimeError):
+        top = _top()
+        folder = top and top / f"jaxlib-{importlib.metadata.version('jaxlib')}-{processor()}"
+        if folder and _own(top) and _own(folder):
+            _prune(top)
+            jax.config.update("jax_compilation_cache_dir", str(folder))
+            jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+            _amend()
+            return folder
+    return None
+
+
+def _top() -> pathlib.Path | None:
+    """Returns the folder of all versions and processors, None where the user wants none."""
+    named = os.environ.get("SVKC_CACHE_DIR")
+    if named is not None:
+        return pathlib.Path(named).expanduser().absolute() if named not in ("", "off") else None
+    if sys.platform == "darwin":
+        return pathlib.Path.home() / "Library" / "Caches" / "svkc"
+    usual = os.environ.get("LOCALAPPDATA" if sys.platform == "win32" else "XDG_CACHE_HOME")
+    return (pathlib.Path(usual) if usual else pathlib.Path.home() / ".cache") / "svkc"
+
+
+def processor(cpuinfo: str = "/proc/cpuinfo") -> str:
+    """Names the model of the processor, with a hash of its features."""
+    try:
+        lines = pathlib.Path(cpuinfo).read_text().partition("\n\n")[0].splitlines()
+        told = {name.strip(): value.strip() for name, _, value in (line.partition(":") for line in lines)}
+    except OSError:
+        told = {"model name": platform.processor() or platform.machine()}
+    model = re.sub(r"[^A-Za-z0-9]+", "-", told.get("model name", platform.machine())).strip("-")
+    return f"{model}-{hashlib.sha256(repr([told.get(name) for name in DESCRIBES]).encode()).hexdigest()[:12]}"
+
+
+def _own(folder: pathlib.Path) -> bool:
+    """Makes a folder of the user alone. One that others own or can write to is refused: whoever writes there chooses what runs here."""
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    found = folder.stat()
+    if hasattr(os, "getuid") and (found.st_uid != os.getuid() or found.st_mode & 0o022):
+        print(f"svkc: no cache of compiled programs: others own {folder} or can write to it", file=sys.stderr)
+        return False
+    return True
+
+
+def _prune(top: pathlib.Path):
+    """Removes what was not used for longest, until the rest is small enough."""
+    files = []
+    for path in top.glob("jaxlib-*/**/*"):
+        # another process may remove it now
+        with contextlib.suppress(OSError):
+            found = path.stat()
+            files += [(max(found.st_atime, found.st_mtime), found.st_size, path)] * path.is_file()
+    total = sum(size for _, size, _ in files)
+    for _, size, path in sorted(files):
+        if total <= SIZE:
+            return
+        path.unlink(missing_ok=True)
+        total -= size
+
+
+def _amend():
+    """Makes jax write whole entries and load them quietly. Where a later jax has other names it goes its own way."""
+    with contextlib.suppress(ImportError, AttributeError):
+        from jax._src import compilation_cache, lru_cache
+
+        if lru_cache.LRUCache.put is not _put:
+            quiet = _without_preferences(compilation_cache.get_executable_and_time)
+            lru_cache.LRUCache.put, compilation_cache.get_executable_and_time = _put, quiet
+
+
+def _put(entries, key: str, value: bytes):
+    """Writes an entry whole or not at all: jax itself never replaces one that another process reads too early, or that was cut short."""
+    path = pathlib.Path(entries.path)
+    # a full disk, or one that is read only: the program is compiled again
+    with contextlib.suppress(OSError), tempfile.TemporaryDirectory(dir=path) as aside:
+        whole = pathlib.Path(aside, "whole")
+        whole.write_bytes(value)
+        whole.replace(path / f"{key}-cache")
+
+
+def _without_preferences(load):
+    """Wraps jax's loading of a program: of what XLA writes meanwhile, complaints of `PREFERENCE` are left out."""
+
+    def quiet(*args, **kw):
+        # one at a time, as the process has one stderr
+        with _loading, tempfile.TemporaryFile() as heard:
+            kept = os.dup(2)
+            os.dup2(heard.fileno(), 2)
+            try:
+                return load(*args, **kw)
+            finally:
+                os.dup2(kept, 2)
+                os.close(kept)
+                heard.seek(0)
+                os.write(2, b"".join(line for line in heard if not PREFERENCE.search(line)))
+
+    # the user may ask for all that XLA says
+    return load if os.environ.get("TF_CPP_MIN_LOG_LEVEL") == "0" else quiet
