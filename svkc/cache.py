@@ -19,7 +19,7 @@ _loading = threading.Lock()
 
 
 def use_cache() -> pathlib.Path | None:
-    """Sets jax's persistent cache in this process, and returns its folder: None without one. Call it before the first program is compiled.
+    """Set jax's persistent cache in this process, and return its folder: None without one. Call it before the first program is compiled.
 
     $SVKC_CACHE_DIR names another folder than the user's usual one, or is `off`. Without it a folder of JAX_COMPILATION_CACHE_DIR stays jax's own affair.
     """
@@ -43,7 +43,7 @@ def use_cache() -> pathlib.Path | None:
 
 
 def _top() -> pathlib.Path | None:
-    """Returns the folder of all versions and processors, None where the user wants none."""
+    """Return the folder of all versions and processors, None where the user wants none."""
     named = os.environ.get("SVKC_CACHE_DIR")
     if named is not None:
         return pathlib.Path(named).expanduser().absolute() if named not in ("", "off") else None
@@ -54,7 +54,7 @@ def _top() -> pathlib.Path | None:
 
 
 def processor(cpuinfo: str = "/proc/cpuinfo") -> str:
-    """Names the model of the processor, with a hash of its features."""
+    """Name the model of the processor, with a hash of its features."""
     try:
         lines = pathlib.Path(cpuinfo).read_text().partition("\n\n")[0].splitlines()
         told = {name.strip(): value.strip() for name, _, value in (line.partition(":") for line in lines)}
@@ -65,7 +65,7 @@ def processor(cpuinfo: str = "/proc/cpuinfo") -> str:
 
 
 def _own(folder: pathlib.Path) -> bool:
-    """Makes a folder of the user alone. One that others own or can write to is refused: whoever writes there chooses what runs here."""
+    """Make a folder of the user alone. One that others own or can write to is refused: whoever writes there chooses what runs here."""
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     found = folder.stat()
     if hasattr(os, "getuid") and (found.st_uid != os.getuid() or found.st_mode & 0o022):
@@ -75,7 +75,7 @@ def _own(folder: pathlib.Path) -> bool:
 
 
 def _prune(top: pathlib.Path):
-    """Removes what was not used for longest, until the rest is small enough."""
+    """Remove what was not used for longest, until the rest is small enough."""
     files = []
     for path in top.glob("jaxlib-*/**/*"):
         # another process may remove it now
@@ -91,7 +91,7 @@ def _prune(top: pathlib.Path):
 
 
 def _amend():
-    """Makes jax write whole entries and load them quietly. Where a later jax has other names it goes its own way."""
+    """Make jax write whole entries and load them quietly. Where a later jax has other names it goes its own way."""
     with contextlib.suppress(ImportError, AttributeError):
         from jax._src import compilation_cache, lru_cache
 
@@ -101,7 +101,7 @@ def _amend():
 
 
 def _put(entries, key: str, value: bytes):
-    """Writes an entry whole or not at all: jax itself never replaces one that another process reads too early, or that was cut short."""
+    """Write an entry whole or not at all: jax itself never replaces one that another process reads too early, or that was cut short."""
     path = pathlib.Path(entries.path)
     # a full disk, or one that is read only: the program is compiled again
     with contextlib.suppress(OSError), tempfile.TemporaryDirectory(dir=path) as aside:
@@ -111,7 +111,7 @@ def _put(entries, key: str, value: bytes):
 
 
 def _without_preferences(load):
-    """Wraps jax's loading of a program: of what XLA writes meanwhile, complaints of `PREFERENCE` are left out."""
+    """Wrap jax's loading of a program: of what XLA writes meanwhile, complaints of `PREFERENCE` are left out."""
 
     def quiet(*args, **kw):
         # one at a time, as the process has one stderr

@@ -15,7 +15,7 @@ import pytest
 ROOT = pathlib.Path(__file__).parent.parent
 # the house floor by floor, the ground first
 HOUSE = [
-    "spatial topology unsupported operation given factors taking cache",
+    "spatial topology unsupported operation given factors taking cache eager",
     "chain reading selection lanes",
     "verb",
     "kinematics trajectory cuttable interop joining",
@@ -24,6 +24,7 @@ HOUSE = [
     "delassus",
     "forward_dynamics",
     "projection",
+    "impact",
     "assembly mobility",
     "binding actuation guards solvers",
     "transition events stepping",
