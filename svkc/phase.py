@@ -20,12 +20,14 @@ from svkc.trajectory import RESULTS, Events
 
 
 class Run(eqx.Module):
-    """What goes from phase to phase. `count`: phases so far; `derivative`, `spoiled`: why there is none, and the first phase of which that is true."""
+    """What goes from phase to phase. `count`: phases so far; `derivative`, `spoiled`: why there is none, and the first phase of which that
+    is true; `unread`: guards whose values are of another structure."""
 
     t: Float[Array, ""]
     state: State
     work: Float[Array, ""] | None
     guards: Float[Array, " guards"] | None
+    unread: Bool[Array, " guards"] | None
     pending: Bool[Array, " timed"]
     events: Events
     records: Records

@@ -103,17 +103,14 @@ def _start(chain: Chain, state: State, t0, ts, made: Plan, options: Options, arg
     """Empty records, sized by capacity; unwritten entries show: inf, -1."""
     links, rows, dtype = len(chain.link_names), options.max_events, state.q.dtype
     state = _lockable(chain, state, made)
-    scene = Scene(chain, state.structure, args)
-    guards = frozen(Reading(made, options.field))(*frozen((t0, Motion(state.q, state.v), scene))) if made.guards else None
-    for i, guard in enumerate(made.guards):
-        if isinstance(guard, Sensor) and guard.loaded:
-            # a load that is too much from the start is seen to be
-            guards = guards.at[i].set(guard.idle)
+    # a load that is too much from the start is seen to be; the others are read at the start of the phase
+    idle = [g.idle if isinstance(g, Sensor) and g.loaded else 1 for g in made.guards]
     return Run(
         t=t0,
         state=state,
         work=jnp.zeros((), dtype) if options.has_work else None,
-        guards=guards,
+        guards=jnp.asarray(idle, dtype) if made.guards else None,
+        unread=jnp.asarray(_fresh(made)) if made.guards else None,
         pending=jnp.ones(len(made.timed), bool),
         events=no_events(rows, links, dtype),
         records=no_records(rows + 1, state),
@@ -127,6 +124,7 @@ def _start(chain: Chain, state: State, t0, ts, made: Plan, options: Options, arg
 
 def _phase(chain: Chain, run: Run, index, t1, ts, made: Plan, options: Options, args) -> Run:
     """One solve, the events at its end, and the records of both."""
+    run = _read(chain, run, made, options, args)
     going = (run.t < t1) | jnp.any(run.pending & (made.times <= t1))
     going = going & (run.result == RESULTS.successful)
     next_time = jnp.min(jnp.where(run.pending, made.times, jnp.inf), initial=jnp.inf)
@@ -148,12 +146,14 @@ def _phase(chain: Chain, run: Run, index, t1, ts, made: Plan, options: Options, 
     if made.actions:
         after, events, result = _apply(chain, run, ended, solved, fired, made)
     result = RESULTS.where(run.result == RESULTS.successful, result, run.result)
-    guards = _compared(chain, after, solved, jnp.any(fired), made, options, args)
+    # what rests at zero after it fired goes on as it is
+    unread = jnp.asarray(_fresh(made)) & jnp.any(fired) & (solved.guards != 0) if made.guards else None
     return Run(
         t=solved.t,
         state=after,
         work=solved.motion.work,
-        guards=guards,
+        guards=solved.guards,
+        unread=unread,
         pending=run.pending & ~timed,
         events=events,
         records=records,
@@ -172,18 +172,21 @@ def _derivative(run: Run, solved: Solved, going, timed: Bool[Array, " timed"], i
     return RESULTS.where(first, code, run.derivative), jnp.where(first, index.astype(jnp.int32), run.spoiled)
 
 
-def _compared(chain: Chain, after: State, solved: Solved, happened, made: Plan, options: Options, args):
-    """Guard values to go on with: after a change of structure those of the new one, so that a guard is compared within one phase.
+def _fresh(made: Plan) -> np.ndarray:
+    """Return which guards are read anew after a change of structure, so that a guard is compared within one phase.
 
-    But for loads: what has to carry too much from the first moment is seen to break, or to leave.
+    Loads are not: what has to carry too much from the first moment is seen to break, or to leave.
     """
-    fresh = [i for i, g in enumerate(made.guards) if not (isinstance(g, Sensor) and g.loaded)]
-    if not fresh:
-        return solved.guards
-    scene = Scene(chain, after.structure, args)
-    now = frozen(Reading(made, options.field))(*frozen((solved.t, Motion(after.q, after.v), scene)))
-    take = np.isin(np.arange(len(made.guards)), fresh) & happened & (solved.guards != 0)
-    return jnp.where(take, now, solved.guards)
+    return np.array([not (isinstance(g, Sensor) and g.loaded) for g in made.guards], bool)
+
+
+def _read(chain: Chain, run: Run, made: Plan, options: Options, args) -> Run:
+    """Return the run with the guards that are unread as they are at the start of this phase."""
+    if not made.guards or not _fresh(made).any():
+        return run
+    scene = Scene(chain, run.state.structure, args)
+    now = frozen(Reading(made, options.field))(*frozen((run.t, Motion(run.state.q, run.state.v), scene)))
+    return dataclasses.replace(run, guards=jnp.where(run.unread, now, run.guards))
 
 
 def _save(run: Run, ended: State, solved: Solved, ts) -> State:
