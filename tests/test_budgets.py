@@ -1,0 +1,44 @@
+"""How large the programs are that users wait for: instructions before XLA's passes, which are the same on every machine. `benchmarks/compile.py` has seconds."""
+
+import pathlib
+import sys
+
+import jax
+import pytest
+
+sys.path.append(str(pathlib.Path(__file__).parent.parent / "benchmarks"))
+import compile as counting
+import compiled
+
+# 10 % above what was counted with jax 0.10.1
+BUDGETS = {
+    "forward dynamics": 2900,
+    "main job": 14500,
+    "four bar": 14500,
+    "arm and ball": 16700,
+    "gradient": 43600,
+}
+
+
+@pytest.mark.parametrize("name", BUDGETS)
+def test_a_program_is_no_larger_than_it_was(name):
+    function, args = compiled.PROGRAMS[name]()
+    count = counting.counted(jax.jit(function).lower(*args).compiler_ir("hlo").as_hlo_text())
+    assert BUDGETS[name] / 2 < count <= BUDGETS[name]
+
+
+def test_calls_are_counted_as_often_as_they_are_made():
+    text = """HloModule m
+
+f (x: f64[]) -> f64[] {
+  x = f64[] parameter(0)
+  ROOT y = f64[] add(x, x)
+}
+
+ENTRY main (x: f64[]) -> f64[] {
+  x = f64[] parameter(0)
+  a = f64[] call(x), to_apply=f
+  ROOT b = f64[] call(a), to_apply=f
+}
+"""
+    assert counting.counted(text) == 3 + 2 * 2

@@ -1,0 +1,94 @@
+"""Public functions that are compiled for compile time where they are called eagerly: the same under every transformation, and within one another."""
+
+import jax
+import jax.numpy as jnp
+import models
+import numpy as np
+import pytest
+
+import svkc
+from svkc import eager
+
+
+@pytest.fixture(scope="module")
+def linkage():
+    """A four-bar, and a run of it without steps of note."""
+    chain = models.four_bar()
+    traj = svkc.simulate(chain, chain.state(v={"crank": 2.0}), 1e-3, dt=1e-3, throw=False)
+    return chain, traj
+
+
+def every(chain, traj, x):
+    """What each of the functions says of the linkage at a crank angle, each given what another made."""
+    state = chain.state({"crank": x}, {"crank": 2.0 + x})
+    tau = jnp.zeros(chain.dofs).at[0].set(x)
+    found = svkc.coordinates(chain, state)
+    again = svkc.connect(chain, svkc.cut(chain, state, "pin"), "pin")
+    free = svkc.mobility(chain, again)
+    wrench = svkc.loop_forces(chain, again, svkc.actuation(chain, again, jnp.where(free.independent, tau, 0)).tau)
+    report = traj.report()
+    return {
+        "state": state.v,
+        "connect": again.v,
+        "coordinates": jnp.sum(found.W, 1),
+        "mobility": free.margin,
+        "forces": wrench.force,
+        "energy": svkc.energy(chain, again),
+        "report": report.energy_drift + report.margin,
+    }
+
+
+def close(got, wanted):
+    for name in wanted:
+        np.testing.assert_allclose(got[name], wanted[name], rtol=1e-9, atol=1e-9 * (1 + float(np.abs(wanted[name]).max())), err_msg=name)
+
+
+def test_each_is_the_same_under_jit_vmap_and_scan(linkage):
+    chain, traj = linkage
+    xs = jnp.array([0.1, 0.2])
+    one = lambda x: every(chain, traj, x)
+    eagerly = jax.tree.map(lambda *x: np.stack(x), *[one(x) for x in xs])
+    close(jax.jit(lambda xs: jax.lax.map(one, xs))(xs), eagerly)
+    close(jax.vmap(one)(xs), eagerly)
+
+
+@pytest.mark.slow
+def test_derivatives_of_each(linkage):
+    chain, traj = linkage
+    one = lambda x: every(chain, traj, x)
+    x, h = jnp.asarray(0.1), 1e-5
+    slopes = jax.tree.map(lambda a, b: np.asarray(a - b) / (2 * h), one(x + h), one(x - h))
+    forwards = jax.jacfwd(one)(x)
+    for name, slope in slopes.items():
+        np.testing.assert_allclose(forwards[name], slope, rtol=1e-6, atol=1e-6 * (1 + np.abs(slope).max()), err_msg=name)
+    weights = {name: np.cos(np.arange(np.size(s))).reshape(np.shape(s)) for name, s in slopes.items()}
+    backwards = jax.grad(lambda x: sum(jnp.sum(v * weights[name]) for name, v in one(x).items()))(x)
+    np.testing.assert_allclose(backwards, sum(np.sum(np.asarray(forwards[name]) * w) for name, w in weights.items()), rtol=1e-9)
+
+
+def test_options_that_jaxlib_does_not_know_are_left_out(monkeypatch):
+    monkeypatch.setattr(eager, "_OPTIONS", {"xla_no_such_option": 1, "xla_backend_optimization_level": 0})
+    assert float(eager.eager_jit(lambda x: 2 * x)(jnp.asarray(3.0))) == 6
+    assert eager._OPTIONS == {"xla_backend_optimization_level": 0}
+
+
+def test_other_errors_are_raised():
+    def fails(x):
+        raise ValueError("no such compile option as this is meant")
+
+    with pytest.raises(ValueError, match="is meant"):
+        eager.eager_jit(fails)(jnp.asarray(3.0))
+
+
+def test_options_are_given_to_the_outermost_call_alone():
+    asked = []
+
+    def jit(function, **how):
+        asked.append(how)
+        return jax.jit(function, **how)
+
+    double = eager.eager_jit(lambda x: 2 * x, jit)
+    assert float(jax.jit(double)(3.0)) == float(jax.jit(lambda: double(3.0))()) == 6
+    assert asked == [{}]
+    assert float(double(3.0)) == 6
+    assert asked[1:] == [{"compiler_options": eager._OPTIONS}]
