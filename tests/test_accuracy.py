@@ -22,6 +22,7 @@ def arm():
     return chain, chain.state(v=np.array([0.5, 0.2, 1.0, 2.0, -3.0, 1.5, 1.0, 2.0, -2.5, 3.0]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("solver", "order", "dt"),
     [
@@ -52,6 +53,7 @@ def exact(arm):
     return svkc.simulate(*arm, 0.4, rtol=1e-13, atol=1e-14, solver=diffrax.Dopri8()).final
 
 
+@pytest.mark.slow
 def test_symplectic_euler_keeps_energy():
     """A pendulum for 100 swings with 60 steps each: the energy's error does not grow, that of the explicit one does."""
     chain = svkc.load(models.MJCF.format(models.bar("rod", models.Y, "0 0 -1")).replace("0.3 -0.2", "0 0"))
@@ -111,6 +113,7 @@ def swinging():
     return run, run(1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", WAYS)
 def test_each_way_to_compute_is_the_same_motion(swinging, way):
     run, usual = swinging
@@ -124,6 +127,7 @@ def test_each_way_to_compute_is_the_same_motion(swinging, way):
     assert tries[0] < 1.5 * tries[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", ["held", "bodies"])
 def test_how_loops_are_kept_leaves_derivatives_as_they_are(swinging, way):
     run, _ = swinging
@@ -167,6 +171,7 @@ def test_the_certificate(tmp_path):
     assert str(svkc.load_trajectory(tmp_path / "run.npz").report()) == str(report)
 
 
+@pytest.mark.slow
 def test_gaps_are_seen_between_saved_times(tmp_path):
     """A loop that drifts open and is cut: no saved state shows it, the certificate does, and the run's code; a file of before that says it is not known."""
     chain = models.four_bar()
@@ -188,6 +193,7 @@ def test_gaps_are_seen_between_saved_times(tmp_path):
     assert float(read.report().gap) == float(cut.gaps[:, 1].max())
 
 
+@pytest.mark.slow
 def test_the_momentum_of_what_is_free(arm):
     chain, state = arm
     report = svkc.simulate(chain, state, 0.5, rtol=1e-10, atol=1e-12).report()
@@ -199,6 +205,7 @@ def test_the_momentum_of_what_is_free(arm):
     assert "N m s" in str(rough)
 
 
+@pytest.mark.slow
 def test_what_is_not_finite_ends_its_lane_where_it_appears(arm):
     """By control, by a guard, with fixed steps and adaptive ones: the time and the phase, the last state that was whole; other lanes are untouched."""
     chain, state = arm

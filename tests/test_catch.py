@@ -49,6 +49,7 @@ def catches(figure):
     return run
 
 
+@pytest.mark.slow
 def test_caught_by_one_hand_then_the_other(figure, catches):
     chain, state = figure
     traj = catches(tossed(chain, state, 1.4, 0.25))
@@ -64,6 +65,7 @@ def test_caught_by_one_hand_then_the_other(figure, catches):
         assert 0.03 < float(jnp.linalg.norm(grip[jnp.array([0, 2])] - jnp.array([0.0, BAR_HEIGHT]))) < 0.05
 
 
+@pytest.mark.slow
 def test_caught_by_both_at_once(figure, catches):
     """Thrown straight up the rigid figure comes back: two guards at one instant, at the time of the parabola; declared grips at the place itself."""
     chain, state = figure
@@ -97,6 +99,7 @@ def pair():
     return svkc.load(PAIR.replace("0.3 -0.2 -9.81", "0 0 0"), virtual_links=links, cuttable="limb", spare=1)
 
 
+@pytest.mark.slow
 def test_momentum_through_every_kind_of_event(pair):
     """Connect, cut, bind, unbind, lock, unlock, a joint coming off and made again: 1e-12 each; energy never grows, cuts change no velocity."""
     rng = np.random.default_rng(7)
@@ -123,6 +126,7 @@ def test_momentum_through_every_kind_of_event(pair):
         state = after
 
 
+@pytest.mark.slow
 def test_connecting_what_is_connected_changes_nothing(pair):
     state = svkc.connect(pair, pair.state(v=np.arange(pair.nv) / 10.0), "weld", here=True)
     again = svkc.connect(pair, state, "weld", "limb", here=True)
@@ -132,6 +136,7 @@ def test_connecting_what_is_connected_changes_nothing(pair):
     assert bool(jnp.all(several.v == state.v))
 
 
+@pytest.mark.slow
 def test_a_batch_of_scenes_is_its_single_runs(pair):
     """Another starting structure, grip and event times in each lane: the numbers of the single runs to 1e-10."""
     rng = np.random.default_rng(3)
@@ -160,6 +165,7 @@ def test_a_batch_of_scenes_is_its_single_runs(pair):
         assert batch.phases.freedoms[i].tolist() == one.phases.freedoms.tolist()
 
 
+@pytest.mark.slow
 def test_a_support_that_can_only_push():
     """A box thrown on the ground under a spring's pull: it sticks, and is let go when the ground would have to pull; the force by Newton's law."""
     xml = models.MJCF.format('<body name="box"><joint name="z" type="slide" axis="0 0 1"/><geom type="box" size="0.1 0.1 0.1" mass="2"/></body>')

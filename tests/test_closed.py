@@ -16,7 +16,10 @@ CASES |= {"figure40": models.figure40}
 MOBILITY = {"four_bar": 1, "parallelogram": 1, "rod_on_balls": 2, "stewart": 6, "figure40": 40}
 
 
-@pytest.fixture(params=[*CASES, "two_hands"], scope="module")
+FAST = ("four_bar", "two_hands")
+
+
+@pytest.fixture(params=[name if name in FAST else pytest.param(name, marks=pytest.mark.slow) for name in (*CASES, "two_hands")], scope="module")
 def case(request, high_bar):
     """Chain, and a state in motion: velocities at random, projected on what the loops allow."""
     rng = np.random.default_rng(3)
@@ -115,7 +118,10 @@ def test_redundant_loop_moves_like_its_minimal_form():
     np.testing.assert_allclose(np.asarray(a)[: chain.nv], acceleration(chain, both, tau), rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("joint", ["weld", "hinge", "slide", "cylinder", "universal", "planar", "ball", "free", (True, False, True, False, True, False)])
+JOINTS = ["weld", "hinge", "slide", "cylinder", "universal", "planar", "ball", "free", (True, False, True, False, True, False)]
+
+
+@pytest.mark.parametrize("joint", [joint if joint == "cylinder" else pytest.param(joint, marks=pytest.mark.slow) for joint in JOINTS])
 def test_every_kind_of_virtual_joint(joint):
     """Two free bodies joined by the joint: rank, acceleration that keeps the loop, coordinates read off and back."""
     xml = models.MJCF.format(

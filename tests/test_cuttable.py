@@ -35,6 +35,7 @@ def case(request):
     return plain, chain, cut[0], state_of(plain, q), state_of(chain, q)
 
 
+@pytest.mark.slow
 def test_before_the_cut_it_is_the_plain_tree(case):
     """Poses, velocities, energy, mobility, acceleration and 0.3 s of motion, to 1e-9."""
     plain, chain, _, a, b = case
@@ -54,6 +55,7 @@ def test_before_the_cut_it_is_the_plain_tree(case):
         np.testing.assert_allclose(x, y, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_after_it_there_are_two_systems(case):
     """Nothing jumps at the cut; without gravity the momentum of everything that hangs on nothing is kept to 1e-12."""
     _, chain, cut, _, state = case
@@ -99,6 +101,7 @@ def part_momentum(chain, state, part):
     return p, L
 
 
+@pytest.mark.slow
 def test_a_link_in_the_middle_of_a_loop():
     """A four-bar whose coupler joint is cut: the loop at the rocker still holds, the crank swings alone; then the joint is made again."""
     link = svkc.VirtualLink("pin", "world", "rocker", "hinge", pos=(1.2, 0, 0), axis=(0, 1, 0), real_pos=(0.2, 0, -0.6), connected=True)
@@ -117,6 +120,7 @@ def test_a_link_in_the_middle_of_a_loop():
     assert float(svkc.kinetic_energy(chain, again)) <= float(before)
 
 
+@pytest.mark.slow
 def test_springs_ranges_armature_and_motors_go_with_the_joint():
     """A hinge with all of them, with ref: the same motion while it holds, nothing of them acts when it is cut."""
     xml = """<mujoco><compiler angle="radian"/><worldbody><body name="a"><joint name="a" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -1" size="0.05"/>
@@ -146,6 +150,7 @@ def test_springs_ranges_armature_and_motors_go_with_the_joint():
     assert float(svkc.kinetic_energy(chain, again)) <= float(svkc.kinetic_energy(chain, alone))
 
 
+@pytest.mark.slow
 def test_a_joint_that_breaks():
     """The pivot of a pendulum breaks where it carries 50 N: the load at that moment by the pendulum's own law, then free fall."""
     xml = models.MJCF.format(models.bar("arm", models.Y, "0 0 -1")).replace('gravity="0.3 -0.2 -9.81"', 'gravity="0 0 -10"')
@@ -169,6 +174,7 @@ def test_a_joint_that_breaks():
     assert abs(float(jnp.linalg.norm(carried.force[0])) - limit) < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("cut", "message"), [("nose", "no joint 'nose'; joints: base"), ("base", "'base' belongs to body 'torso'"), (["left_knee", "chin"], "chin")]
 )
@@ -182,6 +188,7 @@ SPARE = models.MJCF.format(
 )
 
 
+@pytest.mark.slow
 def test_grips_bound_during_a_run():
     """One slot, three grips one after another between bodies that the model does not join, unbound in between; one program."""
     chain = svkc.load(SPARE, spare=1)
@@ -209,6 +216,7 @@ def test_grips_bound_during_a_run():
     assert int(svkc.mobility(chain, emptied).freedoms) == 7
 
 
+@pytest.mark.slow
 def test_no_slot_left():
     """Capacity exceeded: a code, the state of that moment, and the grip that was there still holds."""
     chain = svkc.load(SPARE, spare=1)
@@ -221,6 +229,7 @@ def test_no_slot_left():
         svkc.simulate(chain, chain.state({"arm": -0.9}), 0.5, events=events)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "message"),
     [

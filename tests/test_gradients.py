@@ -12,7 +12,9 @@ import svkc
 TIGHT = derivatives.TIGHT
 
 
-@pytest.mark.parametrize("name", [*derivatives.ALGEBRAIC, "pendulum_cut", "breaking", "four_bar_turning"])
+@pytest.mark.parametrize(
+    "name", ["pendulum_cut", *(pytest.param(name, marks=pytest.mark.slow) for name in (*derivatives.ALGEBRAIC, "breaking", "four_bar_turning"))]
+)
 def test_against_differences(name):
     """Both modes, along a random direction of each parameter; forward and reverse to 1e-10. Figures: examples 05 and 06, and
     `python tests/derivatives.py`."""
@@ -39,6 +41,7 @@ def meeting(chain, x):
     return state, met
 
 
+@pytest.mark.slow
 def test_a_catch_with_a_closed_form(balls):
     """They meet at T = gap / closing speed and go on together: where and when, and every derivative, as the formula says."""
     start = jnp.array([0.1, 0.2, 1.0, -0.5])
@@ -59,6 +62,7 @@ def test_a_catch_with_a_closed_form(balls):
         np.testing.assert_allclose(jacobian(simulated)(start), jacobian(formula)(start), atol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_collision_that_swaps_velocities(balls):
     """Equal balls, elastic: the exact Jacobian is a permutation. Two runs, the second from the time and state where the first one's guard stopped it."""
     start = jnp.array([0.1, 0.2, 1.0, -0.5])
@@ -74,6 +78,7 @@ def test_a_collision_that_swaps_velocities(balls):
     np.testing.assert_allclose(jax.jacfwd(bounced)(start), expected, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_times_that_coincide(balls):
     """t0 and its save time, an event and its save time, t1 and its save time, an event at t0: each of them is to be differentiated by alone, twice too."""
 
@@ -107,6 +112,7 @@ def test_times_that_coincide(balls):
         jax.tree.map(lambda got, want: np.testing.assert_allclose(got, want, atol=1e-9), twice_simulated(x), twice(formula_here)(x))
 
 
+@pytest.mark.slow
 def test_nothing_is_not_a_number():
     """Zero velocity, identity rotations, a link of no length, an empty slot, a locked joint: every derivative is a number, in both modes."""
     rods = models.bar("base", 'type="ball"', "0 0 -0.5", inside=models.bar("fore", models.Y, "0 0 -0.3", "0 0 0"))

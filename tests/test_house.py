@@ -96,6 +96,7 @@ def test_every_public_name_says_what_it_is():
         assert thing.__doc__, name
 
 
+@pytest.mark.slow
 def test_readme_example_runs():
     code = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.S).group(1)
     done = run("-c", code)
@@ -135,6 +136,7 @@ def test_examples_are_all_here():
     assert {path.stem for path in (ROOT / "examples").glob("*.py")} == {*EXAMPLES, "08_mujoco_viewer"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_example_draws_its_picture(name, tmp_path):
     """From the command line, whole; under 80 lines; no library code: only public names."""
@@ -154,6 +156,7 @@ def test_example_draws_its_picture(name, tmp_path):
     _looks_drawn(tmp_path / f"{name}.png")
 
 
+@pytest.mark.slow
 def test_main_job(tmp_path):
     """python -m svkc: the table, the npz, the strobe and, where there is GL, the animation."""
     done = run("-m", "svkc", "--out", tmp_path)
@@ -177,6 +180,7 @@ def test_main_job(tmp_path):
             assert len(image.convert("RGB").getcolors(1 << 20)) > 10
 
 
+@pytest.mark.slow
 def test_the_swing_from_the_command_line(tmp_path):
     """python -m svkc swing: 30 joint freedoms and the swing's own, two fewer at the end."""
     done = run("-m", "svkc", "swing", "--out", tmp_path, optimized=False)
@@ -196,6 +200,7 @@ def _looks_drawn(path):
         assert len(image.convert("RGB").getcolors(1 << 22)) > 20
 
 
+@pytest.mark.slow
 def test_info(tmp_path):
     xml = '<mujoco><worldbody><body name="a"><joint name="j" frictionloss="1"/><geom size="0.1"/></body></worldbody></mujoco>'
     (tmp_path / "m.xml").write_text(xml)

@@ -18,7 +18,7 @@ OVERCONSTRAINED = {
 }
 
 
-@pytest.fixture(params=OVERCONSTRAINED, scope="module")
+@pytest.fixture(params=["bricard", *(pytest.param(name, marks=pytest.mark.slow) for name in OVERCONSTRAINED if name != "bricard")], scope="module")
 def linkage(request):
     make, joints, rank, counted = OVERCONSTRAINED[request.param]
     chain = make()

@@ -87,6 +87,7 @@ def test_lanes_are_those_of_single_runs(case, alone, capsys):
     assert capsys.readouterr().err == ""
 
 
+@pytest.mark.slow
 def test_chunks_fit_into_memory(case, alone, capsys, monkeypatch):
     """Where little memory is free the default chunk is smaller, and never nothing."""
     module, states = sys.modules["svkc.rollout"], case[1]
@@ -99,6 +100,7 @@ def test_chunks_fit_into_memory(case, alone, capsys, monkeypatch):
     assert module._fitting(states, None, jax.local_devices()) == 1
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_goes_on(case, alone, tmp_path, monkeypatch):
     chain, states, data = case
     asked = []
@@ -146,6 +148,7 @@ def start(count, out, dies=""):
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [2, 4])
 def test_several_processes(alone, tmp_path, count):
     """Each takes its share, all have the whole."""
@@ -159,6 +162,7 @@ def test_several_processes(alone, tmp_path, count):
     assert len(list(tmp_path.glob("chunk_*.npz"))) == 6
 
 
+@pytest.mark.slow
 def test_a_killed_process(case, alone, tmp_path):
     """The other one ends and says why; what is finished stays, and the next run goes on from it."""
     other, killed = start(2, tmp_path, dies="1")

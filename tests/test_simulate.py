@@ -179,6 +179,7 @@ def test_control_and_work(pendulum, capsys):
     assert abs(float(traj.phases.energy_drift[0])) < 1e-8
 
 
+@pytest.mark.slow
 def test_drift_is_held_or_not():
     """A four-bar for 2 s: projection keeps the loop to round-off, Baumgarte bounds the gap, nothing lets it grow."""
     chain = models.four_bar()
@@ -191,6 +192,7 @@ def test_drift_is_held_or_not():
     assert gaps["Projection"] < gaps["Baumgarte"] < gaps["Drift"]
 
 
+@pytest.mark.slow
 def test_the_motion_does_not_depend_on_the_coordinates():
     """A four-bar through 1 s with its own choice of theta_G and with another asked for."""
     chain = models.four_bar()
@@ -294,6 +296,7 @@ def test_guards_that_jump(pendulum):
     assert traj.events.time[1] == pytest.approx(0.5, abs=1e-7)
 
 
+@pytest.mark.slow
 def test_one_step_by_itself():
     """What `simulate` does in a step of that kind; of first order, loops kept, in a batch of lanes that are joined differently."""
     chain = models.four_bar()
@@ -319,6 +322,7 @@ def test_one_step_by_itself():
         svkc.step(chain, state, jnp.zeros(2), dt)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("dtype", "rtol", "atol"), [("float64", 1e-11, 1e-13), ("float64", 1e-4, 1e-6), ("float32", 1e-5, 8 * 2.0**-23)])
 def test_the_absolute_tolerance_follows_the_relative_one(pendulum, dtype, rtol, atol):
     """It is a hundredth, or what round-off leaves, so that rtol alone says how exact a run is."""

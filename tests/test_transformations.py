@@ -28,6 +28,7 @@ def held(chain, x, ts=None, **kw):
     return svkc.simulate(chain, state, x[3], ts=ts, events=events, args=x[1], **(kw or TIGHT))
 
 
+@pytest.mark.slow
 def test_the_end_and_an_event_at_a_save_time(pendulum):
     """dL/dt1 is the rate at the end; what is saved at the time of an event moves with what came before."""
 
@@ -44,6 +45,7 @@ def test_the_end_and_an_event_at_a_save_time(pendulum):
     np.testing.assert_allclose(rate["end"], value["rate"], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_every_order_of_the_transformations(pendulum):
     """Lanes with other structures, numbers of events and times: vmap(grad), grad(vmap), jit, jacfwd, jacrev, in a scan: all the same."""
     lanes = jnp.array([[1.2, 0.3, 0.8, 1.3], [1.2, -2.0, 0.5, 0.6], [0.4, 0.3, 0.35, 1.0]])
@@ -69,6 +71,7 @@ def test_every_order_of_the_transformations(pendulum):
         np.testing.assert_allclose(share, shares if share.ndim > com.ndim else shares.sum(0), atol=1e-9, err_msg=name)
 
 
+@pytest.mark.slow
 def test_second_derivatives(pendulum):
     """Hessian-vector products: of forward dynamics with a loop, and of a run with a guard and a scheduled event."""
     chain = models.four_bar()
@@ -92,6 +95,7 @@ def test_second_derivatives(pendulum):
     assert found.error <= 1e-6, found
 
 
+@pytest.mark.slow
 def test_adjoints_pass_through(pendulum):
     """diffrax's own give the same gradient; one that keeps fewer states, too; what does not fit is refused with words."""
     import diffrax
@@ -112,6 +116,7 @@ def test_adjoints_pass_through(pendulum):
         svkc.simulate(pendulum, pendulum.state(), 1.0, stepsize_controller=diffrax.StepTo(jnp.linspace(0, 1, 5)), adjoint=svkc.Replay())
 
 
+@pytest.mark.slow
 def test_where_there_is_no_derivative(pendulum):
     """A guard that grazes, one that jumps, two at one instant, a rank that is lost: a code says so; a grazing guard gives no number."""
 
