@@ -12,7 +12,6 @@ import pytest
 
 import svkc
 from svkc.forward_dynamics import acceleration, forward_dynamics_by_unit_vectors
-from svkc.inverse_dynamics import inertia_by_composites, inertia_by_unit_vectors
 from svkc.kinematics import kinematics, rates
 
 ASSETS = pathlib.Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
@@ -63,10 +62,10 @@ def everything(chain, state, tau):
     vdot = svkc.forward_dynamics(chain, state, tau)
     return {
         "position": position, "quat": quat, "linear": linear, "angular": angular,
-        "mass": svkc.mass_matrix(chain, state), "mass by unit vectors": inertia_by_unit_vectors(chain, kin),
+        "mass": svkc.mass_matrix(chain, state), "mass by unit vectors": svkc.inertia_by_unit_vectors(chain, kin),
         "bias": svkc.bias_force(chain, state), "acceleration": vdot,
         "acceleration by unit vectors": forward_dynamics_by_unit_vectors(chain, state, tau),
-        "acceleration by composites": acceleration(chain, state.structure, state.q, state.v, tau, inertia_by_composites),
+        "acceleration by composites": acceleration(chain, state.structure, state.q, state.v, tau, svkc.inertia_by_composites),
         "inverse": svkc.inverse_dynamics(chain, state, vdot), "kinetic": svkc.kinetic_energy(chain, state),
         "power": jax.jvp(
             lambda q, v: svkc.energy(chain, svkc.State(q, v, state.structure)), (state.q, state.v), (rates(chain, state.q, state.v), vdot)
