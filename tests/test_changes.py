@@ -150,6 +150,7 @@ def test_wrong_calls(high_bar, call, message):
         call(*high_bar)
 
 
+@pytest.mark.slow
 def test_states_and_changes_under_jit_and_vmap(high_bar):
     """The verbs are functions of arrays: the same numbers compiled, and lane by lane."""
     chain, state = high_bar

@@ -174,7 +174,6 @@ def test_a_joint_that_breaks():
     assert abs(float(jnp.linalg.norm(carried.force[0])) - limit) < 1e-6
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("cut", "message"), [("nose", "no joint 'nose'; joints: base"), ("base", "'base' belongs to body 'torso'"), (["left_knee", "chin"], "chin")]
 )
@@ -188,20 +187,31 @@ SPARE = models.MJCF.format(
 )
 
 
-@pytest.mark.slow
-def test_grips_bound_during_a_run():
-    """One slot, three grips one after another between bodies that the model does not join, unbound in between; one program."""
+@pytest.fixture(scope="module")
+def gripped():
+    """A chain with one slot, a state, and the run of six grips and givings up of it at these times, past the end of the run never."""
     chain = svkc.load(SPARE, spare=1)
     state = chain.state({"arm": -0.9})
-    events = [
-        svkc.at(0.1, bind=svkc.Grip("arm", "ball", joint="hinge", axis=(0, 1, 0))),
-        svkc.at(0.2, unbind=("arm", "ball")),
-        svkc.at(0.3, bind=svkc.Grip("world", "ball", joint="ball", real_pos=(0, 0, 0.1))),
-        svkc.at(0.35, bind=svkc.Grip("world", "ball")),
-        svkc.at(0.4, unbind="spare_0"),
-        svkc.at(0.5, bind=svkc.Grip("world", "arm", slot="spare_0")),
-    ]
-    traj = svkc.simulate(chain, state, 0.6, ts=jnp.linspace(0, 0.6, 13), events=events, rtol=1e-9, atol=1e-11)
+
+    def run(times, **kw):
+        events = [
+            svkc.at(times[0], bind=svkc.Grip("arm", "ball", joint="hinge", axis=(0, 1, 0))),
+            svkc.at(times[1], unbind=("arm", "ball")),
+            svkc.at(times[2], bind=svkc.Grip("world", "ball", joint="ball", real_pos=(0, 0, 0.1))),
+            svkc.at(times[3], bind=svkc.Grip("world", "ball")),
+            svkc.at(times[4], unbind="spare_0"),
+            svkc.at(times[5], bind=svkc.Grip("world", "arm", slot="spare_0")),
+        ]
+        return svkc.simulate(chain, state, 0.6, ts=jnp.linspace(0, 0.6, 13), events=events, rtol=1e-9, atol=1e-11, **kw)
+
+    return chain, state, run
+
+
+@pytest.mark.slow
+def test_grips_bound_during_a_run(gripped):
+    """One slot, three grips one after another between bodies that the model does not join, unbound in between; one program."""
+    chain, state, run = gripped
+    traj = run((0.1, 0.2, 0.3, 0.35, 0.4, 0.5))
     # what is gripped already stays as it is: no change at 0.35
     assert traj.phases.freedoms[:7].tolist() == [7, 2, 7, 4, 4, 7, 6]
     assert float(traj.gaps.max()) < 1e-12
@@ -217,19 +227,18 @@ def test_grips_bound_during_a_run():
 
 
 @pytest.mark.slow
-def test_no_slot_left():
+def test_no_slot_left(gripped):
     """Capacity exceeded: a code, the state of that moment, and the grip that was there still holds."""
-    chain = svkc.load(SPARE, spare=1)
-    events = [svkc.at(0.1, bind=svkc.Grip("arm", "ball")), svkc.at(0.2, bind=svkc.Grip("world", "ball"))]
-    traj = svkc.simulate(chain, chain.state({"arm": -0.9}), 0.5, events=events, throw=False)
+    _, _, run = gripped
+    times = (0.1, 9.0, 0.2, 9.0, 9.0, 9.0)
+    traj = run(times, throw=False)
     assert traj.result == svkc.RESULTS.no_slot
     assert float(traj.t_final) == 0.2
     assert traj.final.structure.connected.tolist() == [True]
     with pytest.raises(RuntimeError, match="every spare slot was taken"):
-        svkc.simulate(chain, chain.state({"arm": -0.9}), 0.5, events=events)
+        run(times)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "message"),
     [

@@ -191,6 +191,7 @@ def test_urdf_with_a_mesh(tmp_path, written, stands):
         np.testing.assert_allclose(chain.limit[:, 0], [-1, 1])
 
 
+@pytest.mark.slow
 def test_a_scene_written_in_python():
     """A five-bar as mujoco.MjSpec, part of it attached from another, its loop a virtual link; the spec stays the caller's own."""
 
@@ -221,6 +222,7 @@ def test_a_scene_written_in_python():
     assert svkc.load(chain.to_mjcf()).body_names == chain.body_names
 
 
+@pytest.mark.slow
 def test_the_example_of_the_gallery_runs():
     page = (ROOT / "docs" / "gallery.md").read_text()
     code, names = re.search(r"```python\n(.*?)```", page, re.S).group(1), {"print": lambda x: None}
@@ -230,6 +232,7 @@ def test_the_example_of_the_gallery_runs():
         assert (ROOT / "docs" / picture).stat().st_size < 150_000
 
 
+@pytest.mark.slow
 def test_a_robot_of_others():
     """Minitaur's URDF, loops as virtual links: balls find its axes parallel to five digits only, balls that slide along them leave each leg its two motors."""
     feet = {}

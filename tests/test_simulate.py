@@ -144,6 +144,7 @@ def test_event_time_has_the_solvers_accuracy(pendulum):
     assert 0 < float(many.t_final) < 9
 
 
+@pytest.mark.slow
 def test_direction_and_rearming(pendulum):
     """A guard without an action records every crossing; with a direction every second one; one that starts at zero has not crossed."""
     state = pendulum.state({"arm": 0.5})
@@ -305,6 +306,7 @@ def test_a_saved_run_goes_on(tmp_path, pendulum):
     assert "<mujoco" in told["model"]
 
 
+@pytest.mark.slow
 def test_guards_that_jump(pendulum):
     """A guard that jumps in time happens where it jumps; one that a change of structure makes jump has not crossed."""
     state = pendulum.state({"arm": 1.2})
@@ -351,6 +353,7 @@ def test_the_absolute_tolerance_follows_the_relative_one(pendulum, dtype, rtol, 
     assert int(alone.report().accepted) == int(both.report().accepted)
 
 
+@pytest.mark.slow
 def test_a_step_that_would_be_too_small(pendulum):
     """A controller that may not go below its bound gives up where it would have to: a code, the state it came to, and an error when asked to throw."""
     controller = diffrax.PIDController(rtol=1e-12, atol=1e-14, dtmin=0.02, force_dtmin=False)
