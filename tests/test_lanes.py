@@ -43,7 +43,7 @@ def test_every_rule(count):
     one = rules.with_lanes_last(several)
     for axes in ((0, 0, 0), (0, None, None), (None, 0, 0), (0, 0, None)):
         args = [value if axis == 0 else value[0] for value, axis in zip((x, y, which), axes, strict=True)]
-        for expected, got in zip(jax.tree.leaves(jax.vmap(several, axes)(*args)), jax.tree.leaves(jax.jit(jax.vmap(one, axes))(*args)), strict=True):
+        for expected, got in zip(jax.tree.leaves(jax.jit(jax.vmap(several, axes))(*args)), jax.tree.leaves(jax.jit(jax.vmap(one, axes))(*args)), strict=True):
             np.testing.assert_allclose(got, expected, rtol=1e-13, atol=1e-13)
             assert got.dtype == expected.dtype
 
