@@ -301,6 +301,8 @@ def worst(program, x, step=0.05) -> float:
     program(x, along): values, and their derivatives along a direction. (`svkc.check_grad` compiles the function, too.)
     """
     named = lambda tree: {jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(tree)}
+    # (without weak types, which would compile it again for every parameter)
+    x = jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype), x)
     rng, errors = np.random.default_rng(0), []
     for name, leaf in x.items():
         along = rng.normal(size=leaf.shape)

@@ -33,17 +33,17 @@ def test_a_release_against_differences():
         start = svkc.State(state.q, x["speed"] * state.v, state.structure)
         c = derivatives.changed(chain, x)
         traj = svkc.simulate(c, start, 0.6, events=events, args=x["sine"], max_events=1, adjoint=svkc.Replay(), **TIGHT)
-        return traj.events.time[0] + jnp.sum(jnp.sin(traj.final.q)) + jnp.sum(traj.final.v**2) / 10, traj.events.count
+        # (without the event its time is infinite, and so is this)
+        return traj.events.time[0] + jnp.sum(jnp.sin(traj.final.q)) + jnp.sum(traj.final.v**2) / 10
 
-    gradient = jax.value_and_grad(loss, has_aux=True)
+    gradient = jax.value_and_grad(loss)
 
     @jax.jit
     def program(x, along):
-        (value, count), slope = gradient(x)
-        return value, sum(jnp.vdot(slope[name], along[name]) for name in x), count
+        value, slope = gradient(x)
+        return value, sum(jnp.vdot(slope[name], along[name]) for name in x)
 
-    x = {"sine": jnp.asarray(0.3), "speed": jnp.asarray(1.0)} | derivatives.model(chain, "com", "gravity") | derivatives.heavier(chain)
-    assert program(x, x)[2] == 1
+    x = {"sine": jnp.asarray(0.3), "speed": jnp.asarray(1.0)} | derivatives.heavier(chain)
     assert derivatives.worst(program, x) <= derivatives.RUN
 
 
