@@ -178,7 +178,10 @@ def test_spare_slots_change_nothing():
 
 
 def test_bind_a_spare_slot():
-    """A grip between bodies not known beforehand: the same motion as the declared link; given up it leaves an empty slot and all as it moves."""
+    """A grip between bodies not known beforehand: the same motion as the declared link, by verbs and in a run.
+
+    Given up it leaves an empty slot, and all as it moves.
+    """
     declared = models.four_bar()
     a = declared.state(v={"crank": 1.0})
     xml = models.FOUR_BAR
@@ -189,6 +192,11 @@ def test_bind_a_spare_slot():
     np.testing.assert_allclose(gripped.v[:3], a.v[:3], atol=1e-12)
     f = svkc.forward_dynamics
     np.testing.assert_allclose(f(chain, gripped, jnp.zeros(3))[:3], f(declared, a, jnp.zeros(3))[:3], rtol=1e-9)
+    # made in a run, at its start
+    grip = svkc.at(0.0, bind=svkc.Grip("world", "rocker", joint="ball", real_pos=(0.2, 0, -0.6)))
+    traj = svkc.simulate(chain, open_, 1e-3, dt=1e-3, events=[grip])
+    for ours, theirs in zip(jax.tree.leaves(jax.tree.map(lambda x: x[0], traj.states)), jax.tree.leaves(gripped), strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-12)
     empty = svkc.unbind(chain, gripped, "spare_0")
     assert empty.structure.connected.tolist() == [False]
     np.testing.assert_array_equal(empty.structure.real, chain.structure.real)

@@ -224,7 +224,11 @@ def test_info(tmp_path):
     assert run("-m", "svkc", "info", tmp_path / "bad.xml").returncode == 1
 
 
-def test_pictures_say_what_they_cannot_draw(high_bar, tmp_path, monkeypatch):
+ROD = """<mujoco><worldbody><light pos="0 0 5"/>{}
+  <body name="rod"><joint axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0.3 0.2 -1" size="0.05"/></body></worldbody></mujoco>"""
+
+
+def test_pictures_say_what_they_cannot_draw(tmp_path, monkeypatch):
     """Another ending; a machine without GL, as Python would see it."""
     import importlib
 
@@ -237,13 +241,14 @@ def test_pictures_say_what_they_cannot_draw(high_bar, tmp_path, monkeypatch):
             raise ImportError(name)
         return plain(name, *where)
 
-    traj = svkc.simulate(*high_bar, 0.0)
+    chain = svkc.load(ROD.format(""))
+    traj = svkc.simulate(chain, chain.state(), 0.1, ts=[0.0, 0.05, 0.1])
     with monkeypatch.context() as patch:
         patch.setattr(importlib, "import_module", missing)
         with pytest.raises(RuntimeError, match="libegl1 libgl1"):
-            svkc.render(high_bar[0], traj, tmp_path / "x.gif")
+            svkc.render(chain, traj, tmp_path / "x.gif")
     with pytest.raises(ValueError, match=r"\.png, \.gif, \.mp4 or \.html"):
-        svkc.render(high_bar[0], traj, tmp_path / "x.bmp")
+        svkc.render(chain, traj, tmp_path / "x.bmp")
 
 
 def test_cameras(tmp_path):
@@ -253,8 +258,7 @@ def test_cameras(tmp_path):
     import svkc
 
     camera = '<camera name="above" pos="0 -1 4" xyaxes="1 0 0 0 1 0"/>'
-    body = '<body name="rod"><joint axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0.3 0.2 -1" size="0.05"/></body>'
-    chain = svkc.load(f"<mujoco><worldbody><light pos='0 0 5'/>{camera}{body}</worldbody></mujoco>")
+    chain = svkc.load(ROD.format(camera))
     traj, seen = svkc.simulate(chain, chain.state(), 0.1, ts=[0.0, 0.05, 0.1]), set()
     ways = {"camera": "above"}, {"lookat": (0, 0, -0.5)}, {"lookat": (0, 0, -0.5), "distance": 6.0}, {"azimuth": 20.0, "elevation": -60.0}
     for i, way in enumerate(ways):

@@ -121,6 +121,7 @@ def number(page, name):
     return float(page.inner_text(f"#{name}").split()[0])
 
 
+@pytest.mark.slow
 def test_the_file_has_everything_in_it(release, tmp_path):
     chain, traj = release
     path = svkc.render(chain, traj, tmp_path / "run.html")
@@ -149,6 +150,7 @@ def test_the_file_has_everything_in_it(release, tmp_path):
     np.testing.assert_allclose(x + R @ there, at, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_ten_seconds_are_below_five_megabytes(release, tmp_path):
     """At 40 saved times a second."""
     chain, traj = release
@@ -168,6 +170,7 @@ def test_names_stay_names(pendulum, tmp_path):
     assert "<title>a &lt;b&gt; &amp; c</title>" in path.read_text()
 
 
+@pytest.mark.slow
 def test_a_run_that_stopped_ends_where_it_did(stopped, tmp_path):
     """Times asked for past the end are left out, what the last event made is there, what is no number is null."""
     chain, traj = stopped

@@ -83,6 +83,11 @@ def test_lanes_are_those_of_single_runs(case, alone, capsys):
     traj = call(*case, chunk=4, cost=-np.arange(LANES) % 3)
     agrees(traj, alone)
     assert "3 of 3 chunks (11 lanes)" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_all_lanes_at_once(case, alone, capsys):
+    """In one chunk, and without a word."""
     agrees(call(*case, progress=False), alone)
     assert capsys.readouterr().err == ""
 

@@ -200,14 +200,15 @@ def test_control_and_work(pendulum, capsys):
 
 
 def test_drift_is_held_or_not():
-    """A four-bar for 2 s: projection keeps the loop to round-off, Baumgarte bounds the gap, nothing lets it grow."""
+    """A four-bar for 2 s: projection keeps the loop to round-off, after steps or at every evaluation; Baumgarte bounds the gap, nothing lets it grow."""
     chain = models.four_bar()
     state = chain.state(v={"crank": 4.0})
     gaps = {}
-    for held in (svkc.Projection(), svkc.Baumgarte(30.0), svkc.Drift()):
+    for held in (svkc.Projection(), svkc.Exact(), svkc.Baumgarte(30.0), svkc.Drift()):
         traj = svkc.simulate(chain, state, 2.0, ts=jnp.linspace(0, 2, 21), dt=0.01, stabilization=held, throw=False)
         gaps[type(held).__name__] = float(traj.gaps.max())
     assert gaps["Projection"] < 1e-13
+    assert gaps["Exact"] < 1e-13
     assert gaps["Projection"] < gaps["Baumgarte"] < gaps["Drift"]
 
 
