@@ -43,7 +43,6 @@ def turned_alike(q, expected):
     return q * np.sign(np.sum(q * expected, 1))[:, None], expected
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("case", given("free_top")["cases"], ids=lambda case: case["name"])
 def test_free_top(case):
     """1e-9; where the motion itself amplifies round-off, three times what a plain integration in double precision loses."""
@@ -54,7 +53,6 @@ def test_free_top(case):
     np.testing.assert_allclose(traj.states.v, case["omega_body"], atol=3 * bound * np.max(np.abs(case["omega_body"])))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("case", given("heavy_top")["cases"], ids=lambda case: case["name"])
 def test_heavy_top(case):
     model = given("heavy_top")["model"]
