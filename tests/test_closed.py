@@ -52,9 +52,9 @@ def test_articulated_bodies_carry_what_acts_on_virtual_joints(case):
         q = svkc.integrate(chain, locked.q, scale * along)
         return [accelerated(c, locked.structure, q, locked.v, tau, way) for way in (None, svkc.by_bodies)]
 
-    for usual, bodies in jax.jit(lambda x: jax.jvp(both, (x,), (1.0,)))(0.0):
+    for usual, bodies in (both(0.0), jax.jvp(both, (0.0,), (1.0,))[1]):
         assert np.abs(bodies - usual).max() < 1e-9 * np.abs(usual).max()
-    back = jax.jit(jax.jacrev(lambda x: jnp.stack([jnp.sum(a * jnp.linspace(-1.0, 2.0, chain.dofs)) for a in both(x)])))(0.0)
+    back = [jax.grad(lambda x, i=i: jnp.sum(both(x)[i] * jnp.linspace(-1.0, 2.0, chain.dofs)))(0.0) for i in (0, 1)]
     np.testing.assert_allclose(*back, rtol=1e-8)
 
 
