@@ -124,6 +124,7 @@ INERTIA = MASS / 80 * np.array([[3 * 0.2, 0.06, 0.12], [0.06, 3 * 0.25, 0.08], [
 INERTIA[np.diag_indices(3)] = MASS * 3 / 80 * np.array([0.2**2 + 0.4**2, 0.3**2 + 0.4**2, 0.3**2 + 0.2**2])
 
 
+@pytest.mark.slow
 def test_mesh_include_and_defaults(tmp_path):
     """A scene of two files: classes of defaults, a mesh in a folder of its own, a weld; and the text made of it, which is read anywhere."""
     (tmp_path / "parts" / "shapes").mkdir(parents=True)
