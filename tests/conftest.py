@@ -39,7 +39,7 @@ gc.set_threshold(100_000, 20, 50)
 
 
 # the longest first, so that no worker is left with one of them in the end
-LONGEST = ("test_house", "test_transformations", "test_gradients", "test_extremes", "test_reference", "test_cuttable", "test_accuracy")
+LONGEST = ("test_house", "test_transformations", "test_gradients", "test_simulate", "test_extremes", "test_reference", "test_cuttable", "test_accuracy")
 
 
 def pytest_collection_modifyitems(items):

@@ -13,6 +13,7 @@ import numpy as np
 
 import svkc
 import svkc.scenes
+from svkc.derivative import _differences
 
 TIGHT = {"rtol": 1e-11, "atol": 1e-13, "solver": diffrax.Dopri8()}
 ALGEBRA, RUN = 1e-8, 1e-6
@@ -292,6 +293,28 @@ def brachiation():
         return motion(svkc.simulate(chain, state, 0.8, events=events, control=control, args=x["pose"], **TIGHT))
 
     return f, {"reach": jnp.asarray(0.45), "release": jnp.asarray(0.72), "pose": pose}, RUN
+
+
+def worst(program, x, step=0.05) -> float:
+    """The largest relative error of derivatives against differences, along a random direction of each parameter, where one program has all of it.
+
+    program(x, along): values, and their derivatives along a direction. (`svkc.check_grad` compiles the function, too.)
+    """
+    named = lambda tree: {jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(tree)}
+    # (without weak types, which would compile it again for every parameter)
+    x = jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype), x)
+    rng, errors = np.random.default_rng(0), []
+    for name, leaf in x.items():
+        along = rng.normal(size=leaf.shape)
+        along = jnp.asarray(along / np.linalg.norm(along) * (np.linalg.norm(leaf) or 1.0))
+        along = {other: along if other == name else jnp.zeros_like(value) for other, value in x.items()}
+        derivative = named(program(x, along)[1])
+        difference, _ = _differences(lambda x, along=along: named(program(x, along)[0]), x, along, step)
+        for path, expected in difference.items():
+            size = max(np.abs(derivative[path]).max(), np.abs(expected).max())
+            errors.append(np.abs(derivative[path] - expected).max() / (size if size > 1e-9 else 1.0))
+    # (of what is no number neither max nor the comparison with a bound would tell)
+    return float(np.max(errors)) if np.isfinite(errors).all() else np.inf
 
 
 ALGEBRAIC = {case.__name__: case for case in (four_bar, spatial_loop, over_constrained, every_float, at_rest, assembly, impact)}

@@ -93,6 +93,7 @@ def test_missing(five_bar):
     np.testing.assert_allclose(exact.tau[motors], 3.0, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_actuated_virtual_joint():
     """A four-bar driven at its closing hinge (Fig. 6), with a spring and damper in the tree."""
     xml = models.MJCF.format(models.FOUR_BAR).replace('damping="0"', 'damping="0.2" stiffness="3"')
@@ -105,6 +106,7 @@ def test_actuated_virtual_joint():
     assert reached(chain, state, vdot, found) < 1e-10 * float(jnp.abs(vdot).max())
 
 
+@pytest.mark.slow
 def test_over_constrained():
     """Three parallel legs: a redundant loop, six motors for one freedom."""
     chain = models.parallelogram()
@@ -123,6 +125,7 @@ def test_over_constrained():
     assert svkc.loop_forces(chain, chain.state(connected=["pin2"]), found.tau).unique.tolist() == [True, False]
 
 
+@pytest.mark.slow
 def test_both_hands_on_the_bar(high_bar):
     """16 motors, 12 freedoms, of which the swing about the bar is nobody's: reached by the others, over-actuated by five."""
     chain, state = high_bar
@@ -163,6 +166,7 @@ def test_bounds(five_bar):
     assert float(jnp.abs(never.tau).max()) <= 1
 
 
+@pytest.mark.slow
 def test_open_chain_and_derivative(five_bar):
     """Without loops actuation is inverse dynamics; the torques' derivative by q against differences, in both modes."""
     tree = svkc.load(models.random_tree(4, 3, kinds=("hinge", "ball")))

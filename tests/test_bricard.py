@@ -9,6 +9,8 @@ from scipy.integrate import solve_ivp
 
 import svkc
 
+pytestmark = pytest.mark.slow
+
 CORNERS = np.array([(0, 0, 0), (1, 0, 0), (1, 0, 1), (1, 1, 1), (0, 1, 1), (0, 1, 0)], float)
 AXES = [np.cross(CORNERS[k] - CORNERS[k - 1], CORNERS[(k + 1) % 6] - CORNERS[k]) for k in range(6)]
 THIN, GRAVITY = 1e-13, 9.81

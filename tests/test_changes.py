@@ -82,7 +82,7 @@ TWO = models.MJCF.format(
 )
 
 
-@pytest.mark.parametrize("joint", ["weld", "hinge", "ball", "slide"])
+@pytest.mark.parametrize("joint", ["hinge", *(pytest.param(joint, marks=pytest.mark.slow) for joint in ("weld", "ball", "slide"))])
 def test_momentum_across_a_connect(joint):
     """Two free bodies caught together: momentum stays to 1e-12, energy never grows, the joint's freedoms take nothing."""
     chain = svkc.load(TWO, virtual_links=[svkc.VirtualLink("grip", "a", "b", joint, pos=(0.4, 0.1, 0), real_pos=(-0.6, 0.1, 0), axis=(0.2, 0.5, 1))])
@@ -150,6 +150,7 @@ def test_wrong_calls(high_bar, call, message):
         call(*high_bar)
 
 
+@pytest.mark.slow
 def test_states_and_changes_under_jit_and_vmap(high_bar):
     """The verbs are functions of arrays: the same numbers compiled, and lane by lane."""
     chain, state = high_bar

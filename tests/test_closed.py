@@ -16,7 +16,10 @@ CASES |= {"figure40": models.figure40}
 MOBILITY = {"four_bar": 1, "parallelogram": 1, "rod_on_balls": 2, "stewart": 6, "figure40": 40}
 
 
-@pytest.fixture(params=[*CASES, "two_hands"], scope="module")
+FAST = ("four_bar",)
+
+
+@pytest.fixture(params=[name if name in FAST else pytest.param(name, marks=pytest.mark.slow) for name in (*CASES, "two_hands")], scope="module")
 def case(request, high_bar):
     """Chain, and a state in motion: velocities at random, projected on what the loops allow."""
     rng = np.random.default_rng(3)
@@ -98,6 +101,7 @@ def test_loop_forces_and_torques_explain_the_acceleration(case):
     assert abs(float(missing @ v - power)) < 1e-8 * max(1.0, float(jnp.max(jnp.abs(force))))
 
 
+@pytest.mark.slow
 def test_redundant_loop_moves_like_its_minimal_form():
     chain = models.parallelogram()
     both = chain.state(v={"leg0": 0.7})
@@ -115,7 +119,10 @@ def test_redundant_loop_moves_like_its_minimal_form():
     np.testing.assert_allclose(np.asarray(a)[: chain.nv], acceleration(chain, both, tau), rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("joint", ["weld", "hinge", "slide", "cylinder", "universal", "planar", "ball", "free", (True, False, True, False, True, False)])
+JOINTS = ["weld", "hinge", "slide", "cylinder", "universal", "planar", "ball", "free", (True, False, True, False, True, False)]
+
+
+@pytest.mark.parametrize("joint", [joint if joint == "slide" else pytest.param(joint, marks=pytest.mark.slow) for joint in JOINTS])
 def test_every_kind_of_virtual_joint(joint):
     """Two free bodies joined by the joint: rank, acceleration that keeps the loop, coordinates read off and back."""
     xml = models.MJCF.format(
@@ -154,6 +161,7 @@ def test_every_kind_of_virtual_joint(joint):
     np.testing.assert_allclose(svkc.difference(chain, final.q, read), 0, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_spare_slots_change_nothing():
     numbers = []
     for spare in (0, 1, 4):
@@ -170,7 +178,10 @@ def test_spare_slots_change_nothing():
 
 
 def test_bind_a_spare_slot():
-    """A grip between bodies not known beforehand: the same motion as the declared link."""
+    """A grip between bodies not known beforehand: the same motion as the declared link, by verbs and in a run.
+
+    Given up it leaves an empty slot, and all as it moves.
+    """
     declared = models.four_bar()
     a = declared.state(v={"crank": 1.0})
     xml = models.FOUR_BAR
@@ -181,3 +192,12 @@ def test_bind_a_spare_slot():
     np.testing.assert_allclose(gripped.v[:3], a.v[:3], atol=1e-12)
     f = svkc.forward_dynamics
     np.testing.assert_allclose(f(chain, gripped, jnp.zeros(3))[:3], f(declared, a, jnp.zeros(3))[:3], rtol=1e-9)
+    # made in a run, at its start
+    grip = svkc.at(0.0, bind=svkc.Grip("world", "rocker", joint="ball", real_pos=(0.2, 0, -0.6)))
+    traj = svkc.simulate(chain, open_, 1e-3, dt=1e-3, events=[grip])
+    for ours, theirs in zip(jax.tree.leaves(jax.tree.map(lambda x: x[0], traj.states)), jax.tree.leaves(gripped), strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-12)
+    empty = svkc.unbind(chain, gripped, "spare_0")
+    assert empty.structure.connected.tolist() == [False]
+    np.testing.assert_array_equal(empty.structure.real, chain.structure.real)
+    np.testing.assert_array_equal(empty.v[:3], gripped.v[:3])

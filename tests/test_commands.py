@@ -1,9 +1,12 @@
 """The command line, in processes of its own."""
 
+import pytest
 import test_house
 from test_house import run
 
 import svkc
+
+pytestmark = pytest.mark.slow
 
 ROD = """<mujoco><worldbody>
   <body name="rod" pos="0 0 1"><joint name="pivot" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0.5 0 0" size="0.03"/></body>

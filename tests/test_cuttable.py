@@ -35,6 +35,7 @@ def case(request):
     return plain, chain, cut[0], state_of(plain, q), state_of(chain, q)
 
 
+@pytest.mark.slow
 def test_before_the_cut_it_is_the_plain_tree(case):
     """Poses, velocities, energy, mobility, acceleration and 0.3 s of motion, to 1e-9."""
     plain, chain, _, a, b = case
@@ -54,6 +55,7 @@ def test_before_the_cut_it_is_the_plain_tree(case):
         np.testing.assert_allclose(x, y, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_after_it_there_are_two_systems(case):
     """Nothing jumps at the cut; without gravity the momentum of everything that hangs on nothing is kept to 1e-12."""
     _, chain, cut, _, state = case
@@ -99,6 +101,7 @@ def part_momentum(chain, state, part):
     return p, L
 
 
+@pytest.mark.slow
 def test_a_link_in_the_middle_of_a_loop():
     """A four-bar whose coupler joint is cut: the loop at the rocker still holds, the crank swings alone; then the joint is made again."""
     link = svkc.VirtualLink("pin", "world", "rocker", "hinge", pos=(1.2, 0, 0), axis=(0, 1, 0), real_pos=(0.2, 0, -0.6), connected=True)
@@ -117,6 +120,7 @@ def test_a_link_in_the_middle_of_a_loop():
     assert float(svkc.kinetic_energy(chain, again)) <= float(before)
 
 
+@pytest.mark.slow
 def test_springs_ranges_armature_and_motors_go_with_the_joint():
     """A hinge with all of them, with ref: the same motion while it holds, nothing of them acts when it is cut."""
     xml = """<mujoco><compiler angle="radian"/><worldbody><body name="a"><joint name="a" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -1" size="0.05"/>
@@ -146,6 +150,7 @@ def test_springs_ranges_armature_and_motors_go_with_the_joint():
     assert float(svkc.kinetic_energy(chain, again)) <= float(svkc.kinetic_energy(chain, alone))
 
 
+@pytest.mark.slow
 def test_a_joint_that_breaks():
     """The pivot of a pendulum breaks where it carries 50 N: the load at that moment by the pendulum's own law, then free fall."""
     xml = models.MJCF.format(models.bar("arm", models.Y, "0 0 -1")).replace('gravity="0.3 -0.2 -9.81"', 'gravity="0 0 -10"')
@@ -182,19 +187,31 @@ SPARE = models.MJCF.format(
 )
 
 
-def test_grips_bound_during_a_run():
-    """One slot, three grips one after another between bodies that the model does not join, unbound in between; one program."""
+@pytest.fixture(scope="module")
+def gripped():
+    """A chain with one slot, a state, and the run of six grips and givings up of it at these times, past the end of the run never."""
     chain = svkc.load(SPARE, spare=1)
     state = chain.state({"arm": -0.9})
-    events = [
-        svkc.at(0.1, bind=svkc.Grip("arm", "ball", joint="hinge", axis=(0, 1, 0))),
-        svkc.at(0.2, unbind=("arm", "ball")),
-        svkc.at(0.3, bind=svkc.Grip("world", "ball", joint="ball", real_pos=(0, 0, 0.1))),
-        svkc.at(0.35, bind=svkc.Grip("world", "ball")),
-        svkc.at(0.4, unbind="spare_0"),
-        svkc.at(0.5, bind=svkc.Grip("world", "arm", slot="spare_0")),
-    ]
-    traj = svkc.simulate(chain, state, 0.6, ts=jnp.linspace(0, 0.6, 13), events=events, rtol=1e-9, atol=1e-11)
+
+    def run(times, **kw):
+        events = [
+            svkc.at(times[0], bind=svkc.Grip("arm", "ball", joint="hinge", axis=(0, 1, 0))),
+            svkc.at(times[1], unbind=("arm", "ball")),
+            svkc.at(times[2], bind=svkc.Grip("world", "ball", joint="ball", real_pos=(0, 0, 0.1))),
+            svkc.at(times[3], bind=svkc.Grip("world", "ball")),
+            svkc.at(times[4], unbind="spare_0"),
+            svkc.at(times[5], bind=svkc.Grip("world", "arm", slot="spare_0")),
+        ]
+        return svkc.simulate(chain, state, 0.6, ts=jnp.linspace(0, 0.6, 13), events=events, rtol=1e-9, atol=1e-11, **kw)
+
+    return chain, state, run
+
+
+@pytest.mark.slow
+def test_grips_bound_during_a_run(gripped):
+    """One slot, three grips one after another between bodies that the model does not join, unbound in between; one program."""
+    chain, state, run = gripped
+    traj = run((0.1, 0.2, 0.3, 0.35, 0.4, 0.5))
     # what is gripped already stays as it is: no change at 0.35
     assert traj.phases.freedoms[:7].tolist() == [7, 2, 7, 4, 4, 7, 6]
     assert float(traj.gaps.max()) < 1e-12
@@ -209,16 +226,17 @@ def test_grips_bound_during_a_run():
     assert int(svkc.mobility(chain, emptied).freedoms) == 7
 
 
-def test_no_slot_left():
+@pytest.mark.slow
+def test_no_slot_left(gripped):
     """Capacity exceeded: a code, the state of that moment, and the grip that was there still holds."""
-    chain = svkc.load(SPARE, spare=1)
-    events = [svkc.at(0.1, bind=svkc.Grip("arm", "ball")), svkc.at(0.2, bind=svkc.Grip("world", "ball"))]
-    traj = svkc.simulate(chain, chain.state({"arm": -0.9}), 0.5, events=events, throw=False)
+    _, _, run = gripped
+    times = (0.1, 9.0, 0.2, 9.0, 9.0, 9.0)
+    traj = run(times, throw=False)
     assert traj.result == svkc.RESULTS.no_slot
     assert float(traj.t_final) == 0.2
     assert traj.final.structure.connected.tolist() == [True]
     with pytest.raises(RuntimeError, match="every spare slot was taken"):
-        svkc.simulate(chain, chain.state({"arm": -0.9}), 0.5, events=events)
+        run(times)
 
 
 @pytest.mark.parametrize(

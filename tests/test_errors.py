@@ -270,6 +270,7 @@ def test_each_message(setting, opening):
     assert re.fullmatch(said.pattern(_row(opening)), " ".join(str(caught.value).split())), caught.value
 
 
+@pytest.mark.slow
 def test_inside_compiled_programs(setting):
     """What cannot be known while tracing is raised by the program."""
     assert sorted(said.COMPILED) == sorted(said.messages_of("error_if", 2))

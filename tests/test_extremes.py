@@ -9,6 +9,8 @@ import pytest
 
 import svkc
 
+pytestmark = pytest.mark.slow
+
 SPACE = '<mujoco><compiler balanceinertia="false" boundmass="0" boundinertia="0"/><option gravity="0 0 -9.81"/><worldbody>{}</worldbody></mujoco>'
 FINE = {"rtol": 1e-9, "atol": 1e-11}
 

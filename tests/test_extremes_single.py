@@ -12,6 +12,8 @@ from test_reference import n_four_bar
 
 import svkc
 
+pytestmark = pytest.mark.slow
+
 TIMES = np.linspace(0, 1, 11, dtype=np.float32)
 
 

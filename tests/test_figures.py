@@ -18,3 +18,15 @@ def test_a_long_floor_does_not_make_the_figure_small(tmp_path):
         return matplotlib.image.imread(svkc.render(chain, traj, tmp_path / f"{half}.png"))
 
     np.testing.assert_array_equal(drawn(4.0), drawn(40.0))
+
+
+def test_curves_have_what_a_run_has():
+    """Lines over the saved times, the axes named, an event marked."""
+    chain = svkc.load(models.MJCF.format(models.bar("arm", models.Y, "0 0 -1")))
+    traj = svkc.simulate(chain, chain.state({"arm": 0.5}), 0.1, ts=jnp.linspace(0, 0.1, 3), dt=0.05, events=[svkc.at(0.05)])
+    figure = svkc.plot(traj, chain)
+    for axes in figure.axes:
+        assert axes.get_ylabel()
+    lines = [line for axes in figure.axes for line in axes.lines]
+    assert any(np.array_equal(line.get_xdata(), traj.ts) and np.allclose(line.get_ydata(), traj.states.q[:, 0]) for line in lines)
+    assert any(np.allclose(line.get_xdata(), 0.05) for line in lines)

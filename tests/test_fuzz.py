@@ -28,6 +28,8 @@ from hypothesis import strategies as st
 
 import svkc
 
+pytestmark = pytest.mark.slow
+
 LONG = int(os.environ.get("SVKC_FUZZ", "0"))
 DOCUMENTED = [re.compile(said.pattern(row)) for row in said.ROWS]
 CALLS = {"count": 0, "raised": 0}

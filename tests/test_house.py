@@ -100,6 +100,7 @@ def test_every_public_name_says_what_it_is():
         assert thing.__doc__, name
 
 
+@pytest.mark.slow
 def test_readme_example_runs():
     code = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.S).group(1)
     done = run("-c", code)
@@ -139,6 +140,7 @@ def test_examples_are_all_here():
     assert {path.stem for path in (ROOT / "examples").glob("*.py")} == {*EXAMPLES, "08_mujoco_viewer"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_example_draws_its_picture(name, tmp_path):
     """From the command line, whole; under 80 lines; no library code: only public names."""
@@ -158,6 +160,7 @@ def test_example_draws_its_picture(name, tmp_path):
     _looks_drawn(tmp_path / f"{name}.png")
 
 
+@pytest.mark.slow
 def test_main_job(tmp_path):
     """python -m svkc: the table, the npz, the strobe and, where there is GL, the animation."""
     done = run("-m", "svkc", "--out", tmp_path)
@@ -181,6 +184,7 @@ def test_main_job(tmp_path):
             assert len(image.convert("RGB").getcolors(1 << 20)) > 10
 
 
+@pytest.mark.slow
 def test_the_swing_from_the_command_line(tmp_path):
     """python -m svkc swing: 30 joint freedoms and the swing's own, two fewer at the end."""
     done = run("-m", "svkc", "swing", "--out", tmp_path, optimized=False)
@@ -200,6 +204,7 @@ def _looks_drawn(path):
         assert len(image.convert("RGB").getcolors(1 << 22)) > 20
 
 
+@pytest.mark.slow
 def test_info(tmp_path):
     xml = '<mujoco><worldbody><body name="a"><joint name="j" frictionloss="1"/><geom size="0.1"/></body></worldbody></mujoco>'
     (tmp_path / "m.xml").write_text(xml)
@@ -225,7 +230,11 @@ def test_info(tmp_path):
     assert run("-m", "svkc", "info", tmp_path / "bad.xml").returncode == 1
 
 
-def test_pictures_say_what_they_cannot_draw(high_bar, tmp_path, monkeypatch):
+ROD = """<mujoco><worldbody><light pos="0 0 5"/>{}
+  <body name="rod"><joint axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0.3 0.2 -1" size="0.05"/></body></worldbody></mujoco>"""
+
+
+def test_pictures_say_what_they_cannot_draw(tmp_path, monkeypatch):
     """Another ending; a machine without GL, as Python would see it."""
     import importlib
 
@@ -238,13 +247,14 @@ def test_pictures_say_what_they_cannot_draw(high_bar, tmp_path, monkeypatch):
             raise ImportError(name)
         return plain(name, *where)
 
-    traj = svkc.simulate(*high_bar, 0.0)
+    chain = svkc.load(ROD.format(""))
+    traj = svkc.simulate(chain, chain.state(), 0.1, ts=[0.0, 0.05, 0.1])
     with monkeypatch.context() as patch:
         patch.setattr(importlib, "import_module", missing)
         with pytest.raises(RuntimeError, match="libegl1 libgl1"):
-            svkc.render(high_bar[0], traj, tmp_path / "x.gif")
+            svkc.render(chain, traj, tmp_path / "x.gif")
     with pytest.raises(ValueError, match=r"\.png, \.gif, \.mp4 or \.html"):
-        svkc.render(high_bar[0], traj, tmp_path / "x.bmp")
+        svkc.render(chain, traj, tmp_path / "x.bmp")
 
 
 def test_cameras(tmp_path):
@@ -254,8 +264,7 @@ def test_cameras(tmp_path):
     import svkc
 
     camera = '<camera name="above" pos="0 -1 4" xyaxes="1 0 0 0 1 0"/>'
-    body = '<body name="rod"><joint axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0.3 0.2 -1" size="0.05"/></body>'
-    chain = svkc.load(f"<mujoco><worldbody><light pos='0 0 5'/>{camera}{body}</worldbody></mujoco>")
+    chain = svkc.load(ROD.format(camera))
     traj, seen = svkc.simulate(chain, chain.state(), 0.1, ts=[0.0, 0.05, 0.1]), set()
     ways = {"camera": "above"}, {"lookat": (0, 0, -0.5)}, {"lookat": (0, 0, -0.5), "distance": 6.0}, {"azimuth": 20.0, "elevation": -60.0}
     for i, way in enumerate(ways):

@@ -26,7 +26,7 @@ XML = """<mujoco><worldbody><body name="a" pos="0 0 1"><joint name="a" axis="0 1
 <equality><weld name="w" body1="a" body2="b" active="false"/></equality></mujoco>"""
 
 
-@pytest.mark.parametrize("cuttable", [(), "c"])
+@pytest.mark.parametrize("cuttable", [(), pytest.param("c", marks=pytest.mark.slow)])
 def test_there_and_back(cuttable):
     """MuJoCo puts the bodies where svkc has them and moves them so; with a joint that may be cut as well; <equality> as they hold."""
     chain, rng = svkc.load(XML, cuttable=cuttable), np.random.default_rng(0)
@@ -120,7 +120,8 @@ def residual(chain, state):
     return np.abs(gaps).max()
 
 
-@pytest.mark.parametrize("scene", SCENES)
+# (of the spec is the same chain as of the weld)
+@pytest.mark.parametrize("scene", [scene if scene in ("weld", "spec") else pytest.param(scene, marks=pytest.mark.slow) for scene in SCENES])
 def test_a_scene_as_mjcf_and_back(scene):
     """The same bodies, joints, links, masses to the last digit; the same loops and motion; MuJoCo finds the loops closed."""
     chain, how = SCENES[scene]()
@@ -186,6 +187,7 @@ def test_a_compiled_model_has_no_text():
 VIEWER = pathlib.Path(__file__).parent.parent / "examples" / "08_mujoco_viewer.py"
 
 
+@pytest.mark.slow
 def test_the_viewer_without_a_display():
     """Says so, and is no failure."""
     if not sys.platform.startswith("linux"):
@@ -195,6 +197,7 @@ def test_the_viewer_without_a_display():
     assert (done.returncode, done.stdout) == (0, "no display to open a window on\n"), done.stderr
 
 
+@pytest.mark.slow
 def test_the_viewer_is_shown_every_state(monkeypatch, capsys):
     """The example as it stands, but for the window: what a window would draw is where svkc has the bodies, at each saved time."""
     glfw, shown = pytest.importorskip("glfw"), []

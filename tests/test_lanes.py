@@ -35,6 +35,7 @@ def several(x, y, which):
     return parts.at[which].add(1.0), (more[::-1], jnp.argmax(x, 0), jnp.any(x > y), count), jnp.float32(1.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 5, rules.TILE, rules.TILE + 3])
 def test_every_rule(count):
     x, y = jax.random.normal(KEY, (2, count, 3, 3))
@@ -42,7 +43,7 @@ def test_every_rule(count):
     one = rules.with_lanes_last(several)
     for axes in ((0, 0, 0), (0, None, None), (None, 0, 0), (0, 0, None)):
         args = [value if axis == 0 else value[0] for value, axis in zip((x, y, which), axes, strict=True)]
-        for expected, got in zip(jax.tree.leaves(jax.vmap(several, axes)(*args)), jax.tree.leaves(jax.jit(jax.vmap(one, axes))(*args)), strict=True):
+        for expected, got in zip(jax.tree.leaves(jax.jit(jax.vmap(several, axes))(*args)), jax.tree.leaves(jax.jit(jax.vmap(one, axes))(*args)), strict=True):
             np.testing.assert_allclose(got, expected, rtol=1e-13, atol=1e-13)
             assert got.dtype == expected.dtype
 
@@ -69,6 +70,7 @@ def test_no_operation_of_a_step_goes_the_other_way(monkeypatch):
     assert not seen
 
 
+@pytest.mark.slow
 def test_a_step_in_every_transformation():
     """Lanes of lanes, and derivatives of lanes and by them, are those of one at a time."""
     chain = models.four_bar()
@@ -85,6 +87,7 @@ def test_a_step_in_every_transformation():
     assert svkc.check_grad(lambda tau: jnp.sum(v(tau) ** 2), tau[0, 0]).error < 1e-8
 
 
+@pytest.mark.slow
 def test_runs_by_articulated_bodies():
     """A batch of runs in which every lane differs, its accelerations and its way back onto the loops lanes last: its single runs."""
     chain = models.four_bar()

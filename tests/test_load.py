@@ -124,6 +124,7 @@ INERTIA = MASS / 80 * np.array([[3 * 0.2, 0.06, 0.12], [0.06, 3 * 0.25, 0.08], [
 INERTIA[np.diag_indices(3)] = MASS * 3 / 80 * np.array([0.2**2 + 0.4**2, 0.3**2 + 0.4**2, 0.3**2 + 0.2**2])
 
 
+@pytest.mark.slow
 def test_mesh_include_and_defaults(tmp_path):
     """A scene of two files: classes of defaults, a mesh in a folder of its own, a weld; and the text made of it, which is read anywhere."""
     (tmp_path / "parts" / "shapes").mkdir(parents=True)
@@ -191,6 +192,7 @@ def test_urdf_with_a_mesh(tmp_path, written, stands):
         np.testing.assert_allclose(chain.limit[:, 0], [-1, 1])
 
 
+@pytest.mark.slow
 def test_a_scene_written_in_python():
     """A five-bar as mujoco.MjSpec, part of it attached from another, its loop a virtual link; the spec stays the caller's own."""
 
@@ -221,6 +223,7 @@ def test_a_scene_written_in_python():
     assert svkc.load(chain.to_mjcf()).body_names == chain.body_names
 
 
+@pytest.mark.slow
 def test_the_example_of_the_gallery_runs():
     page = (ROOT / "docs" / "gallery.md").read_text()
     code, names = re.search(r"```python\n(.*?)```", page, re.S).group(1), {"print": lambda x: None}
@@ -230,6 +233,7 @@ def test_the_example_of_the_gallery_runs():
         assert (ROOT / "docs" / picture).stat().st_size < 150_000
 
 
+@pytest.mark.slow
 def test_a_robot_of_others():
     """Minitaur's URDF, loops as virtual links: balls find its axes parallel to five digits only, balls that slide along them leave each leg its two motors."""
     feet = {}

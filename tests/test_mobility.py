@@ -18,7 +18,7 @@ OVERCONSTRAINED = {
 }
 
 
-@pytest.fixture(params=OVERCONSTRAINED, scope="module")
+@pytest.fixture(params=["bricard", *(pytest.param(name, marks=pytest.mark.slow) for name in OVERCONSTRAINED if name != "bricard")], scope="module")
 def linkage(request):
     make, joints, rank, counted = OVERCONSTRAINED[request.param]
     chain = make()
@@ -68,6 +68,7 @@ def test_the_table_names_things():
         svkc.prefer(chain, state, "leg9")
 
 
+@pytest.mark.slow
 def test_loop_forces_are_the_multipliers():
     """Against numpy's multipliers of the same rows: equal where unique, of least norm and said not to be unique where not."""
     for make, unique in ((models.rod_on_balls, [True]), (models.stewart, [True] * 5), (models.four_bar, [False]), (models.parallelogram, [False, False])):

@@ -64,6 +64,7 @@ def smaller(picture):
     return base64.b64encode(file.getvalue()).decode()
 
 
+@pytest.mark.slow
 def test_the_tour_runs_and_prints_what_is_stored():
     stored = nbformat.read(TOUR, 4)
     fresh, (python, package) = executed()
@@ -82,6 +83,7 @@ def test_the_tour_runs_and_prints_what_is_stored():
     assert sum(map(drawn, stored.cells)) == 3
 
 
+@pytest.mark.slow
 def test_the_tour_is_small_and_says_nothing_of_a_machine():
     text = TOUR.read_text()
     assert len(text) < 300_000

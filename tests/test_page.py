@@ -121,6 +121,7 @@ def number(page, name):
     return float(page.inner_text(f"#{name}").split()[0])
 
 
+@pytest.mark.slow
 def test_the_file_has_everything_in_it(release, tmp_path):
     chain, traj = release
     path = svkc.render(chain, traj, tmp_path / "run.html")
@@ -149,6 +150,7 @@ def test_the_file_has_everything_in_it(release, tmp_path):
     np.testing.assert_allclose(x + R @ there, at, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_ten_seconds_are_below_five_megabytes(release, tmp_path):
     """At 40 saved times a second."""
     chain, traj = release
@@ -168,6 +170,7 @@ def test_names_stay_names(pendulum, tmp_path):
     assert "<title>a &lt;b&gt; &amp; c</title>" in path.read_text()
 
 
+@pytest.mark.slow
 def test_a_run_that_stopped_ends_where_it_did(stopped, tmp_path):
     """Times asked for past the end are left out, what the last event made is there, what is no number is null."""
     chain, traj = stopped
@@ -220,6 +223,7 @@ def test_nothing_of_it_is_read_before_it_is_asked_for():
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_it_plays_and_goes_through_time(release, visit, tmp_path):
     """The numbers at every time are the trajectory's."""
     chain, traj = release
@@ -273,6 +277,7 @@ def test_it_plays_and_goes_through_time(release, visit, tmp_path):
     assert page.evaluate("svkc.time") == paused < 0.5
 
 
+@pytest.mark.slow
 def test_events_are_marked(release, visit, tmp_path):
     """A mark says what happened, leads there, and the links that hold are drawn until then."""
     page = visit(svkc.render(*release, tmp_path / "run.html"))
@@ -300,6 +305,7 @@ def test_events_are_marked(release, visit, tmp_path):
     assert red() == 0
 
 
+@pytest.mark.slow
 def test_energy_jumps_where_a_link_is_connected(stopped, visit, tmp_path):
     """Between saved times too, numbers are those of one phase."""
     chain, traj = stopped
@@ -320,6 +326,7 @@ def test_energy_jumps_where_a_link_is_connected(stopped, visit, tmp_path):
     assert page.evaluate("[...svkc.holds.values()].filter(([ball]) => ball.visible).length") == 0
 
 
+@pytest.mark.slow
 def test_the_camera_turns_and_everything_is_seen(release, visit, tmp_path):
     """Also in a narrow window, and after its size changed."""
     path = svkc.render(*release, tmp_path / "run.html")
@@ -346,6 +353,7 @@ def test_the_camera_turns_and_everything_is_seen(release, visit, tmp_path):
     assert narrow.evaluate(corners) < 1
 
 
+@pytest.mark.slow
 def test_every_kind_of_geom_is_drawn(visit, tmp_path):
     page = visit(svkc.render(*kinds(), tmp_path / "kinds.html"))
     whole = picture(page)
@@ -357,6 +365,7 @@ def test_every_kind_of_geom_is_drawn(visit, tmp_path):
         page.evaluate(show, True)
 
 
+@pytest.mark.slow
 def test_names_stay_names_in_the_browser(pendulum, visit, tmp_path):
     """And a run of one moment can be looked at."""
     chain = pendulum
@@ -370,6 +379,7 @@ def test_names_stay_names_in_the_browser(pendulum, visit, tmp_path):
     assert len(np.unique(picture(page).reshape(-1, 3), axis=0)) > 50
 
 
+@pytest.mark.slow
 def test_a_notebook_shows_it(release, visit, tmp_path):
     """As a frame in its own document."""
     shown = svkc.page.show(*release, height=400)

@@ -86,6 +86,7 @@ SERIAL = """<mujoco><option gravity="0 -9.81 0"/><worldbody><body name="link1" p
   <geom type="capsule" fromto="0 -1 0 0 0 0" size="0.03" mass="1.0" contype="0"/></body></body></worldbody></mujoco>"""
 
 
+@pytest.mark.slow
 def test_attached_in_flight_it_is_the_serial_chain(links):
     """Fig. 13: flight, the tip pinned to the ground as it passes, then the motion of the serial two-joint chain for 5 s, to 1e-9."""
     chain, _ = links
@@ -119,6 +120,7 @@ FREE_TOP = (
 )
 
 
+@pytest.mark.slow
 def test_rodrigues_euler_is_of_first_order():
     """(39)-(44) on a tumbling free top: halving the step halves the error of orientation and velocity."""
     chain = svkc.load(FREE_TOP)
@@ -132,6 +134,7 @@ def test_rodrigues_euler_is_of_first_order():
     assert np.all((ratios > 1.85) & (ratios < 2.15)), ratios
 
 
+@pytest.mark.slow
 def test_rodrigues_euler_keeps_quaternions_at_unit_length():
     """1e5 steps of a tumbling top: the length is one to round-off at the end, and Rodrigues' formula by itself loses no more than adds up of round-off."""
     chain = svkc.load(FREE_TOP)
@@ -153,6 +156,7 @@ def benchmark():
     return module
 
 
+@pytest.mark.slow
 def test_the_figure_of_40_freedoms(benchmark):
     """Fig. 16: 17 links, 4 hinges, 12 balls; as 41 links of one freedom it moves the same."""
     spec, balls = benchmark.hinges_for_balls()
@@ -166,6 +170,7 @@ def test_the_figure_of_40_freedoms(benchmark):
     np.testing.assert_allclose(places[0], places[1], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_rodrigues_euler_on_the_figure():
     """Balls in a tree, two of them virtual: first order, loops closed, unit quaternions."""
     chain = models.figure40()

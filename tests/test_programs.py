@@ -9,6 +9,8 @@ import pytest
 
 import svkc
 
+pytestmark = pytest.mark.slow
+
 BODIES = {"dynamics": svkc.Dynamics(inertia=svkc.by_bodies)}
 
 

@@ -69,6 +69,7 @@ def test_optax_moves_a_state(four_bar):
     assert loss(eqx.filter(after, eqx.is_inexact_array)) < loss(free)
 
 
+@pytest.mark.slow
 def test_optimistix_finds_a_throw():
     """A root through a whole run, over a State: the rate with which a hanging rod must begin to be level at 0.4 s."""
     chain = svkc.load(models.MJCF.format(ROD))
@@ -80,6 +81,7 @@ def test_optimistix_finds_a_throw():
     assert 1 < float(found.value.v[0]) < 20
 
 
+@pytest.mark.slow
 def test_optimistix_finds_where_a_chain_rests():
     """The least of the potential energy over a State; there nothing accelerates."""
     chain = svkc.load(models.MJCF.format(models.bar("upper", models.Y, "0 0 -1", inside=models.bar("lower", models.Y, "0 0 -1", "0 0 -1"))))
@@ -91,6 +93,7 @@ def test_optimistix_finds_where_a_chain_rests():
     assert energy(found.value, None) < energy(free, None)
 
 
+@pytest.mark.slow
 def test_optimistix_finds_masses(four_bar):
     """Least squares over a Chain: masses that explain the torques measured."""
     chain, _, state = four_bar

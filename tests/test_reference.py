@@ -75,7 +75,7 @@ def n_four_bar(windows):
     return problem | {"bodies": bodies, "joints": joints}
 
 
-@pytest.mark.parametrize("windows", [1, 2, 5])
+@pytest.mark.parametrize("windows", [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(5, marks=pytest.mark.slow)])
 def test_n_four_bar_through_its_singular_configurations(windows):
     """10 s, two windows 20 s, some forty times through configurations where the rank drops: angle, energy, loops; coordinates are swapped."""
     case = next(case for case in given("n_four_bar")["cases"] if case["N"] == windows)
@@ -105,6 +105,7 @@ def forty_windows():
     assert np.max(traj.gaps) < 1e-12
 
 
+@pytest.mark.slow
 def test_n_four_bar_of_forty_windows():
     """In a process of its own, whose programs are optimized: otherwise it takes eight minutes."""
     flags = os.environ["XLA_FLAGS"].replace("--xla_backend_optimization_level=0", "")
@@ -142,6 +143,7 @@ def springs(chain, problem):
     return control
 
 
+@pytest.mark.slow
 def test_andrews_mechanism():
     """Every angle and rate over 0.05 s; at 0.03 s the digits that are published, to 1e-8."""
     reference = given("andrews")
@@ -163,6 +165,7 @@ def test_andrews_mechanism():
         assert rate[there] == pytest.approx(float(reference["at_0p03"]["v"][i]), rel=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", given("slider_crank_3d")["variants"], ids=lambda variant: variant["name"])
 def test_slider_crank_3d(variant):
     chain, state = maximal.load(variant["problem"])
@@ -171,6 +174,7 @@ def test_slider_crank_3d(variant):
     np.testing.assert_allclose(traj.states.v[:, chain.dof_names.index("slider")], variant["slider_v"], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_rssr_does_not_notice_its_idle_spin():
     """A coupler that spins at 200 rad/s about itself: crank and rocker as with one at rest."""
     found = []
@@ -190,6 +194,7 @@ CART = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("number", "tolerance", "error"), [(0, 1e-11, 1e-8), (1, 1e-13, 1e-10), (2, 1e-9, 1e-5)])
 def test_light_cartpole(number, tolerance, error):
     """A cart of 1e-6, 1e-3, 1e-9 of its pole: rates of 4e3, 1e2, 1e5 rad/s in each swing."""
@@ -200,6 +205,7 @@ def test_light_cartpole(number, tolerance, error):
     np.testing.assert_allclose(traj.states.q[:, 1], case["theta"], atol=error)
 
 
+@pytest.mark.slow
 def test_slider_crank_with_gradients():
     """SUNDIALS' own example: the path, the integral of the kinetic energy, and its derivatives by the spring and the damper."""
     reference = given("sundials_slider_crank")
@@ -246,6 +252,7 @@ def test_slider_crank_with_gradients():
     np.testing.assert_allclose(slope, [wanted["dG_dk"], wanted["dG_dc"]], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_two_rods_latched():
     """Velocities after a hinge and after a weld, momenta and kinetic energy: the closed form."""
     case = given("events")["latch_two_rods"]
@@ -263,6 +270,7 @@ def test_two_rods_latched():
         np.testing.assert_allclose([*linear[:2], angular[2]], case["momenta_before"], atol=1e-14)
 
 
+@pytest.mark.slow
 def test_pendulum_released():
     """A rod comes off its pin at an angle and flies: the time, the rate, and the path of both parts."""
     case = given("events")["pendulum_release"]
@@ -281,6 +289,7 @@ def test_pendulum_released():
     np.testing.assert_allclose(*turned_alike(quat[:, [0, 3]], half), atol=1e-11)
 
 
+@pytest.mark.slow
 def test_simple_pendulum_for_a_long_time():
     """IFToMM A01: a point mass on a rod without mass, from the level, 42 periods and more."""
     case = given("events")["a01_simple_pendulum"]
@@ -292,6 +301,7 @@ def test_simple_pendulum_for_a_long_time():
     np.testing.assert_allclose(found, case["xy"][: len(ts)], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_an_elbow_that_locks():
     """Rate, angular momentum and kinetic energy of a double pendulum whose elbow is locked in full swing: the closed form."""
     case = given("events")["joint_lock"]
@@ -307,6 +317,7 @@ def test_an_elbow_that_locks():
         assert float((svkc.mass_matrix(chain, state) @ state.v)[0]) == pytest.approx(case["angular_momentum"], rel=1e-14)
 
 
+@pytest.mark.slow
 def test_a_ball_that_bounces_ever_faster():
     """Impacts are plastic here; one with restitution is a run that ends, a velocity put in by hand, and the next run: 25 of them, towards a last instant."""
     case = given("events")["bouncing_ball_zeno"]

@@ -83,10 +83,16 @@ def test_lanes_are_those_of_single_runs(case, alone, capsys):
     traj = call(*case, chunk=4, cost=-np.arange(LANES) % 3)
     agrees(traj, alone)
     assert "3 of 3 chunks (11 lanes)" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_all_lanes_at_once(case, alone, capsys):
+    """In one chunk, and without a word."""
     agrees(call(*case, progress=False), alone)
     assert capsys.readouterr().err == ""
 
 
+@pytest.mark.slow
 def test_chunks_fit_into_memory(case, alone, capsys, monkeypatch):
     """Where little memory is free the default chunk is smaller, and never nothing."""
     module, states = sys.modules["svkc.rollout"], case[1]
@@ -99,6 +105,7 @@ def test_chunks_fit_into_memory(case, alone, capsys, monkeypatch):
     assert module._fitting(states, None, jax.local_devices()) == 1
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_goes_on(case, alone, tmp_path, monkeypatch):
     chain, states, data = case
     asked = []
@@ -146,6 +153,7 @@ def start(count, out, dies=""):
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [2, 4])
 def test_several_processes(alone, tmp_path, count):
     """Each takes its share, all have the whole."""
@@ -159,6 +167,7 @@ def test_several_processes(alone, tmp_path, count):
     assert len(list(tmp_path.glob("chunk_*.npz"))) == 6
 
 
+@pytest.mark.slow
 def test_a_killed_process(case, alone, tmp_path):
     """The other one ends and says why; what is finished stays, and the next run goes on from it."""
     other, killed = start(2, tmp_path, dies="1")

@@ -21,6 +21,7 @@ def today():
     return svkc.simulate(chain, chain.state({"pivot": 1.2}), 0.3, ts=jnp.linspace(0, 0.3, 4), dt=0.01, events=events)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("schema", [1, 2, 3])
 def test_older_files_are_read(schema, today, tmp_path):
     """With the numbers that they have; what was not kept then is told as not known; saved again they are as any other."""

@@ -20,6 +20,7 @@ def tilted(angle):
     return svkc.load(models.MJCF.format(models.FOUR_BAR), virtual_links=[pin])
 
 
+@pytest.mark.slow
 def test_nearly_redundant_loops():
     """Tilted by 1e-8 rad a pin's rows still count as redundant, and the bars go round; by 1e-6 they do not, and nothing moves: the margin tells."""
     run = eqx.filter_jit(lambda chain, state: svkc.simulate(chain, state, 1.0, **FINE))
@@ -38,6 +39,7 @@ def test_nearly_redundant_loops():
     assert abs(ends[1e-6]) < 1e-12
 
 
+@pytest.mark.slow
 def test_a_wrong_rank_is_seen():
     """Too low, a loop opens and the run stops there; too high, the margin is round-off."""
     chain = models.four_bar()
@@ -56,6 +58,7 @@ def test_a_wrong_rank_is_seen():
     assert high.derivative == svkc.RESULTS.rank_lost
 
 
+@pytest.mark.slow
 def test_loops_that_allow_only_the_first_order():
     """The pelvis turned on the swing's seat: two parallel slides allow the rate, not the turn. The run stops as they open, and names one of them."""
     from svkc.scenes.swing import swing
@@ -66,6 +69,7 @@ def test_loops_that_allow_only_the_first_order():
         svkc.simulate(chain, state, 0.03)
 
 
+@pytest.mark.slow
 def test_a_loop_of_no_length():
     """A second pin on a hinge that is there already takes nothing away."""
     rods = models.bar("upper", models.Y, "0 0 -1", inside=models.bar("lower", models.Y, "0 0 -0.8", "0 0 -1"))
@@ -78,6 +82,7 @@ def test_a_loop_of_no_length():
     np.testing.assert_allclose(one.final.q[:2], other.final.q, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_loop_that_locks():
     """A crank longer than its rod reaches no further than a dead centre, where the coordinate that drove it stands still: it turns back there, with all
     its energy, on other coordinates."""
@@ -97,6 +102,7 @@ def test_a_loop_that_locks():
     assert int(traj.report().swaps) > 0
 
 
+@pytest.mark.slow
 def test_without_pivots_a_singular_configuration_may_end_the_run():
     """A slider-crank of equal bars whose slider weighs nothing: as the bars align, nothing but the choice of pivots tells where it goes."""
     bar = '<body name="{0}" pos="{1} 0 0"><joint name="{0}" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 1 0 0" size="0.02"/>'
@@ -112,6 +118,7 @@ def test_without_pivots_a_singular_configuration_may_end_the_run():
         assert abs(float(traj.report().energy_drift)) < 2e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("before", [1e-2, 1e-4, 1e-6, 0.0])
 def test_started_beside_a_singular_configuration(before):
     """The N four-bar as its bars align, or nearly: it goes on as the parallelogram that it moves as, the direction of its velocity kept."""

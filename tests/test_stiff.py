@@ -9,6 +9,8 @@ from scipy.integrate import solve_ivp
 
 import svkc
 
+pytestmark = pytest.mark.slow
+
 STIFFNESS, DAMPING, START = 8e5, 4e4, np.pi / 6
 BALL, OWN, SLIDER, TURNING, GRAVITY = 5.0, 0.02, 1.0, 0.1, 9.81
 ARM = '<body name="{0}" pos="0 0 1"><joint name="{0}" axis="0 {1} 0"/><inertial pos="0 0 -1" mass="5" diaginertia="0.02 0.02 0.02"/></body>'

@@ -12,7 +12,6 @@ import pytest
 
 import svkc
 from svkc.forward_dynamics import acceleration, forward_dynamics_by_unit_vectors
-from svkc.inverse_dynamics import inertia_by_composites, inertia_by_unit_vectors
 from svkc.kinematics import kinematics, rates
 
 ASSETS = pathlib.Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
@@ -32,7 +31,11 @@ SOURCES = {name: str(ASSETS / f"{name}.xml") for name in ("humanoid", "ant", "ha
 SOURCES |= {f"random_{n}": models.random_tree(n, seed=n) for n in (2, 7, 25, 60)} | {"urdf": URDF, "figure40": str(svkc.scenes.FOLDER / "figure40.xml")}
 
 
-@pytest.fixture(params=SOURCES, scope="module")
+# of each kind one, in the fast tier: a tree of everything, a figure of others, a URDF
+FAST = ("random_7", "hopper", "urdf")
+
+
+@pytest.fixture(params=[name if name in FAST else pytest.param(name, marks=pytest.mark.slow) for name in SOURCES], scope="module")
 def run(request):
     """A chain, MuJoCo's data without constraints, and eight states along MuJoCo's own motion with random torques."""
     chain = svkc.load(SOURCES[request.param])
@@ -59,10 +62,10 @@ def everything(chain, state, tau):
     vdot = svkc.forward_dynamics(chain, state, tau)
     return {
         "position": position, "quat": quat, "linear": linear, "angular": angular,
-        "mass": svkc.mass_matrix(chain, state), "mass by unit vectors": inertia_by_unit_vectors(chain, kin),
+        "mass": svkc.mass_matrix(chain, state), "mass by unit vectors": svkc.inertia_by_unit_vectors(chain, kin),
         "bias": svkc.bias_force(chain, state), "acceleration": vdot,
         "acceleration by unit vectors": forward_dynamics_by_unit_vectors(chain, state, tau),
-        "acceleration by composites": acceleration(chain, state.structure, state.q, state.v, tau, inertia_by_composites),
+        "acceleration by composites": acceleration(chain, state.structure, state.q, state.v, tau, svkc.inertia_by_composites),
         "inverse": svkc.inverse_dynamics(chain, state, vdot), "kinetic": svkc.kinetic_energy(chain, state),
         "power": jax.jvp(
             lambda q, v: svkc.energy(chain, svkc.State(q, v, state.structure)), (state.q, state.v), (rates(chain, state.q, state.v), vdot)
@@ -136,6 +139,7 @@ def test_open_chain_has_nothing_of_the_closure():
     assert text.count("custom_linear_solve[") == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("twigs", [0, 1, 6])
 def test_deep_chain_agrees_with_mujoco(twigs):
     """40 levels, past the depth that is unrolled: a chain, one with a twig on every third link, one with a ball and as many twigs there as make it wide."""
@@ -158,6 +162,7 @@ def test_deep_chain_agrees_with_mujoco(twigs):
     np.testing.assert_allclose(vdot, by_composites, rtol=1e-9, atol=1e-10 * np.abs(data.qacc).max())
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_deep_chain():
     """Forward and reverse against differences, through loops over levels."""
     xml = ""
