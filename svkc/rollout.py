@@ -1,5 +1,6 @@
 """F7: many runs at once: lanes dealt to chunks, chunks to processes and devices, finished chunks kept."""
 
+import dataclasses
 import functools
 import hashlib
 import json
@@ -18,6 +19,8 @@ from jax.sharding import Mesh, PartitionSpec
 
 from svkc.archive import load_trajectory
 from svkc.chain import Chain, State
+from svkc.events import When, listed
+from svkc.functions import shared
 from svkc.given import finite, function, one, whole
 from svkc.replay import Replay
 from svkc.simulate import simulate
@@ -58,8 +61,8 @@ def rollout(
     chunks = [np.pad(order[i : i + size], (0, max(0, i + size - lanes)), mode="edge") for i in range(0, lanes, size)]
     if len(chunks) < jax.process_count():
         raise ValueError(f"states: {lanes} lanes are {len(chunks)} chunks, too few for {jax.process_count()} processes; start fewer, or give fewer devices")
-    common = chain, jnp.asarray(t1, states.q.dtype), {"throw": False, "adjoint": Replay(every=1 << 30), **options}
-    run = functools.partial(_piece, common, lane=lane, mesh=Mesh(np.array(devices), ("lanes",)))
+    common = chain, jnp.asarray(t1, states.q.dtype), {"throw": False, "adjoint": Replay(every=1 << 30), **options}, listed(options.get("events", ()))
+    run = functools.partial(_shared, common, lane, Mesh(np.array(devices), ("lanes",)))
     folder = None if out is None else _folder(pathlib.Path(out), (chain, states, t1, data, order, options), size)
     mine = range(jax.process_index(), len(chunks), jax.process_count())
     done, begun = {}, time.perf_counter()
@@ -105,13 +108,29 @@ def _free_memory(device) -> float:
         return np.inf
 
 
+def _shared(common, lane: Callable | None, mesh: Mesh, lanes) -> Trajectory:
+    """The run of one chunk, by a program that new function objects share."""
+    chain, t1, options, events = common
+    guards = [i for i, event in enumerate(events) if isinstance(event, When)]
+
+    def run(lane, control, *given):
+        watched = list(events)
+        for i, guard in zip(guards, given, strict=True):
+            watched[i] = dataclasses.replace(events[i], guard=guard)
+        return _piece((chain, t1, {**options, "events": watched, "control": control}, lane), lanes, mesh)
+
+    functions = [("lane", lane), ("control", options.get("control")), *(("guard of when(...)", events[i].guard) for i in guards)]
+    others = {name: x for name, x in options.items() if name not in ("events", "control")}
+    return shared(run, functions, (chain, t1, others, [dataclasses.replace(e, guard=callable) if isinstance(e, When) else e for e in events], lanes, mesh))
+
+
 @eqx.filter_jit
-def _piece(common, lanes, lane: Callable | None, mesh: Mesh) -> Trajectory:
+def _piece(common, lanes, mesh: Mesh) -> Trajectory:
     """The run of one chunk: a piece for each device, without a word between them, so that none waits for another's steps."""
     fixed, static = eqx.partition(common, eqx.is_array)
 
     def one(fixed, state, data):
-        chain, t1, options = eqx.combine(fixed, static)
+        chain, t1, options, lane = eqx.combine(fixed, static)
         own = {} if lane is None else lane(chain, data)
         if not isinstance(own, dict):
             raise ValueError(f"lane: expected a dict of arguments of simulate from it, got {own!r}")

@@ -18,6 +18,7 @@ from svkc.binding import emptied, grip
 from svkc.chain import Chain, State, Structure
 from svkc.closure import largest_gaps
 from svkc.events import Plan
+from svkc.functions import shared
 from svkc.guards import Sensor
 from svkc.location import Reading, event_tolerance
 from svkc.operation import Closed
@@ -51,7 +52,13 @@ def simulate(
         max_steps, progress_meter,
     )  # fmt: skip
     dtype = state.q.dtype
-    traj = _run(chain, state, jnp.asarray(t0, dtype), jnp.asarray(t1, dtype), save_at, made, options, args)
+    given = chain, state, jnp.asarray(t0, dtype), jnp.asarray(t1, dtype), save_at
+
+    def run(control, *guards):
+        return _run(*given, _with(made, guards=guards), _with(options, control=control), args)
+
+    functions = [("control", options.control), *(("guard of when(...)", guard) for guard in made.guards)]
+    traj = shared(run, functions, (given, _with(made, guards=()), _with(options, control=None), args))
     if not throw:
         return traj
     failed = (traj.result != RESULTS.successful) & (traj.result != RESULTS.stopped)
@@ -93,8 +100,11 @@ def _converted(chain: Chain, state: State, t0, made: Plan, options: Options, arg
         return fn if fn is None or isinstance(fn, Sensor) else Closed.over(fn, t0, state, args)
 
     guards, control = tuple(converted(g) for g in made.guards), converted(options.control)
-    fresh = lambda node, name, value: dataclasses.replace(node, **{name: value})
-    return fresh(made, "guards", guards), fresh(options, "control", control)
+    return _with(made, guards=guards), _with(options, control=control)
+
+
+def _with(node, **changed):
+    return dataclasses.replace(node, **changed)
 
 
 def _lockable(chain: Chain, state: State, made: Plan) -> State:
