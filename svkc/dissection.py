@@ -177,7 +177,7 @@ class Reader:
             return fixed(key, x)
 
         def make(making: Making):
-            new = making.made[number] = kind() if isinstance(x, types.SimpleNamespace) else object.__new__(kind)
+            new = making.made[number] = kind() if issubclass(kind, types.SimpleNamespace) else object.__new__(kind)
             for name, part in parts.items():
                 object.__setattr__(new, name, part.make(making))
             return new
