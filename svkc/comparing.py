@@ -9,7 +9,7 @@ import sys
 import sysconfig
 import types
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 # what libraries bring does not change between two calls; svkc is one of them, wherever its sources are
 _PATHS = {sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")} | {*site.getsitepackages(), site.getusersitepackages()}
@@ -105,7 +105,13 @@ class Kept:
 
 
 class IncomparableError(Exception):
-    """Something that is neither data nor compared by its content; the thing is its argument."""
+    """Something that is neither data nor compared by its content; the thing is its argument. It does not reach the caller of a run."""
+
+
+def refuse(thing) -> NoReturn:
+    """Raises `IncomparableError`."""
+    error = IncomparableError(thing)
+    raise error
 
 
 def attributes(thing) -> dict[str, Any]:
@@ -114,12 +120,12 @@ def attributes(thing) -> dict[str, Any]:
     if isinstance(thing, types.ModuleType | type | types.SimpleNamespace):
         return dict(vars(thing))
     if any(getattr(kind, name) is not getattr(object, name) for name in ("__reduce_ex__", "__reduce__", "__getstate__")):
-        raise IncomparableError(thing)
+        refuse(thing)
     try:
         # pickle's own question, which refuses what keeps anything elsewhere
         state = thing.__reduce_ex__(2)[2]
-    except TypeError as error:
-        raise IncomparableError(thing) from error
+    except TypeError:
+        refuse(thing)
     return {name: x for part in (state if isinstance(state, tuple) else (state,)) for name, x in (part or {}).items()}
 
 

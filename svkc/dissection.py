@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from svkc.comparing import CHANGING, IncomparableError, Kept, Same, at_home, attributes, content, facts, from_library, of_library, written
+from svkc.comparing import CHANGING, IncomparableError, Kept, Same, at_home, attributes, content, facts, from_library, of_library, refuse, written
 from svkc.parts import Making, Part, Slot, by_content, fixed, is_data, joined, put_together
 
 PLAIN = (type(None), bool, int, str, bytes, range, type(...), type(NotImplemented))
@@ -84,7 +84,7 @@ class Reader:
     def _array(self, x) -> Part:
         if isinstance(x, jax.core.Tracer):
             if self.whole:
-                raise IncomparableError(x)
+                refuse(x)
         # (whole numbers of numpy are sizes and indices, which Python needs to know)
         elif self.whole or not self.as_data or (isinstance(x, np.ndarray) and not is_data(x)):
             return fixed(by_content(x), x)
@@ -229,13 +229,13 @@ class Reader:
         if kind is object or isinstance(x, jax.Device | enum.Enum):
             return fixed(Same(x), x)
         if kind.__hash__ in (None, object.__hash__):
-            raise IncomparableError(x)
+            refuse(x)
         return fixed((kind, x), x)
 
 
 def _filled(cell: types.CellType, f: types.FunctionType):
     try:
         return cell.cell_contents
-    except ValueError as error:
+    except ValueError:
         # it may be anything when the function is called
-        raise IncomparableError(f) from error
+        refuse(f)

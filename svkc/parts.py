@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from svkc.comparing import IncomparableError, Same
+from svkc.comparing import Same, refuse
 
 
 class Making(NamedTuple):
@@ -71,7 +71,7 @@ def by_content(x):
         if not x.is_fully_addressable or jnp.issubdtype(x.dtype, jax.dtypes.extended):
             return Same(x)
     elif type(x) is not np.ndarray or x.dtype.hasobject:
-        raise IncomparableError(x)
+        refuse(x)
     numbers = np.asarray(x)
     return type(x), repr(x.dtype), getattr(x, "weak_type", False), x.shape, numbers.tobytes()
 

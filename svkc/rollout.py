@@ -36,6 +36,7 @@ def rollout(
 
     data, lane: what differs between lanes besides the state. `lane(chain, data of one lane)` gives a dict of arguments of `simulate` (events, args, control,
     t1, or `chain` itself with other floats); data: a pytree with the lanes as leading axis.
+    Functions are compared as in `simulate`, `lane` too: it may be a lambda in the call itself.
     cost: [lanes], how long each may take (any unit): lanes alike go together, so that the short do not wait for the long.
     chunk: lanes at once on one device (default: 64 on a CPU, 4096 otherwise, no more than there are, nor than have trajectories that fit into a quarter
     of the memory that is free). devices: default all of this process; each goes its own way through its lanes. On a CPU there are as many as

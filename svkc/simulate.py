@@ -44,6 +44,9 @@ def simulate(
     dt: fixed steps (s). rtol, atol: adaptive steps, by default 1e-7 (float32: 1e-4) and a hundredth of rtol.
     solver, stepsize_controller, adjoint, progress_meter: diffrax objects, passed through; by default Dopri8 with rtol, Tsit5 with dt or in float32.
     stabilization: `svkc.Projection()` (default), `svkc.Exact()`, `svkc.Baumgarte(rate)` or `svkc.Drift()`. dynamics: `svkc.Dynamics(inertia, hold)`.
+    Functions, those of `events` too, are compared by code, defaults and the values that they find in closures and globals. A new function object that is
+    equal is not compiled again, also where floating-point arrays in it differ: they are data. Numbers, and arrays of whole numbers, belong to the program,
+    as do arrays on which conditions or numpy depend. A `UserWarning` names the argument that is compiled again because it cannot be compared.
     max_events: how many events may happen (default: each timed one, four times each guard); max_steps: in one phase.
     ValueError: a call that cannot be right. A run that goes wrong ends with a code in `result`, raised when throw=True.
     """
