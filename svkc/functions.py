@@ -74,7 +74,9 @@ def comparable(function) -> Any:
     except Exception as error:
         # (whatever a thing does as it is looked at, the call is to be made)
         reason = error.args[0] if isinstance(error, IncomparableError) else function
-        return Function([], Recipe(Same(function), lambda arrays: function, reason))
+        # a bound method is made anew wherever it is named
+        key = (Same(function.__func__), Same(function.__self__)) if isinstance(function, types.MethodType) else Same(function)
+        return Function([], Recipe(key, lambda arrays: function, reason))
     recipe.kept = reader.kept
     return Function(reader.arrays, recipe)
 
@@ -113,7 +115,7 @@ def shared(program: Callable, functions: list[tuple[str, Any]], rest) -> Any:
 def _note(functions: list[tuple[str, Any, Function]], rest) -> None:
     """Remembers what was compiled, and warns where it was before, but for function objects that could not be compared."""
     keys = tuple(g.recipe.key for _, _, g in functions)
-    loose = [_code(f) if isinstance(g.recipe.key, Same) else loosened(g.recipe.key) for _, f, g in functions]
+    loose = [_code(f) if g.recipe.reason is not None else loosened(g.recipe.key) for _, f, g in functions]
     if keys == tuple(loose) or not concrete(rest, [g.arrays for _, _, g in functions]):
         return
     # (not their hash: jax's trees have the same one whatever is static in them)

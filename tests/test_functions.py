@@ -107,6 +107,8 @@ def test_what_is_compared():
         assert not same(torque(one), torque(other))
     assert not same(falling(1.0, 2), falling(1.0, 3))
     assert not same(functools.partial(fixed_torque, args=1), functools.partial(fixed_torque, args=2))
+    opaque = Controller(Opaque())
+    assert same(opaque.torque, opaque.torque)
     module = eqx.nn.MLP(1, 1, 2, 1, key=jax.random.key(0))
     assert comparable(module) is module
     assert comparable(jax.jit(fixed_torque)).__class__ is not Function
