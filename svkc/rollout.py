@@ -1,7 +1,5 @@
 """F7: many runs at once: lanes dealt to chunks, chunks to processes and devices, finished chunks kept."""
 
-import dataclasses
-import functools
 import hashlib
 import json
 import os
@@ -19,7 +17,6 @@ from jax.sharding import Mesh, PartitionSpec
 
 from svkc.archive import load_trajectory
 from svkc.chain import Chain, State
-from svkc.events import When, listed
 from svkc.functions import shared
 from svkc.given import finite, function, one, whole
 from svkc.replay import Replay
@@ -62,8 +59,13 @@ def rollout(
     chunks = [np.pad(order[i : i + size], (0, max(0, i + size - lanes)), mode="edge") for i in range(0, lanes, size)]
     if len(chunks) < jax.process_count():
         raise ValueError(f"states: {lanes} lanes are {len(chunks)} chunks, too few for {jax.process_count()} processes; start fewer, or give fewer devices")
-    common = chain, jnp.asarray(t1, states.q.dtype), {"throw": False, "adjoint": Replay(every=1 << 30), **options}, listed(options.get("events", ()))
-    run = functools.partial(_shared, common, lane, Mesh(np.array(devices), ("lanes",)))
+    common, mesh = {"throw": False, "adjoint": Replay(every=1 << 30), **options}, Mesh(np.array(devices), ("lanes",))
+    watched = {name: options.get(name, default) for name, default in (("control", None), ("events", ()))}
+
+    def run(given):
+        piece = lambda lane, **own: _piece((chain, jnp.asarray(t1, states.q.dtype), common | own, lane), given, mesh)
+        return shared(piece, lane=lane, **watched)
+
     folder = None if out is None else _folder(pathlib.Path(out), (chain, states, t1, data, order, options), size)
     mine = range(jax.process_index(), len(chunks), jax.process_count())
     done, begun = {}, time.perf_counter()
@@ -107,22 +109,6 @@ def _free_memory(device) -> float:
         return float(os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     except (ValueError, OSError, AttributeError):
         return np.inf
-
-
-def _shared(common, lane: Callable | None, mesh: Mesh, lanes) -> Trajectory:
-    """The run of one chunk, by a program that new function objects share."""
-    chain, t1, options, events = common
-    guards = [i for i, event in enumerate(events) if isinstance(event, When)]
-
-    def run(lane, control, *given):
-        watched = list(events)
-        for i, guard in zip(guards, given, strict=True):
-            watched[i] = dataclasses.replace(events[i], guard=guard)
-        return _piece((chain, t1, {**options, "events": watched, "control": control}, lane), lanes, mesh)
-
-    functions = [("lane", lane), ("control", options.get("control")), *(("guard of when(...)", events[i].guard) for i in guards)]
-    others = {name: x for name, x in options.items() if name not in ("events", "control")}
-    return shared(run, functions, (chain, t1, others, [dataclasses.replace(e, guard=callable) if isinstance(e, When) else e for e in events], lanes, mesh))
 
 
 @eqx.filter_jit

@@ -44,9 +44,9 @@ def simulate(
     dt: fixed steps (s). rtol, atol: adaptive steps, by default 1e-7 (float32: 1e-4) and a hundredth of rtol.
     solver, stepsize_controller, adjoint, progress_meter: diffrax objects, passed through; by default Dopri8 with rtol, Tsit5 with dt or in float32.
     stabilization: `svkc.Projection()` (default), `svkc.Exact()`, `svkc.Baumgarte(rate)` or `svkc.Drift()`. dynamics: `svkc.Dynamics(inertia, hold)`.
-    Functions, those of `events` too, are compared by code, defaults and the values that they find in closures and globals. A new function object that is
-    equal is not compiled again, also where floating-point arrays in it differ: they are data. Numbers, and arrays of whole numbers, belong to the program,
-    as do arrays on which conditions or numpy depend. A `UserWarning` names the argument that is compiled again because it cannot be compared.
+    Functions are compared by code, defaults and the values that they find in closures and globals, where all of these are of simple kinds. A new function
+    object that is equal is not compiled again, nor where floating-point arrays in it differ: they are data. Numbers, and arrays of whole numbers, belong to
+    the program, as do arrays at which Python looks. A `UserWarning` names the argument that is compiled again because it cannot be compared.
     max_events: how many events may happen (default: each timed one, four times each guard); max_steps: in one phase.
     ValueError: a call that cannot be right. A run that goes wrong ends with a code in `result`, raised when throw=True.
     """
@@ -56,12 +56,8 @@ def simulate(
     )  # fmt: skip
     dtype = state.q.dtype
     given = chain, state, jnp.asarray(t0, dtype), jnp.asarray(t1, dtype), save_at
-
-    def run(control, *guards):
-        return _run(*given, _with(made, guards=guards), _with(options, control=control), args)
-
-    functions = [("control", options.control), *(("guard of when(...)", guard) for guard in made.guards)]
-    traj = shared(run, functions, (given, _with(made, guards=()), _with(options, control=None), args))
+    run = lambda control, events: _run(*given, _with(made, guards=events), _with(options, control=control), args)
+    traj = shared(run, control=options.control, events=made.guards)
     if not throw:
         return traj
     failed = (traj.result != RESULTS.successful) & (traj.result != RESULTS.stopped)
