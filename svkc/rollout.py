@@ -1,6 +1,5 @@
 """F7: many runs at once: lanes dealt to chunks, chunks to processes and devices, finished chunks kept."""
 
-import functools
 import hashlib
 import json
 import os
@@ -18,6 +17,7 @@ from jax.sharding import Mesh, PartitionSpec
 
 from svkc.archive import load_trajectory
 from svkc.chain import Chain, State
+from svkc.functions import shared
 from svkc.given import finite, function, one, whole
 from svkc.replay import Replay
 from svkc.simulate import simulate
@@ -33,6 +33,7 @@ def rollout(
 
     data, lane: what differs between lanes besides the state. `lane(chain, data of one lane)` gives a dict of arguments of `simulate` (events, args, control,
     t1, or `chain` itself with other floats); data: a pytree with the lanes as leading axis.
+    Functions are compared as in `simulate`, `lane` too: it may be a lambda in the call itself.
     cost: [lanes], how long each may take (any unit): lanes alike go together, so that the short do not wait for the long.
     chunk: lanes at once on one device (default: 64 on a CPU, 4096 otherwise, no more than there are, nor than have trajectories that fit into a quarter
     of the memory that is free). devices: default all of this process; each goes its own way through its lanes. On a CPU there are as many as
@@ -58,8 +59,13 @@ def rollout(
     chunks = [np.pad(order[i : i + size], (0, max(0, i + size - lanes)), mode="edge") for i in range(0, lanes, size)]
     if len(chunks) < jax.process_count():
         raise ValueError(f"states: {lanes} lanes are {len(chunks)} chunks, too few for {jax.process_count()} processes; start fewer, or give fewer devices")
-    common = chain, jnp.asarray(t1, states.q.dtype), {"throw": False, "adjoint": Replay(every=1 << 30), **options}
-    run = functools.partial(_piece, common, lane=lane, mesh=Mesh(np.array(devices), ("lanes",)))
+    common, mesh = {"throw": False, "adjoint": Replay(every=1 << 30), **options}, Mesh(np.array(devices), ("lanes",))
+    watched = {name: options.get(name, default) for name, default in (("control", None), ("events", ()))}
+
+    def run(given):
+        piece = lambda lane, **own: _piece((chain, jnp.asarray(t1, states.q.dtype), common | own, lane), given, mesh)
+        return shared(piece, lane=lane, **watched)
+
     folder = None if out is None else _folder(pathlib.Path(out), (chain, states, t1, data, order, options), size)
     mine = range(jax.process_index(), len(chunks), jax.process_count())
     done, begun = {}, time.perf_counter()
@@ -106,12 +112,12 @@ def _free_memory(device) -> float:
 
 
 @eqx.filter_jit
-def _piece(common, lanes, lane: Callable | None, mesh: Mesh) -> Trajectory:
+def _piece(common, lanes, mesh: Mesh) -> Trajectory:
     """The run of one chunk: a piece for each device, without a word between them, so that none waits for another's steps."""
     fixed, static = eqx.partition(common, eqx.is_array)
 
     def one(fixed, state, data):
-        chain, t1, options = eqx.combine(fixed, static)
+        chain, t1, options, lane = eqx.combine(fixed, static)
         own = {} if lane is None else lane(chain, data)
         if not isinstance(own, dict):
             raise ValueError(f"lane: expected a dict of arguments of simulate from it, got {own!r}")

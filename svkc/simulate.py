@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Int
 from svkc.binding import emptied, grip
 from svkc.chain import Chain, State, Structure
 from svkc.events import Plan
+from svkc.functions import shared
 from svkc.guards import Sensor
 from svkc.location import Reading, event_tolerance
 from svkc.operation import Closed
@@ -40,6 +41,9 @@ def simulate(
     dt: fixed steps (s). rtol, atol: adaptive steps, by default 1e-7 (float32: 1e-4) and a hundredth of rtol.
     solver, stepsize_controller, adjoint, progress_meter: diffrax objects, passed through; by default Dopri8 with rtol, Tsit5 with dt or in float32.
     stabilization: `svkc.Projection()` (default), `svkc.Exact()`, `svkc.Baumgarte(rate)` or `svkc.Drift()`. dynamics: `svkc.Dynamics(inertia, hold)`.
+    Functions are compared by code, defaults and the values that they find in closures and globals, where all of these are of simple kinds. A new function
+    object that is equal is not compiled again, nor where floating-point arrays in it differ: they are data. Numbers, and arrays of whole numbers, belong to
+    the program, as do arrays at which Python looks. A `UserWarning` names the argument that is compiled again because it cannot be compared.
     max_events: how many events may happen (default: each timed one, four times each guard); max_steps: in one phase.
     ValueError: a call that cannot be right. A run that goes wrong ends with a code in `result`, raised when throw=True.
     """
@@ -48,7 +52,9 @@ def simulate(
         max_steps, progress_meter,
     )  # fmt: skip
     dtype = state.q.dtype
-    traj = _run(chain, state, jnp.asarray(t0, dtype), jnp.asarray(t1, dtype), save_at, made, options, args)
+    given = chain, state, jnp.asarray(t0, dtype), jnp.asarray(t1, dtype), save_at
+    run = lambda control, events: _run(*given, _with(made, guards=events), _with(options, control=control), args)
+    traj = shared(run, control=options.control, events=made.guards)
     if not throw:
         return traj
     if isinstance(traj.result._value, jax.core.Tracer):
@@ -89,8 +95,11 @@ def _converted(chain: Chain, state: State, t0, made: Plan, options: Options, arg
         return fn if fn is None or isinstance(fn, Sensor) else Closed.over(fn, t0, state, args)
 
     guards, control = tuple(converted(g) for g in made.guards), converted(options.control)
-    fresh = lambda node, name, value: dataclasses.replace(node, **{name: value})
-    return fresh(made, "guards", guards), fresh(options, "control", control)
+    return _with(made, guards=guards), _with(options, control=control)
+
+
+def _with(node, **changed):
+    return dataclasses.replace(node, **changed)
 
 
 def _lockable(chain: Chain, state: State, made: Plan) -> State:

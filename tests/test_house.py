@@ -18,7 +18,7 @@ HOUSE = [
     "spatial topology unsupported operation given factors taking cache eager",
     "chain reading selection lanes",
     "verb",
-    "kinematics trajectory cuttable interop joining",
+    "kinematics trajectory cuttable interop joining functions",
     "inverse_dynamics loops load",
     "energy closure articulated archive",
     "delassus",
