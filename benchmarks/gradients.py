@@ -55,7 +55,7 @@ def whole_run(**how):
         c = eqx.tree_at(lambda c: (c.mass, c.inertia, c.com), chain, floats)
         start = svkc.State(state.q, state.v + p["v"], state.structure)
         events = (svkc.at(p["times"][0], cut="right_hand_grip"), svkc.at(p["times"][1], cut="left_hand_grip"))
-        control = lambda t, s, a: jnp.pad(a @ jnp.sin(jnp.arange(1, 7) * t), (6, chain.dofs - 22))
+        control = lambda t, s, a: jnp.pad(a @ jnp.sin(jnp.arange(1.0, 7.0) * t), (6, chain.dofs - 22))
         traj = svkc.simulate(c, start, 1.8, ts=ts, events=events, rtol=1e-8, atol=1e-10, control=control, args=p["torque"], throw=False, **how)
         return jnp.sum(traj.final.q[:3]) + 0.1 * jnp.sum(traj.states.q[40])
 

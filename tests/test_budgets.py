@@ -1,4 +1,4 @@
-"""How large the programs are that users wait for: instructions before XLA's passes, which are the same on every machine. `benchmarks/compile.py` has seconds."""
+"""How large the programs are that users wait for: instructions before XLA's passes, the same on every machine. `benchmarks/compile.py` has seconds."""
 
 import pathlib
 import sys
