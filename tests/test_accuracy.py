@@ -25,10 +25,10 @@ def arm():
 @pytest.mark.parametrize(
     ("solver", "order", "dt"),
     [
-        (svkc.RodriguesEuler(), 1, 2e-3),
+        pytest.param(svkc.RodriguesEuler(), 1, 2e-3, marks=pytest.mark.slow),
         (svkc.SemiImplicitEuler(), 1, 2e-3),
-        (diffrax.Heun(), 2, 4e-3),
-        (diffrax.Bosh3(), 3, 0.01),
+        pytest.param(diffrax.Heun(), 2, 4e-3, marks=pytest.mark.slow),
+        pytest.param(diffrax.Bosh3(), 3, 0.01, marks=pytest.mark.slow),
         (diffrax.Tsit5(), 5, 0.02),
         (diffrax.Dopri8(), 8, 0.05),
         pytest.param(diffrax.ImplicitEuler(), 1, 2e-3, marks=pytest.mark.slow),
@@ -66,7 +66,10 @@ def test_symplectic_euler_keeps_energy():
     assert lost[-1] > 20 * kept.max()
 
 
-@pytest.mark.parametrize("change", [svkc.inertia_change, svkc.least_change, svkc.dependent_change])
+OTHERS = (pytest.param(change, marks=pytest.mark.slow) for change in (svkc.inertia_change, svkc.least_change))
+
+
+@pytest.mark.parametrize("change", [svkc.dependent_change, *OTHERS])
 def test_each_way_back_onto_the_loops(change):
     """One motion, loops closed to round-off; the independent coordinates stay where no other may be moved. By short steps, and by one that is too long."""
     chain = models.four_bar()

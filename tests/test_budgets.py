@@ -11,20 +11,17 @@ import compile as counting
 import compiled
 
 # 10 % above what was counted with jax 0.10.1
-BUDGETS = {
-    "forward dynamics": 2900,
-    "main job": 14500,
-    "four bar": 14500,
-    "arm and ball": 16700,
-    "gradient": 43600,
-}
+BUDGETS = {"forward dynamics": 2900, "main job": 14500, "four bar": 14500}
+# (a smaller gradient is counted in test_gradients, where it is compiled as well)
+SLOW = {"arm and ball": 16700, "gradient": 43600, "arm and ball gradient": 53900}
 
 
-@pytest.mark.parametrize("name", BUDGETS)
+@pytest.mark.parametrize("name", [*BUDGETS, *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)])
 def test_a_program_is_no_larger_than_it_was(name):
     function, args = compiled.PROGRAMS[name]()
     count = counting.counted(jax.jit(function).lower(*args).compiler_ir("hlo").as_hlo_text())
-    assert BUDGETS[name] / 2 < count <= BUDGETS[name]
+    budget = (BUDGETS | SLOW)[name]
+    assert budget / 2 < count <= budget
 
 
 def test_calls_are_counted_as_often_as_they_are_made():

@@ -41,6 +41,7 @@ def test_acceleration_is_that_of_the_multipliers(case):
     assert np.abs(bodies - fast).max() < 1e-10 * np.abs(fast).max()
 
 
+@pytest.mark.slow
 def test_articulated_bodies_carry_what_acts_on_virtual_joints(case):
     """The same with torques at the joints of the loops, and with a joint of the tree locked; and its derivative by masses and along the loops, on each side."""
     name, chain, state, tau = case

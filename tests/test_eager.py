@@ -9,6 +9,8 @@ import pytest
 import svkc
 from svkc import eager
 
+XS = jnp.array([0.1, 0.2])
+
 
 @pytest.fixture(scope="module")
 def linkage():
@@ -43,13 +45,18 @@ def close(got, wanted):
         np.testing.assert_allclose(got[name], wanted[name], rtol=1e-9, atol=1e-9 * (1 + float(np.abs(wanted[name]).max())), err_msg=name)
 
 
-def test_each_is_the_same_under_jit_vmap_and_scan(linkage):
-    chain, traj = linkage
-    xs = jnp.array([0.1, 0.2])
-    one = lambda x: every(chain, traj, x)
-    eagerly = jax.tree.map(lambda *x: np.stack(x), *[one(x) for x in xs])
-    close(jax.jit(lambda xs: jax.lax.map(one, xs))(xs), eagerly)
-    close(jax.vmap(one)(xs), eagerly)
+@pytest.fixture(scope="module")
+def eagerly(linkage):
+    return jax.tree.map(lambda *x: np.stack(x), *[every(*linkage, x) for x in XS])
+
+
+def test_each_is_the_same_under_jit_and_scan(linkage, eagerly):
+    close(jax.jit(lambda xs: jax.lax.map(lambda x: every(*linkage, x), xs))(XS), eagerly)
+
+
+@pytest.mark.slow
+def test_each_is_the_same_under_vmap(linkage, eagerly):
+    close(jax.vmap(lambda x: every(*linkage, x))(XS), eagerly)
 
 
 @pytest.mark.slow

@@ -46,5 +46,6 @@ np.testing.assert_allclose(solve(jax.devices())(A, x), solve(jax.devices()[:1])(
 """
 
 
+@pytest.mark.slow
 def test_devices_of_one_process_do_not_wait_for_each_other():
     subprocess.run([sys.executable, "-c", TWO_DEVICES], check=True, timeout=120)

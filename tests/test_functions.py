@@ -272,6 +272,7 @@ def test_rollout(arm, programs):
     assert len(programs) == seen > 0
 
 
+@pytest.mark.slow
 def test_things_that_cannot_be_compared(arm):
     """A warning after the second compilation, once, and by the argument's name."""
 
@@ -290,6 +291,7 @@ def test_things_that_cannot_be_compared(arm):
     assert end(arm, kept) == end(arm, kept)
 
 
+@pytest.mark.slow
 def test_derivatives_and_lanes(arm):
     """By what is closed over, in lanes, as differences of a run by `args` give them."""
     chain, state = arm
@@ -301,6 +303,7 @@ def test_derivatives_and_lanes(arm):
     np.testing.assert_allclose(slopes, (by_args(gains + step) - by_args(gains - step)) / (2 * step), rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_nothing_stays():
     """No tracer in what programs are found by, and no function that is gone in the notes."""
     found, tracers, gone = [], [], []

@@ -1,5 +1,8 @@
 """Derivatives through every change of structure: against differences, against closed forms, at the hard points."""
 
+import pathlib
+import sys
+
 import derivatives
 import jax
 import jax.numpy as jnp
@@ -9,7 +12,11 @@ import pytest
 
 import svkc
 
+sys.path.append(str(pathlib.Path(__file__).parent.parent / "benchmarks"))
+from compile import counted
+
 TIGHT = derivatives.TIGHT
+BUDGET = 42500
 
 
 @pytest.mark.slow
@@ -24,7 +31,10 @@ def test_against_differences(name):
 
 
 def test_a_release_against_differences():
-    """A rod comes off its pivot at an angle and flies: the gradient of where and how fast it ends and of the time, by one program."""
+    """A rod comes off its pivot at an angle and flies: the gradient of where and how fast it ends and of the time, along a direction in which all change.
+
+    It is one program, whose size is that of a gradient through a change of structure.
+    """
     chain = svkc.load(models.MJCF.format(models.bar("rod", models.Y, "0.2 0 -1")), cuttable="rod")
     state = chain.state({"rod": 1.2}, {"rod": 0.5})
 
@@ -36,15 +46,20 @@ def test_a_release_against_differences():
         # (without the event its time is infinite, and so is this)
         return traj.events.time[0] + jnp.sum(jnp.sin(traj.final.q)) + jnp.sum(traj.final.v**2) / 10
 
-    gradient = jax.value_and_grad(loss)
+    x = {"sine": jnp.asarray(0.3), "speed": jnp.asarray(1.0)} | derivatives.heavier(chain)
+    rng = np.random.default_rng(0)
+    way = {name: jnp.asarray(rng.normal(size=leaf.shape)) for name, leaf in x.items()}
 
     @jax.jit
-    def program(x, along):
-        value, slope = gradient(x)
-        return value, sum(jnp.vdot(slope[name], along[name]) for name in x)
+    def program(part, along):
+        value, slope = jax.value_and_grad(loss)({name: leaf + part["part"] * way[name] for name, leaf in x.items()})
+        return value, along["part"] * sum(jnp.vdot(slope[name], way[name]) for name in x)
 
-    x = {"sine": jnp.asarray(0.3), "speed": jnp.asarray(1.0)} | derivatives.heavier(chain)
-    assert derivatives.worst(program, x) <= derivatives.RUN
+    part = {"part": jnp.asarray(0.0)}
+    lowered = program.lower(part, part)
+    # 10 % above what was counted with jax 0.10.1
+    assert counted(lowered.compiler_ir("hlo").as_hlo_text()) <= BUDGET
+    assert derivatives.worst(lowered.compile(), part) <= derivatives.RUN
 
 
 def both_ways(f):

@@ -34,6 +34,7 @@ def test_one_freedom_where_counting_says_none(linkage):
     assert float(m.margin) > 1e-3
 
 
+@pytest.mark.slow
 def test_it_moves_a_finite_way(linkage):
     """Not only to first order: pushed along its freedom it goes through 0.6 s and tenths of a radian, loop closed, energy kept, rank as it was."""
     chain, state, _, rank, _ = linkage

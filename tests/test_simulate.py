@@ -59,6 +59,7 @@ def test_high_bar(high_bar, compiled):
     assert int(caught.events.count) == 3
 
 
+@pytest.mark.slow
 def test_a_batch_in_which_every_lane_differs(high_bar, compiled):
     """Another release time and another starting structure in each lane, one trace, equal to the single runs."""
     chain, state = high_bar
@@ -95,6 +96,7 @@ def quarter(pendulum, **kw):
     return svkc.simulate(pendulum, pendulum.state({"arm": 1.2}), 1.0, **kw)
 
 
+@pytest.mark.slow
 def test_guards_two_in_one_step_the_earliest_wins(pendulum):
     """Fixed steps of 0.2 s: both guards are crossed within one; in either order the earlier one is found, to what a step of 0.2 s is good for."""
     fine = quarter(pendulum, events=[svkc.when(angle(g), stop=True) for g in (0.7, 0.3)], dt=1e-3)
@@ -125,6 +127,7 @@ def test_guards_at_the_same_instant(caught):
     assert float(traj.events.energy_lost[0]) > 0
 
 
+@pytest.mark.slow
 def test_event_time_has_the_solvers_accuracy(pendulum):
     """The time at which the rod passes the vertical: a quarter period, by the arithmetic-geometric mean; and no more events than were asked for."""
     m, length, com = 1.0, 1.0, 0.5
@@ -199,17 +202,26 @@ def test_control_and_work(pendulum, capsys):
     assert run(3.0, 0.5).result == svkc.RESULTS.non_finite
 
 
-def test_drift_is_held_or_not():
-    """A four-bar for 2 s: projection keeps the loop to round-off, after steps or at every evaluation; Baumgarte bounds the gap, nothing lets it grow."""
+def gap_of_two_seconds(held) -> float:
     chain = models.four_bar()
-    state = chain.state(v={"crank": 4.0})
-    gaps = {}
-    for held in (svkc.Projection(), svkc.Exact(), svkc.Baumgarte(30.0), svkc.Drift()):
-        traj = svkc.simulate(chain, state, 2.0, ts=jnp.linspace(0, 2, 21), dt=0.01, stabilization=held, throw=False)
-        gaps[type(held).__name__] = float(traj.gaps.max())
-    assert gaps["Projection"] < 1e-13
-    assert gaps["Exact"] < 1e-13
-    assert gaps["Projection"] < gaps["Baumgarte"] < gaps["Drift"]
+    traj = svkc.simulate(chain, chain.state(v={"crank": 4.0}), 2.0, ts=jnp.linspace(0, 2, 21), dt=0.01, stabilization=held, throw=False)
+    return float(traj.gaps.max())
+
+
+@pytest.mark.parametrize("held", [pytest.param(svkc.Projection(), marks=pytest.mark.slow), svkc.Exact()])
+def test_drift_is_held(held):
+    """A four-bar for 2 s: projection keeps the loop to round-off, after steps or at every evaluation."""
+    assert gap_of_two_seconds(held) < 1e-13
+
+
+def test_drift_is_bounded():
+    """By Baumgarte's term, below the 6e-6 that it comes to without (next test)."""
+    assert 1e-13 < gap_of_two_seconds(svkc.Baumgarte(30.0)) < 1e-6
+
+
+@pytest.mark.slow
+def test_drift_grows_where_nothing_is_done():
+    assert gap_of_two_seconds(svkc.Drift()) > 1e-6
 
 
 @pytest.mark.slow
@@ -230,6 +242,7 @@ def test_the_motion_does_not_depend_on_the_coordinates():
     np.testing.assert_allclose(a.v, b.v, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_results_tell_what_went_wrong(pendulum):
     """Too few steps; a link that is elsewhere. (Too many events: with the time of one; numbers that are none: with control.)"""
     state = pendulum.state({"arm": 1.0})

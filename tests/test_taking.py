@@ -18,7 +18,10 @@ INDICES = {
 }
 
 
-@pytest.mark.parametrize("index", INDICES.values(), ids=INDICES)
+SLOW = [pytest.param(index, id=name, marks=pytest.mark.slow) for name, index in INDICES.items() if name != "some"]
+
+
+@pytest.mark.parametrize("index", [pytest.param(INDICES["some"], id="some"), *SLOW])
 def test_it_is_indexing(index):
     x, many = jax.random.normal(jax.random.key(0), (7, 3)), jax.random.normal(jax.random.key(1), (7, 5, 3))
     ours = lambda x: jnp.sin(take(x, index))
