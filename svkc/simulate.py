@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Int
 
 from svkc.binding import emptied, grip
 from svkc.chain import Chain, State, Structure
+from svkc.eager import eager_jit
 from svkc.events import Plan
 from svkc.functions import shared
 from svkc.guards import Sensor
@@ -54,7 +55,8 @@ def simulate(
     dtype = state.q.dtype
     given = chain, state, jnp.asarray(t0, dtype), jnp.asarray(t1, dtype), save_at
     run = lambda control, events: _run(*given, _with(made, guards=events), _with(options, control=control), args)
-    traj = shared(run, control=options.control, events=made.guards)
+    run = shared(run, control=options.control, events=made.guards)
+    traj = (_certified_once if len(save_at) <= MOMENTS else _certified)(chain, run, save_at, given[3], options.gap, stages(options.solver))
     if not throw:
         return traj
     if isinstance(traj.result._value, jax.core.Tracer):
@@ -67,7 +69,7 @@ def simulate(
 
 
 @eqx.filter_jit
-def _run(chain: Chain, state: State, t0, t1, ts, made: Plan, options: Options, args) -> Trajectory:
+def _run(chain: Chain, state: State, t0, t1, ts, made: Plan, options: Options, args) -> Run:
     made, options = _converted(chain, state, t0, made, options, args)
     run = _start(chain, state, t0, ts, made, options, args)
 
@@ -78,13 +80,23 @@ def _run(chain: Chain, state: State, t0, t1, ts, made: Plan, options: Options, a
         run, _ = phase(run, jnp.asarray(0))
     else:
         run, _ = jax.lax.scan(phase, run, jnp.arange(options.max_events + 1))
+    return run
+
+
+def _with_certificate(chain: Chain, run: Run, ts, t1, most: float, evaluations: int) -> Trajectory:
+    """Return the run with its certificate. most: a gap that counts as open; evaluations: of the field in one try of a step."""
     short = (run.t < t1) & (run.result == RESULTS.successful)
     result = RESULTS.where(short, RESULTS.max_events, run.result)
-    phases, saved, lost = certified(chain, run.records, run.count, run.saved, stages(options.solver))
+    phases, saved, lost = certified(chain, run.records, run.count, run.saved, evaluations)
     worst = jnp.maximum(jnp.max(saved.gap), jnp.max(phases.gap))
-    result = RESULTS.where((result == RESULTS.successful) & (worst > options.gap), RESULTS.loop_open, result)
+    result = RESULTS.where((result == RESULTS.successful) & (worst > most), RESULTS.loop_open, result)
     derivative = RESULTS.where((lost < phases.start.shape[0]) & (lost <= run.spoiled), RESULTS.rank_lost, run.derivative)
     return Trajectory(ts, run.saved, saved.gap, saved.gap_rate, run.events, phases, run.state, run.t, result, derivative)
+
+
+# a program of its own, so that a run that is called eagerly has it compiled for compile time, as it looks at a few states once
+MOMENTS = 1000
+_certified, _certified_once = eqx.filter_jit(_with_certificate), eager_jit(_with_certificate, eqx.filter_jit)
 
 
 def _converted(chain: Chain, state: State, t0, made: Plan, options: Options, args) -> tuple[Plan, Options]:
