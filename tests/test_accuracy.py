@@ -26,10 +26,10 @@ def arm():
     ("solver", "order", "dt"),
     [
         pytest.param(svkc.RodriguesEuler(), 1, 2e-3, marks=pytest.mark.slow),
-        (svkc.SemiImplicitEuler(), 1, 2e-3),
+        pytest.param(svkc.SemiImplicitEuler(), 1, 2e-3, marks=pytest.mark.slow),
         pytest.param(diffrax.Heun(), 2, 4e-3, marks=pytest.mark.slow),
         pytest.param(diffrax.Bosh3(), 3, 0.01, marks=pytest.mark.slow),
-        (diffrax.Tsit5(), 5, 0.02),
+        pytest.param(diffrax.Tsit5(), 5, 0.02, marks=pytest.mark.slow),
         (diffrax.Dopri8(), 8, 0.05),
         pytest.param(diffrax.ImplicitEuler(), 1, 2e-3, marks=pytest.mark.slow),
         pytest.param(diffrax.Kvaerno3(), 3, 5e-3, marks=pytest.mark.slow),

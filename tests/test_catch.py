@@ -165,14 +165,29 @@ def test_a_batch_of_scenes_is_its_single_runs(pair):
         assert batch.phases.freedoms[i].tolist() == one.phases.freedoms.tolist()
 
 
+def box():
+    """A box of 2 kg on the ground, which holds it; it can move up."""
+    xml = models.MJCF.format('<body name="box"><joint name="z" type="slide" axis="0 0 1"/><geom type="box" size="0.1 0.1 0.1" mass="2"/></body>')
+    xml = xml.replace("0.3 -0.2 -9.81", "0 0 -10")
+    return svkc.load(xml, virtual_links=[svkc.VirtualLink("ground", "world", "box", "weld", connected=True)])
+
+
+def test_guards_say_what_they_are_to():
+    """Called by hand: the ground carries 20 N less what pulls; over a limit of 10 N that is once too much; the box is where the ground is."""
+    chain = box()
+    state, pull = chain.state(), jnp.array([5.0])
+    np.testing.assert_allclose(svkc.leaves(chain, "ground")(0.0, state, tau=pull), 15, rtol=1e-12)
+    np.testing.assert_allclose(svkc.overload(chain, "ground", force=10.0)(0.0, state, tau=pull), 0.5, rtol=1e-12)
+    np.testing.assert_allclose(svkc.touch(chain, "ground", 0.02, axes="z")(0.0, state), -0.02, rtol=1e-12)
+
+
+@pytest.mark.slow
 def test_a_support_that_can_only_push():
     """A box thrown on the ground under a growing pull: it sticks, and is let go when the ground would have to pull; the force by Newton's law.
 
     Told on the way are when it is pressed with less than 10 N, and when it is at a height.
     """
-    xml = models.MJCF.format('<body name="box"><joint name="z" type="slide" axis="0 0 1"/><geom type="box" size="0.1 0.1 0.1" mass="2"/></body>')
-    xml = xml.replace("0.3 -0.2 -9.81", "0 0 -10")
-    chain = svkc.load(xml, virtual_links=[svkc.VirtualLink("ground", "world", "box", "weld", connected=True)])
+    chain = box()
     pull = lambda t, state, args: jnp.where(jnp.arange(1) == 0, 40 * t, 0.0)
     told = [svkc.when(svkc.overload(chain, "ground", force=10.0), direction=False), svkc.when(svkc.touch(chain, "ground", 0.02, axes="z"), direction=True)]
 

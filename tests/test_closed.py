@@ -123,7 +123,8 @@ def test_redundant_loop_moves_like_its_minimal_form():
 JOINTS = ["weld", "hinge", "slide", "cylinder", "universal", "planar", "ball", "free", (True, False, True, False, True, False)]
 
 
-@pytest.mark.parametrize("joint", [joint if joint == "slide" else pytest.param(joint, marks=pytest.mark.slow) for joint in JOINTS])
+@pytest.mark.slow
+@pytest.mark.parametrize("joint", JOINTS)
 def test_every_kind_of_virtual_joint(joint):
     """Two free bodies joined by the joint: rank, acceleration that keeps the loop, coordinates read off and back."""
     xml = models.MJCF.format(

@@ -8,6 +8,7 @@ import numpy as np
 import svkc
 
 
+@pytest.mark.slow
 def test_a_long_floor_does_not_make_the_figure_small(tmp_path):
     """What is fixed is shown no further than a metre beyond what moves: however long the floor, the picture is the same."""
 

@@ -37,6 +37,7 @@ def test_printed_matrices(links):
     np.testing.assert_allclose(co.H[co.dependent][:, co.independent], [[0, 0], [0, 0], [0, 0], [0, 0], [0.5, -0.5], [0.5, 0.5]], atol=1e-15)
 
 
+@pytest.mark.slow
 def test_every_admissible_pair_gives_the_same_motion(links):
     """Of the 28 pairs those of theta_1, theta_6, theta_7, theta_8 can be theta_G, and no others; all six give one motion."""
     chain, _ = links

@@ -160,6 +160,7 @@ def test_direction_and_rearming(pendulum):
     assert all(time > 1 for time, i in zip(traj.events.time.tolist(), traj.events.which.tolist(), strict=True) if i == 2)
 
 
+@pytest.mark.slow
 def test_events_at_the_ends_and_together(pendulum):
     """At t0, at t1, and there a guard's as well."""
     state = pendulum.state({"arm": 0.5}, {"arm": 1.0})
@@ -175,6 +176,7 @@ def test_events_at_the_ends_and_together(pendulum):
     assert float(traj.final.q[0]) < 0.5
 
 
+@pytest.mark.slow
 def test_fixed_and_adaptive_steps_agree(pendulum):
     fixed = quarter(pendulum, ts=FIVE, dt=1e-3)
     adaptive = quarter(pendulum, ts=FIVE, rtol=1e-11, atol=1e-13)
