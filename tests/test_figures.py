@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import matplotlib.image
 import models
 import numpy as np
+import pytest
 
 import svkc
 
