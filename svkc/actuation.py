@@ -13,7 +13,7 @@ from svkc.forward_dynamics import constraint_forces, with_links
 from svkc.given import arrayed, concrete, numbers
 from svkc.inverse_dynamics import generalized_forces, passive_forces
 from svkc.kinematics import kinematics, twists
-from svkc.selection import Selection, count_rank, first_steps, select
+from svkc.selection import Selection, select, select_with_rank
 from svkc.verb import check_state
 
 
@@ -86,11 +86,7 @@ def _coordinates(chain: Chain, state: State):
 
 def _basis(B: Float[Array, "rows dofs"], rank=None) -> tuple[Selection, Int[Array, ""], Float[Array, "dofs dofs"]]:
     """Pivots of B, its rank (None: to be found), and a basis of its null space: for each column that is no pivot a one there, balanced by the pivots."""
-    chosen = select(B, rank)
-    if rank is None:
-        rank = count_rank(chosen.size)
-        # the steps before the rank are the same whether or not others follow
-        chosen = first_steps(chosen, rank)
+    chosen, rank = select_with_rank(B) if rank is None else (select(B, rank), rank)
     P = chosen.P
     Bm = chosen.Q @ B
     R = Bm @ P.T + jnp.diag(jnp.where(chosen.used, 0, 1).astype(B.dtype))

@@ -10,7 +10,7 @@ from svkc.chain import Chain, State
 from svkc.closure import coordinates, scaled_jacobian
 from svkc.kinematics import kinematics
 from svkc.loops import active_dofs, ends
-from svkc.selection import count_rank, select
+from svkc.selection import count_rank, select, weakest
 from svkc.verb import verb
 
 
@@ -58,13 +58,10 @@ def mobility(chain: Chain, state: State) -> Mobility:
     J = scaled_jacobian(chain, state.structure, kin, ends(chain, state.structure, kin, state.q))
     # of the first loop's rows, the first two loops', and so on
     upto = np.arange(6 * links)[None] < 6 * np.arange(1, links + 1)[:, None]
-    sizes = jax.lax.map(lambda rows: select(jnp.where(rows[:, None], J, 0)).size, jnp.asarray(upto))
-    ranks = jax.vmap(count_rank)(sizes)
+    ranks = jax.lax.map(lambda rows: count_rank(select(jnp.where(rows[:, None], jax.lax.stop_gradient(J), 0)).size), jnp.asarray(upto))
     rows = jnp.where(state.structure.connected, 6, 0).astype(jnp.int32)
     redundant = rows - jnp.diff(ranks, prepend=jnp.zeros(1, jnp.int32))
     co = coordinates(chain, state)
-    rank, size = state.structure.rank, sizes[-1]
-    counted = (jnp.arange(size.shape[0], dtype=jnp.int32) < rank) & (size > 0)
-    margin = jnp.min(jnp.where(counted, size, 1), initial=1) / jnp.where(jnp.any(counted), jnp.max(size), 1)
+    rank, margin = state.structure.rank, weakest(select(J, state.structure.rank))
     on = state.structure.connected
     return Mobility(joint_freedoms - rank, joint_freedoms, rank, redundant, co.independent, margin, on, chain.link_names, chain.dof_names)

@@ -124,9 +124,14 @@ def weakest(selection: Selection) -> Float[Array, ""]:
     return jnp.min(jnp.where(used, size, jnp.inf), initial=1, where=used) / jnp.where(jnp.any(used), jnp.max(size), 1)
 
 
-def first_steps(selection: Selection, count: Int[Array, ""]) -> Selection:
-    """Return the selection with its first steps alone, the others inert."""
-    return _kept(selection, selection.used & (jnp.arange(selection.used.shape[0], dtype=jnp.int32) < count))
+def select_with_rank(J: Float[Array, "rows dofs"]) -> tuple[Selection, Int[Array, ""]]:
+    """Return the selection of J with its own rank, and the rank, by one search for pivots."""
+    full = select(jax.lax.stop_gradient(J))
+    rank = count_rank(full.size)
+    # the steps before the rank are the same whether or not others follow; those alone follow J in derivatives, as the others are round-off
+    first = _kept(full, full.used & (jnp.arange(full.used.shape[0], dtype=jnp.int32) < rank))
+    Q, size = _following(J, first.Q, first.P, first.size)
+    return Selection(Q, first.P, size, first.used), rank
 
 
 def too_few(P: Float[Array, "steps dofs"], rank: Int[Array, ""]) -> Bool[Array, ""]:
