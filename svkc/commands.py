@@ -1,5 +1,6 @@
 """F7: what the command line does, a function a command. jax and the rest are imported where they are used: asking for help is quick."""
 
+import gc
 import pathlib
 import time
 import webbrowser
@@ -63,6 +64,9 @@ def run(name: str, t1: float | None, events, ignore, out: pathlib.Path, video: b
     from svkc.cache import use_cache
 
     kept = use_cache()
+    # tracing makes very many small objects that stay: the collector would look through all of them again and again
+    gc.freeze()
+    gc.set_threshold(100_000, 20, 50)
     begin = time.perf_counter()
     stages = tqdm(total=4, desc="loading", bar_format="{l_bar}{bar:20}| {elapsed}", disable=True if quiet else None, leave=False)
     try:
