@@ -13,15 +13,15 @@ from svkc.chain import Chain, State, Structure
 from svkc.closure import loop_gaps
 from svkc.eager import eager_jit
 from svkc.given import arrayed, concrete, finite
-from svkc.impact import AGREE, AGREE_HELD, CLOSE, CLOSE_HELD, RANK, READ, Held, Schedule, newton_turns
 from svkc.kinematics import normalize
 from svkc.loops import active_dofs
-from svkc.projection import agree, close
+from svkc.newton import CLOSE, CLOSE_HELD, RANK, READ, VELOCITY, VELOCITY_HELD, Held, Schedule, solve_structure
 from svkc.topology import Q_SIZE, V_SIZE
 from svkc.verb import check_state
 
 _NEWTON = 30
-_CLOSING = Schedule((READ, *(CLOSE_HELD,) * _NEWTON, *(CLOSE,) * _NEWTON, *RANK, AGREE_HELD, AGREE))
+_CLOSING, _PROJECTING = (*(CLOSE_HELD,) * _NEWTON, *(CLOSE,) * _NEWTON), (VELOCITY_HELD, VELOCITY)
+_PLACE, _ASSEMBLE = Schedule((*_CLOSING, *_PROJECTING)), Schedule((READ, *_CLOSING, *RANK, *_PROJECTING))
 
 
 def gap_tolerance(dtype) -> float:
@@ -137,24 +137,24 @@ def _carried(chain: Chain, structure: Structure, q, v, placed):
     for row in top.link_child:
         if row >= 0:
             carried[top.v_start[row] : top.v_start[row] + 6] = True
-    only = eqx.tree_at(lambda s: (s.connected, s.rank), structure, (structure.connected & placed, jnp.asarray(min(6 * len(placed), top.dofs), jnp.int32)))
-    q = close(chain, only, q, 2 * _NEWTON, hold=jnp.asarray(~carried))
-    v = agree(chain, only, q, jnp.where(active_dofs(chain, structure), v, 0), hold=jnp.asarray(~carried))
-    return q, v
+    every = jnp.asarray(min(6 * len(placed), top.dofs), jnp.int32)
+    only = eqx.tree_at(lambda s: (s.connected, s.rank), structure, (structure.connected & placed, every))
+    found = solve_structure(chain, only, q, v, Held(jnp.asarray(~carried), jnp.asarray(~carried)), _PLACE)
+    return found.q, jnp.where(active_dofs(chain, only), found.v, v)
 
 
 @functools.partial(eager_jit, jit=eqx.filter_jit)
 def _close_and_agree(chain: Chain, structure: Structure, q, v, held_q, held_v, whole: bool) -> tuple[State, Float[Array, " links"]]:
-    """Loops closed with the named coordinates held, then, for what is still open, with all of them free; the same for velocities. And what is left open
-    (rad, or `chain.length`s).
+    """Return the state with its loops closed, and how far each loop is still open (rad, or `chain.length`s).
 
+    Named coordinates are held at first; what that leaves open is closed with all of them free. The same goes for velocities.
     whole: q says where every body is; else those that may be cut are put where their joint's coordinates say.
     """
     placed = (np.array(chain.topology.link_child, int) >= 0) & (not whole)
     if placed.any():
         q, v = _carried(chain, structure, q, v, placed)
     held = Held(held_q, held_v, jnp.asarray(~placed) | ~structure.connected)
-    found = newton_turns(chain, structure, q, v, held, _CLOSING)
+    found = solve_structure(chain, structure, q, v, held, _ASSEMBLE)
     return State(found.q, found.v, eqx.tree_at(lambda s: (s.rank, s.margin), structure, (found.rank, found.margin))), found.left
 
 
@@ -188,7 +188,7 @@ def _as_dofs(chain: Chain, held_q: np.ndarray) -> np.ndarray:
 def check_closed(chain: Chain, state: State, worst: Float[Array, " links"]) -> State:
     """The state; ValueError (or an error raised at run time, under jit) where a loop is open, saying which and by how much. worst: of each loop's gaps."""
     limit = gap_tolerance(state.q.dtype)
-    if isinstance(worst, jax.core.Tracer):
+    if not concrete(worst, state):
         return eqx.error_if(state, ~(jnp.max(worst) < limit), "the loops of the initial state cannot be closed")
     worst = np.asarray(worst)
     if not np.all(worst < limit):

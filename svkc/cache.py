@@ -13,7 +13,7 @@ import threading
 
 SIZE = 512 * 2**20  # bytes, of all processors and versions together
 DESCRIBES = ("vendor_id", "cpu family", "model", "model name", "flags", "CPU implementer", "CPU part", "Features")
-# XLA asks the processor for these of LLVM's preferences, which are not features of any (openxla/xla issue 44565)
+# XLA reports these preferences of LLVM as missing features of the processor (openxla/xla issue 44565)
 PREFERENCE = re.compile(rb"cpu_aot_loader\.cc.*Target machine feature \+prefer-no-(gather|scatter) is not")
 _loading = threading.Lock()
 
@@ -21,7 +21,7 @@ _loading = threading.Lock()
 def use_cache() -> pathlib.Path | None:
     """Set jax's persistent cache in this process, and return its folder: None without one. Call it before the first program is compiled.
 
-    $SVKC_CACHE_DIR names another folder than the user's usual one, or is `off`. Without it a folder of JAX_COMPILATION_CACHE_DIR stays jax's own affair.
+    $SVKC_CACHE_DIR names another folder, or is `off`. If it is not set and JAX_COMPILATION_CACHE_DIR is, jax's own setting is kept.
     """
     import jax
 
@@ -65,7 +65,7 @@ def processor(cpuinfo: str = "/proc/cpuinfo") -> str:
 
 
 def _own(folder: pathlib.Path) -> bool:
-    """Make a folder of the user alone. One that others own or can write to is refused: whoever writes there chooses what runs here."""
+    """Make a folder of mode 0700 and return True. Return False for one that others own or can write to, as its programs are executed."""
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     found = folder.stat()
     if hasattr(os, "getuid") and (found.st_uid != os.getuid() or found.st_mode & 0o022):
@@ -75,7 +75,7 @@ def _own(folder: pathlib.Path) -> bool:
 
 
 def _prune(top: pathlib.Path):
-    """Remove what was not used for longest, until the rest is small enough."""
+    """Remove the least recently used files until the others take at most `SIZE`."""
     files = []
     for path in top.glob("jaxlib-*/**/*"):
         # another process may remove it now
@@ -91,7 +91,7 @@ def _prune(top: pathlib.Path):
 
 
 def _amend():
-    """Make jax write whole entries and load them quietly. Where a later jax has other names it goes its own way."""
+    """Make jax write entries atomically, and load them without false warnings. If a later jax lacks the names patched here, nothing is patched."""
     with contextlib.suppress(ImportError, AttributeError):
         from jax._src import compilation_cache, lru_cache
 
@@ -101,7 +101,7 @@ def _amend():
 
 
 def _put(entries, key: str, value: bytes):
-    """Write an entry whole or not at all: jax itself never replaces one that another process reads too early, or that was cut short."""
+    """Write an entry atomically. jax writes in place, and never replaces an entry that was cut short."""
     path = pathlib.Path(entries.path)
     # a full disk, or one that is read only: the program is compiled again
     with contextlib.suppress(OSError), tempfile.TemporaryDirectory(dir=path) as aside:
@@ -111,7 +111,7 @@ def _put(entries, key: str, value: bytes):
 
 
 def _without_preferences(load):
-    """Wrap jax's loading of a program: of what XLA writes meanwhile, complaints of `PREFERENCE` are left out."""
+    """Wrap jax's loading of a program so that the warnings of `PREFERENCE` are dropped from stderr."""
 
     def quiet(*args, **kw):
         # one at a time, as the process has one stderr

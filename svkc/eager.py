@@ -12,14 +12,14 @@ except ImportError:
     # not public in every release of jax, and nothing public says whether jax is tracing
     from jax._src.core import trace_state_clean
 
-# on a CPU LLVM and the fusion emitters take nine tenths of XLA's time; code that runs once gains nothing from them
+# LLVM's optimization and the fusion emitters take most of XLA's compile time on a CPU
 _OPTIONS = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
 
 
 def eager_jit(function: Callable, jit: Callable = jax.jit) -> Callable:
-    """Return the function compiled by `jit` (`jax.jit` or `equinox.filter_jit`): for compile time where it is called outside of every transformation.
+    """Wrap a function in `jit` (`jax.jit` or `equinox.filter_jit`) so that an eager call compiles fast, and its code runs slower.
 
-    jax takes compiler options at the outermost jit alone, so that under jit, grad, vmap and scan the function is compiled without them. Options that the
+    jax accepts compiler options at the outermost jit only. Under jit, grad, vmap and scan the function is therefore compiled without them. Options that the
     installed jaxlib does not know are left out.
     """
     plain, quick = jit(function), {}
@@ -31,7 +31,7 @@ def eager_jit(function: Callable, jit: Callable = jax.jit) -> Callable:
         while True:
             known = tuple(_OPTIONS)
             if known not in quick:
-                # (one wrapper for the options that are left: jax keeps programs by the wrapper)
+                # jax caches programs by the wrapper, so there is one for each set of options
                 quick[known] = jit(function, compiler_options=dict(_OPTIONS))
             try:
                 return quick[known](*args, **kw)

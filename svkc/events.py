@@ -122,7 +122,7 @@ class Plan(eqx.Module):
         return jnp.stack(rows)
 
     def joins(self, chain: Chain) -> bool:
-        """Whether any event makes something hold that did not: a link or a joint; where none does, no impact is compiled."""
+        """Return whether any event connects a link or locks a joint. If none does, no impact is compiled."""
         return bool(self.binds or self.table(chain, "connect").any() or self.table(chain, "lock").any())
 
     @property

@@ -1,7 +1,8 @@
-"""F2: functions given to a run, compared by what they read, so that a new function object is not a new program.
+"""F2: comparison of functions given to a run by what they read, so that a new function object is not a new program.
 
-A function reads closure cells, defaults, and globals under the names in its code. Where all of these are of simple kinds (numbers, texts, arrays, containers
-and pytrees, other functions, what libraries define) floating-point arrays are data and the rest is compared by content. Any other is compared by identity.
+A function reads closure cells, defaults, and the globals that its code names. If all of these are of simple kinds (numbers, strings, arrays, containers and
+pytrees, other functions, objects defined by libraries), floating-point arrays are data and the rest is static, compared by content. Any other function is
+compared by identity.
 """
 
 import dataclasses
@@ -26,14 +27,14 @@ import numpy as np
 from svkc.given import concrete
 
 PLAIN = (type(None), bool, int, float, complex, str, bytes, range, type(...))
-# what libraries define does not change between two calls; svkc is one of them, wherever its sources are
+# objects that libraries define do not change between two calls; svkc counts as a library, wherever its sources are
 _PATHS = {sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")} | {*site.getsitepackages(), site.getusersitepackages()}
 LIBRARIES = tuple(path + os.sep for path in (*_PATHS, os.path.dirname(os.path.abspath(__file__))))
-# how jax says that Python looks at numbers that are traced
+# errors of jax where Python code reads the value of a tracer
 LOOKED_AT = (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError, jax.errors.TracerIntegerConversionError)
 LOOKED_AT += (jax.errors.TracerBoolConversionError, jax.errors.NonConcreteBooleanIndexError)
 JIT = type(jax.jit(len))
-# code of functions that look at their arrays; what is static in a function, as it was first; by argument and code, the first function told by identity
+# code of functions whose arrays Python has to read; the first static part of each function; the first function of each argument and code compared by identity
 _looking: set = set()
 _first: weakref.WeakKeyDictionary = weakref.WeakKeyDictionary()
 _identified: dict[tuple, Any] = {}
@@ -41,26 +42,27 @@ _identified: dict[tuple, Any] = {}
 
 @dataclasses.dataclass(frozen=True)
 class Still:
-    """A thing without data, compared by a key: its content, or its id. It is the original, so that what a function writes to a list is there afterwards."""
+    """A static value, compared by a key: its content, or its id. It holds the original object, so that writes to a list are kept."""
 
     key: Any
     thing: Any = dataclasses.field(compare=False)
 
 
 def _refuse(what: str) -> NoReturn:
-    """Raises an error that does not reach the caller of a run."""
+    """Raise the error that makes `shared` compare a function by identity."""
     error = TypeError(what)
     raise error
 
 
 class Function(eqx.Module):
-    """A function, or a container that it reads, made anew as build(*parts): arrays, which are leaves, `Still`s, and others. What it writes there is lost."""
+    """A function, or a container that it reads, as build(*parts). Parts are arrays (the leaves), `Still`s, or again `Function`s. Writes to a rebuilt
+    container are lost."""
 
     parts: list
     build: Callable = eqx.field(static=True)
 
     def made(self):
-        """The function or the container itself."""
+        """Return the function or the container itself."""
         return self.build(*(x.made() if isinstance(x, Function) else x.thing if isinstance(x, Still) else x for x in self.parts))
 
     def __call__(self, *args):
@@ -74,7 +76,7 @@ class Function(eqx.Module):
 
 
 def _function(code, space, names, defaults, kwdefaults, *values) -> types.FunctionType:
-    # (imported modules come last, and Python finds them itself)
+    # imported modules come last; Python finds them by itself
     cells = tuple(map(types.CellType, values[len(names) :][: len(code.co_freevars)]))
     f = types.FunctionType(code, {**space, **dict(zip(names, values))}, code.co_name, defaults, cells)
     f.__kwdefaults__ = kwdefaults
@@ -87,12 +89,12 @@ _tree = lambda shape, *parts: jax.tree.unflatten(shape, parts)
 
 
 def _of_library(space) -> bool:
-    """Whether a module, by its globals, is one of Python, of an installed package, or of svkc."""
+    """Return whether these are the globals of a module of Python, of an installed package, or of svkc."""
     return str(space.get("__file__")).startswith(LIBRARIES) or getattr(space.get("__spec__"), "origin", None) in ("built-in", "frozen")
 
 
 def _named(x) -> bool:
-    """Whether a library defines it: a module, a class, or what a module calls so. A jit-wrapped function may be any module's: jax tells it by identity."""
+    """Return whether a library defines x: a module, a class, or a name of a module. jax compares jit-wrapped functions of any module by identity."""
     if isinstance(x, types.ModuleType):
         return _of_library(vars(x))
     found = sys.modules.get(str(getattr(x, "__module__", None)))
@@ -105,7 +107,7 @@ def _named(x) -> bool:
 
 @functools.cache
 def _facts(code: types.CodeType) -> tuple[set[str], set[str], set[str]]:
-    """Names in a code object and those nested in it, modules that they import, and variables outside that they assign or delete."""
+    """Return the names in a code object and those nested in it, the modules that they import, and the outer variables that they assign or delete."""
     lines = [(line.opname, line.argval) for line in dis.get_instructions(code)]
     names, imports = set(code.co_names), {name for operation, name in lines if operation == "IMPORT_NAME"}
     written = {name for operation, name in lines if operation in ("STORE_GLOBAL", "DELETE_GLOBAL", "STORE_DEREF", "DELETE_DEREF")} - set(code.co_cellvars)
@@ -115,7 +117,7 @@ def _facts(code: types.CodeType) -> tuple[set[str], set[str], set[str]]:
 
 
 def _split(f: types.FunctionType):
-    """How a function is built, and of what: code, globals, names among them, and what it reads."""
+    """Return how to build a function, and from what: code, globals, the names among them, and the values it reads."""
     names, imports, written = _facts(f.__code__)
     if written or set(vars(f)) - {"__wrapped__"}:
         _refuse("a variable outside that it assigns" if written else "a function with attributes")
@@ -127,26 +129,26 @@ def _split(f: types.FunctionType):
 
 
 class _Reader:
-    """Takes apart what one function reads. as_data: whether floating-point arrays are data."""
+    """Reads the values that one function depends on. as_data: whether floating-point arrays are data."""
 
     def __init__(self, as_data: bool):
-        # by id: what was read before, None where it is being read
+        # by id: values read before; None while one is being read
         self.as_data, self.known = as_data, {}
 
     def read(self, x):
-        """An array, a `Still`, or a `Function` of parts. IncomparableError: it is not of a simple kind."""
+        """Return x as an array, a `Still`, or a `Function`. TypeError: x is not of a simple kind."""
         kind = type(x)
         if kind is Still:
             return x
         if kind in PLAIN or isinstance(x, enum.Enum | np.dtype):
-            # by their text nan is itself, and -0.0 is not 0.0
+            # compared by their text, nan equals nan and -0.0 differs from 0.0
             return Still((kind, repr(x) if kind in (float, complex) else x), x)
         if isinstance(x, np.ndarray | np.generic | jax.Array):
             return self.array(x)
         if _named(x):
             return Still(id(x), x)
         if id(x) in self.known:
-            # or functions that call each other would be gone through again and again
+            # without this, functions that call each other would be read for ever
             return self.known[id(x)] or _refuse("something that holds itself")
         parts = self.parts(x)
         del self.known[id(x)]
@@ -158,17 +160,17 @@ class _Reader:
 
     def array(self, x):
         if isinstance(x, jax.Array):
-            # tracers always are data, and so is what cannot be looked at here
+            # tracers are always data, and so are arrays whose values this process cannot read
             data = self.as_data or not concrete(x) or jnp.issubdtype(x.dtype, jax.dtypes.extended) or not x.is_fully_addressable
         elif x.dtype.hasobject or type(x) not in (np.ndarray, x.dtype.type):
             _refuse("an array of objects or of a class of its own")
         else:
-            # whole numbers are sizes and indices, which Python needs to know; jax has no long double
+            # integers are sizes and indices, which Python needs; jax has no long double
             data = self.as_data and jnp.issubdtype(x.dtype, jnp.inexact) and x.dtype.char not in "gG"
         return x if data else Still((type(x), repr(x.dtype), getattr(x, "weak_type", False), x.shape, np.asarray(x).tobytes()), x)
 
     def parts(self, x) -> Function:
-        """Of a function or a container."""
+        """Return the parts of a function or a container."""
         kind = type(x)
         self.known[id(x)] = None
         if kind is types.FunctionType:
@@ -178,27 +180,27 @@ class _Reader:
         elif kind is slice:
             build, parts = slice, [x.start, x.stop, x.step]
         elif kind is dict:
-            # in its own order, which jax does not keep
+            # in insertion order, which jax does not keep
             build, parts = _dict, [tuple(x), *x.values()]
         elif isinstance(x, dict) or jax.tree_util.all_leaves([x]):
             _refuse(f"an object of type {kind.__name__}")
         else:
             parts, shape = eqx.tree_flatten_one_level(x)
-            # (jax takes the hash of a tree even where what is static in it has none)
+            # raise now if the static part is not hashable
             hash(tuple(getattr(x, f.name) for f in dataclasses.fields(x) if f.metadata.get("static")) if isinstance(x, eqx.Module) else shape.node_data())
             build, parts = _tree, [Still(shape, shape), *parts]
         return Function([self.read(part) for part in parts], build)
 
 
 def _code(function):
-    """What stays the same when a line makes a function anew."""
+    """Return the code of a function, which all functions made by one line share."""
     return getattr(getattr(function, "func", function), "__code__", type(function))
 
 
 def comparable(function) -> Any:
-    """The function as a `Function`; what jax and equinox compare themselves as it is. Any error: it is to be compared by identity.
-    The same function object keeps its static part and so its program, as is usual in jax, also when a number or a list that it reads has changed; its arrays
-    are read anew.
+    """Return the function as a `Function`. Any error means that it has to be compared by identity. Callables that jax or equinox compare are returned as is.
+
+    As in jax, one function object keeps its program when a number or a list that it reads changes. Its arrays are read at each call.
     """
     if not isinstance(function, types.FunctionType | types.MethodType | functools.partial) or _named(function):
         return function
@@ -210,8 +212,10 @@ def comparable(function) -> Any:
 
 
 def shared(program: Callable, **functions) -> Any:
-    """program(**functions), by a program that new function objects share; functions: by the names of the arguments that they are, or pytrees of them.
-    Where a function looks at its arrays, the program is made once more with those as they are.
+    """Call program(**functions) with comparable functions, so that equal function objects share a compiled program.
+
+    functions: one function, or a pytree of them, for each argument name. If Python code in a function reads the values of its arrays, tracing fails; the call
+    is then repeated with these arrays static.
     """
     while True:
         known, identified = len(_looking), []
@@ -220,7 +224,7 @@ def shared(program: Callable, **functions) -> Any:
             try:
                 return comparable(function)
             except Exception as error:
-                # (whatever a thing does as it is looked at, the run can be made)
+                # whatever error reading an object raises, the run itself can be made
                 identified.append((name, function, error))
                 return function
 

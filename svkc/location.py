@@ -48,7 +48,7 @@ def event_tolerance(t: Float[Array, ""]) -> Float[Array, ""]:
 
 
 def field_of(guards: Reading | Field) -> Field:
-    """The field that guards are told the torques of, or the field itself where there are no guards."""
+    """Return the field of the guards, or the field itself where there are no guards."""
     return guards if isinstance(guards, Field) else guards.field
 
 

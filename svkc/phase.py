@@ -20,14 +20,14 @@ from svkc.trajectory import RESULTS, Events
 
 
 class Run(eqx.Module):
-    """What goes from phase to phase. `count`: phases so far; `derivative`, `spoiled`: why there is none, and the first phase of which that
-    is true; `unread`: guards whose values are of another structure."""
+    """The state that a phase hands to the next. `count`: phases so far; `stale`: guards whose values belong to another structure; `derivative`,
+    `invalid_from`: why the run has no derivative, and the index of the first such phase."""
 
     t: Float[Array, ""]
     state: State
     work: Float[Array, ""] | None
     guards: Float[Array, " guards"] | None
-    unread: Bool[Array, " guards"] | None
+    stale: Bool[Array, " guards"] | None
     pending: Bool[Array, " timed"]
     events: Events
     records: Records
@@ -35,7 +35,7 @@ class Run(eqx.Module):
     saved: State
     result: RESULTS
     derivative: RESULTS
-    spoiled: Int[Array, ""]
+    invalid_from: Int[Array, ""]
 
 
 class Solved(eqx.Module):

@@ -42,33 +42,11 @@ def _solvable(structure: Structure, selection: Selection) -> Selection:
     return without_weak(selection, jnp.maximum(rank_tolerance(selection.size.dtype), held_part(selection.size.dtype) * structure.margin))
 
 
-@functools.partial(jax.jit, static_argnames="iterations")
-def close(chain: Chain, structure: Structure, q: Float[Array, " q"], iterations: int = 2, hold=None) -> Float[Array, " q"]:
-    """Q moved by the least change (scaled coordinates) that closes the loops: Newton's method on the gaps, `iterations` times.
-
-    `hold`: coordinates that must not move in the first half of the iterations.
-    """
-    row, _ = scales(chain)
-
-    @functools.partial(jax.checkpoint, prevent_cse=False)
-    def newton(i, q):
-        kin = kinematics(chain, q)
-        end = ends(chain, structure, kin, q)
-        J = scaled_jacobian(chain, structure, kin, end)
-        if hold is not None:
-            J = jnp.where(hold[None] & (i < iterations // 2), 0, J)
-        selection = _solvable(structure, select(J, structure.rank))
-        open_ = row * gap(structure, end).ravel()
-        return integrate(chain, q, -least_change(chain, structure, kin, selection, J, open_[:, None])[:, 0])
-
-    return jax.lax.fori_loop(0, iterations, newton, normalize(chain, q))
-
-
 @functools.partial(jax.jit, static_argnames=("iterations", "change", "hold"))
 def settle_loops(
     chain: Chain, structure: Structure, q, v, iterations: int, change: Callable = inertia_change, pivots=None, hold: float = 0.0
 ) -> tuple[Float[Array, " q"], Float[Array, " dofs"], Float[Array, "links 2"], Float[Array, ""], Float[Array, "steps dofs"]]:
-    """`close`, then `agree`: one body for both, the last turn of the loop being the velocities', so that it is compiled once.
+    """Close the loops by Newton's method, then project the velocity. The last turn of one loop is the velocity's, so that the body is compiled once.
 
     And what the loops show: the gaps (rad, `chain.length`s) that each loop is left with, |R_mm| / |R_11|, and the pivots to go on with. pivots: those held
     so far (None: none are), which go on until their |R_mm| / |R_11| is below `hold` times that of new ones.
@@ -124,20 +102,3 @@ def _turn_by_bodies(chain: Chain, structure: Structure, q, v, last: Bool[Array, 
     apart = jnp.where(last, J @ jnp.where(active_dofs(chain, structure), v / column, 0), open_)
     step = solve_motion(chain, structure, kin, None, J, jnp.zeros(chain.dofs, q.dtype), apart, by_bodies)
     return step, jax.lax.stop_gradient(sizes(open_))
-
-
-@jax.jit
-def agree(chain: Chain, structure: Structure, q, v, hold=None) -> Float[Array, " dofs"]:
-    """V with the least change (scaled coordinates) that makes J_C v = 0; first without changing those in `hold`, then as far as needed."""
-    _, column = scales(chain)
-    kin = kinematics(chain, q)
-    J = scaled_jacobian(chain, structure, kin, ends(chain, structure, kin, q))
-    active = active_dofs(chain, structure)
-
-    def project(i, v):
-        free = J if hold is None else jnp.where(hold[None] & (i == 0), 0, J)
-        selection = _solvable(structure, select(free, structure.rank))
-        apart = J @ jnp.where(active, v / column, 0)
-        return v - least_change(chain, structure, kin, selection, free, apart[:, None])[:, 0]
-
-    return project(0, v) if hold is None else jax.lax.fori_loop(0, 2, project, v)

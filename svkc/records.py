@@ -1,4 +1,4 @@
-"""F6: the records of a run, row by row: what its phases and events leave behind, and the certificate that is computed from them after the run."""
+"""F6: the records that a run writes, one row for each phase and event, and the certificate that is computed from them after the run."""
 
 import diffrax
 import equinox as eqx
@@ -20,9 +20,9 @@ from svkc.trajectory import Events, Phases
 
 
 class Records(eqx.Module):
-    """One row for each phase: its times, the motion at its two ends, the structure it had, and what its steps cost and showed.
+    """One row for each phase: its times, the motion at its two ends, its structure, and the counts of its steps.
 
-    Rows that were not written hold the state that the run started from, so that whatever is computed of them is finite.
+    Unwritten rows hold the initial state, so that what is computed from them is finite.
     """
 
     start: Float[Array, "*phases"]
@@ -36,8 +36,9 @@ class Records(eqx.Module):
     tally: Tally
 
 
-class Moment(eqx.Module):
-    """What the certificate says of one state: the largest gaps of the loops and their rates, and at the ends of phases energy, momenta and rank margin."""
+class Checked(eqx.Module):
+    """Quantities of the certificate at one state: the largest gaps of the loops (rad, m) and their rates, and at the ends of phases energy (J), linear
+    momentum (N s), angular momentum about the centre of mass (N m s) and rank margin."""
 
     gap: Float[Array, "*states 2"]
     gap_rate: Float[Array, "*states 2"]
@@ -48,7 +49,7 @@ class Moment(eqx.Module):
 
 
 def no_events(rows: int, links: int, dtype) -> Events:
-    """Rows that nothing has been written to: they show, by inf and -1."""
+    """Return empty rows for events. Their times are inf, their indices -1."""
     impulse = jnp.zeros((rows, links, 3), dtype)
     return Events(jnp.full(rows, jnp.inf, dtype), jnp.full(rows, -1, jnp.int32), impulse, impulse, jnp.zeros(rows, dtype), jnp.asarray(0, jnp.int32))
 
@@ -71,23 +72,23 @@ def no_records(rows: int, state: State) -> Records:
 
 
 def recorded(records: Records, row: Bool[Array, " phases"], began: tuple, ended: tuple, work, path: Path) -> Records:
-    """Return the records with the row of one phase written, where there is one. began, ended: time and state."""
+    """Return the records with the row of one phase written. row: one-hot, or all False for no phase; began, ended: time and state."""
     (start, first), (stop, last) = began, ended
     new = Records(start, stop, jnp.stack([first.q, last.q]), jnp.stack([first.v, last.v]), first.structure, work, path.accepted, path.rejected, path.tally)
     write = lambda old, new: jnp.where(row.reshape(-1, *(1,) * jnp.ndim(new)), jnp.asarray(new)[None], old)
     return jax.tree.map(write, records, new)
 
 
-def certified(chain: Chain, records: Records, count: Int[Array, ""], saved: State, stages: int) -> tuple[Phases, Moment, Int[Array, ""]]:
-    """Return the phases of a run, what is said of its saved states, and the first phase with an end where the loops lose rank (past the last one: none).
+def certificate(chain: Chain, records: Records, count: Int[Array, ""], saved: State, stages: int) -> tuple[Phases, Checked, Int[Array, ""]]:
+    """Return the phases of a run, the checks of its saved states, and the index of the first phase whose loops lose rank at an end (past the last: none).
 
-    stages: evaluations of the vector field in one try of a step. One loop looks at every state, so that kinematics and energy are compiled once.
+    stages: evaluations of the vector field in one try of a step. One loop checks every state, so that kinematics and energy are compiled once.
     """
     r, rows, join = records, records.start.shape[0], lambda *x: jnp.concatenate(x)
     states = State(join(r.q[:, 0], r.q[:, 1], saved.q), join(r.v[:, 0], r.v[:, 1], saved.v), jax.tree.map(join, r.structure, r.structure, saved.structure))
     at_end = np.arange(states.q.shape[0]) < 2 * rows
-    moments = jax.lax.map(jax.checkpoint(lambda x: _moment(chain, *x)), (states, jnp.asarray(at_end)))
-    first, last, of_saved = (jax.tree.map(lambda x, part=p: x[part], moments) for p in (slice(rows), slice(rows, 2 * rows), slice(2 * rows, None)))
+    checks = jax.lax.map(jax.checkpoint(lambda x: _check_state(chain, *x)), (states, jnp.asarray(at_end)))
+    first, last, saved_checks = (jax.tree.map(lambda x, part=p: x[part], checks) for p in (slice(rows), slice(rows, 2 * rows), slice(2 * rows, None)))
     written = jnp.arange(rows, dtype=jnp.int32) < count
     fill = lambda value, none: jnp.where(written.reshape(-1, *(1,) * (jnp.ndim(value) - 1)), value, none)
     free, joint_freedoms = jax.vmap(lambda s: (_free(chain, s), jnp.sum(active_dofs(chain, s), dtype=jnp.int32)))(r.structure)
@@ -114,11 +115,11 @@ def certified(chain: Chain, records: Records, count: Int[Array, ""], saved: Stat
         count=count,
     )
     lost = written & (margin < rank_tolerance(margin.dtype))
-    return phases, of_saved, jnp.where(jnp.any(lost), jnp.argmax(lost).astype(jnp.int32), rows)
+    return phases, saved_checks, jnp.where(jnp.any(lost), jnp.argmax(lost).astype(jnp.int32), rows)
 
 
-def _moment(chain: Chain, state: State, at_end: Bool[Array, ""]) -> Moment:
-    """Look at one state. at_end: of a phase; elsewhere energy, momenta and margin are left out."""
+def _check_state(chain: Chain, state: State, at_end: Bool[Array, ""]) -> Checked:
+    """Check one state. at_end: whether it is at an end of a phase; elsewhere energy, momenta and margin are left out."""
     kin, dtype, looped = kinematics(chain, state.q), state.q.dtype, bool(chain.link_names)
     gaps = rates = jnp.zeros(2, dtype)
     J = jnp.zeros((0, chain.dofs), dtype)
@@ -134,7 +135,7 @@ def _moment(chain: Chain, state: State, at_end: Bool[Array, ""]) -> Moment:
         return energy, *frozen(tuple(momenta)), margin
 
     none = jnp.zeros((), dtype), jnp.zeros(3, dtype), jnp.zeros(3, dtype), jnp.ones((), dtype)
-    return Moment(gaps, rates, *jax.lax.cond(at_end, whole, lambda: none))
+    return Checked(gaps, rates, *jax.lax.cond(at_end, whole, lambda: none))
 
 
 def _free(chain: Chain, s: Structure) -> Bool[Array, ""]:
@@ -146,7 +147,7 @@ def _free(chain: Chain, s: Structure) -> Bool[Array, ""]:
     return ~jnp.any(s.connected & ((s.parent == 0) | (s.real == 0)))
 
 
-def _momentum_drift(chain: Chain, first: Moment, last: Moment, span: Float[Array, " phases"]) -> Float[Array, "phases 2"]:
+def _momentum_drift(chain: Chain, first: Checked, last: Checked, span: Float[Array, " phases"]) -> Float[Array, "phases 2"]:
     """Change of linear momentum (N s) that gravity does not explain, and of the angular momentum about the centre of mass (N m s)."""
     fallen = jnp.sum(chain.mass) * chain.gravity[None] * span[:, None]
     size = lambda x: jnp.linalg.norm(x, axis=-1)

@@ -53,7 +53,7 @@ def _block(y: Motion, times, world: World, solver) -> tuple[Motion, Motion]:
 
 
 def _late(path: Path, stop) -> Float[Array, ""]:
-    """Nothing, but it changes as the scheduled end does, where that was reached."""
+    """Return zero, with the tangent of the scheduled end where that was reached."""
     return jnp.where(path.result == SUCCESSFUL, stop - path.t, 0)
 
 

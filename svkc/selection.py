@@ -128,14 +128,14 @@ def select_with_rank(J: Float[Array, "rows dofs"]) -> tuple[Selection, Int[Array
     """Return the selection of J with its own rank, and the rank, by one search for pivots."""
     full = select(jax.lax.stop_gradient(J))
     rank = count_rank(full.size)
-    # the steps before the rank are the same whether or not others follow; those alone follow J in derivatives, as the others are round-off
+    # later steps do not change earlier ones, and are round-off, which must not be differentiated
     first = _kept(full, full.used & (jnp.arange(full.used.shape[0], dtype=jnp.int32) < rank))
     Q, size = _following(J, first.Q, first.P, first.size)
     return Selection(Q, first.P, size, first.used), rank
 
 
 def too_few(P: Float[Array, "steps dofs"], rank: Int[Array, ""]) -> Bool[Array, ""]:
-    """Whether fewer pivots are held than the rank asks for, as before the first choice."""
+    """Return whether fewer pivots are held than the rank, as before the first choice."""
     return jnp.sum(jnp.any(P > 0, 1), dtype=jnp.int32) < rank
 
 

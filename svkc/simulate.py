@@ -23,7 +23,7 @@ from svkc.guards import Sensor
 from svkc.location import Reading, event_tolerance
 from svkc.operation import Closed
 from svkc.phase import Run, Solved, solve
-from svkc.records import certified, no_events, no_records, recorded, stages
+from svkc.records import certificate, no_events, no_records, recorded, stages
 from svkc.request import Options, checked
 from svkc.stepping import Motion, Scene, finite, frozen
 from svkc.trajectory import RESULTS, Events, Trajectory
@@ -42,9 +42,9 @@ def simulate(
     dt: fixed steps (s). rtol, atol: adaptive steps, by default 1e-7 (float32: 1e-4) and a hundredth of rtol.
     solver, stepsize_controller, adjoint, progress_meter: diffrax objects, passed through; by default Dopri8 with rtol, Tsit5 with dt or in float32.
     stabilization: `svkc.Projection()` (default), `svkc.Exact()`, `svkc.Baumgarte(rate)` or `svkc.Drift()`. dynamics: `svkc.Dynamics(inertia, hold)`.
-    Functions are compared by code, defaults and the values that they find in closures and globals, where all of these are of simple kinds. A new function
-    object that is equal is not compiled again, nor where floating-point arrays in it differ: they are data. Numbers, and arrays of whole numbers, belong to
-    the program, as do arrays at which Python looks. A `UserWarning` names the argument that is compiled again because it cannot be compared.
+    Functions are compared by their code and by the values that they read: defaults, closures and globals. An equal function is not compiled again.
+    Floating-point arrays among these values are data. Numbers and integer arrays are static, as are arrays that Python has to read. A function that reads
+    other kinds of objects is compared by identity; if that compiles it again, a `UserWarning` names the argument.
     max_events: how many events may happen (default: each timed one, four times each guard); max_steps: in one phase.
     ValueError: a call that cannot be right. A run that goes wrong ends with a code in `result`, raised when throw=True.
     """
@@ -56,7 +56,7 @@ def simulate(
     given = chain, state, jnp.asarray(t0, dtype), jnp.asarray(t1, dtype), save_at
     run = lambda control, events: _run(*given, _with(made, guards=events), _with(options, control=control), args)
     run = shared(run, control=options.control, events=made.guards)
-    traj = (_certified_once if len(save_at) <= MOMENTS else _certified)(chain, run, save_at, given[3], options.gap, stages(options.solver))
+    traj = (_certified_once if len(save_at) <= FEW_STATES else _certified)(chain, run, save_at, given[3], options.gap, stages(options.solver))
     if not throw:
         return traj
     if isinstance(traj.result._value, jax.core.Tracer):
@@ -84,18 +84,18 @@ def _run(chain: Chain, state: State, t0, t1, ts, made: Plan, options: Options, a
 
 
 def _with_certificate(chain: Chain, run: Run, ts, t1, most: float, evaluations: int) -> Trajectory:
-    """Return the run with its certificate. most: a gap that counts as open; evaluations: of the field in one try of a step."""
+    """Return the run with its certificate. most: the largest gap of a closed loop; evaluations: of the field in one try of a step."""
     short = (run.t < t1) & (run.result == RESULTS.successful)
     result = RESULTS.where(short, RESULTS.max_events, run.result)
-    phases, saved, lost = certified(chain, run.records, run.count, run.saved, evaluations)
+    phases, saved, lost = certificate(chain, run.records, run.count, run.saved, evaluations)
     worst = jnp.maximum(jnp.max(saved.gap), jnp.max(phases.gap))
     result = RESULTS.where((result == RESULTS.successful) & (worst > most), RESULTS.loop_open, result)
-    derivative = RESULTS.where((lost < phases.start.shape[0]) & (lost <= run.spoiled), RESULTS.rank_lost, run.derivative)
+    derivative = RESULTS.where((lost < phases.start.shape[0]) & (lost <= run.invalid_from), RESULTS.rank_lost, run.derivative)
     return Trajectory(ts, run.saved, saved.gap, saved.gap_rate, run.events, phases, run.state, run.t, result, derivative)
 
 
-# a program of its own, so that a run that is called eagerly has it compiled for compile time, as it looks at a few states once
-MOMENTS = 1000
+# a program of its own, which an eager call compiles for compile time: it checks each state once
+FEW_STATES = 1000
 _certified, _certified_once = eqx.filter_jit(_with_certificate), eager_jit(_with_certificate, eqx.filter_jit)
 
 
@@ -124,14 +124,14 @@ def _start(chain: Chain, state: State, t0, ts, made: Plan, options: Options, arg
     """Empty records, sized by capacity; unwritten entries show: inf, -1."""
     links, rows, dtype = len(chain.link_names), options.max_events, state.q.dtype
     state = _lockable(chain, state, made)
-    # a load that is too much from the start is seen to be; the others are read at the start of the phase
+    # an overload from the start is a crossing, so loads begin idle; other guards are evaluated at the start of the phase
     idle = [g.idle if isinstance(g, Sensor) and g.loaded else 1 for g in made.guards]
     return Run(
         t=t0,
         state=state,
         work=jnp.zeros((), dtype) if options.has_work else None,
         guards=jnp.asarray(idle, dtype) if made.guards else None,
-        unread=jnp.asarray(_fresh(made)) if made.guards else None,
+        stale=jnp.asarray(_reevaluated(made)) if made.guards else None,
         pending=jnp.ones(len(made.timed), bool),
         events=no_events(rows, links, dtype),
         records=no_records(rows + 1, state),
@@ -139,13 +139,13 @@ def _start(chain: Chain, state: State, t0, ts, made: Plan, options: Options, arg
         saved=jax.tree.map(lambda x: jnp.broadcast_to(x[None], (ts.shape[0], *x.shape)), state),
         result=RESULTS.successful,
         derivative=RESULTS.successful,
-        spoiled=jnp.asarray(rows + 1, jnp.int32),
+        invalid_from=jnp.asarray(rows + 1, jnp.int32),
     )  # fmt: skip
 
 
 def _phase(chain: Chain, run: Run, index, t1, ts, made: Plan, options: Options, args) -> Run:
     """One solve, the events at its end, and the records of both."""
-    run = _read(chain, run, made, options, args)
+    run = _with_guards(chain, run, made, options, args)
     going = (run.t < t1) | jnp.any(run.pending & (made.times <= t1))
     going = going & (run.result == RESULTS.successful)
     next_time = jnp.min(jnp.where(run.pending, made.times, jnp.inf), initial=jnp.inf)
@@ -162,19 +162,19 @@ def _phase(chain: Chain, run: Run, index, t1, ts, made: Plan, options: Options, 
     work = jnp.zeros_like(run.t) if run.work is None else solved.motion.work - run.work
     records = recorded(run.records, row, (run.t, run.state), (solved.t, ended), work, solved.path)
     count = run.count + going.astype(jnp.int32)
-    derivative, spoiled = _derivative(run, solved, going, timed, index)
+    derivative, invalid_from = _derivative(run, solved, going, timed, index)
     after, events, result = ended, run.events, solved.result
     if made.actions:
         after, events, result = _apply(chain, run, ended, solved, fired, made)
     result = RESULTS.where(run.result == RESULTS.successful, result, run.result)
-    # what rests at zero after it fired goes on as it is
-    unread = jnp.asarray(_fresh(made)) & jnp.any(fired) & (solved.guards != 0) if made.guards else None
+    # a guard that rests at zero after it fired keeps its value
+    stale = jnp.asarray(_reevaluated(made)) & jnp.any(fired) & (solved.guards != 0) if made.guards else None
     return Run(
         t=solved.t,
         state=after,
         work=solved.motion.work,
         guards=solved.guards,
-        unread=unread,
+        stale=stale,
         pending=run.pending & ~timed,
         events=events,
         records=records,
@@ -182,32 +182,32 @@ def _phase(chain: Chain, run: Run, index, t1, ts, made: Plan, options: Options, 
         saved=saved,
         result=result,
         derivative=derivative,
-        spoiled=spoiled,
+        invalid_from=invalid_from,
     )
 
 
 def _derivative(run: Run, solved: Solved, going, timed: Bool[Array, " timed"], index) -> tuple[RESULTS, Int[Array, ""]]:
-    """Return the first reason why the run has no derivative, and the phase it is of; ranks are looked at after the run."""
+    """Return the first reason why the run has no derivative, and the index of its phase. Ranks are checked after the run."""
     code = RESULTS.where(jnp.sum(solved.fired) + jnp.sum(timed) > 1, RESULTS.together, solved.derivative)
     first = (run.derivative == RESULTS.successful) & going & (code != RESULTS.successful)
-    return RESULTS.where(first, code, run.derivative), jnp.where(first, index.astype(jnp.int32), run.spoiled)
+    return RESULTS.where(first, code, run.derivative), jnp.where(first, index.astype(jnp.int32), run.invalid_from)
 
 
-def _fresh(made: Plan) -> np.ndarray:
-    """Return which guards are read anew after a change of structure, so that a guard is compared within one phase.
+def _reevaluated(made: Plan) -> np.ndarray:
+    """Return which guards are re-evaluated after a change of structure, so that a guard is compared within one phase.
 
-    Loads are not: what has to carry too much from the first moment is seen to break, or to leave.
+    Guards of loads are not: a link that is overloaded from the start of a phase breaks at once.
     """
     return np.array([not (isinstance(g, Sensor) and g.loaded) for g in made.guards], bool)
 
 
-def _read(chain: Chain, run: Run, made: Plan, options: Options, args) -> Run:
-    """Return the run with the guards that are unread as they are at the start of this phase."""
-    if not made.guards or not _fresh(made).any():
+def _with_guards(chain: Chain, run: Run, made: Plan, options: Options, args) -> Run:
+    """Return the run with its stale guards re-evaluated at the start of a phase."""
+    if not made.guards or not _reevaluated(made).any():
         return run
     scene = Scene(chain, run.state.structure, args)
     now = frozen(Reading(made, options.field))(*frozen((run.t, Motion(run.state.q, run.state.v), scene)))
-    return dataclasses.replace(run, guards=jnp.where(run.unread, now, run.guards))
+    return dataclasses.replace(run, guards=jnp.where(run.stale, now, run.guards))
 
 
 def _save(run: Run, ended: State, solved: Solved, ts) -> State:

@@ -16,10 +16,10 @@ from svkc.closure import constrained
 from svkc.eager import eager_jit
 from svkc.forward_dynamics import reduced_inertia, solve_free_motion
 from svkc.given import yes_or_no
-from svkc.impact import JOIN, RANK, Held, Schedule, decide_rank, newton_turns
 from svkc.inverse_dynamics import inertia_by_composites, inertia_times
 from svkc.kinematics import Kinematics, kinematics, twists
 from svkc.loops import active_dofs, ends, joint_coordinates, loop_jacobian, with_coordinates
+from svkc.newton import CONNECT, RANK, Held, Schedule, decide_rank, solve_structure
 from svkc.spatial import quat_conjugate, quat_multiply, quat_rotate
 from svkc.topology import V_SIZE
 from svkc.verb import check_state
@@ -95,7 +95,7 @@ def change(
     structure, new_q = _placed(chain, structure, new_links, here, q)
     # the armature of a joint that is made anew is at rest before
     before = v if chain.link_armature is None else jnp.where(active_dofs(chain, state.structure), v, 0)
-    joined = newton_turns(chain, structure, new_q, before, Held(), Schedule(RANK + JOIN))
+    joined = solve_structure(chain, structure, new_q, before, Held(), Schedule(RANK + CONNECT))
     structure = eqx.tree_at(lambda s: (s.rank, s.margin), structure, (joined.rank, joined.margin))
     q, v = jnp.where(holds, joined.q, q), jnp.where(holds, joined.v, v)
     wrench, lost = jnp.where(holds, joined.wrench, 0), jnp.where(holds, joined.lost, 0)

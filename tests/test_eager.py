@@ -99,3 +99,24 @@ def test_options_are_given_to_the_outermost_call_alone():
     assert asked == [{}]
     assert float(double(3.0)) == 6
     assert asked[1:] == [{"compiler_options": eager._OPTIONS}]
+
+
+@pytest.mark.parametrize("make", [models.sarrus, pytest.param(models.bennett, marks=pytest.mark.slow)])
+def test_the_derivative_of_a_state_closed_from_afar(make):
+    """Open, the loops of an over-constrained linkage have a higher rank than closed: what is differentiated is the way that Newton's method went."""
+    chain = make()
+    rng = np.random.default_rng(0)
+    start, along = jnp.asarray(0.04 * rng.normal(size=chain.nv)), jnp.asarray(rng.normal(size=chain.nv))
+    tree = lambda dv: svkc.integrate(chain, chain.q_load, jnp.pad(dv, (0, chain.dofs - chain.nv)))[: chain.nq]
+    closed = lambda x: chain.state(tree(start + x * along)).q
+    x, h = jnp.asarray(0.0), 1e-5
+    difference = (closed(h) - closed(-h)) / (2 * h)
+    assert float(jnp.abs(difference).max()) > 0.1
+    for derivative in (jax.jacfwd(closed)(x), jax.jacrev(closed)(x)):
+        np.testing.assert_allclose(derivative, difference, atol=1e-6 * float(jnp.abs(difference).max()))
+
+
+def test_a_state_that_cannot_be_closed_is_an_error_under_a_derivative():
+    chain = models.four_bar()
+    with pytest.raises(Exception, match="cannot be closed"):
+        jax.grad(lambda x: jnp.sum(chain.state({"crank": x, "coupler": 3.0 + x, "rocker": 3.0}).q))(0.1)

@@ -24,7 +24,7 @@ HOUSE = [
     "delassus",
     "forward_dynamics",
     "projection",
-    "impact",
+    "newton",
     "assembly mobility",
     "binding actuation guards solvers",
     "transition events stepping",
