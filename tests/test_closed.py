@@ -179,27 +179,36 @@ def test_spare_slots_change_nothing():
         np.testing.assert_allclose(other, numbers[0], rtol=1e-13, atol=1e-13)
 
 
-def test_bind_a_spare_slot():
-    """A grip between bodies not known beforehand: the same motion as the declared link, by verbs and in a run.
+GRIP = svkc.Grip("world", "rocker", joint="ball", real_pos=(0.2, 0, -0.6))
 
-    Given up it leaves an empty slot, and all as it moves.
-    """
+
+@pytest.fixture(scope="module")
+def gripped():
+    """A four-bar whose pin is a grip in a spare slot: the chain, its state before the grip, and with it; the four-bar with a declared pin and its state."""
     declared = models.four_bar()
     a = declared.state(v={"crank": 1.0})
-    xml = models.FOUR_BAR
-    chain = svkc.load(models.MJCF.format(xml), spare=1)
+    chain = svkc.load(models.MJCF.format(models.FOUR_BAR), spare=1)
     open_ = chain.state(v=np.asarray(a.v)[:3])
-    bound = svkc.bind(chain, open_, "spare_0", "world", "rocker", joint="ball", real_pos=(0.2, 0, -0.6))
-    gripped = svkc.connect(chain, bound, "spare_0", here=True)
+    bound = svkc.bind(chain, open_, "spare_0", GRIP.parent, GRIP.real, joint=GRIP.joint, real_pos=GRIP.real_pos)
+    return chain, open_, svkc.connect(chain, bound, "spare_0", here=True), declared, a
+
+
+def test_bind_a_spare_slot(gripped):
+    """A grip between bodies not known beforehand: the same motion as the declared link. Given up it leaves an empty slot, and the motion as it was."""
+    chain, _, gripped, declared, a = gripped
     np.testing.assert_allclose(gripped.v[:3], a.v[:3], atol=1e-12)
     f = svkc.forward_dynamics
     np.testing.assert_allclose(f(chain, gripped, jnp.zeros(3))[:3], f(declared, a, jnp.zeros(3))[:3], rtol=1e-9)
-    # made in a run, at its start
-    grip = svkc.at(0.0, bind=svkc.Grip("world", "rocker", joint="ball", real_pos=(0.2, 0, -0.6)))
-    traj = svkc.simulate(chain, open_, 1e-3, dt=1e-3, events=[grip])
-    for ours, theirs in zip(jax.tree.leaves(jax.tree.map(lambda x: x[0], traj.states)), jax.tree.leaves(gripped), strict=True):
-        np.testing.assert_allclose(ours, theirs, atol=1e-12)
     empty = svkc.unbind(chain, gripped, "spare_0")
     assert empty.structure.connected.tolist() == [False]
     np.testing.assert_array_equal(empty.structure.real, chain.structure.real)
     np.testing.assert_array_equal(empty.v[:3], gripped.v[:3])
+
+
+@pytest.mark.slow
+def test_bind_a_spare_slot_in_a_run(gripped):
+    """At the start of a run, as by verbs."""
+    chain, open_, gripped, *_ = gripped
+    traj = svkc.simulate(chain, open_, 1e-3, dt=1e-3, events=[svkc.at(0.0, bind=GRIP)])
+    for ours, theirs in zip(jax.tree.leaves(jax.tree.map(lambda x: x[0], traj.states)), jax.tree.leaves(gripped), strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-12)

@@ -101,7 +101,8 @@ def test_options_are_given_to_the_outermost_call_alone():
     assert asked[1:] == [{"compiler_options": eager._OPTIONS}]
 
 
-@pytest.mark.parametrize("make", [models.sarrus, pytest.param(models.bennett, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [models.sarrus, models.bennett])
 def test_the_derivative_of_a_state_closed_from_afar(make):
     """Open, the loops of an over-constrained linkage have a higher rank than closed: what is differentiated is the way that Newton's method went."""
     chain = make()

@@ -257,6 +257,7 @@ def test_guards(arm, programs):
     assert len(programs) == 1
 
 
+@pytest.mark.slow
 def test_rollout(arm, programs):
     """A lambda in the call itself."""
     chain, state = arm

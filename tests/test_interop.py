@@ -120,8 +120,8 @@ def residual(chain, state):
     return np.abs(gaps).max()
 
 
-# (of the spec is the same chain as of the weld)
-@pytest.mark.parametrize("scene", [scene if scene in ("weld", "spec") else pytest.param(scene, marks=pytest.mark.slow) for scene in SCENES])
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", SCENES)
 def test_a_scene_as_mjcf_and_back(scene):
     """The same bodies, joints, links, masses to the last digit; the same loops and motion; MuJoCo finds the loops closed."""
     chain, how = SCENES[scene]()

@@ -190,6 +190,7 @@ def still(chain):
     return svkc.simulate(chain, chain.state(), 0.0, ts=jnp.zeros(1))
 
 
+@pytest.mark.slow
 def test_a_run_of_one_moment(pendulum, tmp_path):
     run = contents(svkc.render(pendulum, still(pendulum), tmp_path / "still.html"))
     assert (run["times"], run["events"], [p["mobility"] for p in run["phases"]]) == ([0.0], [], [1])

@@ -210,7 +210,8 @@ def gap_of_two_seconds(held) -> float:
     return float(traj.gaps.max())
 
 
-@pytest.mark.parametrize("held", [pytest.param(svkc.Projection(), marks=pytest.mark.slow), svkc.Exact()])
+@pytest.mark.slow
+@pytest.mark.parametrize("held", [svkc.Projection(), svkc.Exact()])
 def test_drift_is_held(held):
     """A four-bar for 2 s: projection keeps the loop to round-off, after steps or at every evaluation."""
     assert gap_of_two_seconds(held) < 1e-13
