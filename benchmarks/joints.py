@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 
 import svkc
-from svkc.spatial import quat_about, quat_conjugate, quat_multiply
+from svkc.tree.spatial import quat_about, quat_conjugate, quat_multiply
 
 FIGURE = pathlib.Path(svkc.__file__).parent / "scenes" / "figure40.xml"
 RESULTS = pathlib.Path(__file__).parent / "results" / "joints.csv"

@@ -5,7 +5,7 @@ import math
 import pathlib
 import sys
 
-from svkc import commands
+from svkc.cli import run as commands
 
 
 def _event(kind: str):
@@ -70,7 +70,7 @@ def main(argv=None) -> int:
     if options.command == "view":
         return commands.view(options.file, not options.no_open)
     if options.command == "bench":
-        from svkc.bench import bench
+        from svkc.cli.bench import bench
 
         return bench(options.lanes)
     return commands.scenes()

@@ -25,13 +25,13 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 hook = install_import_hook("svkc", "beartype.beartype")
 import svkc
 import svkc.__main__
-import svkc.cache
+import svkc._jax.compilation_cache
 import svkc.scenes
 
 hook.uninstall()
 
 # a second run of the suite, and the other workers, find most programs compiled; jax's key of a program tells the XLA_FLAGS of tests and commands apart
-svkc.cache.use_cache()
+svkc._jax.compilation_cache.use_cache()
 
 # tracing makes very many small objects that stay: to look through all of them again and again took a tenth of the suite's time
 gc.freeze()

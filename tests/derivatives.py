@@ -13,7 +13,7 @@ import numpy as np
 
 import svkc
 import svkc.scenes
-from svkc.derivative import _differences
+from svkc.tools.gradient_check import _differences
 
 TIGHT = {"rtol": 1e-11, "atol": 1e-13, "solver": diffrax.Dopri8()}
 ALGEBRA, RUN = 1e-8, 1e-6

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import svkc
-from svkc.tuning import Candidate, candidates
+from svkc.tools.accuracy import Candidate, candidates
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import jax
 import pytest
 from jax._src import compilation_cache, lru_cache
 
-from svkc import cache
+from svkc._jax import compilation_cache as cache
 
 SETTINGS = "jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs"
 
@@ -156,4 +156,4 @@ def test_jax_calls_what_is_put_in_its_place(tmp_path, monkeypatch):
     monkeypatch.setenv("SVKC_CACHE_DIR", str(tmp_path))
     cache.use_cache()
     assert lru_cache.LRUCache.put is cache._put
-    assert compilation_cache.get_executable_and_time.__module__ == "svkc.cache"
+    assert compilation_cache.get_executable_and_time.__module__ == "svkc._jax.compilation_cache"

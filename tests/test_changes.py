@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import svkc
-from svkc.transition import change, velocity_by_impulse
+from svkc.transitions.transition import change, velocity_by_impulse
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import svkc
-from svkc.forward_dynamics import acceleration
+from svkc.loops.forward_dynamics import acceleration
 from svkc.scenes import FOLDER
 
 FIGURE = str(FOLDER / "figure16.xml")
@@ -142,7 +142,7 @@ def test_springs_ranges_armature_and_motors_go_with_the_joint():
     free = svkc.cut(chain, b, "b")
     # its centre of mass falls freely
     alone = run(chain, free, 0.2).final
-    com = lambda s: svkc.poses(chain, s)[0][2] + svkc.spatial.quat_rotate(svkc.poses(chain, s)[1][2], jnp.asarray(chain.model.model.body_ipos[2]))
+    com = lambda s: svkc.poses(chain, s)[0][2] + svkc.tree.spatial.quat_rotate(svkc.poses(chain, s)[1][2], jnp.asarray(chain.model.model.body_ipos[2]))
     lin, ang = svkc.velocities(chain, free)
     u0 = lin[2] + jnp.cross(ang[2], com(free) - svkc.poses(chain, free)[0][2])
     np.testing.assert_allclose(com(alone), com(free) + 0.2 * u0 + 0.02 * chain.gravity, atol=1e-9)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import svkc
-from svkc import eager
+from svkc._jax import eager
 
 XS = jnp.array([0.1, 0.2])
 

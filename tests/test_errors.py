@@ -16,8 +16,8 @@ import said
 from said import PAGE, ROWS
 
 import svkc
-from svkc import commands
-from svkc.operation import operation
+from svkc._jax.primitive import operation
+from svkc.cli import run as commands
 
 # provoked in tests that need more than a call
 ELSEWHERE = {

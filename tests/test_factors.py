@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from svkc.factors import factor_positive, solve_triangle
+from svkc._jax.batched_lapack import factor_positive, solve_triangle
 
 
 @pytest.mark.parametrize("size", [1, 6])
@@ -34,7 +34,7 @@ TWO_DEVICES = """
 import jax, jax.numpy as jnp, numpy as np
 jax.config.update("jax_num_cpu_devices", 2)
 from jax.sharding import Mesh, PartitionSpec
-from svkc.factors import factor_positive
+from svkc._jax.batched_lapack import factor_positive
 
 rng = np.random.default_rng(0)
 A = rng.normal(size=(2 * 127, 24, 24)).astype(np.float32)

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import svkc
-from svkc.functions import Function, comparable
+from svkc._jax.functions import Function, comparable
 
 DT = {"dt": 0.05, "solver": svkc.SemiImplicitEuler(), "max_events": 1, "max_steps": 8}
 GAIN, LIST = 1.0, []
@@ -30,7 +30,7 @@ def arm():
 @pytest.fixture
 def programs(monkeypatch):
     """One item for each program of `simulate` that is made."""
-    made, module = [], sys.modules["svkc.simulate"]
+    made, module = [], sys.modules["svkc.simulation.simulate"]
     whole = module._converted
     monkeypatch.setattr(module, "_converted", lambda *args: (made.append(0), whole(*args))[1])
     return made
@@ -325,7 +325,7 @@ def test_nothing_stays():
         seen.add(id(x))
         assert x is not tracers[0]
         todo += gc.get_referents(x)
-    notes = sys.modules["svkc.functions"]._first
+    notes = sys.modules["svkc._jax.functions"]._first
     before = len(notes)
     for gain in (1.0, np.ones(1)):
         gone.append(torque(gain))

@@ -507,14 +507,15 @@ class Asked(Exception):
 @pytest.fixture
 def only_traced(monkeypatch):
     """Runs are traced for their shapes, and not compiled."""
-    whole = functools.partial(eqx.filter_eval_shape, sys.modules["svkc.simulate"]._run.__wrapped__)
+    whole = functools.partial(eqx.filter_eval_shape, sys.modules["svkc.simulation.simulate"]._run.__wrapped__)
 
     def run(*args):
         whole(*args)
         raise Asked
 
-    monkeypatch.setattr(sys.modules["svkc.simulate"], "_run", run)
-    monkeypatch.setattr(sys.modules["svkc.rollout"], "_piece", functools.partial(eqx.filter_eval_shape, sys.modules["svkc.rollout"]._piece.__wrapped__))
+    monkeypatch.setattr(sys.modules["svkc.simulation.simulate"], "_run", run)
+    rollout = sys.modules["svkc.tools.rollout"]
+    monkeypatch.setattr(rollout, "_piece", functools.partial(eqx.filter_eval_shape, rollout._piece.__wrapped__))
 
 
 RETURNS = [

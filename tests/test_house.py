@@ -1,6 +1,5 @@
-"""The house: imports only go down, the door is light, files and functions are small; README and example run."""
+"""The house: the door is light; README and example run."""
 
-import ast
 import os
 import pathlib
 import re
@@ -13,57 +12,6 @@ import jax
 import pytest
 
 ROOT = pathlib.Path(__file__).parent.parent
-# the house floor by floor, the ground first
-HOUSE = [
-    "spatial topology unsupported operation given factors taking cache eager",
-    "chain reading selection lanes",
-    "verb",
-    "kinematics trajectory cuttable interop joining functions",
-    "inverse_dynamics loops load",
-    "energy closure articulated archive",
-    "delassus",
-    "forward_dynamics",
-    "projection",
-    "newton",
-    "assembly mobility",
-    "binding actuation guards solvers",
-    "transition events stepping",
-    "location scenes settled",
-    "searching",
-    "marching",
-    "replay",
-    "request records",
-    "phase drawing derivative",
-    "simulate animation figures page",
-    "tuning rollout view",
-    "commands bench ahead",
-    "__main__",
-]
-FLOORS = {name: floor for floor, names in enumerate(HOUSE) for name in names.split()}
-# a verb that the contract puts on a noun is imported where it is called
-UPWARDS = {("chain", "assembly"), ("chain", "interop"), ("trajectory", "archive"), ("trajectory", "view")}
-
-
-def test_imports_only_go_down():
-    for path in (ROOT / "svkc").rglob("*.py"):
-        name = path.stem if path.parent.name == "svkc" else path.parent.name
-        if name == "__init__":
-            continue
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("svkc."):
-                target = node.module.split(".")[1]
-                # rooms of one package may see each other
-                assert target == name or FLOORS[target] < FLOORS[name] or (name, target) in UPWARDS, f"{name} imports {target}"
-
-
-def test_files_and_functions_are_small():
-    for path in (ROOT / "svkc").rglob("*.py"):
-        text = path.read_text()
-        assert text.count("\n") <= 300, path
-        for node in ast.walk(ast.parse(text)):
-            if isinstance(node, ast.FunctionDef):
-                lines = node.end_lineno - node.lineno + 1 - len((ast.get_docstring(node) or "").splitlines())
-                assert lines <= 60, f"{path}: {node.name}"
 
 
 CACHE = tempfile.TemporaryDirectory()

@@ -18,7 +18,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import svkc
-from svkc.topology import V_SIZE
+from svkc.model.topology import V_SIZE
 
 XML = """<mujoco><worldbody><body name="a" pos="0 0 1"><joint name="a" axis="0 1 0"/><geom size="0.1" pos="0.1 0 0"/>
 <body name="c" pos="0 0 -0.5"><joint name="c" type="ball"/><geom size="0.1" pos="0 0 -0.2"/></body></body>

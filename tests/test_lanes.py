@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import svkc
-from svkc import lanes as rules
+from svkc._jax import lanes_last as rules
 
 KEY = jax.random.key(3)
 

@@ -7,7 +7,7 @@ import pytest
 from kkt import acceleration
 
 import svkc
-from svkc.selection import select
+from svkc.loops.pivoting import select
 
 # model, joint freedoms, rank, what Kutzbach and Gruebler count
 OVERCONSTRAINED = {

@@ -146,7 +146,7 @@ def test_the_file_has_everything_in_it(release, tmp_path):
     # both ends of a link that holds are at one place
     (parent, at), (real, there) = run["phases"][0]["links"][0]["ends"]
     assert (chain.body_names[parent], chain.body_names[real]) == ("world", "right_hand")
-    x, R = poses[0, real, :3], svkc.reading.matrix(poses[0, real, 3:].astype(float))
+    x, R = poses[0, real, :3], svkc.mjcf.bodies.matrix(poses[0, real, 3:].astype(float))
     np.testing.assert_allclose(x + R @ there, at, atol=1e-6)
 
 
@@ -218,7 +218,7 @@ def test_every_kind_of_geom(tmp_path):
 def test_nothing_of_it_is_read_before_it_is_asked_for():
     code = (
         "import sys; opened = []; sys.addaudithook(lambda name, args: opened.append(str(args[0])) if name == 'open' else None);"
-        "import svkc.page; assert any('view' in path for path in opened); assert not [path for path in opened if 'three.min' in path or 'page.html' in path]"
+        "import svkc.page; assert any('render' in path for path in opened); assert not [path for path in opened if 'three.min' in path or 'page.html' in path]"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

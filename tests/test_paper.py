@@ -12,7 +12,7 @@ import pytest
 
 import svkc
 from svkc.scenes.two_links import two_links
-from svkc.spatial import quat_exp, quat_multiply
+from svkc.tree.spatial import quat_exp, quat_multiply
 
 
 @pytest.fixture(scope="module")

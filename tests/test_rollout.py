@@ -95,7 +95,7 @@ def test_all_lanes_at_once(case, alone, capsys):
 @pytest.mark.slow
 def test_chunks_fit_into_memory(case, alone, capsys, monkeypatch):
     """Where little memory is free the default chunk is smaller, and never nothing."""
-    module, states = sys.modules["svkc.rollout"], case[1]
+    module, states = sys.modules["svkc.tools.rollout"], case[1]
     lane = sum(x.nbytes // LANES for x in jax.tree.leaves(states))
     # four times what four lanes with two times and the rest of a trajectory need
     monkeypatch.setattr(module, "_free_memory", lambda device: 4.0 * 4 * lane * 66)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from svkc.taking import take
+from svkc._jax.static_gather import take
 
 # one past the last row, 7: zeros
 INDICES = {

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import svkc
-from svkc.forward_dynamics import acceleration, forward_dynamics_by_unit_vectors
-from svkc.kinematics import kinematics, rates
+from svkc.loops.forward_dynamics import acceleration, forward_dynamics_by_unit_vectors
+from svkc.tree.kinematics import kinematics, rates
 
 ASSETS = pathlib.Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 URDF = """<robot name="arm">

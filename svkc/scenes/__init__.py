@@ -4,8 +4,8 @@ import pathlib
 
 import numpy as np
 
-from svkc.chain import Chain, State, VirtualLink
-from svkc.load import load
+from svkc.mjcf.load import load
+from svkc.model.chain import Chain, State, VirtualLink
 
 FOLDER = pathlib.Path(__file__).parent
 BAR_HEIGHT, GRIP = 2.6, 0.30  # m: the bar above the ground; half the distance between the hands

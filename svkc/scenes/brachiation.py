@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from svkc.chain import Chain, State, VirtualLink
-from svkc.load import load
+from svkc.mjcf.load import load
+from svkc.model.chain import Chain, State, VirtualLink
 from svkc.scenes import BAR_HEIGHT, FOLDER, PALM
 
 RADIUS = 0.02  # m: of bars and of the rails that carry them

@@ -3,10 +3,10 @@
 import jax.numpy as jnp
 import numpy as np
 
-from svkc.chain import Chain, State, VirtualLink
-from svkc.events import When, when
-from svkc.guards import touch
-from svkc.load import load
+from svkc.mjcf.load import load
+from svkc.model.chain import Chain, State, VirtualLink
+from svkc.transitions.events import When, when
+from svkc.transitions.guards import touch
 
 TOP, DROP, HALF, EDGE = 3.2, 2.0, 0.33, 0.2  # m: pivot above the ground, plate under it; half the distance of the rods; half the depth of the plate
 GRASP, SIT = 1.3, 0.07  # m: hands under the pivot; thigh's axis above the plate

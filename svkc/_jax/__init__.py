@@ -1,0 +1,1 @@
+"""What depends on the internals of JAX, XLA and equinox."""

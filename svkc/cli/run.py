@@ -1,0 +1,271 @@
+"""F7: what the command line does, a function a command. jax and the rest are imported where they are used: asking for help is quick."""
+
+import gc
+import pathlib
+import time
+import webbrowser
+
+RELEASE_RIGHT, RELEASE_LEFT = 0.9, 1.15  # s
+TOLERANCES = {"rtol": 1e-8, "atol": 1e-10}
+
+
+def _high_bar():
+    import svkc
+    from svkc.scenes import high_bar
+
+    return *high_bar(), (svkc.at(RELEASE_RIGHT, cut="right_hand_grip"), svkc.at(RELEASE_LEFT, cut="left_hand_grip"))
+
+
+def _swing():
+    from svkc.scenes.swing import leaving, swing
+
+    chain, state = swing()
+    return chain, state, leaving(chain)
+
+
+def _brachiation():
+    from svkc.scenes.brachiation import brachiation
+
+    return *brachiation(), ()
+
+
+def _walking():
+    from svkc.scenes.walking import walking
+
+    return *walking(), ()
+
+
+# name: how to make it with its events, until when (s), what happens
+SCENES = {
+    "high_bar": (_high_bar, 1.8, "two hands on a bar, one, flight (the paper's Fig. 20)"),
+    "swing": (_swing, 2.0, "the seat of a swing gives way as the thighs slide off (Fig. 21)"),
+    "brachiation": (_brachiation, 1.0, "hangs from the first of three bars; nobody drives it (examples/03_brachiation.py does)"),
+    "walking": (_walking, 0.6, "stands on two feet and falls, only its feet held by the ground; nobody drives it (examples/04_walk.py does)"),
+}
+
+
+def scenes() -> int:
+    """The scenes that ship."""
+    wide = max(map(len, SCENES))
+    for name, (_, end, what) in SCENES.items():
+        print(f"{name:<{wide}}  {end:.1f} s  {what}")
+    print("run one:  svkc run NAME")
+    return 0
+
+
+def run(name: str, t1: float | None, events, ignore, out: pathlib.Path, video: bool, quiet: bool) -> int:
+    """One scene or model: the table of its phases, the run, the pictures. events: (kind, link, time) besides the scene's own."""
+    import jax
+    from tqdm import tqdm
+
+    # the process is the command's own, so the setting is too
+    jax.config.update("jax_enable_x64", True)
+    import svkc
+    from svkc._jax.compilation_cache import use_cache
+
+    kept = use_cache()
+    # tracing makes very many small objects that stay: the collector would look through all of them again and again
+    gc.freeze()
+    gc.set_threshold(100_000, 20, 50)
+    begin = time.perf_counter()
+    stages = tqdm(total=4, desc="loading", bar_format="{l_bar}{bar:20}| {elapsed}", disable=True if quiet else None, leave=False)
+    try:
+        chain, state, events, end = _wanted(name, t1, events, ignore)
+        out.mkdir(parents=True, exist_ok=True)
+        loaded = time.perf_counter()
+        _next(stages, "compiling, and the first run")
+        _simulated(chain, state, events, end, stages.disable)
+    except (ValueError, OSError) as error:
+        stages.close()
+        print(error)
+        return 1
+    compiled = time.perf_counter()
+    _next(stages, "a run")
+    traj = _simulated(chain, state, events, end, stages.disable)
+    done = time.perf_counter()
+    _next(stages, "pictures")
+    written, missing = _write(chain, traj, out, pathlib.Path(name).stem, video, {**TOLERANCES, "t1": end, "what": name})
+    _next(stages, "done")
+    stages.close()
+    print_phases(chain, traj)
+    print(f"load and close the loops {loaded - begin:.1f} s, first run with compilation {compiled - loaded:.1f} s, a run {done - compiled:.3f} s")
+    print(f"compiled programs are kept in {kept}\n" * (kept is not None), end="")
+    print("\n".join(missing) + "\n" * bool(missing) + "wrote " + ", ".join(map(str, written)))
+    print(f"look: open {written[-1]}" + f", or  svkc view {written[0]}" * (written[-1].suffix == ".html"))
+    # what ended early is kept and said, and the shell is told
+    return 0 if traj.result in (svkc.RESULTS.successful, svkc.RESULTS.stopped) else 1
+
+
+def _simulated(chain, state, events, end: float, quiet: bool):
+    """The run, to its end on the clock. Phases of long runs show how far they are."""
+    import diffrax
+    import jax
+    import jax.numpy as jnp
+
+    import svkc
+
+    ts = jnp.linspace(0, end, max(round(end / 0.025), 1) + 1)
+    meter = None if quiet or end <= 10 else diffrax.TqdmProgressMeter()
+    return jax.block_until_ready(svkc.simulate(chain, state, end, ts=ts, events=events, throw=False, progress_meter=meter, **TOLERANCES))
+
+
+def _next(stages, what: str):
+    stages.update()
+    stages.set_description(what)
+
+
+def _wanted(name: str, t1: float | None, events, ignore):
+    """Chain, state, events and end of the run that was asked for."""
+    from svkc.model.validation import positive
+
+    chain, state, own, end = _scene(name, ignore)
+    end = end if t1 is None else t1
+    positive("--t1", end)
+    return chain, state, _asked(chain, events) or own, end
+
+
+def _scene(name: str, ignore):
+    """Chain, state, events and end of a scene that ships, or of a model file at its load pose for two seconds."""
+    import svkc
+
+    if name in SCENES:
+        make, end, _ = SCENES[name]
+        return *make(), end
+    if not pathlib.Path(name).is_file():
+        raise ValueError(f"run: no scene and no file {name!r}; scenes: {', '.join(SCENES)}")
+    chain = svkc.load(name, ignore=ignore)
+    return chain, chain.state(), (), 2.0
+
+
+def _asked(chain, events):
+    """The events of --release and --catch."""
+    import svkc
+
+    for _, link, _ in events:
+        if link not in chain.link_names:
+            raise ValueError(f"run: no virtual link {link!r}; virtual links: {', '.join(chain.link_names) or 'none'}")
+    return tuple(svkc.at(t, cut=link) if kind == "release" else svkc.at(t, connect=link, here=True) for kind, link, t in events)
+
+
+def _write(chain, traj, out: pathlib.Path, stem: str, video: bool, options: dict) -> tuple[list, list[str]]:
+    """The run and its pictures: what was written, and a line for each that could not be."""
+    import svkc
+
+    written, missing = [out / f"{stem}.npz"], []
+    traj.save(written[0], chain, **options)
+    curves = lambda path: traj.plot(chain).savefig(path, dpi=110)
+    draw = lambda path: svkc.render(chain, traj, path, azimuth=90)
+    pictures = [(f"{stem}.png", draw), (f"{stem}_curves.png", curves), (f"{stem}.gif", draw), (f"{stem}.mp4", draw), (f"{stem}.html", draw)]
+    for file, how in pictures:
+        if file.endswith(".mp4") and not video:
+            continue
+        try:
+            how(out / file)
+            written.append(out / file)
+        except (RuntimeError, ImportError) as error:
+            missing.append(f"{file} not drawn: {error}")
+    return written, missing
+
+
+def print_phases(chain, traj):
+    """Freedoms, rank, mobility, steps and energy before and after each event, then the certificate."""
+    p, report = traj.phases, traj.report()
+    names = {i: ", ".join(n for n, on in zip(chain.link_names, p.connected[i], strict=True) if on) or "nothing" for i in range(int(p.count))}
+    wide = max(34, *map(len, names.values()))
+    print(f"      from        to  {'held by':<{wide}} joint   rank  mobility   steps  energy drift")
+    print(f"         s         s  {'':<{wide}} freedoms                           J")
+    for i in range(int(p.count)):
+        if float(p.start[i]) == float(p.stop[i]) and i:
+            continue
+        print(
+            f"{float(p.start[i]):10.6f}{float(p.stop[i]):10.6f}  {names[i]:<{wide}}{int(p.joint_freedoms[i]):6d}{int(p.rank[i]):7d}"
+            f"{int(p.freedoms[i]):10d}{int(p.accepted[i]):8d}{float(p.energy_drift[i]):14.2e}"
+        )
+    times = ", ".join(f"{float(t):.6f} s" for t in traj.events.time[: int(traj.events.count)])
+    print(f"events at {times or 'no time'}; energy at the start {float(p.energy[0, 0]):.3f} J")
+    print(report)
+
+
+def info(path: str) -> int:
+    """What a model is to svkc."""
+    import svkc
+    from svkc._jax.compilation_cache import use_cache
+
+    kept = use_cache()
+    try:
+        chain = svkc.load(path)
+    except ValueError as error:
+        print(error)
+        if "not simulated" not in str(error):
+            return 1
+        chain = svkc.load(path, ignore="all")
+    state = chain.state() if not len(chain.link_names) else _state_or_none(chain)
+    print(f"{len(chain.body_names) - 1} bodies: {', '.join(chain.body_names[1:])}")
+    print(f"{len(chain.joint_names)} joints: {', '.join(chain.joint_names)}")
+    print(f"{len(chain.link_names)} virtual links: {', '.join(chain.link_names) or 'none'}")
+    print(f"{chain.nv} joint freedoms in the tree, {chain.dofs} with every virtual link; {chain.gear.shape[0]} actuators")
+    if state is not None:
+        print(f"as loaded:\n{svkc.mobility(chain, state)}")
+    for line in chain.left_out:
+        print(f"left out: {line}")
+    _suggest(chain)
+    print(f"compiled programs: {kept or 'not kept'} (SVKC_CACHE_DIR names another folder, or off)")
+    return 0
+
+
+def _state_or_none(chain):
+    try:
+        return chain.state()
+    except ValueError as error:
+        print(error)
+        return None
+
+
+def _suggest(chain):
+    """Joints that can be cut, and bodies at the ends of the tree, which could hold on to something."""
+    from svkc.mjcf.cuttable_joints import cuts_of
+
+    def cut(name):
+        try:
+            return bool(cuts_of(chain.model.model, [name]))
+        except ValueError:
+            return False
+
+    parents = {int(p) for p in chain.model.model.body_parentid[1:]}
+    ends = [name for i, name in enumerate(chain.body_names) if i and i not in parents]
+    print(f"joints that can be cut, load(..., cuttable=[...]): {', '.join(filter(cut, chain.joint_names)) or 'none'}")
+    print("ends of the tree, which could be held: " + ", ".join(ends[:12]) + ", ..." * (len(ends) > 12))
+    if ends:
+        print(f'  svkc.VirtualLink("grip", "world", "{ends[0]}", joint="ball"), or load(..., spare=1) and svkc.bind while it moves')
+
+
+def view(path: pathlib.Path, show: bool) -> int:
+    """A run that was saved with its chain: the table, the certificate, the curves and the page."""
+    import jax
+
+    # what was computed in float64 is read as such
+    jax.config.update("jax_enable_x64", True)
+    import svkc
+    from svkc._jax.compilation_cache import use_cache
+
+    use_cache()
+    try:
+        chain, traj = svkc.load_chain(path), svkc.load_trajectory(path)
+    except (ValueError, OSError) as error:
+        print(error)
+        return 1
+    print_phases(chain, traj)
+    written, missing = [], []
+    for target, how in (
+        (path.with_suffix(".html"), lambda p: svkc.render(chain, traj, p)),
+        (path.with_name(f"{path.stem}_curves.png"), lambda p: traj.plot(chain).savefig(p)),
+    ):
+        try:
+            how(target)
+            written.append(target)
+        except ImportError as error:
+            missing.append(f"{target.name} not drawn: {error}")
+    print("\n".join(missing) + "\n" * bool(missing) + "wrote " + ", ".join(map(str, written)))
+    if show:
+        webbrowser.open(written[0].resolve().as_uri())
+    return 0

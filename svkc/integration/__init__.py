@@ -1,0 +1,1 @@
+"""One phase of a run: vector field, steps, projection, event location, derivatives."""

@@ -1,0 +1,1 @@
+"""Closed chains: loop Jacobian, pivots, H, W and S, forward dynamics, projection, mobility, actuation."""

@@ -1,0 +1,200 @@
+"""F3: where the two ends of every virtual link are, how far apart, and how they move: the loop Jacobian J_C (paper (9)-(11)).
+
+Rows of a loop: three angular, then three linear, the motion of the virtual link less that of its real link, in world axes at the real link's end
+of the joint.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from svkc._jax.static_gather import take
+from svkc.model.chain import Chain, Structure
+from svkc.model.topology import Topology
+from svkc.tree.kinematics import Kinematics
+from svkc.tree.spatial import motion_cross, quat_about, quat_conjugate, quat_log, quat_matrix, quat_multiply, quat_normalize, quat_rotate, rotate, shift_motion
+
+
+class Ends(eqx.Module):
+    """Both ends of each virtual link. `base`: the joint's frame in the parent, `virtual`: the virtual link, `real`: its real link's end.
+
+    Places are relative to `real`'s root (`parent_root`, `real_root`: that and the parent's root, from which twists are given).
+    """
+
+    base_quat: Float[Array, "links 4"]
+    virtual_quat: Float[Array, "links 4"]
+    virtual: Float[Array, "links 3"]
+    real_quat: Float[Array, "links 4"]
+    real: Float[Array, "links 3"]
+    from_parent_root: Float[Array, "links 3"]
+    axes: Float[Array, "links 6 3"]
+
+
+def active_dofs(chain: Chain, structure: Structure) -> Bool[Array, " dofs"]:
+    """Joint coordinates that can move: the tree's and the connected virtual links', less the locked ones."""
+    top = chain.topology
+    used = jnp.concatenate([(structure.connected[:, None] & structure.freedoms).ravel(), jnp.zeros(1, bool)])
+    slot = np.full(top.dofs - top.nv, used.shape[0] - 1)
+    for i, d in enumerate(top.links.dof.ravel()):
+        if d < top.dofs:
+            slot[d - top.nv] = i
+    active = jnp.concatenate([jnp.ones(top.nv, bool), used[slot]])
+    return active if structure.locked is None else active & ~structure.locked
+
+
+def _coordinates(chain: Chain, q: Float[Array, " q"]):
+    """Turns [L 3], slides [L 3] and quaternions [L 4] of the virtual joints."""
+    table, end = chain.topology.links, chain.topology.nq_all
+    quat = take(q, np.minimum(table.quat, end)) + (table.quat > end).astype(q.dtype)
+    return take(q, table.angle), take(q, table.slide), quat_normalize(quat)
+
+
+def _turns(top: Topology, angle: Float[Array, "links 3"], ball: Float[Array, "links 4"]):
+    """Rotation of each virtual joint and the axes of its three turns, all in the joint's frame; only what some joint of the scene has is computed.
+
+    Turns in sequence about x, then y, then z, each axis carried by the turns before it; a ball's axes are those of the virtual link.
+    """
+    eye = jnp.eye(3, dtype=angle.dtype)
+    freedoms = np.array(top.link_freedoms, bool).reshape(-1, 6)[:, :3]
+    is_ball = np.all(freedoms, axis=1)
+    turn, axes = None, []
+    for k in range(3):
+        axis = jnp.broadcast_to(eye[k], (len(is_ball), 3))
+        axes.append(axis if turn is None else quat_rotate(turn, axis))
+        if np.any(freedoms[~is_ball, k]):
+            this = quat_about(eye[k : k + 1], angle[:, k])
+            turn = this if turn is None else quat_multiply(turn, this)
+    axes = jnp.stack(axes, 1)
+    if is_ball.any():
+        of_ball = jnp.swapaxes(quat_matrix(ball), -1, -2)
+        axes = jnp.where(is_ball[:, None, None], of_ball, axes)
+        # one that is not a ball holds the identity here
+        turn = ball if turn is None else quat_multiply(ball, turn)
+    return turn, axes
+
+
+@jax.jit
+def ends(chain: Chain, structure: Structure, kin: Kinematics, q: Float[Array, " q"]) -> Ends:
+    """Frames of both ends of every virtual link, the joint's own turn and slide included.
+
+    A joint slides along its parent's axes, then turns: about x, then y, then z (universal: x, y), or by a quaternion (ball).
+    """
+    top = chain.topology
+    angle, slide, ball = _coordinates(chain, q)
+    p, r = structure.parent, structure.real
+    of_parent, of_real = kin.quat[p], kin.quat[r]
+    base_quat = quat_normalize(quat_multiply(of_parent, structure.quat))
+    base = quat_matrix(base_quat)
+    turn, turning = _turns(top, angle, ball)
+    axes = jnp.sum(base[:, None] * turning[:, :, None], -1)
+    from_parent_root = kin.r[p] + quat_rotate(of_parent, structure.pos)
+    if np.any(np.array(top.link_freedoms, bool).reshape(-1, 6)[:, 3:]):
+        from_parent_root = from_parent_root + rotate(base, slide)
+    return Ends(
+        base_quat=base_quat,
+        virtual_quat=base_quat if turn is None else quat_multiply(base_quat, turn),
+        virtual=from_parent_root + (kin.root[p] - kin.root[r]),
+        real_quat=quat_normalize(quat_multiply(of_real, structure.real_quat)),
+        real=kin.r[r] + quat_rotate(of_real, structure.real_pos),
+        from_parent_root=from_parent_root,
+        axes=jnp.concatenate([axes, jnp.swapaxes(base, -1, -2)], 1),
+    )
+
+
+def gap(structure: Structure, end: Ends) -> Float[Array, "links 6"]:
+    """Rotation vector (rad) and distance (m) from the real link's end to the virtual link, world axes; zero where not connected."""
+    turn = quat_log(quat_multiply(end.virtual_quat, quat_conjugate(end.real_quat)))
+    gaps = jnp.concatenate([turn, end.virtual - end.real], -1)
+    return jnp.where(structure.connected[:, None], gaps, 0)
+
+
+def _virtual_axes(chain: Chain, structure: Structure, end: Ends) -> Float[Array, "links 6 6"]:
+    """Motion of the virtual link for a unit of each of its six freedoms, at its own origin; zero for those it has not."""
+    zero = jnp.zeros_like(end.axes[:, :3])
+    S = jnp.concatenate([jnp.concatenate([end.axes[:, :3], zero], -1), jnp.concatenate([zero, end.axes[:, 3:]], -1)], 1)
+    return jnp.where((structure.connected[:, None] & structure.freedoms)[:, :, None], S, 0)
+
+
+def loop_jacobian(chain: Chain, structure: Structure, kin: Kinematics, end: Ends) -> Float[Array, "rows dofs"]:
+    """J_C (paper (11)): six rows a virtual link, zero where not connected; columns of coordinates that cannot move are zero."""
+    top = chain.topology
+    above = jnp.asarray(top.ancestor[:, top.dof_row])
+    sign = above[structure.parent].astype(kin.r.dtype) - above[structure.real].astype(kin.r.dtype)
+    # the joint's place as seen from the root of each coordinate's tree
+    of_parent = above[structure.parent][:, :, None]
+    place = jnp.where(of_parent, end.from_parent_root[:, None, :], end.real[:, None, :])
+    tree = sign[:, :, None] * shift_motion(kin.S[None], place)
+    own = _virtual_axes(chain, structure, end)
+    count = len(top.link_names)
+    # of each link and coordinate the row in `own`, which is followed by zeros
+    source = np.full((count, top.dofs + 1), 6 * count)
+    np.put_along_axis(source, top.links.dof, np.arange(6 * count).reshape(-1, 6), 1)
+    virtual = take(own.reshape(-1, 6), source[:, top.nv : top.dofs])
+    J = jnp.concatenate([tree, virtual], 1)
+    J = jnp.where(structure.connected[:, None, None] & active_dofs(chain, structure)[None, :, None], J, 0)
+    return jnp.swapaxes(J, 1, 2).reshape(-1, top.dofs)
+
+
+def loop_bias(
+    chain: Chain, structure: Structure, kin: Kinematics, end: Ends, V: Float[Array, "rows 6"], A: Float[Array, "rows 6"], v: Float[Array, " dofs"]
+) -> Float[Array, " loop_rows"]:
+    """Jdot_C v (paper (21)): the difference of the two ends' velocity-product accelerations; A: the tree's, with vdot = 0."""
+    top = chain.topology
+    rate = jnp.where(structure.connected[:, None] & structure.freedoms, take(v, top.links.dof), 0)
+    parts = _virtual_axes(chain, structure, end) * rate[:, :, None]
+    slide = jnp.sum(parts[:, 3:], 1)
+    V_parent = shift_motion(V[structure.parent], end.from_parent_root)
+    V_base = V_parent + slide
+    bias = motion_cross(V_parent, slide) + motion_cross(V_base, jnp.sum(parts[:, :3], 1))
+    # turns in sequence carry one another; a ball's axes turn together and add nothing
+    is_ball = np.array([sum(f[:3]) == 3 for f in top.link_freedoms], bool)[:, None]
+    carried = motion_cross(parts[:, 0], parts[:, 1] + parts[:, 2]) + motion_cross(parts[:, 1], parts[:, 2])
+    bias = bias + jnp.where(is_ball, 0, carried)
+    A_virtual = shift_motion(A[structure.parent], end.from_parent_root) + bias
+    A_real = shift_motion(A[structure.real], end.real)
+    return jnp.where(structure.connected[:, None], A_virtual - A_real, 0).reshape(-1)
+
+
+def joint_coordinates(chain: Chain, structure: Structure, kin: Kinematics, q: Float[Array, " q"]) -> Float[Array, " q"]:
+    """Q with the coordinates of every virtual joint read off from where its two bodies are: what the joint's freedoms can express of it."""
+    top = chain.topology
+    base = ends(chain, structure, kin, q)
+    turn = quat_multiply(quat_conjugate(base.base_quat), base.real_quat)
+    p = structure.parent
+    start = kin.r[p] + quat_rotate(kin.quat[p], structure.pos) + (kin.root[p] - kin.root[structure.real])
+    slide = jnp.where(structure.freedoms[:, 3:], quat_rotate(quat_conjugate(base.base_quat), base.real - start), 0)
+    angle = _angles(turn, structure.freedoms)
+    masked = quat_normalize(jnp.concatenate([turn[:, :1], jnp.where(structure.freedoms[:, :3], turn[:, 1:], 0)], -1))
+    table = top.links
+    for values, index in ((angle, table.angle), (slide, table.slide), (masked, table.quat)):
+        at = np.flatnonzero((index < top.nq_all).ravel())
+        q = q.at[index.ravel()[at]].set(values.ravel()[at])
+    return q
+
+
+def with_coordinates(chain: Chain, which: Bool[Array, " links"], new: Float[Array, " q"], q: Float[Array, " q"]) -> Float[Array, " q"]:
+    """The coordinates of the virtual joints in `which` from `new`, everything else from `q`."""
+    table, top = chain.topology.links, chain.topology
+    for index in (table.angle, table.slide, table.quat):
+        at = np.flatnonzero((index < top.nq_all).ravel())
+        slots = index.ravel()[at]
+        q = q.at[slots].set(jnp.where(which[at // index.shape[1]], new[slots], q[slots]))
+    return q
+
+
+def _angles(turn: Float[Array, "links 4"], freedoms: Bool[Array, "links 6"]) -> Float[Array, "links 3"]:
+    """Turns about x, y, z in sequence; those not free are taken as zero, the others solved from the rotation."""
+    R = quat_matrix(turn)
+    fx, fy, fz = freedoms[:, 0], freedoms[:, 1], freedoms[:, 2]
+
+    def angle(s, c):
+        # where there is none, no derivative that is not a number either
+        return jnp.arctan2(s, jnp.where((s == 0) & (c == 0), 1, c))
+
+    # each from the entries of Rx Ry, Rx Rz or Ry Rz that hold it alone
+    x = jnp.where(fx, jnp.where(fz, angle(-R[:, 1, 2], R[:, 2, 2]), angle(R[:, 2, 1], R[:, 1, 1])), 0)
+    y = jnp.where(fy, angle(R[:, 0, 2], jnp.where(fz, R[:, 2, 2], R[:, 0, 0])), 0)
+    z = jnp.where(fz, jnp.where(fx, angle(-R[:, 0, 1], R[:, 0, 0]), angle(R[:, 1, 0], R[:, 1, 1])), 0)
+    return jnp.stack([x, y, z], -1)

@@ -1,0 +1,151 @@
+"""F2: what a MuJoCo model says of bodies, joints and motors, as numpy arrays by row."""
+
+import dataclasses
+
+import numpy as np
+
+from svkc.mjcf.unsupported import plain_motors
+from svkc.model.topology import BALL, FIXED, FREE, HINGE, Q_SIZE, SLIDE, V_SIZE, Topology
+
+_LIMIT_RATE = 50.0  # rad/s: a joint outside its range is an oscillator of this frequency, critically damped, at its load-pose inertia
+KINDS = {0: FREE, 1: BALL, 2: SLIDE, 3: HINGE}  # mjtJoint
+
+
+def name_of(model, kind: str, index: int) -> str:
+    """The name of a body, joint, site or equality, or kind_index where it has none."""
+    import mujoco
+
+    name = mujoco.mj_id2name(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), index)
+    return name or (f"{kind}_{index}" if index or kind != "body" else "world")
+
+
+def matrix(quat) -> np.ndarray:
+    """The rotation matrix [3 3] of a quaternion, in numpy."""
+    import mujoco
+
+    R = np.zeros(9)
+    mujoco.mju_quat2Mat(R, np.asarray(quat, float))
+    return R.reshape(3, 3)
+
+
+@dataclasses.dataclass(frozen=True)
+class Joint:
+    """A joint of the tree and where its coordinates stand; `joint` is -1 for the free joint that a body gets whose own joints may be cut."""
+
+    name: str
+    kind: int
+    body: int
+    joint: int
+    q: int
+    v: int
+
+
+def joints_of(model, cut_bodies) -> list[Joint]:
+    """The joints of the tree in the model's order; a body in `cut_bodies` (body -> name) hangs on the base by a free joint (paper, Fig. 15)."""
+    out, q, v, seen = [], 0, 0, set()
+    for j in range(model.njnt):
+        body = int(model.jnt_bodyid[j])
+        if body in seen:
+            continue
+        kind, name, joint = KINDS[int(model.jnt_type[j])], name_of(model, "joint", j), j
+        if body in cut_bodies:
+            seen.add(body)
+            kind, name, joint = FREE, f"{cut_bodies[body]}_free", -1
+        out.append(Joint(name, kind, body, joint, q, v))
+        q, v = q + Q_SIZE[kind], v + V_SIZE[kind]
+    return out
+
+
+def rows_of(model, cut_bodies) -> tuple[list[tuple[int, int]], Topology]:
+    """One row a joint, sorted by level: [(body, joint or -1)] and the topology without virtual links."""
+    joints = joints_of(model, cut_bodies)
+    order, depth, last, own = [(0, -1, -1)], [0], {0: 0}, {0: None}
+    for body in range(1, model.nbody):
+        parent = 0 if body in cut_bodies else last[int(model.body_parentid[body])]
+        for joint in [j for j in joints if j.body == body] or [None]:
+            own[len(order)] = joint
+            order.append((body, -1 if joint is None else joint.joint, parent))
+            depth.append(depth[parent] + 1)
+            parent = len(order) - 1
+        last[body] = parent
+    rank = np.argsort(depth, kind="stable")
+    new = np.argsort(rank)
+    row_of = {joint.name: int(new[i]) for i, joint in own.items() if joint is not None}
+    topology = Topology(
+        body_names=tuple(name_of(model, "body", i) for i in range(model.nbody)),
+        joint_names=tuple(j.name for j in joints),
+        link_names=(),
+        parent=tuple(int(new[order[i][2]]) if order[i][2] >= 0 else -1 for i in rank),
+        kind=tuple(FIXED if own[i] is None else own[i].kind for i in rank),
+        q_start=tuple(0 if own[i] is None else own[i].q for i in rank),
+        v_start=tuple(0 if own[i] is None else own[i].v for i in rank),
+        nq=sum(Q_SIZE[j.kind] for j in joints),
+        nv=sum(V_SIZE[j.kind] for j in joints),
+        body_row=tuple(int(new[last[i]]) for i in range(model.nbody)),
+        joint_row=tuple(row_of[j.name] for j in joints),
+        link_freedoms=(),
+        link_spare=(),
+    )
+    return [order[i][:2] for i in rank], topology
+
+
+def bodies_of(model, topology, rows) -> dict[str, np.ndarray]:
+    """Of each row: frame in the parent, joint axis and anchor, mass, centre of mass, inertia."""
+    n = len(rows)
+    out = {"pos": np.zeros((n, 3)), "quat": np.tile([1.0, 0, 0, 0], (n, 1)), "axis": np.tile([0.0, 0, 1], (n, 1)), "anchor": np.zeros((n, 3))}
+    out |= {"mass": np.zeros(n), "com": np.zeros((n, 3)), "inertia": np.zeros((n, 3, 3))}
+    for i, (body, joint) in enumerate(rows):
+        if topology.kind[i] != FREE and joint in (-1, int(model.body_jntadr[body])):
+            out["pos"][i], out["quat"][i] = model.body_pos[body], model.body_quat[body]
+        if joint >= 0:
+            out["axis"][i] = model.jnt_axis[joint]
+            if topology.kind[i] in (HINGE, BALL):
+                out["anchor"][i] = model.jnt_pos[joint]
+        if topology.body_row[body] == i:
+            out["mass"][i], out["com"][i], out["inertia"][i] = model.body_mass[body], model.body_ipos[body], _inertia(model, body)
+    return out
+
+
+def _inertia(model, body):
+    """About the centre of mass, in body axes."""
+    R = matrix(model.body_iquat[body])
+    return R @ np.diag(model.body_inertia[body]) @ R.T
+
+
+def joint_forces_of(model, ignored, topology) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Stiffness [dofs], range [2 dofs] (infinite where there is none) and its spring and damper [2 dofs]."""
+    n, place = topology.dofs, np.array(topology.model_v, int)
+    stiffness, limit, spring = np.zeros(n), np.tile([[-np.inf], [np.inf]], (1, n)), np.zeros((2, n))
+    for j in range(model.njnt):
+        own = slice(int(model.jnt_dofadr[j]), int(model.jnt_dofadr[j]) + V_SIZE[KINDS[int(model.jnt_type[j])]])
+        dofs = place[own]
+        if "spring" not in ignored:
+            stiffness[dofs] = np.ravel(model.jnt_stiffness[j])[0]
+        if model.jnt_limited[j] and model.jnt_type[j] in (2, 3) and "limit" not in ignored:
+            limit[:, dofs] = model.jnt_range[j][:, None]
+            m = 1 / model.dof_invweight0[own] if np.all(model.dof_invweight0[own] > 0) else model.dof_M0[own]
+            spring[:, dofs] = m * _LIMIT_RATE**2, 2 * m * _LIMIT_RATE
+    return stiffness, limit, spring
+
+
+def by_dof(topology, values) -> np.ndarray:
+    """[dofs] from the model's own [nv]: zero for virtual joints that are none of its."""
+    out = np.zeros(topology.dofs)
+    out[np.array(topology.model_v, int)] = np.ravel(values)
+    return out
+
+
+def motors_of(model, ignored, topology):
+    """Gear matrix and ranges of the actuators that are plain torques on joints."""
+    count = 0 if {"actuator", "all"} & ignored and not plain_motors(model).all() else model.nu
+    place = np.array(topology.model_v, int)
+    gear, control, force = np.zeros((count, topology.dofs)), np.tile([-np.inf, np.inf], (count, 1)), np.tile([-np.inf, np.inf], (count, 1))
+    for i in range(count):
+        joint = int(model.actuator_trnid[i, 0])
+        size, start = V_SIZE[KINDS[int(model.jnt_type[joint])]], int(model.jnt_dofadr[joint])
+        gear[i, place[start : start + size]] = model.actuator_gear[i, :size] * model.actuator_gainprm[i, 0]
+        if model.actuator_ctrllimited[i]:
+            control[i] = model.actuator_ctrlrange[i]
+        if model.actuator_forcelimited[i]:
+            force[i] = np.sort(model.actuator_forcerange[i] / model.actuator_gainprm[i, 0])
+    return gear, control, force

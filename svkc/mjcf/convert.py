@@ -1,0 +1,138 @@
+"""F2: states and scenes as MuJoCo holds them, and quaternions as those do who put the scalar last."""
+
+import os
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from svkc.mjcf.bodies import matrix, name_of
+from svkc.model.chain import Chain, State
+from svkc.model.checked_jit import check_chain, check_state, vector
+from svkc.model.topology import JOINTS
+
+
+def _equalities(chain: Chain) -> list[tuple[int, int]]:
+    """(virtual link, MuJoCo's <equality>) of each link that was one."""
+    model, names = chain.model.model, {name: i for i, name in enumerate(chain.link_names)}
+    found = [(name_of(model, "equality", i), i) for i in range(model.neq)]
+    return [(names[name], i) for name, i in found if name in names]
+
+
+def text_of(spec) -> str:
+    """MJCF of a mujoco.MjSpec as it was written, to the last digit; makes the directories of its files absolute."""
+    spec.compiler.savecompiled = spec.compiler.savecanonical = False
+    here = os.path.abspath(spec.modelfiledir or ".")
+    if not spec.assets:
+        if any(item.file for item in [*spec.meshes, *spec.hfields, *spec.skins]):
+            spec.compiler.meshdir = os.path.join(here, spec.compiler.meshdir)
+        if any(item.file for item in spec.textures):
+            spec.compiler.texturedir = os.path.join(here, spec.compiler.texturedir)
+    return spec.to_xml()
+
+
+def to_mjcf(chain: Chain) -> str:
+    """See `Chain.to_mjcf`."""
+    import mujoco
+
+    if chain.model.text is None:
+        raise ValueError("to_mjcf: the chain was loaded from a MjModel, which does not say what it was compiled from; load a path, text or MjSpec")
+    try:
+        spec = mujoco.MjSpec.from_string(chain.model.text)
+    except ValueError as error:
+        raise ValueError(f"to_mjcf: MuJoCo cannot read what it writes of this MjSpec: {error}") from error
+    own, top, notes = dict(_equalities(chain)), chain.topology, []
+    for link, name in enumerate(chain.link_names):
+        if link in own:
+            spec.equalities[own[link]].active = bool(chain.structure.connected[link])
+        elif not top.link_spare[link] and not (top.link_child and top.link_child[link] >= 0):
+            notes += _as_equality(chain, spec, link, name)
+    slots = [name for name, spare in zip(chain.link_names, top.link_spare, strict=True) if spare]
+    cuttable = [name for name, _, _ in top.cut_joints]
+    notes += [f"not in this text: {len(slots)} spare slots, svkc.load(..., spare={len(slots)})"] if slots else []
+    notes += [f"not in this text: what may be cut, svkc.load(..., cuttable={cuttable})"] if cuttable else []
+    # two hyphens would end the comment
+    spec.comment = "\n".join(filter(None, [spec.comment, *(note.replace("--", "- -") for note in notes)]))
+    return text_of(spec)
+
+
+def _as_equality(chain: Chain, spec, link: int, name: str) -> list[str]:
+    """Adds a virtual link between two new sites; returns what has to be said of it."""
+    import mujoco
+
+    s, top = chain.structure, chain.topology
+    free, active = top.link_freedoms[link], bool(s.connected[link])
+    bodies = [top.body_row.index(int(row)) for row in (s.parent[link], s.real[link])]
+    frames = [tuple(float(x) for x in frame[link]) for frame in (s.pos, s.quat, s.real_pos, s.real_quat)]
+    given = ", ".join(f"{key}={frame}" for key, frame in zip(("pos", "quat", "real_pos", "real_quat"), frames, strict=True))
+    ends = ", ".join(repr(top.body_names[body]) for body in bodies)
+    call = f"svkc.VirtualLink({name!r}, {ends}, {_joint_of(free)!r}, {given}, connected={active}, actuated={top.link_actuated[link]})"
+    turns = sum(free[:3])
+    if turns == 2 or any(free[3:]):
+        return [f"no <equality> is like {call}"]
+    kind = mujoco.mjtEq.mjEQ_CONNECT if turns else mujoco.mjtEq.mjEQ_WELD
+    places = {name: np.zeros(3)}
+    if turns == 1:
+        places[_unlike(f"{name}_axis", chain.link_names)] = float(chain.length) * np.array(free[:3], float)
+    for label, place in places.items():
+        sites = []
+        for body, side, pos, quat in zip(bodies, ("parent", "real"), frames[::2], frames[1::2], strict=True):
+            sites.append(_unlike(f"{label}_{side}", [site.name for site in spec.sites]))
+            spec.bodies[body].add_site(name=sites[-1], pos=np.array(pos) + matrix(quat) @ place, quat=quat, group=3)
+        spec.add_equality(name=label, type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, name1=sites[0], name2=sites[1], active=active)
+    return [f"not in this text: motors on the virtual joint of {call}"] if top.link_actuated[link] else []
+
+
+def _unlike(name: str, taken) -> str:
+    """The name, longer where another has it."""
+    while name in taken:
+        name += "_"
+    return name
+
+
+def _joint_of(freedoms: tuple[bool, ...]):
+    """The joint as it is declared."""
+    return next((joint for joint, those in JOINTS.items() if those == freedoms), freedoms)
+
+
+def _checked(chain: Chain, data) -> None:
+    nq, nv = len(chain.topology.model_q), len(chain.topology.model_v)
+    sizes = [np.asarray(getattr(data, name, None)).shape for name in ("qpos", "qvel")]
+    if sizes != [(nq,), (nv,)]:
+        got = [size[0] if size else "no" for size in sizes]
+        raise ValueError(f"data: got {got[0]} qpos and {got[1]} qvel, the chain's model has {nq} and {nv}; make it of the same model")
+
+
+def to_mujoco(chain: Chain, state: State, data) -> None:
+    """Copies q (m, rad, wxyz) and v (m/s, rad/s) into a `mujoco.MjData` of the chain's model, and which of its <equality> hold; call `mj_forward` next.
+
+    Of a joint that was cut, the coordinates that it would have. ValueError: the data is another model's.
+    """
+    check_state(chain, state)
+    _checked(chain, data)
+    data.qpos[:] = np.asarray(state.q)[np.array(chain.topology.model_q, int)]
+    data.qvel[:] = np.asarray(state.v)[np.array(chain.topology.model_v, int)]
+    for link, equality in _equalities(chain):
+        data.eq_active[equality] = bool(state.structure.connected[link])
+
+
+def from_mujoco(chain: Chain, data) -> State:
+    """The state in a `mujoco.MjData` of the chain's model, by copy: its loops are closed and velocities made consistent, as by `chain.state`; links that
+    were <equality> hold where it says so, others as in the chain. ValueError: the data is another model's, a loop cannot be closed."""
+    check_chain(chain)
+    _checked(chain, data)
+    connected = np.array(chain.structure.connected)
+    for link, equality in _equalities(chain):
+        connected[link] = bool(data.eq_active[equality])
+    return chain.state(np.array(data.qpos), np.array(data.qvel), connected)
+
+
+def xyzw(chain: Chain, q) -> Float[Array, " q"]:
+    """Q with the scalar of every quaternion last, as Pinocchio, ROS and scipy have it."""
+    check_chain(chain)
+    q = vector(chain, "q", q, chain.topology.nq_all)
+    starts, _ = chain.topology.quaternions
+    if not len(starts):
+        return q
+    at = starts[:, None] + np.arange(4)
+    return q.at[at].set(jnp.roll(q[at], -1, axis=-1))

@@ -1,0 +1,199 @@
+"""F2: a MuJoCo model -> Chain, on the host in numpy. mujoco is imported here and nowhere below."""
+
+import dataclasses
+import os
+import pathlib
+import warnings
+from typing import Any
+
+import jax
+import numpy as np
+
+from svkc.mjcf.bodies import bodies_of, by_dof, joint_forces_of, motors_of, name_of, rows_of
+from svkc.mjcf.convert import text_of
+from svkc.mjcf.cuttable_joints import cuts_of, placed_in
+from svkc.mjcf.unsupported import what_is_left_out
+from svkc.mjcf.virtual_links import equalities, floats, structure_of
+from svkc.model.chain import Chain, VirtualLink
+from svkc.model.topology import Topology, joint_freedoms
+from svkc.model.validation import texts, whole
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Source:
+    """The MuJoCo model a chain was made of and its MJCF (None where only the compiled model was given), for pictures, `chain.to_mjcf` and files; and the
+    other arguments of `load`.
+
+    Chains are told apart by their numbers and topology, not by it.
+    """
+
+    model: Any
+    text: str | None = None
+    arguments: dict[str, Any] | None = None
+
+    def __eq__(self, other):
+        return isinstance(other, Source)
+
+    def __hash__(self):
+        return 0
+
+
+def load(source, *, virtual_links=(), cuttable=(), spare=0, ignore=()) -> Chain:
+    """A Chain from MJCF or URDF (path or text), a mujoco.MjSpec or a mujoco.MjModel.
+
+    `virtual_links`: more of them, beside the <equality> connect (ball) and weld of the model; `spare`: slots for links bound at run time;
+    `cuttable`: names of joints of the tree that may be cut, each a virtual link of its name, connected at first (paper, Fig. 15);
+    `ignore`: kinds of elements to leave out, by the names the error message uses, or "all"; "equality" means those that are neither connect
+    nor weld. "limit" leaves out joint ranges.
+    Collisions between geoms are never modelled. ValueError: the source does not parse, elements not supported, unknown names.
+    """
+    declared = tuple(virtual_links) if np.iterable(virtual_links) else (virtual_links,)
+    arguments = {"virtual_links": declared, "cuttable": cuttable, "spare": spare, "ignore": ignore}
+    kept = dataclasses.replace(_compiled(source), arguments=arguments)
+    model = kept.model
+    cuts = cuts_of(model, texts("cuttable", cuttable))
+    ignore, spare = texts("ignore", ignore), whole("spare", spare, 0, 1000)
+    left_out = what_is_left_out(model, ignore)
+    rows, topology = rows_of(model, {cut.body: cut.link.name for cut in cuts})
+    if not topology.joint_names:
+        raise ValueError("source: the model has no joints, so that nothing in it can move")
+    _told_apart("bodies", topology.body_names)
+    _told_apart("joints", [*topology.joint_names, *(name_of(model, "joint", j) for cut in cuts for j in cut.joints)])
+    links = [*equalities(model), *declared]
+    first = len(links)
+    for link in links:
+        if not isinstance(link, VirtualLink):
+            raise ValueError(f"virtual_links: expected svkc.VirtualLink objects, got {link!r}")
+    links += [cut.link for cut in cuts]
+    links += [VirtualLink(f"spare_{i}", "world", "world", "free") for i in range(spare)]
+    names = [link.name for link in links]
+    if len(set(names)) < len(names):
+        raise ValueError(f"virtual_links: names must differ, got {names}")
+    topology = dataclasses.replace(
+        topology,
+        link_names=tuple(names),
+        link_freedoms=tuple(joint_freedoms(link.joint) for link in links),
+        link_spare=tuple(i >= len(links) - spare for i in range(len(links))),
+        link_actuated=tuple(bool(link.actuated) for link in links),
+    )
+    topology = placed_in(model, topology, cuts, first)
+    structure = structure_of(model, topology, links)
+    return _finite(_chain(kept, topology, rows, structure, ignore, left_out))
+
+
+def _told_apart(what: str, names) -> None:
+    """ValueError where a name that svkc gives to what has none is one that the model uses."""
+    if len(set(names)) < len(names):
+        raise ValueError(f"source: names of {what} must differ, those given to what has none included; got {names}")
+
+
+def _finite(chain: Chain) -> Chain:
+    """The chain; ValueError for numbers that are not finite in the precision it is kept in."""
+    for path, leaf in jax.tree_util.tree_leaves_with_path(chain):
+        name, leaf = jax.tree_util.keystr(path), np.asarray(leaf)
+        if np.isnan(leaf).any() or (np.isinf(leaf).any() and name not in (".control_range", ".force_range", ".limit")):
+            raise ValueError(f"source: the model has numbers that are not finite, or too large for {leaf.dtype}: {name[1:]}")
+    return chain
+
+
+def _compiled(source) -> Source:
+    """The mujoco.MjModel of any source and its text; ValueError with MuJoCo's own words where it does not parse."""
+    import mujoco
+
+    if isinstance(source, mujoco.MjModel):
+        return Source(source)
+    if not isinstance(source, (mujoco.MjSpec, str, os.PathLike)):
+        raise ValueError(f"source: expected MJCF or URDF text, a path, MjSpec or MjModel, got {type(source).__name__}")
+    text = "<" if isinstance(source, mujoco.MjSpec) else os.fsdecode(source)
+    if "<" not in text and not os.path.isfile(text):
+        raise ValueError(f"source: no such file: {text!r}")
+    try:
+        spec = source.copy() if isinstance(source, mujoco.MjSpec) else _read(text)
+        model = spec.compile()
+        with warnings.catch_warnings(action="ignore"):
+            return Source(model, text_of(spec))
+    except (ValueError, OSError, mujoco.FatalError) as error:
+        raise ValueError(f"source: the model cannot be read: {error}") from error
+
+
+def _read(text: str):
+    """MJCF or URDF, by text or path. URDF keeps the links that fixed joints hold, whose names are wanted for grips; ROS's package:// is looked up."""
+    import mujoco
+
+    inline = "<" in text
+    spec = mujoco.MjSpec.from_string(text) if inline else mujoco.MjSpec.from_file(text)
+    if "<robot" in (text if inline else pathlib.Path(text).read_text(errors="replace")):
+        spec.compiler.fusestatic = False
+        for mesh in spec.meshes:
+            mesh.file = _found(mesh.file, pathlib.Path("." if inline else text).resolve().parent)
+    return spec
+
+
+def _found(file: str, folder: pathlib.Path) -> str:
+    """A file of package://NAME/...: in a folder NAME above, or beside what stands above, or else by its last name in `folder`; others as they are."""
+    if not file.startswith("package://"):
+        return file
+    name = pathlib.PurePosixPath(file.removeprefix("package://"))
+    inside = name.relative_to(name.parts[0])
+    places = [place / path for path in (name, inside) for place in (folder, *folder.parents)] + [folder / name.name]
+    return next((str(place) for place in places if place.is_file()), file)
+
+
+def _load_pose(model, topology: Topology) -> np.ndarray:
+    """[q] the model's qpos0, bodies that may be cut where that puts them, virtual joints at zero."""
+    import mujoco
+
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    tables = topology.links
+    q = np.zeros(topology.nq_all)
+    q[tables.quat[tables.quat[:, 0] < topology.nq_all, 0]] = 1
+    q[np.array(topology.model_q, int)] = model.qpos0
+    for row in topology.link_child:
+        if row >= 0:
+            body, start = topology.body_row.index(row), topology.q_start[row]
+            q[start : start + 7] = *data.xpos[body], *data.xquat[body]
+    return q
+
+
+def _chain(source: Source, topology, rows, structure, ignore, left_out) -> Chain:
+    import mujoco
+
+    model = source.model
+    ignored, bodies = set(ignore), bodies_of(model, topology, rows)
+    stiffness, limit, spring = joint_forces_of(model, ignored, topology)
+    damping = by_dof(topology, 0 * model.dof_damping if "damping" in ignored else model.dof_damping)
+    armature = by_dof(topology, 0 * model.dof_armature if "armature" in ignored else model.dof_armature)
+    gravity = np.zeros(3) if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY) else model.opt.gravity
+    gear, control, force = motors_of(model, ignored, topology)
+    offsets = np.linalg.norm(np.concatenate([bodies["pos"][np.array(topology.parent) > 0], bodies["com"]]), axis=1)
+    offsets = offsets[offsets > 1e-12]
+    q_load = _load_pose(model, topology)
+    q_spring = np.array(q_load)
+    q_spring[np.array(topology.model_q, int)] = model.qpos_spring
+    nv = topology.nv
+
+    def unless(empty, value):
+        return None if empty else floats(value)
+
+    return Chain(
+        topology=topology,
+        **{name: floats(bodies[name]) for name in ("pos", "quat", "axis", "mass", "com", "inertia")},
+        gravity=floats(gravity),
+        q_load=floats(q_load),
+        length=floats(np.sqrt(np.mean(offsets**2)) if len(offsets) else 1.0),
+        gear=floats(gear),
+        control_range=floats(control),
+        force_range=floats(force),
+        structure=structure,
+        anchor=unless(not bodies["anchor"].any(), bodies["anchor"]),
+        armature=unless(not np.any(armature[:nv]), armature[:nv]),
+        link_armature=unless(not np.any(armature[nv:]), armature[nv:]),
+        damping=unless(not np.any(damping), damping),
+        stiffness=unless(not stiffness.any(), stiffness),
+        q_spring=unless(not stiffness.any(), q_spring),
+        limit=unless(not np.isfinite(limit).any(), limit),
+        limit_spring=unless(not np.isfinite(limit).any(), spring),
+        model=source,
+        left_out=left_out,
+    )

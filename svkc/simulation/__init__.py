@@ -1,0 +1,1 @@
+"""A run: options, phases, events applied, records, certificate, trajectory, files."""

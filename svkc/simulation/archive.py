@@ -1,0 +1,182 @@
+"""F4: trajectories on disk: one npz, written whole or not at all."""
+
+import dataclasses
+import json
+import os
+import pathlib
+import threading
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from svkc.mjcf.load import load
+from svkc.model.chain import Chain, State, Structure, VirtualLink
+from svkc.model.checked_jit import check_chain
+from svkc.simulation.trajectory import RESULTS, Events, Phases, Trajectory
+
+# 2: with `derivative` and the phases' `margin`; 3: with the structures' `margin` and the rest of the certificate; 4: with the phases' gaps
+SCHEMA = 4
+_CODES = ("result", "derivative")
+_PARTS = {"states": State, "final": State, "structure": Structure, "events": Events, "phases": Phases}
+
+
+def _flatten(node, prefix: str = "") -> dict[str, np.ndarray]:
+    """{"states.q": array, ...}; parts that are None are left out."""
+    out = {}
+    for field in dataclasses.fields(node):
+        value, name = getattr(node, field.name), prefix + field.name
+        if field.name in _PARTS:
+            out |= _flatten(value, name + ".")
+        elif field.name not in _CODES and value is not None:
+            out[name] = np.asarray(value)
+    return out
+
+
+def _build(cls, arrays: dict[str, Any], prefix: str = "", **known):
+    fields = dict(known)
+    for field in dataclasses.fields(cls):
+        name = prefix + field.name
+        if field.name in _PARTS:
+            fields[field.name] = _build(_PARTS[field.name], arrays, name + ".")
+        elif field.name not in fields:
+            fields[field.name] = jnp.asarray(arrays[name]) if name in arrays else None
+    return cls(**fields)
+
+
+def save(traj: Trajectory, path, chain=None, options=None) -> None:
+    """Writes one .npz: every array by name, and a JSON line of metadata (schema, result, versions, certificate, options; names and model of the chain)."""
+    import svkc
+
+    if chain is not None:
+        check_chain(chain)
+    meta = {"schema": SCHEMA, "svkc": svkc.__version__, "jax": jax.__version__, "units": "SI, rad, wxyz"}
+    meta |= {name: np.asarray(getattr(traj, name)._value).tolist() for name in _CODES}
+    certify = Trajectory.report
+    for _ in range(np.ndim(traj.ts) - 1):
+        # lanes
+        certify = jax.vmap(certify)
+    report = certify(jax.tree.map(jnp.asarray, traj))
+    meta["certificate"] = {f.name: np.asarray(getattr(report, f.name)).tolist() for f in dataclasses.fields(report) if f.name not in _CODES}
+    meta["options"] = options or {}
+    arrays = _flatten(traj)
+    if chain is not None:
+        meta |= {"bodies": chain.body_names, "joints": chain.joint_names, "links": chain.link_names}
+        meta |= {"model": chain.model.text, "arguments": _plain(chain.model.arguments)}
+        arrays |= {f"chain.{i}": np.asarray(x) for i, x in enumerate(jax.tree.leaves(chain))}
+    path = pathlib.Path(path)
+    # beside it, as readable as any file that the user makes
+    temporary = path.with_name(f"{path.name}.{os.getpid()}.{threading.get_ident()}.part")
+    try:
+        with open(temporary, "wb") as file:
+            np.savez_compressed(file, metadata=np.array(json.dumps(meta, default=str)), **arrays)
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def _complete(arrays: dict[str, np.ndarray], schema: int) -> None:
+    """What was not kept before schema 4, as not known: inf, -1, or nothing let go."""
+    rows, dtype = arrays["phases.start"].shape, arrays["ts"].dtype
+    arrays |= {f"phases.{name}": np.full((*rows, 2), np.inf, dtype) for name in ("gap", "gap_rate")}
+    if schema >= 3:
+        return
+    unknown = {
+        "evaluations": np.full(rows, -1, np.int32),
+        "swaps": np.full(rows, -1, np.int32),
+        "loop": np.full(rows, -1, np.int32),
+        "error": np.full(rows, np.inf, dtype),
+    }
+    unknown |= {"free": np.zeros(rows, bool), "momentum_drift": np.zeros((*rows, 2), dtype)}
+    arrays |= {f"phases.{name}": value for name, value in unknown.items()} | {"gap_rates": np.full_like(arrays["gaps"], np.inf)}
+    arrays.setdefault("phases.margin", np.full(rows, np.inf, dtype))
+    for part in ("states", "final"):
+        arrays[f"{part}.structure.margin"] = np.zeros_like(arrays[f"{part}.structure.rank"], dtype)
+
+
+# what every file has had from the first
+_FIRST = {"ts", "gaps", "states.q", "states.structure.rank", "final.q", "final.structure.rank", "events.time", "phases.start"}
+
+
+def _named(cls, prefix: str = "") -> set[str]:
+    """The names of all arrays that `_build` looks for, but for those that may be None."""
+    out = set()
+    for field in dataclasses.fields(cls):
+        if field.name in _PARTS:
+            out |= _named(_PARTS[field.name], prefix + field.name + ".")
+        elif field.name not in (*_CODES, "locked", "independent"):
+            out.add(prefix + field.name)
+    return out
+
+
+def _check_whole(path, arrays: dict[str, Any], names: set[str]) -> None:
+    missing = names - set(arrays)
+    if missing:
+        raise ValueError(f"{path} lacks {', '.join(sorted(missing))}; it is not a trajectory written by svkc")
+
+
+def _plain(value):
+    """What load was given, as JSON has it."""
+    if isinstance(value, VirtualLink):
+        value = dataclasses.asdict(value)
+    if isinstance(value, dict):
+        return {key: _plain(x) for key, x in value.items()}
+    if isinstance(value, (list, tuple, set, frozenset, np.ndarray, jax.Array)):
+        return [_plain(x) for x in value]
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def load_chain(path) -> Chain:
+    """The chain that a trajectory was saved with: loaded from its MJCF as it was then, with the floats that it had. Files of meshes are read where they were.
+
+    ValueError: saved without a chain, or with one that came from a compiled model, which says not what it was compiled from; no whole file (as above).
+    """
+    arrays, meta, _ = _read(path)
+    if not meta.get("model"):
+        raise ValueError(f"{path} holds no model; save with traj.save(path, chain), the chain loaded from a path, text or MjSpec")
+    given = meta["arguments"]
+    given["virtual_links"] = [VirtualLink(**link) for link in given["virtual_links"]]
+    leaves, how = jax.tree.flatten(load(meta["model"], **given))
+    return jax.tree.unflatten(how, [jnp.asarray(arrays[f"chain.{i}"]) for i in range(len(leaves))])
+
+
+def load_trajectory(path) -> Trajectory:
+    """The trajectory that `Trajectory.save` wrote. ValueError: not such a file, cut short, or of a newer schema. FileNotFoundError: no file."""
+    arrays, meta, codes = _read(path)
+    arrays = {name: x for name, x in arrays.items() if not name.startswith("chain.")}
+    _check_whole(path, arrays, _FIRST)
+    schema = int(meta["schema"])
+    if schema < 4:
+        _complete(arrays, schema)
+    _check_whole(path, arrays, _named(Trajectory))
+    code = lambda value: eqx.tree_at(lambda item: item._value, RESULTS.successful, value)
+    build = lambda arrays, codes: _build(Trajectory, arrays, **{name: code(value) for name, value in codes.items()})
+    for _ in range(arrays["ts"].ndim - 1):
+        # lanes
+        build = jax.vmap(build)
+    try:
+        return build(arrays, {name: jnp.asarray(code) for name, code in codes.items()})
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path} is not a whole trajectory written by svkc: {error}") from error
+
+
+def _read(path) -> tuple[dict[str, np.ndarray], dict, dict[str, np.ndarray]]:
+    """Arrays, metadata and result codes of a file of ours."""
+    if not isinstance(path, str | bytes | os.PathLike):
+        raise ValueError(f"load_trajectory: expected a path, got {path!r}")
+    try:
+        with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        meta = json.loads(str(arrays.pop("metadata")))
+        schema, codes = int(meta["schema"]), {name: np.asarray(meta.get(name, 0), np.int32) for name in _CODES}
+    except FileNotFoundError:
+        raise
+    # whatever the readers of zip, npy and JSON say of what is none
+    except Exception as error:
+        raise ValueError(f"{path} is not a whole trajectory written by svkc: {error}") from error
+    if schema > SCHEMA:
+        raise ValueError(f"{path} has schema {schema}, this version reads up to {SCHEMA}; use a newer svkc")
+    return arrays, meta, codes

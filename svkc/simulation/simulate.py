@@ -1,0 +1,284 @@
+"""F6: a run, phase after phase: a scan over solves of one smooth field each, with the change of structure between them.
+
+A phase ends at the next scheduled time or at the end of the first step in which a guard crosses zero; the crossing is then located by steps of the
+solver back from there, so that its time and state have the solver's own order and not that of an interpolation. Lanes of a batch
+that are done go on with phases of no length.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Int
+
+from svkc._jax.eager import eager_jit
+from svkc._jax.functions import shared
+from svkc._jax.primitive import Closed
+from svkc.integration.event_adjoint import Reading, event_tolerance
+from svkc.integration.vector_field import Motion, Scene, finite, frozen
+from svkc.model.chain import Chain, State, Structure
+from svkc.simulation.options import Options, checked
+from svkc.simulation.phase import Run, Solved, solve
+from svkc.simulation.records import certificate, no_events, no_records, recorded, stages
+from svkc.simulation.trajectory import RESULTS, Events, Trajectory
+from svkc.transitions.events import Plan
+from svkc.transitions.guards import Sensor
+from svkc.transitions.spare_links import emptied, grip
+from svkc.transitions.transition import change, connect_tolerance, release
+
+
+def simulate(
+    chain: Chain, state: State, t1, *, t0=0.0, ts=None, events=(), control=None, args=None, dt=None, rtol=None, atol=None, solver=None,
+    stepsize_controller=None, stabilization=None, dynamics=None, adjoint=None, max_events=None, max_steps=None, throw=True, progress_meter=None,
+) -> Trajectory:  # fmt: skip
+    """The motion from t0 to t1 (s), through every change of structure in `events` (`svkc.at`, `svkc.when`).
+
+    ts: times to save, stepped to exactly; None: t0 and t1. A state saved at an event's time is the one after it; times past the end of a run that
+    stopped early hold its last state.
+    control(t, state, args): joint torques (N m, N) over every coordinate, or the tree's.
+    dt: fixed steps (s). rtol, atol: adaptive steps, by default 1e-7 (float32: 1e-4) and a hundredth of rtol.
+    solver, stepsize_controller, adjoint, progress_meter: diffrax objects, passed through; by default Dopri8 with rtol, Tsit5 with dt or in float32.
+    stabilization: `svkc.Projection()` (default), `svkc.Exact()`, `svkc.Baumgarte(rate)` or `svkc.Drift()`. dynamics: `svkc.Dynamics(inertia, hold)`.
+    Functions are compared by their code and by the values that they read: defaults, closures and globals. An equal function is not compiled again.
+    Floating-point arrays among these values are data. Numbers and integer arrays are static, as are arrays that Python has to read. A function that reads
+    other kinds of objects is compared by identity; if that compiles it again, a `UserWarning` names the argument.
+    max_events: how many events may happen (default: each timed one, four times each guard); max_steps: in one phase.
+    ValueError: a call that cannot be right. A run that goes wrong ends with a code in `result`, raised when throw=True.
+    """
+    options, save_at, made = checked(
+        chain, state, t0, t1, ts, events, control, dt, rtol, atol, solver, stepsize_controller, stabilization, dynamics, adjoint, max_events,
+        max_steps, progress_meter,
+    )  # fmt: skip
+    dtype = state.q.dtype
+    given = chain, state, jnp.asarray(t0, dtype), jnp.asarray(t1, dtype), save_at
+    run = lambda control, events: _run(*given, _with(made, guards=events), _with(options, control=control), args)
+    run = shared(run, control=options.control, events=made.guards)
+    traj = (_certified_once if len(save_at) <= FEW_STATES else _certified)(chain, run, save_at, given[3], options.gap, stages(options.solver))
+    if not throw:
+        return traj
+    if isinstance(traj.result._value, jax.core.Tracer):
+        return traj.result.error_if(traj, (traj.result != RESULTS.successful) & (traj.result != RESULTS.stopped))
+    if np.any(~np.isin(np.asarray(traj.result._value), [RESULTS.successful._value, RESULTS.stopped._value])):
+        phase, loop = int(traj.phases.count), int(traj.report().loop)
+        where = f"phase {phase}" if loop < 0 else f"phase {phase}, loop {chain.link_names[loop]!r}"
+        raise RuntimeError(f"simulate stopped at t = {float(traj.t_final):.9g} s, in {where}: {RESULTS[traj.result]}")
+    return traj
+
+
+@eqx.filter_jit
+def _run(chain: Chain, state: State, t0, t1, ts, made: Plan, options: Options, args) -> Run:
+    made, options = _converted(chain, state, t0, made, options, args)
+    run = _start(chain, state, t0, ts, made, options, args)
+
+    def phase(run: Run, index):
+        return _phase(chain, run, index, t1, ts, made, options, args), None
+
+    if options.max_events == 0:
+        run, _ = phase(run, jnp.asarray(0))
+    else:
+        run, _ = jax.lax.scan(phase, run, jnp.arange(options.max_events + 1))
+    return run
+
+
+def _with_certificate(chain: Chain, run: Run, ts, t1, most: float, evaluations: int) -> Trajectory:
+    """Return the run with its certificate. most: the largest gap of a closed loop; evaluations: of the field in one try of a step."""
+    short = (run.t < t1) & (run.result == RESULTS.successful)
+    result = RESULTS.where(short, RESULTS.max_events, run.result)
+    phases, saved, lost = certificate(chain, run.records, run.count, run.saved, evaluations)
+    worst = jnp.maximum(jnp.max(saved.gap), jnp.max(phases.gap))
+    result = RESULTS.where((result == RESULTS.successful) & (worst > most), RESULTS.loop_open, result)
+    derivative = RESULTS.where((lost < phases.start.shape[0]) & (lost <= run.invalid_from), RESULTS.rank_lost, run.derivative)
+    return Trajectory(ts, run.saved, saved.gap, saved.gap_rate, run.events, phases, run.state, run.t, result, derivative)
+
+
+# a program of its own, which an eager call compiles for compile time: it checks each state once
+FEW_STATES = 1000
+_certified, _certified_once = eqx.filter_jit(_with_certificate), eager_jit(_with_certificate, eqx.filter_jit)
+
+
+def _converted(chain: Chain, state: State, t0, made: Plan, options: Options, args) -> tuple[Plan, Options]:
+    """Control and guards with all that they close over as their leaves, so that it can be differentiated."""
+    state = _lockable(chain, state, made)
+
+    def converted(fn):
+        return fn if fn is None or isinstance(fn, Sensor) else Closed.over(fn, t0, state, args)
+
+    guards, control = tuple(converted(g) for g in made.guards), converted(options.control)
+    return _with(made, guards=guards), _with(options, control=control)
+
+
+def _with(node, **changed):
+    return dataclasses.replace(node, **changed)
+
+
+def _lockable(chain: Chain, state: State, made: Plan) -> State:
+    if not made.locks or state.structure.locked is not None:
+        return state
+    return eqx.tree_at(lambda s: s.structure.locked, state, jnp.zeros(chain.dofs, bool), is_leaf=lambda x: x is None)
+
+
+def _start(chain: Chain, state: State, t0, ts, made: Plan, options: Options, args) -> Run:
+    """Empty records, sized by capacity; unwritten entries show: inf, -1."""
+    links, rows, dtype = len(chain.link_names), options.max_events, state.q.dtype
+    state = _lockable(chain, state, made)
+    # an overload from the start is a crossing, so loads begin idle; other guards are evaluated at the start of the phase
+    idle = [g.idle if isinstance(g, Sensor) and g.loaded else 1 for g in made.guards]
+    return Run(
+        t=t0,
+        state=state,
+        work=jnp.zeros((), dtype) if options.has_work else None,
+        guards=jnp.asarray(idle, dtype) if made.guards else None,
+        stale=jnp.asarray(_reevaluated(made)) if made.guards else None,
+        pending=jnp.ones(len(made.timed), bool),
+        events=no_events(rows, links, dtype),
+        records=no_records(rows + 1, state),
+        count=jnp.asarray(0, jnp.int32),
+        saved=jax.tree.map(lambda x: jnp.broadcast_to(x[None], (ts.shape[0], *x.shape)), state),
+        result=RESULTS.successful,
+        derivative=RESULTS.successful,
+        invalid_from=jnp.asarray(rows + 1, jnp.int32),
+    )  # fmt: skip
+
+
+def _phase(chain: Chain, run: Run, index, t1, ts, made: Plan, options: Options, args) -> Run:
+    """One solve, the events at its end, and the records of both."""
+    run = _with_guards(chain, run, made, options, args)
+    going = (run.t < t1) | jnp.any(run.pending & (made.times <= t1))
+    going = going & (run.result == RESULTS.successful)
+    next_time = jnp.min(jnp.where(run.pending, made.times, jnp.inf), initial=jnp.inf)
+    # (the event's own time where it is that of the end, and the end's own where the run is there already: each is to be differentiated by)
+    ahead = jnp.where(next_time <= t1, next_time, t1)
+    stop = jnp.where((ahead < run.t) | (run.result != RESULTS.successful), run.t, ahead)
+    solved = solve(run, stop, ts, made, options, Scene(chain, run.state.structure, args))
+    reached = going & (solved.result == RESULTS.successful)
+    timed = run.pending & (made.times <= solved.t + event_tolerance(solved.t)) & reached
+    fired = jnp.zeros(len(made.actions), bool).at[np.array(made.timed + made.guarded, int)].set(jnp.concatenate([timed, solved.fired & reached]))
+    ended = State(solved.motion.q, solved.motion.v, run.state.structure)
+    saved = _save(run, ended, solved, ts)
+    row = (jnp.arange(run.records.start.shape[0]) == index) & going
+    work = jnp.zeros_like(run.t) if run.work is None else solved.motion.work - run.work
+    records = recorded(run.records, row, (run.t, run.state), (solved.t, ended), work, solved.path)
+    count = run.count + going.astype(jnp.int32)
+    derivative, invalid_from = _derivative(run, solved, going, timed, index)
+    after, events, result = ended, run.events, solved.result
+    if made.actions:
+        after, events, result = _apply(chain, run, ended, solved, fired, made)
+    result = RESULTS.where(run.result == RESULTS.successful, result, run.result)
+    # a guard that rests at zero after it fired keeps its value
+    stale = jnp.asarray(_reevaluated(made)) & jnp.any(fired) & (solved.guards != 0) if made.guards else None
+    return Run(
+        t=solved.t,
+        state=after,
+        work=solved.motion.work,
+        guards=solved.guards,
+        stale=stale,
+        pending=run.pending & ~timed,
+        events=events,
+        records=records,
+        count=count,
+        saved=saved,
+        result=result,
+        derivative=derivative,
+        invalid_from=invalid_from,
+    )
+
+
+def _derivative(run: Run, solved: Solved, going, timed: Bool[Array, " timed"], index) -> tuple[RESULTS, Int[Array, ""]]:
+    """Return the first reason why the run has no derivative, and the index of its phase. Ranks are checked after the run."""
+    code = RESULTS.where(jnp.sum(solved.fired) + jnp.sum(timed) > 1, RESULTS.together, solved.derivative)
+    first = (run.derivative == RESULTS.successful) & going & (code != RESULTS.successful)
+    return RESULTS.where(first, code, run.derivative), jnp.where(first, index.astype(jnp.int32), run.invalid_from)
+
+
+def _reevaluated(made: Plan) -> np.ndarray:
+    """Return which guards are re-evaluated after a change of structure, so that a guard is compared within one phase.
+
+    Guards of loads are not: a link that is overloaded from the start of a phase breaks at once.
+    """
+    return np.array([not (isinstance(g, Sensor) and g.loaded) for g in made.guards], bool)
+
+
+def _with_guards(chain: Chain, run: Run, made: Plan, options: Options, args) -> Run:
+    """Return the run with its stale guards re-evaluated at the start of a phase."""
+    if not made.guards or not _reevaluated(made).any():
+        return run
+    scene = Scene(chain, run.state.structure, args)
+    now = frozen(Reading(made, options.field))(*frozen((run.t, Motion(run.state.q, run.state.v), scene)))
+    return dataclasses.replace(run, guards=jnp.where(run.stale, now, run.guards))
+
+
+def _save(run: Run, ended: State, solved: Solved, ts) -> State:
+    """The saved states with those of this phase written in: from its start to its end, both included; later ones hold its end."""
+    here, later = ((ts >= run.t) & (ts <= solved.t))[:, None], (ts > solved.t)[:, None]
+    q = jnp.where(here, solved.saved.q, jnp.where(later, ended.q[None], run.saved.q))
+    v = jnp.where(here, solved.saved.v, jnp.where(later, ended.v[None], run.saved.v))
+
+    def write(new, old):
+        return jnp.where((ts >= run.t).reshape(-1, *(1,) * new.ndim), new[None], old)
+
+    return State(q, v, jax.tree.map(write, ended.structure, run.saved.structure))
+
+
+def _apply(chain: Chain, run: Run, ended: State, solved: Solved, fired: Bool[Array, " events"], made: Plan):
+    """The change of structure that all events of this instant make together; one record row for each of them."""
+    any_of = lambda what: jnp.any(fired[:, None] & made.table(chain, what), 0)
+    connected = (ended.structure.connected | any_of("connect")) & ~any_of("cut")
+    locked = (ended.structure.locked | any_of("lock")) & ~any_of("unlock") if made.locks else None
+    here = any_of("here") if made.table(chain, "here").any() or made.binds else None
+    happened, full, emptying = jnp.any(fired), jnp.zeros((), bool), None
+    if made.binds:
+        structure, gripped, full, emptying = _bound(chain, ended.structure, fired, made)
+        ended = State(ended.q, ended.v, structure)
+        connected, here = (connected | gripped) & ~emptying, here | gripped
+
+    def changed():
+        done = change(chain, ended, connected, locked, here) if made.joins(chain) else release(chain, ended, connected, locked)
+        return done if emptying is None else eqx.tree_at(lambda d: d.state.structure, done, emptied(done.state.structure, emptying))
+
+    def same():
+        return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), eqx.filter_eval_shape(changed))
+
+    done = jax.lax.cond(eqxi.unvmap_any(happened), changed, same)
+    # what a change makes of numbers that are not is not taken
+    sound = finite(Motion(done.state.q, done.state.v)) & ~jnp.isnan(done.gap)
+    after = jax.tree.map(lambda new, old: jnp.where(happened & sound, new, old), done.state, ended)
+    r, count = run.events, jnp.sum(fired, dtype=jnp.int32)
+    place = r.count + jnp.cumsum(fired, dtype=jnp.int32) - 1
+    rows = jnp.arange(r.time.shape[0], dtype=jnp.int32)
+    hit = (rows[:, None] == place[None]) & fired[None]
+    written = jnp.any(hit, 1)
+    first = written & (rows == r.count)
+    mine = jnp.any(hit[:, :, None] & (made.table(chain, "connect") | made.table_of_grips(chain))[None], 1)[:, :, None]
+    events = Events(
+        jnp.where(written, solved.t, r.time),
+        jnp.where(written, jnp.argmax(hit, 1).astype(jnp.int32), r.which),
+        jnp.where(mine, done.impulse[None], r.impulse),
+        jnp.where(mine, done.angular_impulse[None], r.angular_impulse),
+        jnp.where(first, done.energy_lost, r.energy_lost),
+        jnp.minimum(r.count + count, r.time.shape[0]),
+    )
+    stops = jnp.any(fired & np.array([a.stop for a in made.actions], bool))
+    result = RESULTS.where(stops, RESULTS.stopped, solved.result)
+    result = RESULTS.where(happened & (done.gap > connect_tolerance), RESULTS.not_in_place, result)
+    result = RESULTS.where(sound, result, RESULTS.non_finite)
+    result = RESULTS.where(full, RESULTS.no_slot, result)
+    result = RESULTS.where(r.count + count > r.time.shape[0], RESULTS.max_events, result)
+    return after, events, result
+
+
+def _bound(chain: Chain, structure: Structure, fired: Bool[Array, " events"], made: Plan):
+    """The structure with the slots that the events of this instant bind, the slots to connect, whether one was lacking, and the slots to empty."""
+    emptying = jnp.any(fired[:, None] & made.unbound(chain, structure), 0)
+    gripped, full = jnp.zeros(len(chain.link_names), bool), jnp.zeros((), bool)
+    for event, wishes in enumerate(made.grips):
+        for wish in wishes:
+            # slots given to others at this instant are no longer free
+            taken = eqx.tree_at(lambda s: s.connected, structure, structure.connected | gripped)
+            bound, slot, lacking = grip(chain, taken, wish)
+            bound = eqx.tree_at(lambda s: s.connected, bound, structure.connected)
+            structure = jax.tree.map(lambda new, old, e=event: jnp.where(fired[e], new, old), bound, structure)
+            gripped, full = gripped | (slot & fired[event]), full | (lacking & fired[event])
+    return structure, gripped, full, emptying

@@ -1,0 +1,260 @@
+"""F5: changes of structure to come, at a time or when a guard crosses zero, and where in a step it does."""
+
+import dataclasses
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from svkc.model.chain import Chain, Structure
+from svkc.model.topology import V_SIZE
+from svkc.model.validation import concrete, numbers, texts, yes_or_no
+from svkc.transitions.initial_state import joint_slice, link_index
+from svkc.transitions.spare_links import Grip, checked_freedoms, holding, placed, rows_of, spare_slot, to_axis
+
+
+class Action(eqx.Module):
+    """What an event does: names of virtual links to connect (those in `here`: where they are) and cut, of joints to lock and unlock, grips to
+    make with spare slots and, by slot or by pair of bodies, to give up."""
+
+    connect: tuple[str, ...] = eqx.field(static=True, default=())
+    cut: tuple[str, ...] = eqx.field(static=True, default=())
+    lock: tuple[str, ...] = eqx.field(static=True, default=())
+    unlock: tuple[str, ...] = eqx.field(static=True, default=())
+    here: tuple[str, ...] = eqx.field(static=True, default=())
+    stop: bool = eqx.field(static=True, default=False)
+    unbind: tuple = eqx.field(static=True, default=())
+    bind: tuple[Grip, ...] = ()
+
+
+class At(eqx.Module):
+    """An event at a time (s); the time is differentiable."""
+
+    time: Any
+    action: Action
+
+
+class When(eqx.Module):
+    """An event when guard(t, state, args) crosses zero: upwards (True), downwards (False), either way (None)."""
+
+    guard: Callable
+    action: Action
+    direction: bool | None = eqx.field(static=True, default=None)
+
+
+def _several(value) -> tuple:
+    """One thing, or what holds several."""
+    return tuple(value) if isinstance(value, Iterable) and not isinstance(value, str) else (value,)
+
+
+def _action(connect, cut, lock, unlock, here, stop, bind, unbind) -> Action:
+    bind = _several(bind)
+    if not all(isinstance(g, Grip) for g in bind):
+        raise ValueError(f"bind: expected svkc.Grip objects, got {bind!r}")
+    unbind = _several(unbind)
+    if len(unbind) == 2 and all(isinstance(u, str) for u in unbind) and not all(u.startswith("spare_") for u in unbind):
+        unbind = (unbind,)
+    if not all(isinstance(u, str) or (isinstance(u, tuple) and len(u) == 2) for u in unbind):
+        raise ValueError(f"unbind: expected names of spare slots or pairs of body names (parent, real), got {unbind!r}")
+    connect = texts("connect", connect)
+    here = (connect if here else ()) if isinstance(here, bool | np.bool_) else texts("here", here)
+    if not set(here) <= set(connect):
+        raise ValueError(f"here: {here} must be among the links to connect, {connect}")
+    cut, lock, unlock = texts("cut", cut), texts("lock", lock), texts("unlock", unlock)
+    return Action(connect, cut, lock, unlock, here, yes_or_no("stop", stop), unbind, bind)
+
+
+def at(time, connect=(), cut=(), *, lock=(), unlock=(), here=False, stop=False, bind=(), unbind=()) -> At:
+    """At this time (s): connect and cut virtual links, lock and unlock joints, by name. Where a link is both connected and cut, it is cut.
+
+    here: True, or names: grip where the bodies are. stop: end the run then. bind: `svkc.Grip`s to make with spare slots, where the bodies are; where all
+    are taken the run ends with a code. unbind: spare slots by name, or all between a pair (parent, real) of bodies, cut and emptied.
+    """
+    numbers("time", time)
+    return At(time, _action(connect, cut, lock, unlock, here, stop, bind, unbind))
+
+
+def when(guard, connect=(), cut=(), direction=None, *, lock=(), unlock=(), here=False, stop=False, bind=(), unbind=()) -> When:
+    """When guard(t, state, args) -> real crosses zero, located to round-off and differentiable in time; the actions are those of `at`.
+
+    direction: True for upwards only, False for downwards only. A guard is watched while its action would change something, or always if it has
+    none, so name the links it is about where several act alike; one that is exactly zero at the start has not crossed, nor has one that rests at zero
+    (to eps^(3/4)) after it fired. Crossings are seen between the ends of steps of one phase: two within one step go unseen, so bound the step
+    (`stepsize_controller`, `dt`) where that can happen. A guard that jumps over zero happens where it jumps; only a smooth one has a time to
+    differentiate.
+    """
+    if not callable(guard):
+        raise ValueError(f"when: guard must be a function of (t, state, args), got {guard!r}")
+    if direction is not None and not isinstance(direction, bool | np.bool_):
+        raise ValueError(f"when: direction must be True, False or None, got {direction!r}")
+    direction = None if direction is None else bool(direction)
+    return When(guard, _action(connect, cut, lock, unlock, here, stop, bind, unbind), direction)
+
+
+class Plan(eqx.Module):
+    """A list of events as tables: which are timed, and what each does."""
+
+    times: Float[Array, " timed"]
+    guards: tuple[Callable, ...]
+    timed: tuple[int, ...] = eqx.field(static=True)
+    guarded: tuple[int, ...] = eqx.field(static=True)
+    directions: tuple[bool | None, ...] = eqx.field(static=True)
+    actions: tuple[Action, ...] = eqx.field(static=True)
+    grips: tuple[tuple[Grip, ...], ...] = ()
+
+    @property
+    def binds(self) -> bool:
+        return any(self.grips) or any(a.unbind for a in self.actions)
+
+    def unbound(self, chain: Chain, structure: Structure) -> Bool[Array, "events links"]:
+        """Spare slots that each event would empty now."""
+        none = jnp.zeros(len(chain.link_names), bool)
+        rows = []
+        for action in self.actions:
+            row = none
+            for what in action.unbind:
+                slots = np.array(chain.link_names) == what if isinstance(what, str) else holding(chain, structure, *what)
+                row = row | slots
+            rows.append(row)
+        return jnp.stack(rows)
+
+    def joins(self, chain: Chain) -> bool:
+        """Return whether any event connects a link or locks a joint. If none does, no impact is compiled."""
+        return bool(self.binds or self.table(chain, "connect").any() or self.table(chain, "lock").any())
+
+    @property
+    def locks(self) -> bool:
+        return any(a.lock or a.unlock for a in self.actions)
+
+    def table(self, chain: Chain, what: str) -> np.ndarray:
+        """[events, links or dofs] Boolean of one part of the actions."""
+        if what in ("lock", "unlock"):
+            table = np.zeros((len(self.actions), chain.dofs), bool)
+            for row, action in zip(table, self.actions, strict=True):
+                for name in getattr(action, what):
+                    row[joint_slice(chain, name, V_SIZE, chain.topology.v_start)] = True
+            return table
+        table = np.zeros((len(self.actions), len(chain.link_names)), bool)
+        for row, action in zip(table, self.actions, strict=True):
+            row[[link_index(chain, name) for name in getattr(action, what)]] = True
+        return table
+
+    def table_of_grips(self, chain: Chain) -> np.ndarray:
+        """[events, links] Boolean of the spare slots an event may bind."""
+        return np.array([bool(g) for g in self.grips], bool)[:, None] & np.array(chain.topology.link_spare, bool)[None]
+
+    def watched(self, chain: Chain, structure: Structure) -> Bool[Array, " guards"]:
+        """Guards whose action would change something now, or that have none."""
+        rows = list(self.guarded)
+        on, off = (self.table(chain, what)[rows] for what in ("connect", "cut"))
+        c = structure.connected[None]
+        change = jnp.any(on & ~c, 1) | jnp.any(off & c, 1)
+        if self.locks:
+            on, off = (self.table(chain, what)[rows] for what in ("lock", "unlock"))
+            change = change | jnp.any(on & ~structure.locked[None], 1) | jnp.any(off & structure.locked[None], 1)
+        if self.binds:
+            empties = jnp.any(self.unbound(chain, structure)[np.array(rows)] & structure.connected[None], 1)
+            held = lambda g: jnp.any(holding(chain, structure, g.parent, g.real))
+            grips = [jnp.any(~jnp.stack([held(g) for g in self.grips[i]])) if self.grips[i] else jnp.zeros((), bool) for i in rows]
+            change = change | empties | jnp.stack(grips)
+        always = [(a := self.actions[i]).stop or not (a.connect + a.cut + a.lock + a.unlock + a.unbind + self.grips[i]) for i in rows]
+        return change | np.array(always, bool)
+
+    def crossed(self, before: Float[Array, " guards"], after: Float[Array, " guards"]) -> Bool[Array, " guards"]:
+        """Guards that went through zero; one that starts at zero has not."""
+        up, down = (before < 0) & (after >= 0), (before > 0) & (after <= 0)
+        either = np.array([d is None for d in self.directions], bool)
+        upward = np.array([d is True for d in self.directions], bool)
+        return jnp.where(either, up | down, jnp.where(upward, up, down))
+
+
+def listed(events) -> tuple:
+    """The events of a list; ValueError for anything that is not one."""
+    events = tuple(events) if isinstance(events, Iterable) else (events,)
+    for event in events:
+        if not isinstance(event, At | When):
+            raise ValueError(f"events: expected svkc.at(...) and svkc.when(...), got {event!r}")
+    return events
+
+
+def plan(chain: Chain, events: tuple, dtype) -> Plan:
+    """Tables of the events; ValueError for names the chain does not have."""
+    timed = tuple(i for i, e in enumerate(events) if isinstance(e, At))
+    guarded = tuple(i for i, e in enumerate(events) if isinstance(e, When))
+    times = [events[i].time for i in timed]
+    if any(np.shape(t) != () for t in times):
+        raise ValueError("at: time must be one number; for a time in each lane use vmap")
+    # on the host where nothing is traced, as a program of its own would be compiled to stack them
+    times = np.array(times, dtype) if concrete(*times) else jnp.stack([jnp.asarray(t, dtype) for t in times])
+    made = Plan(
+        times=jnp.asarray(times, dtype),
+        guards=tuple(events[i].guard for i in guarded),
+        timed=timed,
+        guarded=guarded,
+        directions=tuple(events[i].direction for i in guarded),
+        # what is static and what can be differentiated, apart
+        actions=tuple(dataclasses.replace(e.action, bind=()) if e.action.bind else e.action for e in events),
+        grips=tuple(tuple(_checked_grip(chain, g, dtype) for g in e.action.bind) for e in events),
+    )
+    for what in ("connect", "cut", "lock", "unlock"):
+        made.table(chain, what)
+    for action in made.actions:
+        for what in action.unbind:
+            spare_slot(chain, what) if isinstance(what, str) else rows_of(chain, *what)
+    return made
+
+
+def _checked_grip(chain: Chain, wish: Grip, dtype) -> Grip:
+    rows_of(chain, wish.parent, wish.real)
+    checked_freedoms(wish.joint)
+    to_axis(wish.axis)
+    if wish.slot is not None:
+        spare_slot(chain, wish.slot)
+    elif not any(chain.topology.link_spare):
+        raise ValueError("bind: the chain has no spare slots; load it with spare=n")
+    return dataclasses.replace(wish, real_pos=placed("real_pos", wish.real_pos, dtype))
+
+
+# how often a bracket may be narrowed
+NARROWINGS = 200
+
+
+class Bracket(eqx.Module):
+    """Two times, at the first a function is below zero, at the second not: narrowed to round-off by false position with the Illinois weight, every third
+    time by bisection. `fine`: how narrow; `last`: which end has moved (1: b, -1: a)."""
+
+    a: Float[Array, ""]
+    b: Float[Array, ""]
+    fa: Float[Array, ""]
+    fb: Float[Array, ""]
+    fine: Float[Array, ""]
+    last: Int[Array, ""]
+    count: Int[Array, ""]
+
+    @staticmethod
+    def around(a, b, fa, fb) -> "Bracket":
+        """From the two times and the function there."""
+        eps = jnp.finfo(fb.dtype).eps
+        fine = 2 * eps * jnp.maximum(jnp.abs(a), jnp.abs(b)) + eps * (b - a)
+        return Bracket(a, b, fa, fb, fine, *(jnp.zeros((), jnp.int32) for _ in range(2)))
+
+    def wide(self) -> Bool[Array, ""]:
+        """Whether to go on."""
+        return (self.b - self.a > self.fine) & (self.count < NARROWINGS)
+
+    def inside(self) -> Float[Array, ""]:
+        """The time to look at next."""
+        weight = self.fb - self.fa
+        secant = self.b - self.fb * (self.b - self.a) / jnp.where(weight == 0, 1, weight)
+        c = jnp.where((self.count % 3 == 2) | (weight == 0), self.a + (self.b - self.a) / 2, secant)
+        return jnp.clip(c, self.a + self.fine / 4, self.b - self.fine / 4)
+
+    def narrowed(self, c, fc) -> "Bracket":
+        """With what the function is at c."""
+        right = fc >= 0
+        fa, fb = jnp.where(right & (self.last == 1), self.fa / 2, self.fa), jnp.where(~right & (self.last == -1), self.fb / 2, self.fb)
+        a, fa, b, fb = jnp.where(right, self.a, c), jnp.where(right, fa, fc), jnp.where(right, c, self.b), jnp.where(right, fc, fb)
+        return Bracket(a, b, fa, fb, self.fine, jnp.where(right, 1, -1).astype(jnp.int32), self.count + 1)

@@ -1,0 +1,1 @@
+"""Open chains: spatial algebra, kinematics, inverse dynamics, mass matrix, articulated bodies, energy."""

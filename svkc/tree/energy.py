@@ -1,0 +1,77 @@
+"""F3: energy and momentum of the tree; virtual links have no mass."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from svkc.loops.constraint import active_dofs
+from svkc.model.chain import Chain, State
+from svkc.model.checked_jit import verb
+from svkc.tree.kinematics import Kinematics, difference, kinematics, twists
+from svkc.tree.spatial import cross, rotate
+
+
+def _bodies(chain: Chain, kin: Kinematics, v):
+    """Of each row: centre of mass from the root's origin, its velocity, angular velocity, angular momentum about it."""
+    V = twists(chain, kin, v)
+    c = kin.r + rotate(kin.R, chain.com)
+    w = V[:, :3]
+    spin = rotate(kin.R, rotate(chain.rotational, rotate(jnp.swapaxes(kin.R, -1, -2), w)))
+    return c, V[:, 3:] + cross(w, c), w, spin
+
+
+def _energies(chain: Chain, state: State, kin: Kinematics, bodies) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    c, u, w, spin = bodies
+    kinetic = jnp.sum(chain.mass * jnp.sum(u * u, -1)) / 2 + jnp.sum(w * spin) / 2
+    if chain.armature is not None:
+        kinetic = kinetic + jnp.sum(chain.armature * state.v[: chain.nv] ** 2) / 2
+    active = active_dofs(chain, state.structure)
+    if chain.link_armature is not None:
+        kinetic = kinetic + jnp.sum(jnp.where(active, state.v, 0)[chain.nv :] ** 2 * chain.link_armature) / 2
+    potential = -jnp.sum(chain.mass * jnp.sum((kin.root + c) * chain.gravity[None], -1))
+    if chain.stiffness is not None:
+        stretch = jnp.where(active, difference(chain, chain.q_spring, state.q), 0)
+        potential = potential + jnp.sum(chain.stiffness * stretch**2) / 2
+    return kinetic, potential
+
+
+def _both(chain: Chain, state: State) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    kin = kinematics(chain, state.q)
+    return _energies(chain, state, kin, _bodies(chain, kin, state.v))
+
+
+@verb(eager=True)
+def kinetic_energy(chain: Chain, state: State) -> Float[Array, ""]:
+    """Kinetic energy (J), armature included: v^T M v / 2."""
+    return _both(chain, state)[0]
+
+
+@verb(eager=True)
+def potential_energy(chain: Chain, state: State) -> Float[Array, ""]:
+    """Gravity's potential (J), zero at the world's origin, and that of the joints' springs."""
+    return _both(chain, state)[1]
+
+
+@verb(eager=True)
+def energy(chain: Chain, state: State) -> Float[Array, ""]:
+    """Mechanical energy (J): kinetic, gravity's and the joint springs' (Featherstone section 2.13)."""
+    kinetic, potential = _both(chain, state)
+    return kinetic + potential
+
+
+def energy_and_momentum(chain: Chain, state: State, kin: Kinematics) -> tuple[Float[Array, ""], Float[Array, "3"], Float[Array, "3"]]:
+    """Return `energy`, linear momentum (N s), and angular momentum about the centre of mass of all bodies (N m s), in world axes."""
+    bodies = _bodies(chain, kin, state.v)
+    kinetic, potential = _energies(chain, state, kin, bodies)
+    c, u, _, spin = bodies
+    p, place = chain.mass[:, None] * u, kin.root + c
+    centre = jnp.sum(chain.mass[:, None] * place, 0) / jnp.sum(chain.mass)
+    return kinetic + potential, jnp.sum(p, 0), jnp.sum(spin + cross(place - centre[None], p), 0)
+
+
+@verb(eager=True)
+def momentum(chain: Chain, state: State) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+    """Linear momentum (N s) and angular momentum about the world's origin (N m s), in world axes (Featherstone section 2.12)."""
+    kin = kinematics(chain, state.q)
+    c, u, _, spin = _bodies(chain, kin, state.v)
+    p = chain.mass[:, None] * u
+    return jnp.sum(p, 0), jnp.sum(spin + cross(kin.root + c, p), 0)

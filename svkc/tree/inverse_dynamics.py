@@ -1,0 +1,134 @@
+"""F3: recursive Newton-Euler on the tree, the joint-space inertia by unit vectors and by composite bodies, and the forces joints make by themselves."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from svkc._jax.static_gather import take
+from svkc.model.chain import Chain, State
+from svkc.model.checked_jit import verb
+from svkc.tree.kinematics import Kinematics, difference, down, kinematics, put, to_rows, twists, up, velocity_products
+from svkc.tree.spatial import cross, halves, rotate
+
+
+def newton_euler(chain: Chain, kin: Kinematics, V: Float[Array, "rows 6"] | None, A: Float[Array, "rows 6"]) -> Float[Array, " nv"]:
+    """Joint forces S^T F that give every row the spatial acceleration A at the twist V (None: at rest); Featherstone section 5.3.
+
+    Each body's force is taken at its centre of mass, where gyroscopic terms need no parallel axes, and moved to the root's origin.
+    """
+    c = kin.r + rotate(kin.R, chain.com)
+    alpha, acceleration = halves(A)
+    acceleration = acceleration + cross(alpha, c)
+    R = kin.R
+
+    def spin(w):
+        return rotate(R, rotate(chain.rotational, rotate(jnp.swapaxes(R, -1, -2), w)))
+
+    moment = spin(alpha)
+    if V is not None:
+        w, u = halves(V)
+        acceleration = acceleration + cross(w, u + cross(w, c))
+        moment = moment + cross(w, spin(w))
+    force = chain.mass[:, None] * acceleration
+    F = up(chain.topology, jnp.concatenate([moment + cross(c, force), force], -1))
+    return jnp.sum(kin.S * take(F, chain.topology.dof_row), -1)
+
+
+def generalized_forces(chain: Chain, kin: Kinematics, V, v, vdot: Float[Array, " nv"]) -> Float[Array, " nv"]:
+    """ID(q, v, vdot) of the tree with gravity and armature (paper, section III-A, step 2)."""
+    A = down(chain.topology, to_rows(chain.topology, kin.S * vdot[:, None]) + velocity_products(chain, kin, V, v))
+    A = A - jnp.concatenate([jnp.zeros_like(chain.gravity), chain.gravity])[None]
+    tau = newton_euler(chain, kin, V, A)
+    return tau if chain.armature is None else tau + chain.armature * vdot
+
+
+def inertia_times(chain: Chain, kin: Kinematics, x: Float[Array, " nv"]) -> Float[Array, " nv"]:
+    """M x: ID(q, 0, x) without gravity."""
+    A = down(chain.topology, to_rows(chain.topology, kin.S * x[:, None]))
+    tau = newton_euler(chain, kin, None, A)
+    return tau if chain.armature is None else tau + chain.armature * x
+
+
+def inertia_by_unit_vectors(chain: Chain, kin: Kinematics) -> Float[Array, "nv nv"]:
+    """Column i is ID(q, 0, e_i) without gravity: the paper's way (section III-B, step 3)."""
+    return jax.vmap(lambda unit: inertia_times(chain, kin, unit), out_axes=1)(jnp.eye(chain.nv, dtype=kin.r.dtype))
+
+
+def central_inertias(chain: Chain, kin: Kinematics) -> tuple[Float[Array, "rows 3"], Float[Array, "rows 3 3"]]:
+    """Of each row: the centre of mass from the root's origin, and the inertia about it, in world axes."""
+    RI = jnp.sum(kin.R[:, :, :, None] * chain.rotational[:, None, :, :], 2)
+    return kin.r + rotate(kin.R, chain.com), jnp.sum(RI[:, :, None, :] * kin.R[:, None, :, :], -1)
+
+
+def inertia_by_composites(chain: Chain, kin: Kinematics) -> Float[Array, "nv nv"]:
+    """Composite rigid bodies (Featherstone section 6.2): mass, first moment and rotational inertia simply add up towards the root."""
+    top, (c, central) = chain.topology, central_inertias(chain, kin)
+    m = chain.mass[:, None]
+    square = jnp.sum(c * c, -1)[:, None, None] * jnp.eye(3, dtype=c.dtype)[None] - c[:, :, None] * c[:, None, :]
+    I = central + m[:, :, None] * square
+    total = take(up(top, jnp.concatenate([m, m * c, I.reshape(-1, 9)], -1)), top.dof_row)
+    m, h, I = total[:, :1], total[:, 1:4], total[:, 4:].reshape(-1, 3, 3)
+    w, u = halves(kin.S)
+    # momentum of everything a joint carries, for a unit of its velocity
+    F = jnp.concatenate([rotate(I, w) + cross(h, u), m * u + cross(w, h)], -1)
+    related = top.ancestor[top.dof_row][:, top.dof_row]
+    M = jnp.where(related, F @ kin.S.T, 0)
+    M = jnp.where(related.T & ~related, M.T, M)
+    return M if chain.armature is None else M + jnp.diag(chain.armature)
+
+
+def passive_forces(chain: Chain, q: Float[Array, " q"], v: Float[Array, " dofs"]) -> Float[Array, " dofs"]:
+    """Springs and dampers of the model's joints (N m, N), MuJoCo's meaning: -stiffness (q - q_spring) - damping v."""
+    tau = jnp.zeros_like(v)
+    if chain.damping is not None:
+        tau = tau - chain.damping * v
+    if chain.stiffness is not None:
+        # the stretch of a ball is a rotation vector in body axes
+        tau = tau - chain.stiffness * difference(chain, chain.q_spring, q)
+    return tau
+
+
+def limit_forces(chain: Chain, q: Float[Array, " q"], v: Float[Array, " dofs"]) -> Float[Array, " dofs"]:
+    """The torque that keeps joints inside their range (paper, section VII-B): a stiff spring and damper that act outside of it only.
+
+    With x the distance outside and a = 0.02 rad or m: -(k x + c v) exp(-a / x); zero inside. All derivatives are continuous where it sets in: a kink
+    there would cost adaptive steps of high order more than the motion itself.
+    """
+    tau = jnp.zeros_like(v)
+    if chain.limit is None:
+        return tau
+    k, c = chain.limit_spring
+    at_q, at_v = chain.topology.scalars
+    lower, upper = chain.limit[:, at_v]
+    x = take(q, at_q)
+    out = jnp.maximum(x - upper, 0) - jnp.maximum(lower - x, 0)
+    onset = jnp.where(out != 0, jnp.exp(-0.02 / jnp.where(out != 0, jnp.abs(out), 1)), 0)
+    return put(tau, at_v, -(k[at_v] * out + c[at_v] * take(v, at_v)) * onset)
+
+
+@verb
+def mass_matrix(chain: Chain, state: State) -> Float[Array, "nv nv"]:
+    """Joint-space inertia of the tree (kg, kg m, kg m^2), armature included, by composite bodies (Featherstone section 6.2)."""
+    return inertia_by_composites(chain, kinematics(chain, state.q))
+
+
+@verb
+def bias_force(chain: Chain, state: State) -> Float[Array, " nv"]:
+    """Velocity-product and gravity forces (N, N m) of the tree: ID(q, v, 0) (MuJoCo's qfrc_bias; Featherstone section 6.1)."""
+    kin = kinematics(chain, state.q)
+    V = twists(chain, kin, state.v)
+    return generalized_forces(chain, kin, V, state.v, jnp.zeros(chain.nv, state.v.dtype))
+
+
+@verb
+def inverse_dynamics(chain: Chain, state: State, vdot: Float[Array, " accelerations"]) -> Float[Array, " nv"]:
+    """Torques (N m, N) the tree's joints must be given for vdot (over the tree, or over every coordinate): recursive Newton-Euler.
+
+    What springs and dampers of the joints give by themselves is taken off, so that this is the inverse of `forward_dynamics` on a tree.
+    """
+    if vdot.shape not in ((chain.nv,), (chain.dofs,)):
+        raise ValueError(f"vdot: got shape {vdot.shape}, expected {chain.nv} (the tree's) or {chain.dofs} (all)")
+    kin = kinematics(chain, state.q)
+    V = twists(chain, kin, state.v)
+    tau = generalized_forces(chain, kin, V, state.v, vdot[: chain.nv])
+    return tau - passive_forces(chain, state.q, state.v)[: chain.nv]

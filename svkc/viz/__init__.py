@@ -1,0 +1,1 @@
+"""Pictures: strobe, animation, curves, the page."""

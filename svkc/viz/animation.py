@@ -1,0 +1,159 @@
+"""F7: moving pictures of a run by MuJoCo's offscreen renderer: gif by Pillow, mp4 by imageio-ffmpeg."""
+
+import pathlib
+import warnings
+from collections.abc import Iterator
+
+import numpy as np
+
+from svkc.mjcf.bodies import matrix
+from svkc.model.chain import Chain
+from svkc.simulation.trajectory import Trajectory
+from svkc.viz.shapes import color, happened, held, world_poses
+
+GL_PACKAGES = "libegl1 libgl1"
+FLASH = 0.3  # s: for how long the links that an event changed are drawn large
+
+
+def _gl_context():
+    """A class of offscreen GL context whose library is on this machine; RuntimeError naming the packages otherwise."""
+    import importlib
+
+    for module in ("mujoco.egl", "mujoco.osmesa"):
+        try:
+            return importlib.import_module(module).GLContext
+        except (ImportError, AttributeError, RuntimeError, OSError, TypeError):
+            continue
+    raise RuntimeError(f"no library to draw with: install the packages {GL_PACKAGES} (apt-get install --no-install-recommends {GL_PACKAGES})")
+
+
+def gif(path: pathlib.Path, images: Iterator, fps: float):
+    """An animation that repeats, 96 colours a frame, rare ones too."""
+    from PIL import Image
+
+    first, *others = (image.quantize(96, Image.Quantize.MAXCOVERAGE) for image in images)
+    first.save(path, save_all=True, append_images=others, duration=round(1000 / fps), loop=0)
+
+
+def mp4(path: pathlib.Path, images: Iterator, fps: float):
+    """H.264 by the ffmpeg that imageio-ffmpeg brings. RuntimeError: it is not installed."""
+    try:
+        import imageio_ffmpeg
+    except ImportError as error:
+        raise RuntimeError("mp4 needs the package imageio-ffmpeg: pip install 'svkc[video]'") from error
+    first = next(images)
+    writer = imageio_ffmpeg.write_frames(str(path), first.size, fps=fps, macro_block_size=2, quality=7, ffmpeg_log_level="error")
+    with warnings.catch_warnings():
+        # jax warns of forks, for threads that hold locks; this one becomes ffmpeg at once
+        warnings.simplefilter("ignore", RuntimeWarning)
+        writer.send(None)
+    try:
+        for image in (first, *images):
+            writer.send(np.ascontiguousarray(image))
+    finally:
+        writer.close()
+
+
+def frames(chain: Chain, traj: Trajectory, *, fps: float, size, trails, camera, lookat, distance, azimuth, elevation) -> Iterator:
+    """PIL images `1/fps` s apart, the nearest saved state to each: links that hold as spheres, paths of the bodies in `trails`, a strip below.
+
+    ValueError: no such body or camera. RuntimeError: no GL library.
+    """
+    import mujoco
+    from PIL import Image
+
+    model = chain.model.model
+    unknown = [name for name in trails if name not in chain.body_names]
+    if unknown:
+        raise ValueError(f"trails: no body {unknown[0]!r}; bodies: {', '.join(chain.body_names)}")
+    model.vis.quality.shadowsize = model.vis.quality.offsamples = 0
+    model.vis.global_.offwidth, model.vis.global_.offheight = np.maximum(size, (model.vis.global_.offwidth, model.vis.global_.offheight))
+    data = mujoco.MjData(model)
+    ts, (positions, R) = np.asarray(traj.ts), world_poses(chain, traj.states)
+    holding, events = held(chain, traj.states, positions, R), happened(traj, chain)
+    eye = _camera(model, positions, camera, lookat, distance, azimuth, elevation)
+    shapes = [matrix(quat) for quat in model.geom_quat]
+    context = _gl_context()
+    import mujoco.rendering.classic.gl_context as gl
+
+    gl.GLContext = context
+    mujoco.mj_forward(model, data)
+    with mujoco.Renderer(model, height=size[1], width=size[0]) as renderer:
+        for t in np.arange(ts[0], ts[-1] + 0.5 / fps, 1 / fps):
+            i = int(np.argmin(np.abs(ts - t)))
+            # bodies where svkc has them: the tree may be another one where joints can be cut
+            for g, body in enumerate(model.geom_bodyid):
+                data.geom_xpos[g] = positions[i, body] + R[i, body] @ model.geom_pos[g]
+                data.geom_xmat[g] = (R[i, body] @ shapes[g]).ravel()
+            for c, body in enumerate(model.cam_bodyid):
+                data.cam_xpos[c] = positions[i, body] + R[i, body] @ model.cam_pos[c]
+                data.cam_xmat[c] = (R[i, body] @ matrix(model.cam_quat[c])).ravel()
+            renderer.update_scene(data, eye)
+            _draw_links(renderer.scene, holding[i], any(0 <= t - when < FLASH for when, _ in events))
+            for k, name in enumerate(trails):
+                _draw_trail(renderer.scene, positions[: i + 1, chain.body_names.index(name)], color(k))
+            yield _captioned(Image.fromarray(renderer.render()), ts[i], ts[0], ts[-1], [chain.link_names[k] for k in holding[i]], events)
+
+
+def _camera(model, positions, camera, lookat, distance, azimuth, elevation):
+    """The model's camera of that name, or one that sees all places where bodies are."""
+    import mujoco
+
+    if camera is not None:
+        names = [model.camera(i).name for i in range(model.ncam)]
+        if camera not in names:
+            raise ValueError(f"camera: no camera {camera!r} in the model; cameras: {', '.join(names) or 'none'}")
+        return camera
+    moving = positions[:, 1:].reshape(-1, 3)
+    low, high = moving.min(0), moving.max(0)
+    eye = mujoco.MjvCamera()
+    eye.lookat[:] = (low + high) / 2 if lookat is None else lookat
+    eye.distance = 1.0 * float(np.linalg.norm(high - low)) + 1 if distance is None else distance
+    eye.azimuth, eye.elevation = azimuth, elevation
+    return eye
+
+
+def _rgba(hexadecimal: str, alpha: float):
+    return np.array([int(hexadecimal[k : k + 2], 16) / 255 for k in (1, 3, 5)] + [alpha], np.float32)
+
+
+def _draw_links(scene, places: dict[int, np.ndarray], large: bool):
+    """A red sphere where each connected virtual link is, larger just after an event."""
+    import mujoco
+
+    for place in places.values():
+        if scene.ngeom < scene.maxgeom:
+            size, rgba = np.full(3, 0.07 if large else 0.04), np.array([0.9, 0.1, 0.1, 1], np.float32)
+            mujoco.mjv_initGeom(scene.geoms[scene.ngeom], mujoco.mjtGeom.mjGEOM_SPHERE, size, place, np.eye(3).ravel(), rgba)
+            scene.ngeom += 1
+
+
+def _draw_trail(scene, path: np.ndarray, hexadecimal: str):
+    """Where a body's origin has been."""
+    import mujoco
+
+    for a, b in zip(path, path[1:], strict=False):
+        if scene.ngeom < scene.maxgeom:
+            geom = scene.geoms[scene.ngeom]
+            mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_CAPSULE, np.zeros(3), np.zeros(3), np.eye(3).ravel(), _rgba(hexadecimal, 0.9))
+            mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_CAPSULE, 0.006, a, b)
+            scene.ngeom += 1
+
+
+def _captioned(image, t: float, start: float, end: float, holding: list[str], events):
+    """A strip below the picture: the time, what holds, the last event, and a line of time with a mark at each event."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    width, strip, margin = image.width, 58, 10
+    out = Image.new("RGB", (width, image.height + strip), "#f4f4f2")
+    out.paste(image, (0, 0))
+    draw, y, font = ImageDraw.Draw(out), image.height, ImageFont.load_default(14)
+    draw.text((margin, y + 6), f"{t:6.3f} s   held by {', '.join(holding) or 'nothing'}", "#222222", font)
+    past = [f"{when:.3f} s: {what}" for when, what in events if when <= t]
+    draw.text((margin, y + 25), past[-1] if past else "", "#b03030", font)
+    place = lambda s: margin + (width - 2 * margin) * (s - start) / max(end - start, 1e-12)
+    draw.rectangle((margin, y + 49, width - margin, y + 51), "#c8c8c4")
+    draw.rectangle((margin, y + 49, place(t), y + 51), "#1f5fa8")
+    for when, _ in events:
+        draw.rectangle((place(when) - 1, y + 45, place(when) + 1, y + 55), "#b03030")
+    return out
