@@ -10,7 +10,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from svkc.tree.kinematics import integrate, rates
+from svkc.tree.configuration import integrate, rates
 
 
 def turned(chain, u, v):

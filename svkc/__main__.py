@@ -1,80 +1,8 @@
-"""F7: the command line. `svkc` alone, or `python -m svkc`, runs the high bar: two hands, one hand, flight."""
+"""`python -m svkc`."""
 
-import argparse
-import math
-import pathlib
 import sys
 
-from svkc.cli import run as commands
-
-
-def _event(kind: str):
-    """Reads NAME@TIME."""
-
-    def read(text: str):
-        link, _, time = text.rpartition("@")
-        try:
-            seconds = float(time)
-        except ValueError:
-            seconds = math.nan
-        if not link or not math.isfinite(seconds):
-            raise argparse.ArgumentTypeError(f"expected NAME@TIME, a virtual link and seconds, got {text!r}")
-        return kind, link, seconds
-
-    return read
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser("svkc", description="Structure-varying kinematic chains. Without a command: the high bar, release and all.")
-    add = parser.add_subparsers(dest="command", metavar="COMMAND", required=True).add_parser
-    run = add("run", help="a scene, or a model from where it was loaded: table, npz, pictures, page")
-    run.add_argument(
-        "what", nargs="?", default="high_bar", metavar="SCENE|MODEL", help="a name that `svkc scenes` lists (default: high_bar), or an MJCF or URDF file"
-    )
-    run.add_argument("--t1", type=float, help="until when, s")
-    for kind, what in (("release", "let a virtual link go"), ("catch", "connect one where its bodies are then")):
-        run.add_argument(
-            f"--{kind}",
-            dest="events",
-            action="append",
-            default=[],
-            type=_event(kind),
-            metavar="NAME@TIME",
-            help=f"{what} at a time, s; again for more, instead of the scene's own events",
-        )
-    run.add_argument("--ignore", nargs="*", default=[], metavar="KIND", help="kinds of elements of a model to leave out, or all")
-    run.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out"), help="folder for results (default: out)")
-    run.add_argument("--mp4", action="store_true", help="an mp4 too (needs the extra svkc[video])")
-    run.add_argument("--quiet", action="store_true", help="no progress")
-    add("info", help="what a model is to svkc").add_argument("model", help="MJCF or URDF file")
-    view = add("view", help="table, curves and page of a run that was saved")
-    view.add_argument("file", type=pathlib.Path, help="an .npz of traj.save(path, chain)")
-    view.add_argument("--no-open", action="store_true", help="write the page and do not open it")
-    bench = add("bench", help="time of a step, alone and in a batch, beside MuJoCo's")
-    bench.add_argument("--lanes", type=int, default=256, help="lanes of the batch (default: 256)")
-    add("scenes", help="the scenes that ship")
-    return parser
-
-
-def main(argv=None) -> int:
-    """Entry point."""
-    argv = list(sys.argv[1:] if argv is None else argv)
-    # alone it is the main job, and a scene's name is enough
-    if not argv or argv[0] in commands.SCENES or (argv[0].startswith("-") and argv[0] not in ("-h", "--help")):
-        argv = ["run", *argv]
-    options = _parser().parse_args(argv)
-    if options.command == "run":
-        return commands.run(options.what, options.t1, options.events, tuple(options.ignore), options.out, options.mp4, options.quiet)
-    if options.command == "info":
-        return commands.info(options.model)
-    if options.command == "view":
-        return commands.view(options.file, not options.no_open)
-    if options.command == "bench":
-        from svkc.cli.bench import bench
-
-        return bench(options.lanes)
-    return commands.scenes()
-
+from svkc.cli.main import main
 
 if __name__ == "__main__":
     sys.exit(main())

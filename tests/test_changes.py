@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import svkc
-from svkc.transitions.transition import change, velocity_by_impulse
+from svkc.transitions.impact import velocity_by_impulse
+from svkc.transitions.transition import change
 
 
 @pytest.fixture(scope="module")

@@ -75,7 +75,7 @@ def test_velocities_and_accelerations_keep_the_loops(case):
     name, chain, state, tau = case
     assert float(jnp.max(jnp.abs(svkc.loop_gaps(chain, state)))) < 1e-12
     assert float(jnp.max(jnp.abs(svkc.velocity_gaps(chain, state)))) < 1e-12
-    from svkc.tree.kinematics import rates
+    from svkc.tree.configuration import rates
 
     vdot = svkc.forward_dynamics(chain, state, tau)
 
@@ -143,7 +143,7 @@ def test_every_kind_of_virtual_joint(joint):
     assert float(jnp.max(jnp.abs(svkc.velocity_gaps(chain, state)))) < 1e-12
     tau = jnp.asarray(rng.normal(size=chain.nv))
     vdot = svkc.forward_dynamics(chain, state, tau)
-    from svkc.tree.kinematics import rates
+    from svkc.tree.configuration import rates
 
     def relative(q, v):
         return svkc.velocity_gaps(chain, svkc.State(q, v, state.structure))
@@ -156,7 +156,7 @@ def test_every_kind_of_virtual_joint(joint):
     assert float(jnp.max(jnp.abs(svkc.loop_gaps(chain, final)))) < 1e-12
     # energy of the two bodies under gravity alone is kept: the joint does no work
     assert abs(float(svkc.energy(chain, final) - svkc.energy(chain, state))) < 1e-6
-    from svkc.loops.constraint import joint_coordinates
+    from svkc.transitions.placement import joint_coordinates
     from svkc.tree.kinematics import kinematics
 
     read = joint_coordinates(chain, final.structure, kinematics(chain, final.q), final.q)

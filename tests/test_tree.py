@@ -12,7 +12,8 @@ import pytest
 
 import svkc
 from svkc.loops.forward_dynamics import acceleration, forward_dynamics_by_unit_vectors
-from svkc.tree.kinematics import kinematics, rates
+from svkc.tree.configuration import rates
+from svkc.tree.kinematics import kinematics
 
 ASSETS = pathlib.Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 URDF = """<robot name="arm">

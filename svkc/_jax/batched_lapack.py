@@ -1,4 +1,4 @@
-"""F0: LAPACK's factors and solves, in a batch a few matrices at a time.
+"""LAPACK's factors and solves, in a batch a few matrices at a time.
 
 jaxlib 0.10 deals a batch of more than 2e5 operations to its threads and blocks the one that waits for them. Where several CPU devices share those threads
 all of them may come to wait, for ever: there a batch goes in parts that are small enough.

@@ -1,4 +1,4 @@
-"""F7: compiled programs kept on disk from one process to the next, for the command line and the tests. A library user's settings stay as they are."""
+"""Compiled programs kept on disk from one process to the next, for the command line and the tests. A library user's settings stay as they are."""
 
 import contextlib
 import hashlib

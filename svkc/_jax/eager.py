@@ -1,4 +1,4 @@
-"""F0: compilation of functions that are called eagerly, once or a few times: for compile time, not for speed."""
+"""Compilation of functions that are called eagerly, once or a few times: for compile time, not for speed."""
 
 import functools
 import re

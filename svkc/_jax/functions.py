@@ -1,4 +1,4 @@
-"""F2: comparison of functions given to a run by what they read, so that a new function object is not a new program.
+"""Comparison of functions given to a run by what they read, so that a new function object is not a new program.
 
 A function reads closure cells, defaults, and the globals that its code names. If all of these are of simple kinds (numbers, strings, arrays, containers and
 pytrees, other functions, objects defined by libraries), floating-point arrays are data and the rest is static, compared by content. Any other function is
@@ -24,7 +24,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from svkc.model.validation import concrete
+from svkc._jax.pytrees import concrete
 
 PLAIN = (type(None), bool, int, float, complex, str, bytes, range, type(...))
 # objects that libraries define do not change between two calls; svkc counts as a library, wherever its sources are

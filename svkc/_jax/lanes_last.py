@@ -1,4 +1,4 @@
-"""F1: a `vmap` that keeps the lanes on the last axis, where processors take several in one instruction.
+"""A `vmap` that keeps the lanes on the last axis, where processors take several in one instruction.
 
 jax puts them first; the axes of 3, 6 or 46 that end up last are too short for that. A function's jaxpr is gone through once more with every array
 [..., lanes]; what has no rule here goes through jax's own `vmap`.

@@ -1,4 +1,4 @@
-"""F0: functions that have derivatives of their own, in every transformation and where they are differentiated twice; and functions whose closures do."""
+"""Functions that have derivatives of their own, in every transformation and where they are differentiated twice; and functions whose closures do."""
 
 from collections.abc import Callable
 from typing import Any
@@ -6,6 +6,7 @@ from typing import Any
 import equinox as eqx
 import equinox.internal as eqxi
 import jax
+from jax.interpreters import ad
 
 
 def operation(name: str, function: Callable, jvp: Callable, transpose: Callable | None = None) -> Callable:
@@ -26,6 +27,11 @@ def operation(name: str, function: Callable, jvp: Callable, transpose: Callable 
     backwards = not_linear if transpose is None else eqxi.filter_primitive_transpose(transpose, materialise_zeros=True)
     primitive = eqxi.create_vprim(name, defined, shaped_like, eqxi.filter_primitive_jvp(jvp), backwards)
     return lambda *args: eqxi.filter_primitive_bind(primitive, *args)
+
+
+def is_cotangent_of(x) -> bool:
+    """Return whether an input of a transpose is one whose cotangent is asked for."""
+    return isinstance(x, ad.UndefinedPrimal)
 
 
 class Closed(eqx.Module):

@@ -1,4 +1,4 @@
-"""F0: rows of an array by an index that is known beforehand, whose derivatives are rows and sums again.
+"""Rows of an array by an index that is known beforehand, whose derivatives are rows and sums again.
 
 The transpose of jax's own indexing is a scatter, which XLA's CPU backend runs entry by entry, and never in one kernel with what is around it.
 """

@@ -1,4 +1,4 @@
-"""F7: what a step costs on this machine, beside MuJoCo's on the same model. The whole comparison, with more peers, is benchmarks/speed.py of the sources."""
+"""What a step costs on this machine, beside MuJoCo's on the same model. The whole comparison, with more peers, is benchmarks/speed.py of the sources."""
 
 import os
 import statistics

@@ -1,4 +1,4 @@
-"""F6: steps put back onto the loops within diffrax's own loop, for diffrax's own adjoints."""
+"""Steps put back onto the loops within diffrax's own loop, for diffrax's own adjoints."""
 
 import functools
 from typing import Any, ClassVar
@@ -6,7 +6,9 @@ from typing import Any, ClassVar
 import diffrax
 import jax
 
-from svkc.integration.vector_field import Field, Motion, projects, settle
+from svkc.integration.integrators import Motion
+from svkc.integration.stabilization import projects
+from svkc.integration.vector_field import Field, settle
 
 
 class _Interpolation(diffrax.AbstractLocalInterpolation):

@@ -1,55 +1,14 @@
-"""F6: what guards say, what is found out about the one that ends a phase, and the derivatives of the time and motion there."""
+"""Derivatives of the time and the state at the end of a phase, by the implicit function theorem."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.interpreters import ad
-from jaxtyping import Array, Bool, Float, Int
 
-from svkc._jax.primitive import operation
-from svkc.integration.vector_field import Field, Motion, Scene, filled
-from svkc.model.chain import State
-from svkc.model.validation import one
-from svkc.transitions.events import Plan
-from svkc.transitions.guards import Sensor
-
-# a guard that at the rate it crosses zero with would change this little over a step, measured by its size, touches zero rather than crosses it
-FLAT = 1e-5
-
-
-class Reading(eqx.Module):
-    """What every guard says of a moment; those that measure the mechanism are told its torques."""
-
-    made: Plan
-    field: Field
-
-    def __call__(self, t, y: Motion, scene: Scene) -> Float[Array, " guards"]:
-        state = State(y.q, y.v, scene.structure)
-        guards = self.made.guards
-        tau = self.field.torques(t, y, scene)[0] if any(isinstance(g, Sensor) and g.loaded for g in guards) else jnp.zeros_like(y.v)
-        values = [g.measure(scene.chain, state, tau) if isinstance(g, Sensor) else g(t, state, scene.args) for g in guards]
-        return jnp.stack([jnp.asarray(one("guard", x), y.q.dtype) for x in values])
-
-
-class Found(eqx.Module):
-    """The guards that fired, which guard values go on, the first guard, whether there was one, it jumped over zero, or it only touched it."""
-
-    fired: Bool[Array, " guards"]
-    values: Float[Array, " guards"]
-    first: Int[Array, ""]
-    hit: Bool[Array, ""]
-    jumps: Bool[Array, ""]
-    flat: Bool[Array, ""]
-
-
-def event_tolerance(t: Float[Array, ""]) -> Float[Array, ""]:
-    """Events this close (s) to the earliest happen together with it: sqrt(eps), 1.5e-8 in float64, relative from t = 1 s on."""
-    return jnp.finfo(t.dtype).eps ** 0.5 * jnp.maximum(1, jnp.abs(t))
-
-
-def field_of(guards: Reading | Field) -> Field:
-    """Return the field of the guards, or the field itself where there are no guards."""
-    return guards if isinstance(guards, Field) else guards.field
+from svkc._jax.primitive import is_cotangent_of, operation
+from svkc._jax.pytrees import filled
+from svkc.integration.event_location import field_of
+from svkc.integration.integrators import Motion, Scene
+from svkc.integration.vector_field import Field
 
 
 def _arrived_jvp(primals, tangents):
@@ -102,8 +61,7 @@ def _carried_jvp(primals, tangents):
 
 def _carried_transpose(inputs, cotangent: Motion):
     changes, *where = inputs
-    linear = lambda x: isinstance(x, ad.UndefinedPrimal)
-    asked = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) if linear(x) else None, changes, is_leaf=linear)
+    asked = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) if is_cotangent_of(x) else None, changes, is_leaf=is_cotangent_of)
     return _brought_back(filled(where[2], cotangent), asked, *where), *jax.tree.map(lambda _: None, tuple(where))
 
 

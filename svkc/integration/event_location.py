@@ -1,12 +1,99 @@
-"""F6: the search for where a guard was zero, a look at a time; the loop that takes the steps makes the looks."""
+"""Event location: guards, the bracket about a root, and the search for the root.
+
+The search is a state machine that is advanced by one evaluation of the guards; the stepping loop makes the evaluations.
+"""
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from svkc.integration.event_adjoint import FLAT, Found, Reading, event_tolerance
-from svkc.integration.vector_field import Motion, Scene, chosen
-from svkc.transitions.events import Bracket
+from svkc._jax.pytrees import chosen
+from svkc.integration.integrators import Motion, Scene
+from svkc.integration.vector_field import Field
+from svkc.model.chain import State
+from svkc.model.validation import one
+from svkc.transitions.events import Plan
+from svkc.transitions.guards import Sensor
+
+# how often a bracket may be narrowed
+NARROWINGS = 200
+
+
+class Bracket(eqx.Module):
+    """Two times, at the first a function is below zero, at the second not: narrowed to round-off by false position with the Illinois weight, every third
+    time by bisection. `fine`: how narrow; `last`: which end has moved (1: b, -1: a)."""
+
+    a: Float[Array, ""]
+    b: Float[Array, ""]
+    fa: Float[Array, ""]
+    fb: Float[Array, ""]
+    fine: Float[Array, ""]
+    last: Int[Array, ""]
+    count: Int[Array, ""]
+
+    @staticmethod
+    def around(a, b, fa, fb) -> "Bracket":
+        """From the two times and the function there."""
+        eps = jnp.finfo(fb.dtype).eps
+        fine = 2 * eps * jnp.maximum(jnp.abs(a), jnp.abs(b)) + eps * (b - a)
+        return Bracket(a, b, fa, fb, fine, *(jnp.zeros((), jnp.int32) for _ in range(2)))
+
+    def wide(self) -> Bool[Array, ""]:
+        """Whether to go on."""
+        return (self.b - self.a > self.fine) & (self.count < NARROWINGS)
+
+    def inside(self) -> Float[Array, ""]:
+        """The time to look at next."""
+        weight = self.fb - self.fa
+        secant = self.b - self.fb * (self.b - self.a) / jnp.where(weight == 0, 1, weight)
+        c = jnp.where((self.count % 3 == 2) | (weight == 0), self.a + (self.b - self.a) / 2, secant)
+        return jnp.clip(c, self.a + self.fine / 4, self.b - self.fine / 4)
+
+    def narrowed(self, c, fc) -> "Bracket":
+        """With what the function is at c."""
+        right = fc >= 0
+        fa, fb = jnp.where(right & (self.last == 1), self.fa / 2, self.fa), jnp.where(~right & (self.last == -1), self.fb / 2, self.fb)
+        a, fa, b, fb = jnp.where(right, self.a, c), jnp.where(right, fa, fc), jnp.where(right, c, self.b), jnp.where(right, fc, fb)
+        return Bracket(a, b, fa, fb, self.fine, jnp.where(right, 1, -1).astype(jnp.int32), self.count + 1)
+
+
+# a guard that at the rate it crosses zero with would change this little over a step, measured by its size, touches zero rather than crosses it
+FLAT = 1e-5
+
+
+class Reading(eqx.Module):
+    """What every guard says of a moment; those that measure the mechanism are told its torques."""
+
+    made: Plan
+    field: Field
+
+    def __call__(self, t, y: Motion, scene: Scene) -> Float[Array, " guards"]:
+        state = State(y.q, y.v, scene.structure)
+        guards = self.made.guards
+        tau = self.field.torques(t, y, scene)[0] if any(isinstance(g, Sensor) and g.loaded for g in guards) else jnp.zeros_like(y.v)
+        values = [g.measure(scene.chain, state, tau) if isinstance(g, Sensor) else g(t, state, scene.args) for g in guards]
+        return jnp.stack([jnp.asarray(one("guard", x), y.q.dtype) for x in values])
+
+
+class Found(eqx.Module):
+    """The guards that fired, which guard values go on, the first guard, whether there was one, it jumped over zero, or it only touched it."""
+
+    fired: Bool[Array, " guards"]
+    values: Float[Array, " guards"]
+    first: Int[Array, ""]
+    hit: Bool[Array, ""]
+    jumps: Bool[Array, ""]
+    flat: Bool[Array, ""]
+
+
+def event_tolerance(t: Float[Array, ""]) -> Float[Array, ""]:
+    """Events this close (s) to the earliest happen together with it: sqrt(eps), 1.5e-8 in float64, relative from t = 1 s on."""
+    return jnp.finfo(t.dtype).eps ** 0.5 * jnp.maximum(1, jnp.abs(t))
+
+
+def field_of(guards: Reading | Field) -> Field:
+    """Return the field of the guards, or the field itself where there are no guards."""
+    return guards if isinstance(guards, Field) else guards.field
 
 
 class Watched(eqx.Module):

@@ -1,22 +1,76 @@
-"""F5: solvers of our own, as diffrax solvers, and one step by itself."""
+"""The state and the arguments of the vector field, integrators of our own as diffrax solvers, and one step by itself."""
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import optimistix
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from svkc._jax.lanes_last import with_lanes_last
-from svkc.loops.constraint import active_dofs
-from svkc.loops.forward_dynamics import joint_torques, moving
-from svkc.model.chain import Chain, State
-from svkc.model.checked_jit import verb
+from svkc.loops.constrained_dynamics import by_bodies
+from svkc.loops.forward_dynamics import moving
+from svkc.model.chain import Chain, State, Structure, active_dofs
+from svkc.model.checked_jit import joint_torques, verb
 from svkc.model.validation import one
-from svkc.tree.articulated_body import by_bodies
+from svkc.tree.configuration import integrate
 from svkc.tree.inverse_dynamics import limit_forces
-from svkc.tree.kinematics import integrate
+
+# a step that would leave less than this part of itself before a time to be met goes all the way
+REST = 1e-6
+
+
+class Motion(eqx.Module):
+    """What is integrated: q, v, and the work (J) done by control, limits and dampers; None where the scene has none of them."""
+
+    q: Float[Array, " q"]
+    v: Float[Array, " dofs"]
+    work: Float[Array, ""] | None = None
+
+
+class Scene(eqx.Module):
+    """The `args` of the vector field: all it depends on besides time and motion. pivots: of the loops' rows, where they are held (`Dynamics.hold`)."""
+
+    chain: Chain
+    structure: Structure
+    args: Any
+    pivots: Float[Array, "steps dofs"] | None = None
+
+
+def finite(y: Motion) -> Bool[Array, ""]:
+    """Whether every number is."""
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(y)]))
+
+
+class FixedSteps(diffrax.AbstractStepSizeController):
+    """Steps of dt; diffrax is told the times `ts` to shorten them for. A step that is not finite is not taken: it ends the solve."""
+
+    dt: Float[Array, ""]
+    ts: Float[Array, " times"]
+
+    def wrap(self, direction):
+        return self
+
+    def _next(self, t):
+        times = jnp.where(self.ts > t, self.ts, jnp.inf)
+        stop = jnp.min(times, initial=jnp.inf)
+        return jnp.where(t + self.dt * (1 + REST) >= stop, stop, t + self.dt)
+
+    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+        return self._next(t0), None
+
+    def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
+        whole = finite(y1_candidate)
+        said = diffrax.RESULTS.where(whole, diffrax.RESULTS.successful, diffrax.RESULTS.internal_error)
+        return whole, jnp.where(whole, t1, t0), self._next(t1), False, controller_state, said
+
+
+def motion_norm(error: Motion) -> Float[Array, ""]:
+    """Root mean square over q and v alone: work and guards do not choose the step."""
+    both = jnp.concatenate([error.q, error.v])
+    return jnp.sqrt(jnp.mean(both * both))
 
 
 class RodriguesEuler(diffrax.AbstractSolver):

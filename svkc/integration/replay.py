@@ -1,20 +1,25 @@
-"""F6: the motion of one phase as a function that is differentiated both ways, whatever solver and step control found it.
+"""The motion of one phase as a function that is differentiated both ways, whatever solver and step control found it.
 
 The run itself is never differentiated. Its steps are gone through again, their times held fixed, for what a change of start and parameters does to
 each: forwards for a tangent, backwards for a cotangent. Kept of a run are the times of its steps and one state in `every`. What a change of the start's
 time or of a save time does is the rate of the motion there.
 """
 
+import diffrax
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from svkc._jax.control_flow import unvmap_any
 from svkc._jax.primitive import operation
+from svkc._jax.pytrees import filled, frozen
 from svkc.integration.event_adjoint import arrival_tangent, carried
-from svkc.integration.integrate import SUCCESSFUL, How, Path, World, march
-from svkc.integration.vector_field import Motion, filled, frozen, step_alone
+from svkc.integration.integrate import march
+from svkc.integration.integrators import Motion, Scene
+from svkc.integration.solution import SUCCESSFUL, How, Path, World
+from svkc.integration.vector_field import Field, settle
 from svkc.model.validation import whole
 
 # blocks are passed over in groups where the run has no more steps
@@ -137,7 +142,7 @@ def _through(start: Motion, d_start: Motion, grid, place, world: World, d_world,
             spread = lambda old, new: jnp.where(here.reshape(-1, *(1,) * (old.ndim - 1)) & going, new[local], old)
             return jax.tree.map(lambda new, old: jnp.where(going, new, old), after, d_y), jax.tree.map(spread, d_saved, d_every)
 
-        carry = jax.lax.cond(eqxi.unvmap_any(going), taken, lambda: (d_y, d_saved))
+        carry = jax.lax.cond(unvmap_any(going), taken, lambda: (d_y, d_saved))
         return carry, carry[0]
 
     @jax.checkpoint
@@ -148,7 +153,7 @@ def _through(start: Motion, d_start: Motion, grid, place, world: World, d_world,
         def none(carry):
             return carry, jax.tree.map(lambda d: jnp.zeros((GROUP, *d.shape), d.dtype), carry[0])
 
-        return jax.lax.cond(eqxi.unvmap_any(jnp.any(x[1])), some, none, carry)
+        return jax.lax.cond(unvmap_any(jnp.any(x[1])), some, none, carry)
 
     d_saved = jax.tree.map(lambda d: jnp.where((place == 0).reshape(-1, *(1,) * d.ndim), d[None], 0), d_start)
     xs = jax.tree.map(lambda x: x.reshape(-1, GROUP, *x.shape[1:]), (index, *rest))
@@ -162,3 +167,44 @@ def _through(start: Motion, d_start: Motion, grid, place, world: World, d_world,
 # integrated(start, times, world, how, guards or field) -> Path, t, Motion: where the run went, with the time of its end fixed in derivatives; and its end,
 # whose time is a guard's zero or the scheduled one
 integrated = operation("integrated", _integrated, _integrated_jvp)
+
+
+def staged(solver: diffrax.AbstractSolver, kind: str | None) -> diffrax.AbstractSolver:
+    """The solver with its loop over stages made for what is to be differentiated: "lax" forwards, "bounded" both ways, None diffrax's own choice."""
+    if not isinstance(solver, diffrax.AbstractRungeKutta):
+        return solver
+    return eqx.tree_at(lambda s: s.scan_kind, solver, kind, is_leaf=lambda x: x is None)
+
+
+def step_alone(solver: diffrax.AbstractSolver, field: Field, t0, t1, y: Motion, scene: Scene) -> Motion:
+    """One settled step of a solver that remembers nothing of the step before, to be differentiated: of each evaluation of the field, and
+    of each turn of the loop that settles the step, only the arguments are kept on the way back."""
+    rate = eqx.filter_checkpoint(field)
+    if isinstance(solver, diffrax.AbstractERK) and isinstance(solver.tableau, diffrax.ButcherTableau):
+        raw = _explicit_step(solver.tableau, rate, t0, t1, y, scene)
+    else:
+        solver = staged(solver, "bounded")
+        term = diffrax.ODETerm(rate)
+        raw = solver.step(term, t0, t1, y, scene, solver.init(term, t0, t1, y, scene), False)[0]
+    return settle(field, scene, raw)[0]
+
+
+def _explicit_step(tableau: diffrax.ButcherTableau, rate, t0, t1, y: Motion, scene: Scene) -> Motion:
+    """An explicit Runge-Kutta step as a loop over its stages, without those that only estimate the error."""
+    used = int(np.max(np.flatnonzero(tableau.b_sol))) + 1
+    A = np.zeros((used, used))
+    for i, row in enumerate(tableau.a_lower[: used - 1]):
+        A[i + 1, : i + 1] = row
+    c, dtype = np.append(0.0, tableau.c)[:used], t1.dtype
+    add = lambda weights, rates: jax.tree.map(lambda y, k: y + (t1 - t0) * jnp.tensordot(weights, k, 1), y, rates)
+
+    def stage(rates, x):
+        weights, part, here = x
+        k = rate(t0 + part * (t1 - t0), add(weights, rates), scene)
+        put = lambda ks, k: jnp.where(here.reshape(-1, *(1,) * k.ndim), k[None], ks)
+        return jax.tree.map(put, rates, k), None
+
+    none = jax.tree.map(lambda y: jnp.zeros((used, *y.shape), y.dtype), y)
+    stages = (jnp.asarray(A, dtype), jnp.asarray(c, dtype), np.eye(used, dtype=bool))
+    rates, _ = jax.lax.scan(stage, none, stages)
+    return add(jnp.asarray(tableau.b_sol[:used], dtype), rates)

@@ -1,4 +1,4 @@
-"""F5: which actuator torques give an acceleration, in any structure (paper, section III-A): S^T tau_A = W^T tau_O, square, redundant or missing."""
+"""Which actuator torques give an acceleration, in any structure (paper, section III-A): S^T tau_A = W^T tau_O, square, redundant or missing."""
 
 import equinox as eqx
 import jax
@@ -7,12 +7,15 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.eager import eager_jit
-from svkc.loops.coordinates import constrained, open_coordinates, scales
-from svkc.loops.forward_dynamics import constraint_forces, with_links
+from svkc._jax.pytrees import concrete
+from svkc.loops.constrained_dynamics import with_links
+from svkc.loops.constraint import scales
+from svkc.loops.coordinates import constrained, open_coordinates
+from svkc.loops.forward_dynamics import constraint_forces
 from svkc.loops.pivoting import Selection, select, select_with_rank
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import check_state
-from svkc.model.validation import arrayed, concrete, numbers
+from svkc.model.validation import arrayed, numbers
 from svkc.tree.inverse_dynamics import generalized_forces, passive_forces
 from svkc.tree.kinematics import kinematics, twists
 

@@ -1,4 +1,4 @@
-"""F3: where the two ends of every virtual link are, how far apart, and how they move: the loop Jacobian J_C (paper (9)-(11)).
+"""Where the two ends of every virtual link are, how far apart, and how they move: the loop Jacobian J_C (paper (9)-(11)).
 
 Rows of a loop: three angular, then three linear, the motion of the virtual link less that of its real link, in world axes at the real link's end
 of the joint.
@@ -8,12 +8,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from svkc._jax.static_gather import take
-from svkc.model.chain import Chain, Structure
-from svkc.model.topology import Topology
-from svkc.tree.kinematics import Kinematics
+from svkc.model.chain import Chain, State, Structure, active_dofs
+from svkc.model.checked_jit import verb
+from svkc.model.topology import FREE, SLIDE, Topology
+from svkc.tree.kinematics import Kinematics, bias_accelerations, kinematics
 from svkc.tree.spatial import motion_cross, quat_about, quat_conjugate, quat_log, quat_matrix, quat_multiply, quat_normalize, quat_rotate, rotate, shift_motion
 
 
@@ -30,18 +31,6 @@ class Ends(eqx.Module):
     real: Float[Array, "links 3"]
     from_parent_root: Float[Array, "links 3"]
     axes: Float[Array, "links 6 3"]
-
-
-def active_dofs(chain: Chain, structure: Structure) -> Bool[Array, " dofs"]:
-    """Joint coordinates that can move: the tree's and the connected virtual links', less the locked ones."""
-    top = chain.topology
-    used = jnp.concatenate([(structure.connected[:, None] & structure.freedoms).ravel(), jnp.zeros(1, bool)])
-    slot = np.full(top.dofs - top.nv, used.shape[0] - 1)
-    for i, d in enumerate(top.links.dof.ravel()):
-        if d < top.dofs:
-            slot[d - top.nv] = i
-    active = jnp.concatenate([jnp.ones(top.nv, bool), used[slot]])
-    return active if structure.locked is None else active & ~structure.locked
 
 
 def _coordinates(chain: Chain, q: Float[Array, " q"]):
@@ -157,44 +146,84 @@ def loop_bias(
     return jnp.where(structure.connected[:, None], A_virtual - A_real, 0).reshape(-1)
 
 
-def joint_coordinates(chain: Chain, structure: Structure, kin: Kinematics, q: Float[Array, " q"]) -> Float[Array, " q"]:
-    """Q with the coordinates of every virtual joint read off from where its two bodies are: what the joint's freedoms can express of it."""
+def scales(chain: Chain) -> tuple[Float[Array, " rows"], Float[Array, " dofs"]]:
+    """Factors of the rows and columns of J_C that leave numbers without units: 1/length for linear rows, length for slides."""
     top = chain.topology
-    base = ends(chain, structure, kin, q)
-    turn = quat_multiply(quat_conjugate(base.base_quat), base.real_quat)
-    p = structure.parent
-    start = kin.r[p] + quat_rotate(kin.quat[p], structure.pos) + (kin.root[p] - kin.root[structure.real])
-    slide = jnp.where(structure.freedoms[:, 3:], quat_rotate(quat_conjugate(base.base_quat), base.real - start), 0)
-    angle = _angles(turn, structure.freedoms)
-    masked = quat_normalize(jnp.concatenate([turn[:, :1], jnp.where(structure.freedoms[:, :3], turn[:, 1:], 0)], -1))
-    table = top.links
-    for values, index in ((angle, table.angle), (slide, table.slide), (masked, table.quat)):
-        at = np.flatnonzero((index < top.nq_all).ravel())
-        q = q.at[index.ravel()[at]].set(values.ravel()[at])
-    return q
+    rows = jnp.tile(jnp.where(np.arange(6) < 3, 1, 1 / chain.length), len(top.link_names))
+    linear = np.zeros(top.dofs, bool)
+    linear[: top.nv] = np.array(top.kind)[top.dof_row] == SLIDE
+    for i in top.rows_of(FREE):
+        linear[top.v_start[i] : top.v_start[i] + 3] = True
+    slides = top.links.dof[:, 3:]
+    linear[slides[slides < top.dofs]] = True
+    return rows, jnp.where(linear, chain.length, 1)
 
 
-def with_coordinates(chain: Chain, which: Bool[Array, " links"], new: Float[Array, " q"], q: Float[Array, " q"]) -> Float[Array, " q"]:
-    """The coordinates of the virtual joints in `which` from `new`, everything else from `q`."""
-    table, top = chain.topology.links, chain.topology
-    for index in (table.angle, table.slide, table.quat):
-        at = np.flatnonzero((index < top.nq_all).ravel())
-        slots = index.ravel()[at]
-        q = q.at[slots].set(jnp.where(which[at // index.shape[1]], new[slots], q[slots]))
-    return q
+def scaled_jacobian(chain: Chain, structure: Structure, kin, end) -> Float[Array, "rows dofs"]:
+    """J_C without units: rows and columns multiplied by `scales`."""
+    row, column = scales(chain)
+    return row[:, None] * loop_jacobian(chain, structure, kin, end) * column[None]
 
 
-def _angles(turn: Float[Array, "links 4"], freedoms: Bool[Array, "links 6"]) -> Float[Array, "links 3"]:
-    """Turns about x, y, z in sequence; those not free are taken as zero, the others solved from the rotation."""
-    R = quat_matrix(turn)
-    fx, fy, fz = freedoms[:, 0], freedoms[:, 1], freedoms[:, 2]
+def loop_rates(chain: Chain, structure: Structure, v, kin: Kinematics, V, end, J, baumgarte=None) -> Float[Array, " rows"]:
+    """Jdot_C v without units. baumgarte: rate (1/s) at which gaps are pulled back."""
+    row, column = scales(chain)
+    moving = jnp.where(active_dofs(chain, structure), v, 0)
+    bias = row * loop_bias(chain, structure, kin, end, V, bias_accelerations(chain, kin, V, v), moving)
+    if baumgarte is not None:
+        bias = bias + 2 * baumgarte * (J @ (moving / column)) + baumgarte**2 * row * gap(structure, end).ravel()
+    return bias
 
-    def angle(s, c):
-        # where there is none, no derivative that is not a number either
-        return jnp.arctan2(s, jnp.where((s == 0) & (c == 0), 1, c))
 
-    # each from the entries of Rx Ry, Rx Rz or Ry Rz that hold it alone
-    x = jnp.where(fx, jnp.where(fz, angle(-R[:, 1, 2], R[:, 2, 2]), angle(R[:, 2, 1], R[:, 1, 1])), 0)
-    y = jnp.where(fy, angle(R[:, 0, 2], jnp.where(fz, R[:, 2, 2], R[:, 0, 0])), 0)
-    z = jnp.where(fz, jnp.where(fx, angle(-R[:, 0, 1], R[:, 0, 0]), angle(R[:, 1, 0], R[:, 1, 1])), 0)
-    return jnp.stack([x, y, z], -1)
+def gaps_and_rates(chain: Chain, state: State) -> tuple[Float[Array, "links 6"], Float[Array, "links 6"]]:
+    """`loop_gaps` and `velocity_gaps` from one pass over the tree."""
+    kin = kinematics(chain, state.q)
+    end = ends(chain, state.structure, kin, state.q)
+    return gap(state.structure, end), (loop_jacobian(chain, state.structure, kin, end) @ state.v).reshape(-1, 6)
+
+
+def sizes(rows: Float[Array, " rows"]) -> Float[Array, "links 2"]:
+    """Of each loop's rows: how long its rotation vector is, and how long the distance."""
+    return jnp.sqrt(jnp.sum(rows.reshape(-1, 2, 3) ** 2, -1))
+
+
+def largest(x: Float[Array, "links 6"]) -> Float[Array, "2"]:
+    """Return the largest angular and the largest linear part over the loops."""
+    if not len(x):
+        return jnp.zeros(2, x.dtype)
+    square = jnp.sum(x.reshape(-1, 2, 3) ** 2, -1)
+    closed = square == 0
+    # a root that can be differentiated where the loop is closed to the last bit
+    return jnp.max(jnp.where(closed, 0, jnp.sqrt(jnp.where(closed, 1, square))), 0)
+
+
+def largest_gaps(chain: Chain, state: State) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
+    """The largest over the loops: of the gaps (rad, m) and of their rates (rad/s, m/s)."""
+    gaps, rates = gaps_and_rates(chain, state)
+    return largest(gaps), largest(rates)
+
+
+@verb(eager=True)
+def loop_gaps(chain: Chain, state: State) -> Float[Array, "links 6"]:
+    """How far each connected loop is open: rotation vector (rad), then distance (m), in the world; zero where not connected."""
+    return gaps_and_rates(chain, state)[0]
+
+
+@verb(eager=True)
+def jacobian(chain: Chain, state: State) -> tuple[Float[Array, "links 3 dofs"], Float[Array, "links 3 dofs"]]:
+    """J_C (paper (11)): linear (m/s) and angular (rad/s) velocity of each connected virtual link relative to its real link, for a unit rate of each
+    joint coordinate, at the joint, in world axes."""
+    kin = kinematics(chain, state.q)
+    J = loop_jacobian(chain, state.structure, kin, ends(chain, state.structure, kin, state.q)).reshape(-1, 6, chain.dofs)
+    return J[:, 3:], J[:, :3]
+
+
+@verb(eager=True)
+def velocity_gaps(chain: Chain, state: State) -> Float[Array, "links 6"]:
+    """J_C v: relative twist (rad/s, m/s) across each connected virtual link."""
+    return gaps_and_rates(chain, state)[1]
+
+
+def gap_tolerance(dtype) -> float:
+    """Largest loop gap, over `chain.length` where it is in metres, that counts as closed: eps^(4/7), 1.1e-9 in float64, 1.1e-4 in float32."""
+    return float(np.finfo(dtype).eps ** (4 / 7))

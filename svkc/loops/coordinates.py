@@ -1,24 +1,18 @@
-"""F3: which coordinates are independent, and what follows from it: H, W, S, Hdot v (paper, section II).
+"""Which coordinates are independent, and what follows from it: H, W, S, Hdot v (paper, section II).
 
 Rows in metres and columns of slides are divided by the chain's `length`, so that pivots and rank have no units.
 """
 
 import equinox as eqx
-import equinox.internal as eqxi
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from svkc.loops.constraint import active_dofs, ends, gap, loop_bias, loop_jacobian
-from svkc.loops.pivoting import Selection, held_part, select, select_again, solve_frozen, square, too_few, weakest, without_weak
-from svkc.model.chain import Chain, State, Structure
-from svkc.model.checked_jit import verb
-from svkc.model.topology import FREE, SLIDE
-from svkc.tree.kinematics import Kinematics, bias_accelerations, kinematics, twists
-
-# part of the phase's own margin below which a configuration is near a singular one; elsewhere the motion depends on no choice of pivots
-NEAR = 0.1
+from svkc.loops.constraint import ends, loop_rates, scaled_jacobian, scales
+from svkc.loops.pivoting import Selection, choose, solve_frozen, square
+from svkc.model.chain import Chain, State, Structure, active_dofs
+from svkc.model.checked_jit import check_state, verb
+from svkc.tree.kinematics import Kinematics, kinematics, twists
 
 
 class Coordinates(eqx.Module):
@@ -53,56 +47,11 @@ class Coordinates(eqx.Module):
         return self.bias
 
 
-def scales(chain: Chain) -> tuple[Float[Array, " rows"], Float[Array, " dofs"]]:
-    """Factors of the rows and columns of J_C that leave numbers without units: 1/length for linear rows, length for slides."""
-    top = chain.topology
-    rows = jnp.tile(jnp.where(np.arange(6) < 3, 1, 1 / chain.length), len(top.link_names))
-    linear = np.zeros(top.dofs, bool)
-    linear[: top.nv] = np.array(top.kind)[top.dof_row] == SLIDE
-    for i in top.rows_of(FREE):
-        linear[top.v_start[i] : top.v_start[i] + 3] = True
-    slides = top.links.dof[:, 3:]
-    linear[slides[slides < top.dofs]] = True
-    return rows, jnp.where(linear, chain.length, 1)
-
-
-def scaled_jacobian(chain: Chain, structure: Structure, kin, end) -> Float[Array, "rows dofs"]:
-    """J_C without units: rows and columns multiplied by `scales`."""
-    row, column = scales(chain)
-    return row[:, None] * loop_jacobian(chain, structure, kin, end) * column[None]
-
-
-def loop_rates(chain: Chain, structure: Structure, v, kin: Kinematics, V, end, J, baumgarte=None) -> Float[Array, " rows"]:
-    """Jdot_C v without units. baumgarte: rate (1/s) at which gaps are pulled back."""
-    row, column = scales(chain)
-    moving = jnp.where(active_dofs(chain, structure), v, 0)
-    bias = row * loop_bias(chain, structure, kin, end, V, bias_accelerations(chain, kin, V, v), moving)
-    if baumgarte is not None:
-        bias = bias + 2 * baumgarte * (J @ (moving / column)) + baumgarte**2 * row * gap(structure, end).ravel()
-    return bias
-
-
 def agreeing(chain: Chain, selection: Selection, J: Float[Array, "rows dofs"], v: Float[Array, " dofs"]) -> Float[Array, " dofs"]:
     """W v_G (16): the dependent velocities as the independent ones ask for."""
     _, column = scales(chain)
     Jm, JS = square(selection, J)
     return v - column * (selection.P.T @ solve_frozen(JS, Jm @ (v / column)))
-
-
-def choose(structure: Structure, J: Float[Array, "rows dofs"], pivots=None) -> Selection:
-    """The pivots of J_C, with the rank of the phase and the coordinates that are asked to be independent; without rows that are too weak just now.
-
-    pivots [steps, dofs]: one-hot, chosen before (None: to be chosen now); near a singular configuration, or where they are too few, new ones are.
-    """
-    new = lambda: select(J, structure.rank, structure.independent)
-    if pivots is None:
-        selection = new()
-    else:
-        held = select_again(J, pivots)
-        near = (weakest(held) < NEAR * structure.margin) | too_few(pivots, structure.rank)
-        # (one lane near is enough to choose for all)
-        selection = jax.lax.cond(eqxi.unvmap_any(near), lambda: jax.tree.map(lambda a, b: jnp.where(near, a, b), new(), held), lambda: held)
-    return without_weak(selection, held_part(J.dtype) * structure.margin)
 
 
 def constrain(chain: Chain, structure: Structure, selection: Selection, J: Float[Array, "rows dofs"], bias: Float[Array, " rows"]) -> Coordinates:
@@ -144,50 +93,17 @@ def coordinates(chain: Chain, state: State) -> Coordinates:
     return constrained(chain, state.structure, state.q, state.v, kin, twists(chain, kin, state.v))
 
 
-def gaps_and_rates(chain: Chain, state: State) -> tuple[Float[Array, "links 6"], Float[Array, "links 6"]]:
-    """`loop_gaps` and `velocity_gaps` from one pass over the tree."""
-    kin = kinematics(chain, state.q)
-    end = ends(chain, state.structure, kin, state.q)
-    return gap(state.structure, end), (loop_jacobian(chain, state.structure, kin, end) @ state.v).reshape(-1, 6)
+def prefer(chain: Chain, state: State, *names: str) -> State:
+    """The state with these joint coordinates asked to be independent (theta_G), as far as the loops let them be; no names: the choice is svkc's again.
 
-
-def sizes(rows: Float[Array, " rows"]) -> Float[Array, "links 2"]:
-    """Of each loop's rows: how long its rotation vector is, and how long the distance."""
-    return jnp.sqrt(jnp.sum(rows.reshape(-1, 2, 3) ** 2, -1))
-
-
-def largest(x: Float[Array, "links 6"]) -> Float[Array, "2"]:
-    """Return the largest angular and the largest linear part over the loops."""
-    if not len(x):
-        return jnp.zeros(2, x.dtype)
-    square = jnp.sum(x.reshape(-1, 2, 3) ** 2, -1)
-    closed = square == 0
-    # a root that can be differentiated where the loop is closed to the last bit
-    return jnp.max(jnp.where(closed, 0, jnp.sqrt(jnp.where(closed, 1, square))), 0)
-
-
-def largest_gaps(chain: Chain, state: State) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
-    """The largest over the loops: of the gaps (rad, m) and of their rates (rad/s, m/s)."""
-    gaps, rates = gaps_and_rates(chain, state)
-    return largest(gaps), largest(rates)
-
-
-@verb(eager=True)
-def loop_gaps(chain: Chain, state: State) -> Float[Array, "links 6"]:
-    """How far each connected loop is open: rotation vector (rad), then distance (m), in the world; zero where not connected."""
-    return gaps_and_rates(chain, state)[0]
-
-
-@verb(eager=True)
-def jacobian(chain: Chain, state: State) -> tuple[Float[Array, "links 3 dofs"], Float[Array, "links 3 dofs"]]:
-    """J_C (paper (11)): linear (m/s) and angular (rad/s) velocity of each connected virtual link relative to its real link, for a unit rate of each
-    joint coordinate, at the joint, in world axes."""
-    kin = kinematics(chain, state.q)
-    J = loop_jacobian(chain, state.structure, kin, ends(chain, state.structure, kin, state.q)).reshape(-1, 6, chain.dofs)
-    return J[:, 3:], J[:, :3]
-
-
-@verb(eager=True)
-def velocity_gaps(chain: Chain, state: State) -> Float[Array, "links 6"]:
-    """J_C v: relative twist (rad/s, m/s) across each connected virtual link."""
-    return gaps_and_rates(chain, state)[1]
+    names: of joints, virtual links, or single coordinates (`chain.dof_names`). The motion does not depend on it. ValueError: unknown names.
+    """
+    check_state(chain, state)
+    asked = np.zeros(chain.dofs, bool)
+    for name in names:
+        here = np.array([isinstance(name, str) and name in (n, n.rpartition(".")[0] or n) for n in chain.dof_names])
+        if not here.any():
+            raise ValueError(f"no joint coordinate {name!r}; coordinates: {', '.join(chain.dof_names)}")
+        asked |= here
+    wanted = jnp.asarray(asked) if names else None
+    return eqx.tree_at(lambda s: s.structure.independent, state, wanted, is_leaf=lambda x: x is None)

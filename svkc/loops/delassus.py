@@ -1,4 +1,4 @@
-"""F4: accelerations of a closed chain by articulated bodies and the forces of its loops: no pivots are chosen.
+"""Accelerations of a closed chain by articulated bodies and the forces of its loops: no pivots are chosen.
 
 What a force in one loop row does in all others is Delassus' matrix D = J M^-1 J^T over the tree's coordinates. Virtual joints have coordinates without
 inertia: along them nothing is carried, so the rows are seen across them alone; the three rows that a ball turns in are not in D at all.

@@ -1,4 +1,4 @@
-"""F4: how free a structure is (paper (13)): freedoms, rank, redundant rows."""
+"""How free a structure is (paper (13)): freedoms, rank, redundant rows."""
 
 import equinox as eqx
 import jax
@@ -6,10 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from svkc.loops.constraint import active_dofs, ends
-from svkc.loops.coordinates import coordinates, scaled_jacobian
+from svkc.loops.constraint import ends, scaled_jacobian
+from svkc.loops.coordinates import coordinates
 from svkc.loops.pivoting import count_rank, select, weakest
-from svkc.model.chain import Chain, State
+from svkc.model.chain import Chain, State, active_dofs
 from svkc.model.checked_jit import verb
 from svkc.tree.kinematics import kinematics
 

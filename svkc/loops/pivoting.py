@@ -1,4 +1,4 @@
-"""F0: which columns of a matrix are independent: pivots, rank, and solves with that choice held fixed.
+"""Which columns of a matrix are independent: pivots, rank, and solves with that choice held fixed.
 
 Pivots are integers chosen on stop_gradient(J). What follows from them is exact to differentiate wherever the rank does not change.
 """
@@ -11,7 +11,9 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.batched_lapack import factor_positive, solve_triangle
+from svkc._jax.control_flow import unvmap_any
 from svkc._jax.primitive import operation
+from svkc.model.chain import Structure
 
 
 class Selection(eqx.Module):
@@ -160,3 +162,23 @@ def square(selection: Selection, J: Float[Array, "rows dofs"]) -> tuple[Float[Ar
     """J_Cm = Q J_C, m independent rows (12), and J_S, its pivot columns in order (14), with ones on the unused diagonal."""
     Jm = selection.Q @ J
     return Jm, Jm @ selection.P.T + jnp.diag(jnp.where(selection.used, 0, 1).astype(J.dtype))
+
+
+# part of the phase's own margin below which a configuration is near a singular one; elsewhere the motion depends on no choice of pivots
+NEAR = 0.1
+
+
+def choose(structure: Structure, J: Float[Array, "rows dofs"], pivots=None) -> Selection:
+    """The pivots of J_C, with the rank of the phase and the coordinates that are asked to be independent; without rows that are too weak just now.
+
+    pivots [steps, dofs]: one-hot, chosen before (None: to be chosen now); near a singular configuration, or where they are too few, new ones are.
+    """
+    new = lambda: select(J, structure.rank, structure.independent)
+    if pivots is None:
+        selection = new()
+    else:
+        held = select_again(J, pivots)
+        near = (weakest(held) < NEAR * structure.margin) | too_few(pivots, structure.rank)
+        # (one lane near is enough to choose for all)
+        selection = jax.lax.cond(unvmap_any(near), lambda: jax.tree.map(lambda a, b: jnp.where(near, a, b), new(), held), lambda: held)
+    return without_weak(selection, held_part(J.dtype) * structure.margin)

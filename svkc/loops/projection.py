@@ -1,4 +1,4 @@
-"""F5: the way back onto closed loops, by the smallest change."""
+"""Projection onto closed loops, by the smallest change."""
 
 import functools
 from collections.abc import Callable
@@ -8,13 +8,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from svkc._jax.lanes_last import with_lanes_last
-from svkc.loops.constraint import active_dofs, ends, gap
-from svkc.loops.coordinates import scaled_jacobian, scales, sizes
-from svkc.loops.forward_dynamics import solve_motion
+from svkc.loops.constrained_dynamics import by_bodies, solve_motion
+from svkc.loops.constraint import ends, gap, scaled_jacobian, scales, sizes
 from svkc.loops.pivoting import Selection, held_part, rank_tolerance, select, select_again, solve_frozen, solve_positive, square, too_few, weakest, without_weak
-from svkc.model.chain import Chain, Structure
-from svkc.tree.articulated_body import by_bodies
-from svkc.tree.kinematics import Kinematics, integrate, kinematics, normalize
+from svkc.model.chain import Chain, Structure, active_dofs
+from svkc.tree.configuration import integrate, normalize
+from svkc.tree.kinematics import Kinematics, kinematics
 
 
 def least_change(chain: Chain, structure: Structure, kin: Kinematics, selection: Selection, J, x: Float[Array, "rows n"]) -> Float[Array, "dofs n"]:

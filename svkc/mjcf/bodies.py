@@ -1,4 +1,4 @@
-"""F2: what a MuJoCo model says of bodies, joints and motors, as numpy arrays by row."""
+"""What a MuJoCo model says of bodies, joints and motors, as numpy arrays by row."""
 
 import dataclasses
 

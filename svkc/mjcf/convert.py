@@ -1,15 +1,13 @@
-"""F2: states and scenes as MuJoCo holds them, and quaternions as those do who put the scalar last."""
+"""States and scenes to MuJoCo and back."""
 
 import os
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from svkc.mjcf.bodies import matrix, name_of
 from svkc.model.chain import Chain, State
-from svkc.model.checked_jit import check_chain, check_state, vector
-from svkc.model.topology import JOINTS
+from svkc.model.checked_jit import check_chain, check_state
+from svkc.model.virtual_link import JOINTS
 
 
 def _equalities(chain: Chain) -> list[tuple[int, int]]:
@@ -125,14 +123,3 @@ def from_mujoco(chain: Chain, data) -> State:
     for link, equality in _equalities(chain):
         connected[link] = bool(data.eq_active[equality])
     return chain.state(np.array(data.qpos), np.array(data.qvel), connected)
-
-
-def xyzw(chain: Chain, q) -> Float[Array, " q"]:
-    """Q with the scalar of every quaternion last, as Pinocchio, ROS and scipy have it."""
-    check_chain(chain)
-    q = vector(chain, "q", q, chain.topology.nq_all)
-    starts, _ = chain.topology.quaternions
-    if not len(starts):
-        return q
-    at = starts[:, None] + np.arange(4)
-    return q.at[at].set(jnp.roll(q[at], -1, axis=-1))

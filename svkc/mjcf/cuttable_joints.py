@@ -1,12 +1,12 @@
-"""F2: joints of the tree that may be cut (paper, Fig. 15): the child hangs on the base by a free joint, a virtual link with the joint holds it."""
+"""Joints of the tree that may be cut (paper, Fig. 15): the child hangs on the base by a free joint, a virtual link with the joint holds it."""
 
 import dataclasses
 
 import numpy as np
 
 from svkc.mjcf.bodies import KINDS, matrix, name_of
-from svkc.model.chain import VirtualLink
 from svkc.model.topology import BALL, FREE, HINGE, SLIDE, V_SIZE, Topology
+from svkc.model.virtual_link import VirtualLink
 
 # place of the coordinates of each kind among the six freedoms of a virtual joint
 _FREEDOMS = {"hinge": (2,), "slide": (5,), "ball": (0, 1, 2), "universal": (0, 1)}

@@ -1,4 +1,4 @@
-"""F2: a MuJoCo model -> Chain, on the host in numpy. mujoco is imported here and nowhere below."""
+"""A MuJoCo model -> Chain, on the host in numpy. mujoco is imported here and nowhere below."""
 
 import dataclasses
 import os
@@ -14,9 +14,10 @@ from svkc.mjcf.convert import text_of
 from svkc.mjcf.cuttable_joints import cuts_of, placed_in
 from svkc.mjcf.unsupported import what_is_left_out
 from svkc.mjcf.virtual_links import equalities, floats, structure_of
-from svkc.model.chain import Chain, VirtualLink
-from svkc.model.topology import Topology, joint_freedoms
+from svkc.model.chain import Chain
+from svkc.model.topology import Topology
 from svkc.model.validation import texts, whole
+from svkc.model.virtual_link import VirtualLink, joint_freedoms
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""F1: what a MuJoCo model may hold that svkc does not simulate, said all at once."""
+"""What a MuJoCo model may hold that svkc does not simulate, said all at once."""
 
 import numpy as np
 

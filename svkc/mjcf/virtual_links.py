@@ -1,4 +1,4 @@
-"""F2: virtual links as a model and its user declare them: <equality>, ends by bodies or sites, placements."""
+"""Virtual links as a model and its user declare them: <equality>, ends by bodies or sites, placements."""
 
 import dataclasses
 
@@ -6,8 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from svkc.mjcf.bodies import name_of
-from svkc.model.chain import Structure, VirtualLink
-from svkc.model.topology import Topology, joint_freedoms
+from svkc.model.chain import Structure
+from svkc.model.topology import Topology
+from svkc.model.virtual_link import VirtualLink, joint_freedoms
 
 
 def equalities(model) -> list[VirtualLink]:

@@ -1,6 +1,5 @@
-"""F1: the nouns. Chain (what the bodies are), Structure (how they are joined now), State (how they move now), VirtualLink."""
+"""The nouns: chain (what the bodies are), structure (how they are joined now), state (how they move now)."""
 
-import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -8,51 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from svkc.model.topology import FREE, Topology, joint_freedoms
-from svkc.model.validation import numbers, yes_or_no
-
-
-@dataclasses.dataclass(frozen=True)
-class VirtualLink:
-    """A massless extra link, child of `parent`, that coincides with its `real` link while connected (paper, section IV).
-
-    `parent`, `real`: names of bodies ("world" is the ground) or of sites. `pos` (m), `quat`: the joint's frame in the parent; `real_pos`, `real_quat`: the
-    same frame in the real link, None: from the load pose. Of a site: in the site's frame; `real_pos` None: at the site. `axis`: of the joint, in the
-    frame `pos`, `quat` makes in the parent.
-    `joint`: weld, hinge, slide, cylinder, universal, planar, ball, free, or six Booleans (three rotations, three translations).
-    `actuated`: a motor drives the joint's own coordinates (paper, Fig. 6).
-    """
-
-    name: str
-    parent: str
-    real: str
-    joint: Any = "weld"
-    pos: Any = (0.0, 0.0, 0.0)
-    quat: Any = (1.0, 0.0, 0.0, 0.0)
-    real_pos: Any = None
-    real_quat: Any = None
-    axis: Any = (0.0, 0.0, 1.0)
-    connected: bool = False
-    actuated: bool = False
-
-    def __post_init__(self):
-        for name in ("name", "parent", "real"):
-            if not isinstance(getattr(self, name), str):
-                raise ValueError(f"virtual link: {name} must be a name, got {getattr(self, name)!r}")
-        joint_freedoms(self.joint)
-        for name in ("connected", "actuated"):
-            yes_or_no(f"virtual link {self.name!r}: {name}", getattr(self, name))
-        for name, size in (("pos", 3), ("quat", 4), ("real_pos", 3), ("real_quat", 4), ("axis", 3)):
-            value = getattr(self, name)
-            if value is None and name.startswith("real"):
-                continue
-            value = np.asarray(numbers(f"virtual link {self.name!r}: {name}", value), float)
-            if value.shape != (size,) or not np.isfinite(value).all():
-                raise ValueError(f"virtual link {self.name!r}: {name} must be {size} finite numbers, got {value}")
-            if size == 4 and abs(np.linalg.norm(value) - 1) > 1e-6:
-                raise ValueError(f"virtual link {self.name!r}: {name} must be a unit quaternion, got one of norm {np.linalg.norm(value):.6g}")
-        if not 0 < np.linalg.norm(np.asarray(self.axis, float)) < np.inf:
-            raise ValueError(f"virtual link {self.name!r}: axis must not be zero")
+from svkc.model.topology import FREE, Topology
+from svkc.model.validation import numbers
 
 
 class Structure(eqx.Module):
@@ -252,3 +208,15 @@ def _pointers(chain: Chain) -> np.ndarray:
             table[1, parent] = children[0]
             table[2, children[:-1]] = children[1:]
     return table
+
+
+def active_dofs(chain: Chain, structure: Structure) -> Bool[Array, " dofs"]:
+    """Joint coordinates that can move: the tree's and the connected virtual links', less the locked ones."""
+    top = chain.topology
+    used = jnp.concatenate([(structure.connected[:, None] & structure.freedoms).ravel(), jnp.zeros(1, bool)])
+    slot = np.full(top.dofs - top.nv, used.shape[0] - 1)
+    for i, d in enumerate(top.links.dof.ravel()):
+        if d < top.dofs:
+            slot[d - top.nv] = i
+    active = jnp.concatenate([jnp.ones(top.nv, bool), used[slot]])
+    return active if structure.locked is None else active & ~structure.locked

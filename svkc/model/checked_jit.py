@@ -1,4 +1,4 @@
-"""F1: verbs on a chain and a state: compiled, and what they are given looked at while jax traces, so that a call pays nothing for it."""
+"""Verbs on a chain and a state: compiled, and what they are given looked at while jax traces, so that a call pays nothing for it."""
 
 import functools
 import inspect
@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from svkc._jax.eager import eager_jit
 from svkc.model.chain import Chain, State, Structure
@@ -77,3 +78,12 @@ def verb(fn: Callable | None = None, *, eager: bool = False) -> Callable:
             raise
 
     return call
+
+
+def joint_torques(chain: Chain, tau) -> Float[Array, " dofs"]:
+    """Torques over every coordinate; those of virtual joints are zero where only the tree's are given. ValueError: another size."""
+    if tau.shape == (chain.dofs,):
+        return tau
+    if tau.shape == (chain.nv,):
+        return jnp.concatenate([tau, jnp.zeros(chain.dofs - chain.nv, tau.dtype)])
+    raise ValueError(f"tau: got shape {tau.shape}, expected {chain.dofs} joint torques (or {chain.nv}, the tree's)")

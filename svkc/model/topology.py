@@ -1,4 +1,4 @@
-"""F1: everything about a chain that never changes: rows, levels, joint kinds, where coordinates stand."""
+"""What never changes about a chain: rows, levels, joint kinds, places of coordinates."""
 
 import dataclasses
 import functools
@@ -8,28 +8,6 @@ import numpy as np
 FIXED, HINGE, SLIDE, BALL, FREE = range(5)
 Q_SIZE = (0, 1, 1, 4, 7)
 V_SIZE = (0, 1, 1, 3, 6)
-
-# the freedoms of the named joints: rotations about x, y, z, then translations along x, y, z; the axis of the joint is z
-JOINTS = {
-    "weld": (False, False, False, False, False, False),
-    "hinge": (False, False, True, False, False, False),
-    "slide": (False, False, False, False, False, True),
-    "cylinder": (False, False, True, False, False, True),
-    "universal": (True, True, False, False, False, False),
-    "planar": (False, False, True, True, True, False),
-    "ball": (True, True, True, False, False, False),
-    "free": (True, True, True, True, True, True),
-}
-
-
-def joint_freedoms(joint) -> tuple[bool, ...]:
-    """The six Booleans of a joint given by name or as six Booleans; ValueError otherwise."""
-    if isinstance(joint, str):
-        if joint in JOINTS:
-            return JOINTS[joint]
-    elif np.iterable(joint) and len(six := list(joint)) == 6 and all(isinstance(x, bool | np.bool_ | int) and x in (0, 1) for x in six):
-        return tuple(bool(x) for x in six)
-    raise ValueError(f"joint: got {joint!r}, expected one of {', '.join(JOINTS)} or six Booleans (three rotations, three translations)")
 
 
 @dataclasses.dataclass(frozen=True)

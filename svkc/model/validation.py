@@ -1,13 +1,10 @@
-"""F1: plain arguments as callers give them: numbers that must be whole, positive, or real; what cannot be right is said by name."""
+"""Plain arguments as callers give them: numbers that must be whole, positive, or real; what cannot be right is said by name."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-
-def concrete(*values) -> bool:
-    """Whether the values can be looked at: none of them is traced."""
-    return not any(isinstance(x, jax.core.Tracer) for v in values for x in jax.tree.leaves(v))
+from svkc._jax.pytrees import concrete
 
 
 def arrayed(value):

@@ -5,7 +5,8 @@ import pathlib
 import numpy as np
 
 from svkc.mjcf.load import load
-from svkc.model.chain import Chain, State, VirtualLink
+from svkc.model.chain import Chain, State
+from svkc.model.virtual_link import VirtualLink
 
 FOLDER = pathlib.Path(__file__).parent
 BAR_HEIGHT, GRIP = 2.6, 0.30  # m: the bar above the ground; half the distance between the hands

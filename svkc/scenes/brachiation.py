@@ -3,7 +3,8 @@
 import numpy as np
 
 from svkc.mjcf.load import load
-from svkc.model.chain import Chain, State, VirtualLink
+from svkc.model.chain import Chain, State
+from svkc.model.virtual_link import VirtualLink
 from svkc.scenes import BAR_HEIGHT, FOLDER, PALM
 
 RADIUS = 0.02  # m: of bars and of the rails that carry them

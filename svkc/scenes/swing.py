@@ -4,7 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from svkc.mjcf.load import load
-from svkc.model.chain import Chain, State, VirtualLink
+from svkc.model.chain import Chain, State
+from svkc.model.virtual_link import VirtualLink
 from svkc.transitions.events import When, when
 from svkc.transitions.guards import touch
 

@@ -1,7 +1,8 @@
 """The example of the paper's section VII-A (Figs. 14 and 18): a free-flying chain of two links that gets attached to the ground."""
 
 from svkc.mjcf.load import load
-from svkc.model.chain import Chain, State, VirtualLink
+from svkc.model.chain import Chain, State
+from svkc.model.virtual_link import VirtualLink
 
 _ROD = '<geom type="capsule" fromto="0 0 0 0 1 0" size="0.03" mass="{}" contype="0" conaffinity="0"/>'
 _MJCF = f"""<mujoco model="two_links"><option gravity="{{}}"/><worldbody><body name="base"><freejoint name="base"/>{_ROD.format(1.0)}

@@ -4,7 +4,8 @@ import jax.numpy as jnp
 import mujoco
 
 from svkc.mjcf.load import load
-from svkc.model.chain import Chain, State, VirtualLink
+from svkc.model.chain import Chain, State
+from svkc.model.virtual_link import VirtualLink
 from svkc.scenes import FOLDER
 
 STRIDE, HIP = 0.33, 0.906  # m: from foot to foot where both stand; the hips above the ground

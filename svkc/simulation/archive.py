@@ -1,4 +1,4 @@
-"""F4: trajectories on disk: one npz, written whole or not at all."""
+"""Trajectories on disk: one npz, written whole or not at all."""
 
 import dataclasses
 import json
@@ -13,9 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from svkc.mjcf.load import load
-from svkc.model.chain import Chain, State, Structure, VirtualLink
+from svkc.model.chain import Chain, State, Structure
 from svkc.model.checked_jit import check_chain
-from svkc.simulation.trajectory import RESULTS, Events, Phases, Trajectory
+from svkc.model.virtual_link import VirtualLink
+from svkc.simulation.records import RESULTS, Events, Phases
+from svkc.simulation.trajectory import Trajectory
 
 # 2: with `derivative` and the phases' `margin`; 3: with the structures' `margin` and the rest of the certificate; 4: with the phases' gaps
 SCHEMA = 4

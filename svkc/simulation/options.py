@@ -1,4 +1,4 @@
-"""F5: what a call of `simulate` asks for, checked at once, with defaults filled in."""
+"""What a call of `simulate` asks for, checked at once, with defaults filled in."""
 
 from collections.abc import Callable
 from typing import Any
@@ -11,15 +11,17 @@ import numpy as np
 import optimistix
 from jaxtyping import Array, Float
 
-from svkc.integration.integrators import SimplifiedNewton
+from svkc._jax.pytrees import concrete
+from svkc.integration.integrators import FixedSteps, SimplifiedNewton, motion_norm
 from svkc.integration.replay import Replay
-from svkc.integration.vector_field import Baumgarte, Drift, Field, FixedSteps, Projection, motion_norm
-from svkc.loops.forward_dynamics import Dynamics
+from svkc.integration.stabilization import Baumgarte, Drift, Projection
+from svkc.integration.vector_field import Field
+from svkc.loops.constrained_dynamics import Dynamics
+from svkc.loops.constraint import gap_tolerance
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import check_state
-from svkc.model.validation import concrete, finite, function, one, positive, whole
+from svkc.model.validation import finite, function, one, positive, whole
 from svkc.transitions.events import At, Plan, listed, plan
-from svkc.transitions.initial_state import gap_tolerance
 
 
 class Options(eqx.Module):

@@ -1,4 +1,4 @@
-"""F6: one phase: a solve of one smooth field, up to the next scheduled time or the first guard that crosses zero."""
+"""One phase: a solve of one smooth field, up to the next scheduled time or the first guard that crosses zero."""
 
 import diffrax
 import equinox as eqx
@@ -6,16 +6,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from svkc._jax.pytrees import frozen
 from svkc.integration.diffrax_adjoint import Settled
-from svkc.integration.event_adjoint import Reading, arrived
-from svkc.integration.event_location import Watched
-from svkc.integration.integrate import EVENT, MAX_STEPS, NON_FINITE, OPEN, SUCCESSFUL, How, Path, Tally, World, march
-from svkc.integration.replay import Replay, integrated
-from svkc.integration.vector_field import Field, Motion, Scene, finite, frozen, staged
+from svkc.integration.event_adjoint import arrived
+from svkc.integration.event_location import Reading, Watched
+from svkc.integration.integrate import march
+from svkc.integration.integrators import Motion, Scene, finite
+from svkc.integration.replay import Replay, integrated, staged
+from svkc.integration.solution import EVENT, MAX_STEPS, NON_FINITE, OPEN, SUCCESSFUL, How, Path, Tally, World
+from svkc.integration.vector_field import Field
 from svkc.model.chain import State
 from svkc.simulation.options import Options
-from svkc.simulation.records import Records
-from svkc.simulation.trajectory import RESULTS, Events
+from svkc.simulation.records import RESULTS, Events, Records
 from svkc.transitions.events import Plan
 
 

@@ -1,22 +1,12 @@
-"""F6: the records that a run writes, one row for each phase and event, and the certificate that is computed from them after the run."""
+"""Outcomes of a run, and the records that it writes: one row for each phase and for each event."""
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from svkc.integration.integrate import Path, Tally
-from svkc.integration.vector_field import frozen
-from svkc.loops.constraint import active_dofs, ends, gap, loop_jacobian
-from svkc.loops.coordinates import largest, scales
-from svkc.loops.pivoting import rank_tolerance, select, weakest
-from svkc.model.chain import Chain, State, Structure
-from svkc.model.topology import FREE
-from svkc.simulation.trajectory import Events, Phases
-from svkc.tree.energy import energy_and_momentum
-from svkc.tree.kinematics import kinematics
+from svkc.integration.solution import Path, Tally
+from svkc.model.chain import State, Structure
 
 
 class Records(eqx.Module):
@@ -36,16 +26,19 @@ class Records(eqx.Module):
     tally: Tally
 
 
-class Checked(eqx.Module):
-    """Quantities of the certificate at one state: the largest gaps of the loops (rad, m) and their rates, and at the ends of phases energy (J), linear
-    momentum (N s), angular momentum about the centre of mass (N m s) and rank margin."""
+class Events(eqx.Module):
+    """What happened, in the order of time; rows past `count` are unused (time inf, which -1).
 
-    gap: Float[Array, "*states 2"]
-    gap_rate: Float[Array, "*states 2"]
-    energy: Float[Array, "*states"]
-    linear: Float[Array, "*states 3"]
-    angular: Float[Array, "*states 3"]
-    margin: Float[Array, "*states"]
+    `which`: the event's place in the list given; `impulse` (N s), `angular_impulse` (N m s): on each real link from its parent, at the joint, in
+    world axes, for the links this event connected; `energy_lost` (J): of events at one instant, in the first one's row.
+    """
+
+    time: Float[Array, " events"]
+    which: Int[Array, " events"]
+    impulse: Float[Array, "events links 3"]
+    angular_impulse: Float[Array, "events links 3"]
+    energy_lost: Float[Array, " events"]
+    count: Int[Array, ""]
 
 
 def no_events(rows: int, links: int, dtype) -> Events:
@@ -79,82 +72,62 @@ def recorded(records: Records, row: Bool[Array, " phases"], began: tuple, ended:
     return jax.tree.map(write, records, new)
 
 
-def certificate(chain: Chain, records: Records, count: Int[Array, ""], saved: State, stages: int) -> tuple[Phases, Checked, Int[Array, ""]]:
-    """Return the phases of a run, the checks of its saved states, and the index of the first phase whose loops lose rank at an end (past the last: none).
+class RESULTS(eqx.Enumeration):
+    """How a run ended, lane by lane."""
 
-    stages: evaluations of the vector field in one try of a step. One loop checks every state, so that kinematics and energy are compiled once.
+    successful = ""
+    stopped = "An event asked the run to stop."
+    max_events = "More events than max_events: the state is that of the last event handled. Raise max_events, or look for chattering."
+    max_steps = "More steps than max_steps in one phase. Raise max_steps, or loosen rtol and atol."
+    step_too_small = "The step size fell to its lower bound: the problem is too stiff, or singular, for this solver and tolerance."
+    not_in_place = "A link was to be connected at its declared placement, but its bodies were elsewhere. Use here, or a guard that waits."
+    loop_open = "A loop is open by more than the tolerance. Use smaller steps, or projection; look at mobility and its margin there."
+    non_finite = "A number that is not finite appeared."
+    grazing = "A guard touched zero rather than crossed it: the time of its event has no derivative, and those given are not numbers."
+    jump = "A guard jumped over zero: the time of its event counts as fixed in derivatives."
+    together = "Events happened at one instant: derivatives are those of this order, and none where their times can change apart."
+    rank_lost = "The loops lose rank at an end of a phase: derivatives across it are not to be relied on."
+    no_slot = "A grip was to be made and every spare slot was taken: it was not made, everything else was. Load with more spare slots, or unbind."
+
+
+class Phases(eqx.Module):
+    """The stretches between changes of structure; rows past `count` are unused.
+
+    `energy`: mechanical energy (J) at start and end; `work`: done in between by control, limits and dampers (J); `margin`: the least |R_mm| / |R_11| of
+    the phase (of its two ends where steps are not projected), how far the weakest row that counts is from being redundant; `swaps`: how often the
+    choice of dependent coordinates changed from step to step (-1: not looked at); `loop`: the one that could not be closed (-1: none);
+    `evaluations`: of the vector field, in steps alone; `error`: the estimated errors of the steps added up (root mean square over q and v; inf: the
+    solver estimates none); `gap`: the largest of the loops' gaps (rad, m) at the ends of steps (of the phase, with a diffrax adjoint); `gap_rate`: of
+    their rates (rad/s, m/s) at the phase's two ends, before the event that ends it; `free`: nothing holds the bodies to the ground; `momentum_drift`:
+    then, the change of linear momentum (N s) that gravity does not explain and that of the angular momentum about the centre of mass (N m s).
     """
-    r, rows, join = records, records.start.shape[0], lambda *x: jnp.concatenate(x)
-    states = State(join(r.q[:, 0], r.q[:, 1], saved.q), join(r.v[:, 0], r.v[:, 1], saved.v), jax.tree.map(join, r.structure, r.structure, saved.structure))
-    at_end = np.arange(states.q.shape[0]) < 2 * rows
-    checks = jax.lax.map(jax.checkpoint(lambda x: _check_state(chain, *x)), (states, jnp.asarray(at_end)))
-    first, last, saved_checks = (jax.tree.map(lambda x, part=p: x[part], checks) for p in (slice(rows), slice(rows, 2 * rows), slice(2 * rows, None)))
-    written = jnp.arange(rows, dtype=jnp.int32) < count
-    fill = lambda value, none: jnp.where(written.reshape(-1, *(1,) * (jnp.ndim(value) - 1)), value, none)
-    free, joint_freedoms = jax.vmap(lambda s: (_free(chain, s), jnp.sum(active_dofs(chain, s), dtype=jnp.int32)))(r.structure)
-    margin, gaps, rates = frozen((jnp.minimum(first.margin, last.margin), jnp.maximum(first.gap, last.gap), jnp.maximum(first.gap_rate, last.gap_rate)))
-    phases = Phases(
-        start=r.start,
-        stop=r.stop,
-        connected=fill(r.structure.connected, False),
-        rank=fill(r.structure.rank, -1),
-        joint_freedoms=fill(joint_freedoms, -1),
-        energy=fill(jnp.stack([first.energy, last.energy], 1), 0),
-        work=r.work,
-        margin=fill(jnp.minimum(margin, r.tally.margin), 1),
-        accepted=r.accepted,
-        rejected=r.rejected,
-        evaluations=stages * r.tally.tries,
-        swaps=r.tally.swaps,
-        loop=r.tally.loop,
-        error=r.tally.error,
-        gap=fill(jnp.maximum(gaps, r.tally.gap), 0),
-        gap_rate=fill(rates, 0),
-        free=fill(free, False),
-        momentum_drift=jnp.where((written & free)[:, None], frozen(_momentum_drift(chain, first, last, fill(r.stop - r.start, 0))), 0),
-        count=count,
-    )
-    lost = written & (margin < rank_tolerance(margin.dtype))
-    return phases, saved_checks, jnp.where(jnp.any(lost), jnp.argmax(lost).astype(jnp.int32), rows)
 
+    start: Float[Array, " phases"]
+    stop: Float[Array, " phases"]
+    connected: Bool[Array, "phases links"]
+    rank: Int[Array, " phases"]
+    joint_freedoms: Int[Array, " phases"]
+    energy: Float[Array, "phases 2"]
+    work: Float[Array, " phases"]
+    margin: Float[Array, " phases"]
+    accepted: Int[Array, " phases"]
+    rejected: Int[Array, " phases"]
+    evaluations: Int[Array, " phases"]
+    swaps: Int[Array, " phases"]
+    loop: Int[Array, " phases"]
+    error: Float[Array, " phases"]
+    gap: Float[Array, "phases 2"]
+    gap_rate: Float[Array, "phases 2"]
+    free: Bool[Array, " phases"]
+    momentum_drift: Float[Array, "phases 2"]
+    count: Int[Array, ""]
 
-def _check_state(chain: Chain, state: State, at_end: Bool[Array, ""]) -> Checked:
-    """Check one state. at_end: whether it is at an end of a phase; elsewhere energy, momenta and margin are left out."""
-    kin, dtype, looped = kinematics(chain, state.q), state.q.dtype, bool(chain.link_names)
-    gaps = rates = jnp.zeros(2, dtype)
-    J = jnp.zeros((0, chain.dofs), dtype)
-    if looped:
-        end = ends(chain, state.structure, kin, state.q)
-        J = loop_jacobian(chain, state.structure, kin, end)
-        gaps, rates = largest(gap(state.structure, end)), largest((J @ state.v).reshape(-1, 6))
+    @property
+    def freedoms(self) -> Int[Array, "... phases"]:
+        """Mobility N_F = N_J - m (13)."""
+        return self.joint_freedoms - self.rank
 
-    def whole():
-        energy, *momenta = energy_and_momentum(chain, state, kin)
-        row, column = scales(chain)
-        margin = weakest(select(frozen(row[:, None] * J * column[None]), state.structure.rank)) if looped else jnp.ones((), dtype)
-        return energy, *frozen(tuple(momenta)), margin
-
-    none = jnp.zeros((), dtype), jnp.zeros(3, dtype), jnp.zeros(3, dtype), jnp.ones((), dtype)
-    return Checked(gaps, rates, *jax.lax.cond(at_end, whole, lambda: none))
-
-
-def _free(chain: Chain, s: Structure) -> Bool[Array, ""]:
-    """Whether nothing holds the bodies to the ground: every tree hangs on it by a free joint, and no loop does."""
-    top = chain.topology
-    roots = [i for i in range(1, len(top.parent)) if top.parent[i] == 0]
-    if not roots or any(top.kind[i] != FREE for i in roots):
-        return jnp.zeros((), bool)
-    return ~jnp.any(s.connected & ((s.parent == 0) | (s.real == 0)))
-
-
-def _momentum_drift(chain: Chain, first: Checked, last: Checked, span: Float[Array, " phases"]) -> Float[Array, "phases 2"]:
-    """Change of linear momentum (N s) that gravity does not explain, and of the angular momentum about the centre of mass (N m s)."""
-    fallen = jnp.sum(chain.mass) * chain.gravity[None] * span[:, None]
-    size = lambda x: jnp.linalg.norm(x, axis=-1)
-    return jnp.stack([size(last.linear - first.linear - fallen), size(last.angular - first.angular)], 1)
-
-
-def stages(solver: diffrax.AbstractSolver) -> int:
-    """Evaluations of the vector field in one try of a step; Newton iterations of implicit stages are not counted."""
-    tableau = getattr(solver, "tableau", None)
-    return len(np.asarray(tableau.b_sol)) if isinstance(tableau, diffrax.ButcherTableau) else 1
+    @property
+    def energy_drift(self) -> Float[Array, "... phases"]:
+        """Energy gained that no work explains (J)."""
+        return self.energy[..., 1] - self.energy[..., 0] - self.work

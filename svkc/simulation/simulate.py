@@ -1,4 +1,4 @@
-"""F6: a run, phase after phase: a scan over solves of one smooth field each, with the change of structure between them.
+"""A run, phase after phase: a scan over solves of one smooth field each, with the change of structure between them.
 
 A phase ends at the next scheduled time or at the end of the first step in which a guard crosses zero; the crossing is then located by steps of the
 solver back from there, so that its time and state have the solver's own order and not that of an interpolation. Lanes of a batch
@@ -8,7 +8,6 @@ that are done go on with phases of no length.
 import dataclasses
 
 import equinox as eqx
-import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,17 +16,18 @@ from jaxtyping import Array, Bool, Int
 from svkc._jax.eager import eager_jit
 from svkc._jax.functions import shared
 from svkc._jax.primitive import Closed
-from svkc.integration.event_adjoint import Reading, event_tolerance
-from svkc.integration.vector_field import Motion, Scene, finite, frozen
-from svkc.model.chain import Chain, State, Structure
+from svkc._jax.pytrees import frozen
+from svkc.integration.event_location import Reading, event_tolerance
+from svkc.integration.integrators import Motion, Scene
+from svkc.model.chain import Chain, State
+from svkc.simulation.apply_events import apply_events, reevaluated
+from svkc.simulation.certificate import certificate, stages
 from svkc.simulation.options import Options, checked
 from svkc.simulation.phase import Run, Solved, solve
-from svkc.simulation.records import certificate, no_events, no_records, recorded, stages
-from svkc.simulation.trajectory import RESULTS, Events, Trajectory
+from svkc.simulation.records import RESULTS, no_events, no_records, recorded
+from svkc.simulation.trajectory import Trajectory
 from svkc.transitions.events import Plan
 from svkc.transitions.guards import Sensor
-from svkc.transitions.spare_links import emptied, grip
-from svkc.transitions.transition import change, connect_tolerance, release
 
 
 def simulate(
@@ -131,7 +131,7 @@ def _start(chain: Chain, state: State, t0, ts, made: Plan, options: Options, arg
         state=state,
         work=jnp.zeros((), dtype) if options.has_work else None,
         guards=jnp.asarray(idle, dtype) if made.guards else None,
-        stale=jnp.asarray(_reevaluated(made)) if made.guards else None,
+        stale=jnp.asarray(reevaluated(made)) if made.guards else None,
         pending=jnp.ones(len(made.timed), bool),
         events=no_events(rows, links, dtype),
         records=no_records(rows + 1, state),
@@ -165,10 +165,10 @@ def _phase(chain: Chain, run: Run, index, t1, ts, made: Plan, options: Options, 
     derivative, invalid_from = _derivative(run, solved, going, timed, index)
     after, events, result = ended, run.events, solved.result
     if made.actions:
-        after, events, result = _apply(chain, run, ended, solved, fired, made)
+        after, events, result = apply_events(chain, run, ended, solved, fired, made)
     result = RESULTS.where(run.result == RESULTS.successful, result, run.result)
     # a guard that rests at zero after it fired keeps its value
-    stale = jnp.asarray(_reevaluated(made)) & jnp.any(fired) & (solved.guards != 0) if made.guards else None
+    stale = jnp.asarray(reevaluated(made)) & jnp.any(fired) & (solved.guards != 0) if made.guards else None
     return Run(
         t=solved.t,
         state=after,
@@ -193,17 +193,9 @@ def _derivative(run: Run, solved: Solved, going, timed: Bool[Array, " timed"], i
     return RESULTS.where(first, code, run.derivative), jnp.where(first, index.astype(jnp.int32), run.invalid_from)
 
 
-def _reevaluated(made: Plan) -> np.ndarray:
-    """Return which guards are re-evaluated after a change of structure, so that a guard is compared within one phase.
-
-    Guards of loads are not: a link that is overloaded from the start of a phase breaks at once.
-    """
-    return np.array([not (isinstance(g, Sensor) and g.loaded) for g in made.guards], bool)
-
-
 def _with_guards(chain: Chain, run: Run, made: Plan, options: Options, args) -> Run:
     """Return the run with its stale guards re-evaluated at the start of a phase."""
-    if not made.guards or not _reevaluated(made).any():
+    if not made.guards or not reevaluated(made).any():
         return run
     scene = Scene(chain, run.state.structure, args)
     now = frozen(Reading(made, options.field))(*frozen((run.t, Motion(run.state.q, run.state.v), scene)))
@@ -220,65 +212,3 @@ def _save(run: Run, ended: State, solved: Solved, ts) -> State:
         return jnp.where((ts >= run.t).reshape(-1, *(1,) * new.ndim), new[None], old)
 
     return State(q, v, jax.tree.map(write, ended.structure, run.saved.structure))
-
-
-def _apply(chain: Chain, run: Run, ended: State, solved: Solved, fired: Bool[Array, " events"], made: Plan):
-    """The change of structure that all events of this instant make together; one record row for each of them."""
-    any_of = lambda what: jnp.any(fired[:, None] & made.table(chain, what), 0)
-    connected = (ended.structure.connected | any_of("connect")) & ~any_of("cut")
-    locked = (ended.structure.locked | any_of("lock")) & ~any_of("unlock") if made.locks else None
-    here = any_of("here") if made.table(chain, "here").any() or made.binds else None
-    happened, full, emptying = jnp.any(fired), jnp.zeros((), bool), None
-    if made.binds:
-        structure, gripped, full, emptying = _bound(chain, ended.structure, fired, made)
-        ended = State(ended.q, ended.v, structure)
-        connected, here = (connected | gripped) & ~emptying, here | gripped
-
-    def changed():
-        done = change(chain, ended, connected, locked, here) if made.joins(chain) else release(chain, ended, connected, locked)
-        return done if emptying is None else eqx.tree_at(lambda d: d.state.structure, done, emptied(done.state.structure, emptying))
-
-    def same():
-        return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), eqx.filter_eval_shape(changed))
-
-    done = jax.lax.cond(eqxi.unvmap_any(happened), changed, same)
-    # what a change makes of numbers that are not is not taken
-    sound = finite(Motion(done.state.q, done.state.v)) & ~jnp.isnan(done.gap)
-    after = jax.tree.map(lambda new, old: jnp.where(happened & sound, new, old), done.state, ended)
-    r, count = run.events, jnp.sum(fired, dtype=jnp.int32)
-    place = r.count + jnp.cumsum(fired, dtype=jnp.int32) - 1
-    rows = jnp.arange(r.time.shape[0], dtype=jnp.int32)
-    hit = (rows[:, None] == place[None]) & fired[None]
-    written = jnp.any(hit, 1)
-    first = written & (rows == r.count)
-    mine = jnp.any(hit[:, :, None] & (made.table(chain, "connect") | made.table_of_grips(chain))[None], 1)[:, :, None]
-    events = Events(
-        jnp.where(written, solved.t, r.time),
-        jnp.where(written, jnp.argmax(hit, 1).astype(jnp.int32), r.which),
-        jnp.where(mine, done.impulse[None], r.impulse),
-        jnp.where(mine, done.angular_impulse[None], r.angular_impulse),
-        jnp.where(first, done.energy_lost, r.energy_lost),
-        jnp.minimum(r.count + count, r.time.shape[0]),
-    )
-    stops = jnp.any(fired & np.array([a.stop for a in made.actions], bool))
-    result = RESULTS.where(stops, RESULTS.stopped, solved.result)
-    result = RESULTS.where(happened & (done.gap > connect_tolerance), RESULTS.not_in_place, result)
-    result = RESULTS.where(sound, result, RESULTS.non_finite)
-    result = RESULTS.where(full, RESULTS.no_slot, result)
-    result = RESULTS.where(r.count + count > r.time.shape[0], RESULTS.max_events, result)
-    return after, events, result
-
-
-def _bound(chain: Chain, structure: Structure, fired: Bool[Array, " events"], made: Plan):
-    """The structure with the slots that the events of this instant bind, the slots to connect, whether one was lacking, and the slots to empty."""
-    emptying = jnp.any(fired[:, None] & made.unbound(chain, structure), 0)
-    gripped, full = jnp.zeros(len(chain.link_names), bool), jnp.zeros((), bool)
-    for event, wishes in enumerate(made.grips):
-        for wish in wishes:
-            # slots given to others at this instant are no longer free
-            taken = eqx.tree_at(lambda s: s.connected, structure, structure.connected | gripped)
-            bound, slot, lacking = grip(chain, taken, wish)
-            bound = eqx.tree_at(lambda s: s.connected, bound, structure.connected)
-            structure = jax.tree.map(lambda new, old, e=event: jnp.where(fired[e], new, old), bound, structure)
-            gripped, full = gripped | (slot & fired[event]), full | (lacking & fired[event])
-    return structure, gripped, full, emptying

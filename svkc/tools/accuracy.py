@@ -1,4 +1,4 @@
-"""F7: the dial turned on a scene of one's own: which integrator, step and way against drift is the fastest that holds an error."""
+"""The dial turned on a scene of one's own: which integrator, step and way against drift is the fastest that holds an error."""
 
 import dataclasses
 import sys
@@ -12,16 +12,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from svkc.integration.integrators import RodriguesEuler, SemiImplicitEuler
-from svkc.integration.vector_field import Drift, Projection
-from svkc.loops.forward_dynamics import Dynamics
+from svkc.integration.stabilization import Drift, Projection
+from svkc.loops.constrained_dynamics import Dynamics, by_bodies
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import check_state
 from svkc.model.validation import one, positive, whole
 from svkc.simulation.options import tolerances
+from svkc.simulation.records import RESULTS
 from svkc.simulation.simulate import simulate
-from svkc.simulation.trajectory import RESULTS, Trajectory
-from svkc.tree.articulated_body import by_bodies
-from svkc.tree.kinematics import difference
+from svkc.simulation.trajectory import Trajectory
+from svkc.tree.configuration import difference
 
 
 @dataclasses.dataclass(frozen=True)

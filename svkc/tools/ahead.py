@@ -1,4 +1,4 @@
-"""F7: programs compiled before they are needed."""
+"""Programs compiled before they are needed."""
 
 import time
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""F7: derivatives as users meet them: checked against differences, and in the tangent of the configuration."""
+"""Derivatives checked against central differences."""
 
 import dataclasses
 from collections.abc import Callable
@@ -7,12 +7,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
-from svkc.model.chain import Chain
-from svkc.model.checked_jit import check_chain, vector
 from svkc.model.validation import function, positive, whole
-from svkc.tree.kinematics import integrate
 
 
 class Check(eqx.Module):
@@ -155,13 +151,3 @@ def _compare(derivative, difference, doubt, modes: float, output: str, input: st
     entry = f"{output}[{at}]" if off.size > 1 else output
     pick = lambda x: float(np.ravel(x)[at])
     return Check(float(off[at] / size), entry, input, pick(derivative), pick(difference), pick(doubt) / float(size), modes)
-
-
-def tangent(chain: Chain, q, gradient) -> Float[Array, " dofs"]:
-    """A gradient by q as one in the tangent of the configuration (per m, rad): of f(integrate(chain, q, dv)) by dv at dv = 0.
-
-    What an optimiser should step along: q <- integrate(chain, q, -rate * tangent(chain, q, gradient)) keeps quaternions at unit length.
-    """
-    check_chain(chain)
-    q, gradient = (vector(chain, name, x, chain.topology.nq_all) for name, x in (("q", q), ("gradient", gradient)))
-    return jax.vjp(lambda dv: integrate(chain, q, dv), jnp.zeros(chain.dofs, q.dtype))[1](gradient)[0]

@@ -1,4 +1,4 @@
-"""F7: many runs at once: lanes dealt to chunks, chunks to processes and devices, finished chunks kept."""
+"""Many runs at once: lanes dealt to chunks, chunks to processes and devices, finished chunks kept."""
 
 import hashlib
 import json

@@ -1,4 +1,4 @@
-"""F5: changes of structure to come, at a time or when a guard crosses zero, and where in a step it does."""
+"""Events: changes of structure at a time or at the zero of a guard, and the plan of a run."""
 
 import dataclasses
 from collections.abc import Callable, Iterable
@@ -7,13 +7,14 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
+from svkc._jax.pytrees import concrete
 from svkc.model.chain import Chain, Structure
+from svkc.model.names import joint_slice, link_index, rows_of, spare_slot
 from svkc.model.topology import V_SIZE
-from svkc.model.validation import concrete, numbers, texts, yes_or_no
-from svkc.transitions.initial_state import joint_slice, link_index
-from svkc.transitions.spare_links import Grip, checked_freedoms, holding, placed, rows_of, spare_slot, to_axis
+from svkc.model.validation import numbers, texts, yes_or_no
+from svkc.transitions.spare_links import Grip, checked_freedoms, holding, placed, to_axis
 
 
 class Action(eqx.Module):
@@ -216,45 +217,3 @@ def _checked_grip(chain: Chain, wish: Grip, dtype) -> Grip:
     elif not any(chain.topology.link_spare):
         raise ValueError("bind: the chain has no spare slots; load it with spare=n")
     return dataclasses.replace(wish, real_pos=placed("real_pos", wish.real_pos, dtype))
-
-
-# how often a bracket may be narrowed
-NARROWINGS = 200
-
-
-class Bracket(eqx.Module):
-    """Two times, at the first a function is below zero, at the second not: narrowed to round-off by false position with the Illinois weight, every third
-    time by bisection. `fine`: how narrow; `last`: which end has moved (1: b, -1: a)."""
-
-    a: Float[Array, ""]
-    b: Float[Array, ""]
-    fa: Float[Array, ""]
-    fb: Float[Array, ""]
-    fine: Float[Array, ""]
-    last: Int[Array, ""]
-    count: Int[Array, ""]
-
-    @staticmethod
-    def around(a, b, fa, fb) -> "Bracket":
-        """From the two times and the function there."""
-        eps = jnp.finfo(fb.dtype).eps
-        fine = 2 * eps * jnp.maximum(jnp.abs(a), jnp.abs(b)) + eps * (b - a)
-        return Bracket(a, b, fa, fb, fine, *(jnp.zeros((), jnp.int32) for _ in range(2)))
-
-    def wide(self) -> Bool[Array, ""]:
-        """Whether to go on."""
-        return (self.b - self.a > self.fine) & (self.count < NARROWINGS)
-
-    def inside(self) -> Float[Array, ""]:
-        """The time to look at next."""
-        weight = self.fb - self.fa
-        secant = self.b - self.fb * (self.b - self.a) / jnp.where(weight == 0, 1, weight)
-        c = jnp.where((self.count % 3 == 2) | (weight == 0), self.a + (self.b - self.a) / 2, secant)
-        return jnp.clip(c, self.a + self.fine / 4, self.b - self.fine / 4)
-
-    def narrowed(self, c, fc) -> "Bracket":
-        """With what the function is at c."""
-        right = fc >= 0
-        fa, fb = jnp.where(right & (self.last == 1), self.fa / 2, self.fa), jnp.where(~right & (self.last == -1), self.fb / 2, self.fb)
-        a, fa, b, fb = jnp.where(right, self.a, c), jnp.where(right, fa, fc), jnp.where(right, c, self.b), jnp.where(right, fc, fb)
-        return Bracket(a, b, fa, fb, self.fine, jnp.where(right, 1, -1).astype(jnp.int32), self.count + 1)

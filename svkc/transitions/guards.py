@@ -1,4 +1,4 @@
-"""F5: guards that measure the mechanism itself: bodies that touch, a support that would have to pull, a joint that carries too much."""
+"""Guards that measure the mechanism itself: bodies that touch, a support that would have to pull, a joint that carries too much."""
 
 from typing import ClassVar
 
@@ -8,11 +8,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from svkc.loops.constraint import ends
-from svkc.loops.forward_dynamics import joint_torques, loop_forces
+from svkc.loops.forward_dynamics import loop_forces
 from svkc.model.chain import Chain, State
-from svkc.model.checked_jit import check_chain
+from svkc.model.checked_jit import check_chain, joint_torques
+from svkc.model.names import link_index
 from svkc.model.validation import finite, one, positive
-from svkc.transitions.initial_state import link_index
 from svkc.tree.kinematics import kinematics
 from svkc.tree.spatial import quat_conjugate, quat_rotate
 

@@ -1,4 +1,4 @@
-"""F4: a consistent state from what the user knows of it: names to numbers, loops closed, velocities made to agree."""
+"""A consistent state from what the user knows of it: names to numbers, loops closed, velocities made to agree."""
 
 import functools
 import warnings
@@ -10,76 +10,18 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from svkc._jax.eager import eager_jit
-from svkc.loops.constraint import active_dofs
-from svkc.loops.coordinates import loop_gaps
-from svkc.model.chain import Chain, State, Structure
-from svkc.model.checked_jit import check_state
+from svkc._jax.pytrees import concrete
+from svkc.loops.constraint import gap_tolerance, loop_gaps
+from svkc.model.chain import Chain, State, Structure, active_dofs
+from svkc.model.names import connection_mask, joint_slice
 from svkc.model.topology import Q_SIZE, V_SIZE
-from svkc.model.validation import arrayed, concrete, finite
+from svkc.model.validation import finite
 from svkc.transitions.newton import CLOSE, CLOSE_HELD, RANK, READ, VELOCITY, VELOCITY_HELD, Held, Schedule, solve_structure
-from svkc.tree.kinematics import normalize
+from svkc.tree.configuration import normalize
 
 _NEWTON = 30
 _CLOSING, _PROJECTING = (*(CLOSE_HELD,) * _NEWTON, *(CLOSE,) * _NEWTON), (VELOCITY_HELD, VELOCITY)
 _PLACE, _ASSEMBLE = Schedule((*_CLOSING, *_PROJECTING)), Schedule((READ, *_CLOSING, *RANK, *_PROJECTING))
-
-
-def gap_tolerance(dtype) -> float:
-    """Largest loop gap, over `chain.length` where it is in metres, that counts as closed: eps^(4/7), 1.1e-9 in float64, 1.1e-4 in float32."""
-    return float(np.finfo(dtype).eps ** (4 / 7))
-
-
-def connection_mask(chain: Chain, connected) -> np.ndarray | jax.Array:
-    """[links] Boolean from names, a mask, or None (as the model says)."""
-    if connected is None:
-        return chain.structure.connected
-    names = (connected,) if isinstance(connected, str) else connected
-    if isinstance(names, (tuple, list, set, frozenset)) and all(isinstance(n, str) for n in names):
-        return np.isin(chain.link_names, [chain.link_names[link_index(chain, n)] for n in names])
-    mask = arrayed(connected)
-    if mask.shape != (len(chain.link_names),) or mask.dtype != bool:
-        raise ValueError(f"connected: expected names of virtual links or {len(chain.link_names)} Booleans, got {mask.dtype} of shape {mask.shape}")
-    return mask
-
-
-def link_index(chain: Chain, name: str) -> int:
-    """The slot of a virtual link; ValueError naming those there are."""
-    if not isinstance(name, str) or name not in chain.link_names:
-        raise ValueError(f"no virtual link {name!r}; virtual links: {', '.join(chain.link_names) or 'none'}")
-    return chain.link_names.index(name)
-
-
-def joint_slice(chain: Chain, name: str, sizes, start) -> slice:
-    """Where a joint of the tree, or one that may be cut, stands in q (sizes=Q_SIZE) or v; ValueError naming those there are."""
-    top = chain.topology
-    for joint, link, freedom in top.cut_joints:
-        if joint == name:
-            ball = sum(top.link_freedoms[link][:3]) == 3
-            if sizes is V_SIZE:
-                first = top.links.dof[link, freedom]
-                return slice(int(first), int(first) + (3 if ball else 1))
-            first = top.links.quat[link, 0] if ball else np.concatenate([top.links.angle, top.links.slide], 1)[link, freedom]
-            return slice(int(first), int(first) + (4 if ball else 1))
-    if not isinstance(name, str) or name not in top.joint_names:
-        raise ValueError(f"no joint {name!r}; joints: {', '.join(top.joint_names)}")
-    row = top.joint_row[top.joint_names.index(name)]
-    return slice(start[row], start[row] + sizes[top.kind[row]])
-
-
-def prefer(chain: Chain, state: State, *names: str) -> State:
-    """The state with these joint coordinates asked to be independent (theta_G), as far as the loops let them be; no names: the choice is svkc's again.
-
-    names: of joints, virtual links, or single coordinates (`chain.dof_names`). The motion does not depend on it. ValueError: unknown names.
-    """
-    check_state(chain, state)
-    asked = np.zeros(chain.dofs, bool)
-    for name in names:
-        here = np.array([isinstance(name, str) and name in (n, n.rpartition(".")[0] or n) for n in chain.dof_names])
-        if not here.any():
-            raise ValueError(f"no joint coordinate {name!r}; coordinates: {', '.join(chain.dof_names)}")
-        asked |= here
-    wanted = jnp.asarray(asked) if names else None
-    return eqx.tree_at(lambda s: s.structure.independent, state, wanted, is_leaf=lambda x: x is None)
 
 
 def _put(array, at, values):

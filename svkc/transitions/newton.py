@@ -1,4 +1,4 @@
-"""F5: Newton's method on a structure: its rank, its loops closed, velocities that keep them, and the velocity after an impact (paper, section V-C).
+"""Newton's method on a structure: its rank, its loops closed, velocities that keep them, and the velocity after an impact (paper, section V-C).
 
 A caller lists the iterations that it needs. One loop over one body takes them all, so that kinematics, loop Jacobian and pivots are compiled once.
 """
@@ -13,14 +13,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.primitive import operation
-from svkc.loops.constraint import active_dofs, ends, gap, joint_coordinates, with_coordinates
-from svkc.loops.coordinates import scaled_jacobian, scales
-from svkc.loops.forward_dynamics import constraint_forces, solve_motion, with_links
-from svkc.loops.pivoting import Selection, count_rank, held_part, rank_tolerance, select, without_weak
+from svkc.loops.constraint import ends, gap, scaled_jacobian, scales
+from svkc.loops.pivoting import count_rank, held_part, rank_tolerance, select, without_weak
 from svkc.loops.projection import least_change
-from svkc.model.chain import Chain, Structure
-from svkc.tree.inverse_dynamics import inertia_times
-from svkc.tree.kinematics import Kinematics, integrate, kinematics, normalize
+from svkc.model.chain import Chain, Structure, active_dofs
+from svkc.transitions.impact import velocity_after_impact
+from svkc.transitions.placement import joint_coordinates, with_coordinates
+from svkc.tree.configuration import integrate, normalize
+from svkc.tree.kinematics import kinematics
 
 # kinds of iterations
 READ = 0  # set the coordinates of virtual joints to what the poses of their bodies say
@@ -129,7 +129,7 @@ def _iterate(chain: Chain, structure: Structure, q: Float[Array, " q"], v: Float
             now = now.searched(kind, full.size, open_)
         new = now.v + jnp.where(of_v, step, 0), now.wrench, now.lost
         if IMPACT in kinds:
-            new = jax.lax.cond(kind == IMPACT, lambda: _impact(chain, structure, kin, selection, J, now.v), lambda: new)
+            new = jax.lax.cond(kind == IMPACT, lambda: velocity_after_impact(chain, structure, kin, selection, J, now.v), lambda: new)
         moved = integrate(chain, at, jnp.where(kind == PERTURB, away, jnp.where(_among(kind, CLOSE_HELD, CLOSE, RECLOSE), step, 0)))
         if READ in kinds:
             read = lambda: with_coordinates(chain, held.read, joint_coordinates(chain, structure, kin, at), at)
@@ -141,17 +141,6 @@ def _iterate(chain: Chain, structure: Structure, q: Float[Array, " q"], v: Float
 
     xs = jnp.asarray(np.array(kinds, np.int32)), jnp.asarray(np.arange(len(kinds)) >= unranked)
     return jax.lax.scan(one, Newton.init(chain, structure, q, jnp.where(active, v, 0)), xs)[0]
-
-
-def _impact(chain: Chain, structure: Structure, kin: Kinematics, selection: Selection, J, v):
-    """Return v+ = W (W^T M W)^-1 W^T M v-, the impulse of each loop on its real link, and the energy lost: the paper's (29)-(38) in one formula.
-
-    v+ is the projection of v-, orthogonal in the metric of the inertia, on the velocities that the structure allows. Redundant loops need no special case.
-    """
-    jump = solve_motion(chain, structure, kin, selection, J, jnp.zeros_like(v), J @ (v / scales(chain)[1]))
-    impulse = with_links(chain, inertia_times(chain, kin, jump[: chain.nv]), jump)
-    # v- and v+ differ by a vector orthogonal to v+, so that the loss is a square and cannot be negative
-    return v + jump, -constraint_forces(chain, selection, J, impulse), jump @ impulse / 2
 
 
 def _solve(chain: Chain, structure: Structure, q, v, held: Held, schedule: Schedule) -> Newton:

@@ -1,4 +1,4 @@
-"""F4: spare virtual links: run-time data that says between which two bodies, where and how."""
+"""Spare virtual links: run-time data that says between which two bodies, where and how."""
 
 from typing import Any
 
@@ -9,9 +9,9 @@ from jaxtyping import Array, Bool
 
 from svkc.model.chain import Chain, State, Structure
 from svkc.model.checked_jit import check_state
-from svkc.model.topology import joint_freedoms
+from svkc.model.names import rows_of, spare_slot
 from svkc.model.validation import finite
-from svkc.transitions.initial_state import link_index
+from svkc.model.virtual_link import joint_freedoms
 
 
 def _listed(x):
@@ -31,23 +31,6 @@ class Grip(eqx.Module):
     axis: Any = eqx.field(static=True, default=(0.0, 0.0, 1.0), converter=_listed)
     real_pos: Any = (0.0, 0.0, 0.0)
     slot: str | None = eqx.field(static=True, default=None)
-
-
-def rows_of(chain: Chain, *bodies: str) -> list[int]:
-    """Rows of bodies by name; ValueError naming those there are."""
-    for body in bodies:
-        if not isinstance(body, str) or body not in chain.body_names:
-            raise ValueError(f"bind: no body {body!r}; bodies: {', '.join(chain.body_names)}")
-    return [chain.topology.body_row[chain.body_names.index(b)] for b in bodies]
-
-
-def spare_slot(chain: Chain, name: str) -> int:
-    """The slot of a spare link; ValueError for any other link."""
-    slot = link_index(chain, name)
-    if not chain.topology.link_spare[slot]:
-        spare = [n for n, s in zip(chain.link_names, chain.topology.link_spare, strict=True) if s]
-        raise ValueError(f"bind: {name!r} is not a spare slot; spare slots: {', '.join(spare) or 'none; load with spare=n'}")
-    return slot
 
 
 def checked_freedoms(joint) -> tuple[bool, ...]:

@@ -1,4 +1,4 @@
-"""F5: the structure changes: connect, cut, lock, and the velocity just after (paper, section V)."""
+"""Changes of structure: connect, cut, lock, unlock, unbind (paper, section V)."""
 
 import functools
 
@@ -6,56 +6,20 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import cho_factor, cho_solve
 from jaxtyping import Array, Bool, Float
 
 from svkc._jax.eager import eager_jit
-from svkc.loops.constraint import active_dofs, ends, joint_coordinates, loop_jacobian, with_coordinates
-from svkc.loops.coordinates import constrained
-from svkc.loops.forward_dynamics import reduced_inertia, solve_free_motion
-from svkc.model.chain import Chain, State, Structure
+from svkc.model.chain import Chain, State, Structure, active_dofs
 from svkc.model.checked_jit import check_state
+from svkc.model.names import connection_mask, joint_slice, link_index, spare_slot
 from svkc.model.topology import V_SIZE
 from svkc.model.validation import yes_or_no
-from svkc.transitions.initial_state import check_closed, connection_mask, joint_slice, link_index
+from svkc.transitions.impact import Change, lock_projection
+from svkc.transitions.initial_state import check_closed
 from svkc.transitions.newton import CONNECT, RANK, Held, Schedule, decide_rank, solve_structure
-from svkc.transitions.spare_links import emptied, spare_slot
-from svkc.tree.inverse_dynamics import inertia_by_composites, inertia_times
-from svkc.tree.kinematics import Kinematics, kinematics, twists
-from svkc.tree.spatial import quat_conjugate, quat_multiply, quat_rotate
-
-
-class Change(eqx.Module):
-    """What a change of structure did: the state after it, impulses on the real links from their parents, at the joints, and energy lost (J).
-
-    `gap`: the largest gap of a loop before it was closed; `left`: of each loop after it (rad, or `chain.length`s).
-    """
-
-    state: State
-    impulse: Float[Array, "links 3"]
-    angular_impulse: Float[Array, "links 3"]
-    energy_lost: Float[Array, ""]
-    gap: Float[Array, ""]
-    left: Float[Array, " links"]
-
-
-def gripped_here(chain: Chain, structure: Structure, q, here: Bool[Array, " links"], kin: Kinematics) -> Structure:
-    """Placements of the links in `here` taken from where the bodies are: the point is the real link's own, the axes stay the parent's.
-
-    So a palm grips the bar where it touches it, about the bar's direction; floats of the placement stay differentiable.
-    """
-    end = ends(chain, structure, kin, q)
-    p = structure.parent
-    to_parent = quat_conjugate(kin.quat[p])
-    place = end.real - kin.r[p] - (kin.root[p] - kin.root[structure.real])
-    pos = quat_rotate(to_parent, place)
-    real_quat = quat_multiply(quat_conjugate(kin.quat[structure.real]), end.base_quat)
-    take = here[:, None]
-    return eqx.tree_at(
-        lambda s: (s.pos, s.real_quat),
-        structure,
-        (jnp.where(take, pos, structure.pos), jnp.where(take, real_quat, structure.real_quat)),
-    )
+from svkc.transitions.placement import gripped_here, joint_coordinates, with_coordinates
+from svkc.transitions.spare_links import emptied
+from svkc.tree.kinematics import kinematics
 
 
 def _restructured(chain: Chain, structure: Structure, connected, locked) -> tuple[Structure, Bool[Array, " links"], Bool[Array, ""]]:
@@ -109,16 +73,6 @@ def release(chain: Chain, state: State, connected: Bool[Array, " links"], locked
     structure, _, _ = _restructured(chain, state.structure, connected, locked)
     nothing, zero = jnp.zeros((len(chain.link_names), 3), state.v.dtype), jnp.zeros((), state.v.dtype)
     return Change(State(state.q, state.v, decide_rank(chain, structure, state.q)), nothing, nothing, zero, zero, nothing[:, 0])
-
-
-def lock_projection(chain: Chain, structure: Structure, q, v):
-    """The projection where only joints are locked and there are no virtual links; velocity after, energy lost."""
-    if structure.locked is None:
-        return v, jnp.zeros((), v.dtype)
-    kin = kinematics(chain, q)
-    after = solve_free_motion(chain, structure, kin, inertia_times(chain, kin, v))
-    jump = after - v
-    return after, jump @ inertia_times(chain, kin, jump) / 2
 
 
 def transition(chain: Chain, state: State, connected) -> State:
@@ -188,29 +142,3 @@ def unbind(chain: Chain, state: State, *names: str) -> State:
     slots = np.isin(np.arange(len(chain.link_names)), [spare_slot(chain, n) for n in names])
     after = release(chain, state, state.structure.connected & ~jnp.asarray(slots)).state
     return State(after.q, after.v, emptied(after.structure, jnp.asarray(slots)))
-
-
-@functools.partial(jax.jit, static_argnames="name")
-def velocity_by_impulse(chain: Chain, state: State, name: str) -> tuple[Float[Array, " dofs"], Float[Array, "6"]]:
-    """The velocity after connecting one link and the impulse F_1 on it, by the paper's (34)-(38) in the coordinates theta_G of the old structure.
-
-    The paper's own form, good where B is regular; it checks the projection that `connect` uses. State: not connected yet, bodies in place.
-    """
-    slot, nv = link_index(chain, name), chain.nv
-    kin = kinematics(chain, state.q)
-    before = constrained(chain, state.structure, state.q, state.v, kin, twists(chain, kin, state.v))
-    after = eqx.tree_at(lambda s: s.connected, state.structure, state.structure.connected.at[slot].set(True))
-    q = with_coordinates(chain, after.connected & ~state.structure.connected, joint_coordinates(chain, after, kin, state.q), state.q)
-    J = loop_jacobian(chain, after, kin, ends(chain, after, kin, q))[6 * slot : 6 * slot + 6]
-    own = np.array([d for d in chain.topology.links.dof[slot] if d < chain.dofs], int)
-    # J_1 - J_2 along theta_G, and the axes of the new joint, on the side where (27) has them
-    J_G, J_r = J[:, :nv] @ before.W[:nv], -J[:, own]
-    A = cho_factor(reduced_inertia(chain, before, inertia_by_composites(chain, kin)))
-    B_inverse = jnp.linalg.inv(J_G @ cho_solve(A, J_G.T))
-    C = J_r @ jnp.linalg.solve(J_r.T @ B_inverse @ J_r, J_r.T @ B_inverse) if len(own) else jnp.zeros_like(B_inverse)
-    u = J[:, :nv] @ state.v[:nv]
-    F = -B_inverse @ (jnp.eye(6, dtype=u.dtype) - C) @ u
-    v = state.v + before.W @ cho_solve(A, J_G.T @ F)
-    if len(own):
-        v = v.at[own].set(jnp.linalg.lstsq(J_r, J[:, :nv] @ v[:nv])[0])
-    return v, F

@@ -1,12 +1,12 @@
-"""F3: energy and momentum of the tree; virtual links have no mass."""
+"""Energy and momentum of the tree; virtual links have no mass."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from svkc.loops.constraint import active_dofs
-from svkc.model.chain import Chain, State
+from svkc.model.chain import Chain, State, active_dofs
 from svkc.model.checked_jit import verb
-from svkc.tree.kinematics import Kinematics, difference, kinematics, twists
+from svkc.tree.configuration import difference
+from svkc.tree.kinematics import Kinematics, kinematics, twists
 from svkc.tree.spatial import cross, rotate
 
 

@@ -1,14 +1,15 @@
-"""F3: recursive Newton-Euler on the tree, the joint-space inertia by unit vectors and by composite bodies, and the forces joints make by themselves."""
+"""Recursive Newton-Euler on the tree (Featherstone chapter 5), and the forces of springs, dampers and joint limits."""
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from svkc._jax.static_gather import take
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import verb
-from svkc.tree.kinematics import Kinematics, difference, down, kinematics, put, to_rows, twists, up, velocity_products
+from svkc.tree.configuration import difference
+from svkc.tree.kinematics import Kinematics, kinematics, twists, velocity_products
 from svkc.tree.spatial import cross, halves, rotate
+from svkc.tree.traversal import down, put, to_rows, up
 
 
 def newton_euler(chain: Chain, kin: Kinematics, V: Float[Array, "rows 6"] | None, A: Float[Array, "rows 6"]) -> Float[Array, " nv"]:
@@ -49,34 +50,6 @@ def inertia_times(chain: Chain, kin: Kinematics, x: Float[Array, " nv"]) -> Floa
     return tau if chain.armature is None else tau + chain.armature * x
 
 
-def inertia_by_unit_vectors(chain: Chain, kin: Kinematics) -> Float[Array, "nv nv"]:
-    """Column i is ID(q, 0, e_i) without gravity: the paper's way (section III-B, step 3)."""
-    return jax.vmap(lambda unit: inertia_times(chain, kin, unit), out_axes=1)(jnp.eye(chain.nv, dtype=kin.r.dtype))
-
-
-def central_inertias(chain: Chain, kin: Kinematics) -> tuple[Float[Array, "rows 3"], Float[Array, "rows 3 3"]]:
-    """Of each row: the centre of mass from the root's origin, and the inertia about it, in world axes."""
-    RI = jnp.sum(kin.R[:, :, :, None] * chain.rotational[:, None, :, :], 2)
-    return kin.r + rotate(kin.R, chain.com), jnp.sum(RI[:, :, None, :] * kin.R[:, None, :, :], -1)
-
-
-def inertia_by_composites(chain: Chain, kin: Kinematics) -> Float[Array, "nv nv"]:
-    """Composite rigid bodies (Featherstone section 6.2): mass, first moment and rotational inertia simply add up towards the root."""
-    top, (c, central) = chain.topology, central_inertias(chain, kin)
-    m = chain.mass[:, None]
-    square = jnp.sum(c * c, -1)[:, None, None] * jnp.eye(3, dtype=c.dtype)[None] - c[:, :, None] * c[:, None, :]
-    I = central + m[:, :, None] * square
-    total = take(up(top, jnp.concatenate([m, m * c, I.reshape(-1, 9)], -1)), top.dof_row)
-    m, h, I = total[:, :1], total[:, 1:4], total[:, 4:].reshape(-1, 3, 3)
-    w, u = halves(kin.S)
-    # momentum of everything a joint carries, for a unit of its velocity
-    F = jnp.concatenate([rotate(I, w) + cross(h, u), m * u + cross(w, h)], -1)
-    related = top.ancestor[top.dof_row][:, top.dof_row]
-    M = jnp.where(related, F @ kin.S.T, 0)
-    M = jnp.where(related.T & ~related, M.T, M)
-    return M if chain.armature is None else M + jnp.diag(chain.armature)
-
-
 def passive_forces(chain: Chain, q: Float[Array, " q"], v: Float[Array, " dofs"]) -> Float[Array, " dofs"]:
     """Springs and dampers of the model's joints (N m, N), MuJoCo's meaning: -stiffness (q - q_spring) - damping v."""
     tau = jnp.zeros_like(v)
@@ -104,12 +77,6 @@ def limit_forces(chain: Chain, q: Float[Array, " q"], v: Float[Array, " dofs"]) 
     out = jnp.maximum(x - upper, 0) - jnp.maximum(lower - x, 0)
     onset = jnp.where(out != 0, jnp.exp(-0.02 / jnp.where(out != 0, jnp.abs(out), 1)), 0)
     return put(tau, at_v, -(k[at_v] * out + c[at_v] * take(v, at_v)) * onset)
-
-
-@verb
-def mass_matrix(chain: Chain, state: State) -> Float[Array, "nv nv"]:
-    """Joint-space inertia of the tree (kg, kg m, kg m^2), armature included, by composite bodies (Featherstone section 6.2)."""
-    return inertia_by_composites(chain, kinematics(chain, state.q))
 
 
 @verb

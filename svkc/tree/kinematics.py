@@ -1,10 +1,7 @@
-"""F2: poses, twists and accelerations of the tree, and steps on its configuration.
+"""Poses, twists and accelerations of the tree.
 
-All vectors are in world axes about the origin of the tree's root body, so that twists and forces add up along the tree without transforms
-(Featherstone section 2.8 with X = 1) and keep their digits far from the world's origin.
+Joint kinds are few and known beforehand: all joints of one kind are one array, and a level of the tree is one operation.
 """
-
-import functools
 
 import equinox as eqx
 import jax
@@ -16,88 +13,8 @@ from svkc._jax.static_gather import take
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import verb
 from svkc.model.topology import BALL, FREE, HINGE, SLIDE, Topology
-from svkc.tree.spatial import cross, motion_cross, quat_about, quat_conjugate, quat_exp, quat_log, quat_matrix, quat_multiply, quat_normalize, quat_rate, rotate
-
-# deeper trees sum by doubling along the ancestors: compile time would grow with every level
-LEVELS_UNROLLED = 24
-# children's children and so on that a row may have side by side there; with more the table of ancestors is smaller
-WIDEST = 4
-
-
-def down(top: Topology, x: Float[Array, "rows *n"]) -> Float[Array, "rows *n"]:
-    """Sum of x over each row and its ancestors, level by level."""
-    if len(top.levels) > LEVELS_UNROLLED:
-        for above, _ in _doublings(top):
-            x = x + take(x, above)
-        return x
-    parent, levels = np.array(top.parent), [x[:1]]
-    for (start, _), (first, last) in zip(top.levels[:-1], top.levels[1:], strict=True):
-        levels.append(x[first:last] + take(levels[-1], parent[first:last] - start))
-    return jnp.concatenate(levels)
-
-
-def up(top: Topology, x: Float[Array, "rows *n"]) -> Float[Array, "rows *n"]:
-    """Sum of x over each row and its descendants, level by level."""
-    if len(top.levels) > LEVELS_UNROLLED:
-        if any(below.shape[1] > WIDEST for _, below in _doublings(top)):
-            return jnp.tensordot(jnp.asarray(top.ancestor.T, x.dtype), x, 1)
-        for _, below in _doublings(top):
-            x = x + jnp.sum(take(x, below), 1)
-        return x
-    levels, below = [], None
-    for level, (first, last) in reversed(list(enumerate(top.levels))):
-        below = x[first:last] if below is None else x[first:last] + from_children(top, level, below)
-        levels.append(below)
-    return jnp.concatenate(levels[::-1])
-
-
-@functools.cache
-def _doublings(top: Topology) -> list[tuple[np.ndarray, np.ndarray]]:
-    """For 1, 2, 4, ... generations: each row's ancestor so far up, and its descendants so far down; one past the last row where there is none."""
-    parent = np.array(top.parent)
-    none, above = len(parent), np.append(np.where(parent < 0, len(parent), parent), len(parent))
-    found = []
-    while np.any(above < none):
-        below = [np.flatnonzero(above[:-1] == i) for i in range(none)]
-        table = np.full((none, max(map(len, below))), none)
-        for row, own in zip(table, below, strict=True):
-            row[: len(own)] = own
-        # (as small as jax has them in both precisions: `articulated.levels`)
-        found.append((above[:-1].astype(np.int32), table.astype(np.int32)))
-        above = above[above]
-    return found
-
-
-def from_children(top: Topology, level: int, below: Float[Array, "below *n"]) -> Float[Array, "here *n"]:
-    """For each row of a level, the sum of its children's rows in the level below."""
-    (first, last), (lo, hi) = top.levels[level], top.levels[level + 1]
-    parent = np.array(top.parent)[lo:hi]
-    children = [np.flatnonzero(parent == i) for i in range(first, last)]
-    table = np.full((last - first, max(map(len, children))), hi - lo)
-    for i, c in enumerate(children):
-        table[i, : len(c)] = c
-    return jnp.sum(take(below, table), 1)
-
-
-def put(x: Float[Array, "rows *n"], rows: np.ndarray, values: Float[Array, "some *n"]) -> Float[Array, "rows *n"]:
-    """X with some of its rows replaced. (No scatter: XLA's CPU backend makes one kernel of a loop's whole body only where there is none.)"""
-    source = np.arange(len(x))
-    source[rows] = len(x) + np.arange(len(rows))
-    return take(jnp.concatenate([x, values]), source)
-
-
-def to_rows(top: Topology, x: Float[Array, "nv *n"]) -> Float[Array, "rows *n"]:
-    """Sum of x over the coordinates of each row's joint."""
-    parts, order = [], []
-    for kinds, size in (((HINGE, SLIDE), 1), ((BALL,), 3), ((FREE,), 6)):
-        rows = top.rows_of(*kinds)
-        if len(rows):
-            start = np.array(top.v_start)[rows]
-            parts.append(sum(take(x, start + k) for k in range(size)))
-            order.append(rows)
-    fixed = np.setdiff1d(np.arange(len(top.parent)), np.concatenate(order) if order else np.zeros(0, int))
-    parts.append(jnp.zeros((len(fixed), *x.shape[1:]), x.dtype))
-    return take(jnp.concatenate(parts), np.argsort(np.concatenate([*order, fixed])))
+from svkc.tree.spatial import cross, motion_cross, quat_about, quat_matrix, quat_multiply, quat_normalize, rotate
+from svkc.tree.traversal import LEVELS_UNROLLED, down, put, to_rows
 
 
 class Kinematics(eqx.Module):
@@ -216,46 +133,6 @@ def velocity_products(chain: Chain, kin: Kinematics, V: Float[Array, "rows 6"], 
 def bias_accelerations(chain: Chain, kin: Kinematics, V: Float[Array, "rows 6"], v: Float[Array, " dofs"]) -> Float[Array, "rows 6"]:
     """Spatial accelerations with vdot = 0 and no gravity."""
     return down(chain.topology, velocity_products(chain, kin, V, v))
-
-
-def rates(chain: Chain, q: Float[Array, " q"], v: Float[Array, " dofs"]) -> Float[Array, " q"]:
-    """Qdot for the velocities v: quaternions turn by qdot = q w / 2, everything else is its own rate."""
-    quat_q, quat_v = chain.topology.quaternions
-    scalar_q, scalar_v = chain.topology.scalars
-    turn = quat_rate(take(q, quat_q[:, None] + np.arange(4)), take(v, quat_v[:, None] + np.arange(3)))
-    order = np.argsort(np.concatenate([scalar_q, (quat_q[:, None] + np.arange(4)).ravel()]))
-    return take(jnp.concatenate([take(v, scalar_v), turn.ravel()]), order)
-
-
-@verb
-def integrate(chain: Chain, q: Float[Array, " q"], dv: Float[Array, " dofs"]) -> Float[Array, " q"]:
-    """Q moved by the tangent vector dv (m, rad; body axes for rotations): the exponential map, Rodrigues' formula (39)."""
-    quat_q, quat_v = chain.topology.quaternions
-    scalar_q, scalar_v = chain.topology.scalars
-    at = quat_q[:, None] + np.arange(4)
-    turned = quat_multiply(quat_normalize(take(q, at)), quat_exp(take(dv, quat_v[:, None] + np.arange(3))))
-    order = np.argsort(np.concatenate([scalar_q, at.ravel()]))
-    return take(jnp.concatenate([take(q, scalar_q) + take(dv, scalar_v), turned.ravel()]), order)
-
-
-@verb
-def difference(chain: Chain, q1: Float[Array, " q"], q2: Float[Array, " q"]) -> Float[Array, " dofs"]:
-    """The tangent vector (m, rad, in the coordinates of v) that takes q1 to q2: integrate(q1, difference(q1, q2)) = q2."""
-    quat_q, quat_v = chain.topology.quaternions
-    scalar_q, scalar_v = chain.topology.scalars
-    at = quat_q[:, None] + np.arange(4)
-    turn = quat_log(quat_multiply(quat_conjugate(quat_normalize(take(q1, at))), quat_normalize(take(q2, at))))
-    order = np.argsort(np.concatenate([scalar_v, (quat_v[:, None] + np.arange(3)).ravel()]))
-    return take(jnp.concatenate([take(q2, scalar_q) - take(q1, scalar_q), turn.ravel()]), order)
-
-
-def normalize(chain: Chain, q: Float[Array, " q"]) -> Float[Array, " q"]:
-    """Q with every quaternion of unit length."""
-    quat_q, _ = chain.topology.quaternions
-    if not len(quat_q):
-        return q
-    at = quat_q[:, None] + np.arange(4)
-    return put(q, at.ravel(), quat_normalize(take(q, at)).ravel())
 
 
 @verb

@@ -1,4 +1,4 @@
-"""F0: rotations, quaternions and 6-vectors, written once and broadcast over leading axes.
+"""Rotations, quaternions and 6-vectors, written once and broadcast over leading axes.
 
 Quaternions are wxyz and turn body vectors into world vectors. 6-vectors are angular first (Featherstone, Rigid Body Dynamics
 Algorithms, 2008, section 2).

@@ -1,4 +1,4 @@
-"""F7: moving pictures of a run by MuJoCo's offscreen renderer: gif by Pillow, mp4 by imageio-ffmpeg."""
+"""Moving pictures of a run by MuJoCo's offscreen renderer: gif by Pillow, mp4 by imageio-ffmpeg."""
 
 import pathlib
 import warnings

@@ -1,4 +1,4 @@
-"""F7: a run as one HTML page of its own: bodies in three dimensions, a timeline with its events, numbers beside it. Nothing is read from a network."""
+"""A run as one HTML page of its own: bodies in three dimensions, a timeline with its events, numbers beside it. Nothing is read from a network."""
 
 import base64
 import dataclasses
@@ -10,9 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from svkc.loops.constraint import active_dofs
-from svkc.loops.coordinates import largest_gaps
-from svkc.model.chain import Chain, State, Structure
+from svkc.loops.constraint import largest_gaps
+from svkc.model.chain import Chain, State, Structure, active_dofs
 from svkc.simulation.trajectory import Trajectory
 from svkc.tree.energy import energy
 from svkc.tree.kinematics import poses

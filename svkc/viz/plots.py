@@ -1,4 +1,4 @@
-"""F7: flat pictures of a run by matplotlib: a strobe, curves over time."""
+"""Flat pictures of a run by matplotlib: a strobe, curves over time."""
 
 import pathlib
 

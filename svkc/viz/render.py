@@ -1,4 +1,4 @@
-"""F7: pictures of a run. matplotlib, Pillow and mujoco's renderer are imported where they are used."""
+"""Pictures of a run. matplotlib, Pillow and mujoco's renderer are imported where they are used."""
 
 import os
 import pathlib

@@ -1,4 +1,4 @@
-"""F7: what every picture of a run shows: bodies where they are, thick lines for their shapes, what holds, what happened and when."""
+"""What every picture of a run shows: bodies where they are, thick lines for their shapes, what holds, what happened and when."""
 
 import jax
 import numpy as np

@@ -1,0 +1,91 @@
+"""Commands that look at models and saved runs."""
+
+import pathlib
+import webbrowser
+
+from svkc.cli.run import print_phases
+
+
+def info(path: str) -> int:
+    """What a model is to svkc."""
+    import svkc
+    from svkc._jax.compilation_cache import use_cache
+
+    kept = use_cache()
+    try:
+        chain = svkc.load(path)
+    except ValueError as error:
+        print(error)
+        if "not simulated" not in str(error):
+            return 1
+        chain = svkc.load(path, ignore="all")
+    state = chain.state() if not len(chain.link_names) else _state_or_none(chain)
+    print(f"{len(chain.body_names) - 1} bodies: {', '.join(chain.body_names[1:])}")
+    print(f"{len(chain.joint_names)} joints: {', '.join(chain.joint_names)}")
+    print(f"{len(chain.link_names)} virtual links: {', '.join(chain.link_names) or 'none'}")
+    print(f"{chain.nv} joint freedoms in the tree, {chain.dofs} with every virtual link; {chain.gear.shape[0]} actuators")
+    if state is not None:
+        print(f"as loaded:\n{svkc.mobility(chain, state)}")
+    for line in chain.left_out:
+        print(f"left out: {line}")
+    _suggest(chain)
+    print(f"compiled programs: {kept or 'not kept'} (SVKC_CACHE_DIR names another folder, or off)")
+    return 0
+
+
+def _state_or_none(chain):
+    try:
+        return chain.state()
+    except ValueError as error:
+        print(error)
+        return None
+
+
+def _suggest(chain):
+    """Joints that can be cut, and bodies at the ends of the tree, which could hold on to something."""
+    from svkc.mjcf.cuttable_joints import cuts_of
+
+    def cut(name):
+        try:
+            return bool(cuts_of(chain.model.model, [name]))
+        except ValueError:
+            return False
+
+    parents = {int(p) for p in chain.model.model.body_parentid[1:]}
+    ends = [name for i, name in enumerate(chain.body_names) if i and i not in parents]
+    print(f"joints that can be cut, load(..., cuttable=[...]): {', '.join(filter(cut, chain.joint_names)) or 'none'}")
+    print("ends of the tree, which could be held: " + ", ".join(ends[:12]) + ", ..." * (len(ends) > 12))
+    if ends:
+        print(f'  svkc.VirtualLink("grip", "world", "{ends[0]}", joint="ball"), or load(..., spare=1) and svkc.bind while it moves')
+
+
+def view(path: pathlib.Path, show: bool) -> int:
+    """A run that was saved with its chain: the table, the certificate, the curves and the page."""
+    import jax
+
+    # what was computed in float64 is read as such
+    jax.config.update("jax_enable_x64", True)
+    import svkc
+    from svkc._jax.compilation_cache import use_cache
+
+    use_cache()
+    try:
+        chain, traj = svkc.load_chain(path), svkc.load_trajectory(path)
+    except (ValueError, OSError) as error:
+        print(error)
+        return 1
+    print_phases(chain, traj)
+    written, missing = [], []
+    for target, how in (
+        (path.with_suffix(".html"), lambda p: svkc.render(chain, traj, p)),
+        (path.with_name(f"{path.stem}_curves.png"), lambda p: traj.plot(chain).savefig(p)),
+    ):
+        try:
+            how(target)
+            written.append(target)
+        except ImportError as error:
+            missing.append(f"{target.name} not drawn: {error}")
+    print("\n".join(missing) + "\n" * bool(missing) + "wrote " + ", ".join(map(str, written)))
+    if show:
+        webbrowser.open(written[0].resolve().as_uri())
+    return 0

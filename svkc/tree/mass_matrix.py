@@ -1,0 +1,57 @@
+"""The mass matrix: by composite bodies, by unit vectors."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from svkc._jax.static_gather import take
+from svkc.model.chain import Chain, State
+from svkc.model.checked_jit import verb
+from svkc.tree.inverse_dynamics import inertia_times
+from svkc.tree.kinematics import Kinematics, kinematics
+from svkc.tree.spatial import cross, halves, rotate, skew
+from svkc.tree.traversal import up
+
+
+def inertia_by_unit_vectors(chain: Chain, kin: Kinematics) -> Float[Array, "nv nv"]:
+    """Column i is ID(q, 0, e_i) without gravity: the paper's way (section III-B, step 3)."""
+    return jax.vmap(lambda unit: inertia_times(chain, kin, unit), out_axes=1)(jnp.eye(chain.nv, dtype=kin.r.dtype))
+
+
+def central_inertias(chain: Chain, kin: Kinematics) -> tuple[Float[Array, "rows 3"], Float[Array, "rows 3 3"]]:
+    """Of each row: the centre of mass from the root's origin, and the inertia about it, in world axes."""
+    RI = jnp.sum(kin.R[:, :, :, None] * chain.rotational[:, None, :, :], 2)
+    return kin.r + rotate(kin.R, chain.com), jnp.sum(RI[:, :, None, :] * kin.R[:, None, :, :], -1)
+
+
+def inertia_by_composites(chain: Chain, kin: Kinematics) -> Float[Array, "nv nv"]:
+    """Composite rigid bodies (Featherstone section 6.2): mass, first moment and rotational inertia simply add up towards the root."""
+    top, (c, central) = chain.topology, central_inertias(chain, kin)
+    m = chain.mass[:, None]
+    square = jnp.sum(c * c, -1)[:, None, None] * jnp.eye(3, dtype=c.dtype)[None] - c[:, :, None] * c[:, None, :]
+    I = central + m[:, :, None] * square
+    total = take(up(top, jnp.concatenate([m, m * c, I.reshape(-1, 9)], -1)), top.dof_row)
+    m, h, I = total[:, :1], total[:, 1:4], total[:, 4:].reshape(-1, 3, 3)
+    w, u = halves(kin.S)
+    # momentum of everything a joint carries, for a unit of its velocity
+    F = jnp.concatenate([rotate(I, w) + cross(h, u), m * u + cross(w, h)], -1)
+    related = top.ancestor[top.dof_row][:, top.dof_row]
+    M = jnp.where(related, F @ kin.S.T, 0)
+    M = jnp.where(related.T & ~related, M.T, M)
+    return M if chain.armature is None else M + jnp.diag(chain.armature)
+
+
+@verb
+def mass_matrix(chain: Chain, state: State) -> Float[Array, "nv nv"]:
+    """Joint-space inertia of the tree (kg, kg m, kg m^2), armature included, by composite bodies (Featherstone section 6.2)."""
+    return inertia_by_composites(chain, kinematics(chain, state.q))
+
+
+def body_inertias(chain: Chain, kin: Kinematics) -> Float[Array, "rows 6 6"]:
+    """Spatial inertia of each row in world axes about its root's origin (Featherstone (2.63))."""
+    (c, central), m = central_inertias(chain, kin), chain.mass[:, None, None]
+    cx = skew(c)
+    square = jnp.sum(cx[:, :, None, :] * cx[:, None, :, :], -1)
+    upper = jnp.concatenate([central + m * square, m * cx], -1)
+    lower = jnp.concatenate([-m * cx, m * jnp.eye(3, dtype=c.dtype)[None]], -1)
+    return jnp.concatenate([upper, lower], -2)

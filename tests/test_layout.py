@@ -1,0 +1,105 @@
+"""The layout: imports only go down, internals of JAX are touched in one package, files and functions are small."""
+
+import ast
+import functools
+import itertools
+import pathlib
+
+ROOT = pathlib.Path(__file__).parent.parent / "svkc"
+# a package may import from those to its left and from itself
+ORDER = "_jax model mjcf tree loops transitions integration simulation tools viz scenes cli".split()
+# methods that the contract puts on the nouns: they import upwards when they are called
+CONVENIENCE = {
+    ("model/chain", "state", "transitions/initial_state"),
+    ("model/chain", "to_mjcf", "mjcf/convert"),
+    ("simulation/trajectory", "save", "simulation/archive"),
+    ("simulation/trajectory", "plot", "viz/render"),
+}
+INTERNALS = ("jax.interpreters", "jax.extend", "jax._src", "equinox.internal", "jax.custom_batching")
+FILES = sorted(str(path.relative_to(ROOT).with_suffix("")) for path in ROOT.rglob("*.py") if path.parent != ROOT)
+
+
+@functools.cache
+def imports(file: str) -> list[tuple[str, str | None]]:
+    """What a file imports, late imports too: the full name, and the function about it."""
+    found = []
+
+    def visit(node, function):
+        if isinstance(node, ast.FunctionDef):
+            function = node.name
+        if isinstance(node, ast.Import):
+            found.extend((alias.name, function) for alias in node.names)
+        if isinstance(node, ast.ImportFrom):
+            found.extend((f"{node.module}.{alias.name}", function) for alias in node.names)
+        for child in ast.iter_child_nodes(node):
+            visit(child, function)
+
+    visit(ast.parse((ROOT / f"{file}.py").read_text()), None)
+    return found
+
+
+def targets(file: str) -> set[tuple[str, str | None]]:
+    """The files of svkc that a file imports from."""
+    found = set()
+    for name, function in imports(file):
+        parts = name.split(".")[1:] if name.startswith("svkc.") else []
+        for end in range(len(parts), 0, -1):
+            candidate = "/".join(parts[:end])
+            if candidate in FILES or f"{candidate}/__init__" in FILES:
+                found.add((candidate if candidate in FILES else f"{candidate}/__init__", function))
+                break
+    return found
+
+
+def package(file: str) -> str:
+    return file.split("/")[0]
+
+
+def test_imports_only_go_down():
+    for file in FILES:
+        for target, function in targets(file):
+            if (file, function, target) not in CONVENIENCE:
+                assert ORDER.index(package(target)) <= ORDER.index(package(file)), f"{file} imports {target}, which is above it"
+
+
+def test_every_exception_is_one():
+    """A method that no longer imports upwards is taken off the list."""
+    for file, function, target in CONVENIENCE:
+        assert (target, function) in targets(file)
+
+
+def test_no_file_imports_itself_by_way_of_others():
+    below = {file: {t for t, function in targets(file) if (file, function, t) not in CONVENIENCE} for file in FILES}
+    while free := {file for file, needed in below.items() if not needed}:
+        below = {file: needed - free for file, needed in below.items() if file not in free}
+    assert not below, f"in a cycle of imports: {sorted(below)}"
+
+
+def test_each_package_keeps_to_its_subject():
+    """JAX's internals stay in `_jax`, MuJoCo in what reads, writes and draws its models, and no package is a way into another."""
+    for file in FILES:
+        names, room = [name for name, _ in imports(file)], package(file)
+        if room != "_jax":
+            assert not [name for name, inside in itertools.product(names, INTERNALS) if name.startswith(inside)], file
+        if room in ("_jax", "model", "tree", "loops", "transitions", "integration", "simulation", "tools"):
+            assert not [name for name in names if name.split(".")[0] == "mujoco"], file
+        if room in ("tree", "loops", "transitions", "integration"):
+            assert not [target for target, _ in targets(file) if package(target) == "mjcf"], file
+        if file.endswith("__init__") and room != "scenes":
+            assert not names, file
+
+
+def test_packages_are_about_a_dozen():
+    assert {package(file) for file in FILES} == set(ORDER)
+    for name in ORDER:
+        assert sum(package(file) == name for file in FILES) > 2, name
+
+
+def test_files_and_functions_are_small():
+    for path in ROOT.rglob("*.py"):
+        text = path.read_text()
+        assert text.count("\n") <= 300, path
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.FunctionDef):
+                lines = node.end_lineno - node.lineno + 1 - len((ast.get_docstring(node) or "").splitlines())
+                assert lines <= 60, f"{path}: {node.name}"
