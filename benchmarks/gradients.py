@@ -1,9 +1,13 @@
-"""What derivatives cost: time and memory of a whole run, its gradient and its directional derivative, and the compilation of each.
+"""What derivatives cost: time and memory of a whole run, its gradient and its directional
+derivative, and the compilation of each.
 
-High bar: 1.8 s with both releases, 198 parameters (masses, centres of mass, velocity, release times, torques). Open chain: the same figure in free
-fall, alone and 64 by `vmap`, 200 steps of the classical Runge-Kutta method of 2 ms, 198 parameters (velocity, torques), beside MJX's gradient of the same
-steps and central differences with MuJoCo, both of which hold the torque of a step's middle; all three gradients are compared. `python
-benchmarks/gradients.py` prints and writes results/gradients.csv; needs the extra `bench`. float64. Medians; runs that are compared take turns."""
+High bar: 1.8 s with both releases, 198 parameters (masses, centres of mass, velocity, release
+times, torques). Open chain: the same figure in free
+fall, alone and 64 by `vmap`, 200 steps of the classical Runge-Kutta method of 2 ms, 198 parameters
+(velocity, torques), beside MJX's gradient of the same steps and central differences with MuJoCo,
+both of which hold the torque of a step's middle; all three gradients are compared. `python
+benchmarks/gradients.py` prints and writes results/gradients.csv; needs the extra `bench`. float64.
+Medians; runs that are compared take turns."""
 
 import csv
 import os
@@ -51,22 +55,55 @@ def whole_run(**how):
     ts = jnp.linspace(0, 1.8, 73)
 
     def loss(p):
-        floats = (chain.mass * p["mass"], chain.inertia * p["mass"][:, None, None], chain.com * p["com"])
+        floats = (
+            chain.mass * p["mass"],
+            chain.inertia * p["mass"][:, None, None],
+            chain.com * p["com"],
+        )
         c = eqx.tree_at(lambda c: (c.mass, c.inertia, c.com), chain, floats)
         start = svkc.State(state.q, state.v + p["v"], state.structure)
-        events = (svkc.at(p["times"][0], cut="right_hand_grip"), svkc.at(p["times"][1], cut="left_hand_grip"))
-        control = lambda t, s, a: jnp.pad(a @ jnp.sin(jnp.arange(1.0, 7.0) * t), (6, chain.dofs - 22))
-        traj = svkc.simulate(c, start, 1.8, ts=ts, events=events, rtol=1e-8, atol=1e-10, control=control, args=p["torque"], throw=False, **how)
+        events = (
+            svkc.at(p["times"][0], cut="right_hand_grip"),
+            svkc.at(p["times"][1], cut="left_hand_grip"),
+        )
+        control = lambda t, s, a: jnp.pad(
+            a @ jnp.sin(jnp.arange(1.0, 7.0) * t), (6, chain.dofs - 22)
+        )
+        traj = svkc.simulate(
+            c,
+            start,
+            1.8,
+            ts=ts,
+            events=events,
+            rtol=1e-8,
+            atol=1e-10,
+            control=control,
+            args=p["torque"],
+            throw=False,
+            **how,
+        )
         return jnp.sum(traj.final.q[:3]) + 0.1 * jnp.sum(traj.states.q[40])
 
     bodies = chain.mass.shape[0]
-    p = {"mass": jnp.ones(bodies), "com": jnp.ones((bodies, 3)), "v": jnp.zeros(chain.dofs), "times": jnp.array([0.9, 1.15])}
+    p = {
+        "mass": jnp.ones(bodies),
+        "com": jnp.ones((bodies, 3)),
+        "v": jnp.zeros(chain.dofs),
+        "times": jnp.array([0.9, 1.15]),
+    }
     return loss, p | {"torque": jnp.full((16, 6), 5.0)}
 
 
 def torques(coefficients, t, pad):
     """Of the joints, at a time: sines of eleven frequencies."""
-    return pad(coefficients @ np.sin(np.arange(1, 12) * t) if isinstance(t, float) else coefficients @ jnp.sin(jnp.arange(1, 12) * t), (6, 0))
+    return pad(
+        (
+            coefficients @ np.sin(np.arange(1, 12) * t)
+            if isinstance(t, float)
+            else coefficients @ jnp.sin(jnp.arange(1, 12) * t)
+        ),
+        (6, 0),
+    )
 
 
 def falling_spec():
@@ -74,7 +111,9 @@ def falling_spec():
     spec = mujoco.MjSpec.from_file(str(FOLDER / "figure16.xml"))
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
     spec.option.timestep = DT
-    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT
+    spec.option.disableflags |= (
+        mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT
+    )
     return spec
 
 
@@ -86,7 +125,17 @@ def falling():
     def loss(p):
         control = lambda t, s, a: torques(a, t, jnp.pad)
         start = svkc.State(state.q, p["v"], state.structure)
-        traj = svkc.simulate(chain, start, STEPS * DT, dt=DT, control=control, args=p["torque"], solver=ClassicalRungeKutta(), max_steps=STEPS + 2, throw=False)
+        traj = svkc.simulate(
+            chain,
+            start,
+            STEPS * DT,
+            dt=DT,
+            control=control,
+            args=p["torque"],
+            solver=ClassicalRungeKutta(),
+            max_steps=STEPS + 2,
+            throw=False,
+        )
         return jnp.sum(traj.final.q[:7])
 
     return loss, {"v": jnp.zeros(22), "torque": jnp.ones((16, 11))}
@@ -101,7 +150,12 @@ def falling_by_mjx():
 
     def loss(p):
         def step(data, i):
-            return mjx.step(model, data.replace(qfrc_applied=torques(p["torque"], (i + 0.5) * DT, jnp.pad))), None
+            return (
+                mjx.step(
+                    model, data.replace(qfrc_applied=torques(p["torque"], (i + 0.5) * DT, jnp.pad))
+                ),
+                None,
+            )
 
         return jnp.sum(jax.lax.scan(step, data.replace(qvel=p["v"]), jnp.arange(STEPS))[0].qpos[:7])
 
@@ -130,12 +184,18 @@ def falling_by_mujoco():
 
 
 def compiled(function, p):
-    """The program, and seconds of tracing with lowering and of compilation, and its temporary memory (MB)."""
+    """The program, and seconds of tracing with lowering and of compilation, and its temporary
+    memory (MB)."""
     begun = time.perf_counter()
     lowered = jax.jit(function).lower(p)
     middle = time.perf_counter()
     program = lowered.compile()
-    return program, middle - begun, time.perf_counter() - middle, program.memory_analysis().temp_size_in_bytes / 1e6
+    return (
+        program,
+        middle - begun,
+        time.perf_counter() - middle,
+        program.memory_analysis().temp_size_in_bytes / 1e6,
+    )
 
 
 def timed(programs, p, runs=RUNS):
@@ -152,16 +212,36 @@ def timed(programs, p, runs=RUNS):
 def measured(case, loss, p, peers=()):
     """Rows of one case: forward, reverse, forward mode; then those of its peers."""
     along = jax.tree.map(jnp.ones_like, p)
-    kinds = {"run": loss, "gradient": jax.value_and_grad(loss), "directional": lambda p: jax.jvp(loss, (p,), (along,))}
+    kinds = {
+        "run": loss,
+        "gradient": jax.value_and_grad(loss),
+        "directional": lambda p: jax.jvp(loss, (p,), (along,)),
+    }
     made = {("svkc", kind): compiled(f, p) for kind, f in kinds.items()}
     for peer, its in peers:
-        made |= {(peer, kind): compiled(f, p) for kind, f in (("run", its), ("gradient", jax.value_and_grad(its)))}
+        made |= {
+            (peer, kind): compiled(f, p)
+            for kind, f in (("run", its), ("gradient", jax.value_and_grad(its)))
+        }
     seconds = timed({name: program for name, (program, *_) in made.items()}, p)
     rows = []
     for (who, kind), (_, traced, compile_time, memory) in made.items():
         ratio = seconds[who, kind] / seconds[who, "run"]
-        rows.append([case, who, kind, f"{1e3 * seconds[who, kind]:.1f}", f"{ratio:.2f}", f"{traced:.1f}", f"{compile_time:.1f}", f"{memory:.1f}"])
-    return rows, {who: program(p)[1] for (who, kind), (program, *_) in made.items() if kind == "gradient"}
+        rows.append(
+            [
+                case,
+                who,
+                kind,
+                f"{1e3 * seconds[who, kind]:.1f}",
+                f"{ratio:.2f}",
+                f"{traced:.1f}",
+                f"{compile_time:.1f}",
+                f"{memory:.1f}",
+            ]
+        )
+    return rows, {
+        who: program(p)[1] for (who, kind), (program, *_) in made.items() if kind == "gradient"
+    }
 
 
 def flat(gradient):
@@ -184,21 +264,55 @@ def main():
         peers = []
         print(f"no MJX: {missing}; pip install 'svkc[bench]'")
     more, gradients = measured(f"open chain, {count} parameters", loss, p, peers)
-    many = jax.tree.map(lambda x: x + 0.01 * jax.random.normal(jax.random.key(0), (LANES, *x.shape)), p)
-    more += measured(f"open chain, {LANES} lanes", lambda many: jnp.sum(jax.vmap(loss)(many)), many)[0]
+    many = jax.tree.map(
+        lambda x: x + 0.01 * jax.random.normal(jax.random.key(0), (LANES, *x.shape)), p
+    )
+    more += measured(
+        f"open chain, {LANES} lanes", lambda many: jnp.sum(jax.vmap(loss)(many)), many
+    )[0]
     value, by_differences = falling_by_mujoco()
     once = timed({"run": lambda p: value(p)}, p)["run"]
     whole = timed({"gradient": lambda p: by_differences(p)}, p, runs=1)["gradient"]
     gradients = {who: flat(g) for who, g in gradients.items()} | {"MuJoCo": by_differences(p)}
     for kind, seconds in (("run", once), ("gradient", whole)):
-        more.append([f"open chain, {count} parameters", "MuJoCo, differences", kind, f"{1e3 * seconds:.1f}", f"{seconds / once:.2f}", "", "", ""])
-    head = ["case", "by", "what", "ms", "times its run", "trace and lower s", "compile s", "temporary MB"]
+        more.append(
+            [
+                f"open chain, {count} parameters",
+                "MuJoCo, differences",
+                kind,
+                f"{1e3 * seconds:.1f}",
+                f"{seconds / once:.2f}",
+                "",
+                "",
+                "",
+            ]
+        )
+    head = [
+        "case",
+        "by",
+        "what",
+        "ms",
+        "times its run",
+        "trace and lower s",
+        "compile s",
+        "temporary MB",
+    ]
     for row in (head, *rows, *more):
-        print("  ".join(cell.ljust(width) for cell, width in zip(row, (28, 20, 12, 10, 14, 18, 10, 12))))
+        print(
+            "  ".join(
+                cell.ljust(width) for cell, width in zip(row, (28, 20, 12, 10, 14, 18, 10, 12))
+            )
+        )
     for who, g in gradients.items():
         if who != "svkc":
-            print(f"gradient of the open chain: {who} differs from svkc by {np.abs(g - gradients['svkc']).max() / np.abs(g).max():.1e} of the largest entry")
-    versions = f"jax {jax.__version__}, mujoco {mujoco.__version__}, Python {platform.python_version()}, {os.cpu_count()} cores {platform.machine()}"
+            print(
+                f"gradient of the open chain: {who} differs from svkc by"
+                f" {np.abs(g - gradients['svkc']).max() / np.abs(g).max():.1e} of the largest entry"
+            )
+    versions = (
+        f"jax {jax.__version__}, mujoco {mujoco.__version__}, Python {platform.python_version()},"
+        f" {os.cpu_count()} cores {platform.machine()}"
+    )
     print(versions)
     RESULTS.parent.mkdir(exist_ok=True)
     with RESULTS.open("w", newline="") as file:

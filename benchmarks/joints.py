@@ -1,6 +1,8 @@
-"""Section VI of the paper, joints of several freedoms mean fewer links and less computation, measured on the 40-freedom figure of its Fig. 16.
+"""Section VI of the paper, joints of several freedoms mean fewer links and less computation,
+measured on the 40-freedom figure of its Fig. 16.
 
-As 12 balls and 4 hinges, and as 40 hinges. `python benchmarks/joints.py` prints and writes results/joints.csv. The figures take turns, so that
+As 12 balls and 4 hinges, and as 40 hinges. `python benchmarks/joints.py` prints and writes
+results/joints.csv. The figures take turns, so that
 a busy machine slows both. Times of a batch are those of all its lanes together."""
 
 import csv
@@ -25,7 +27,8 @@ DT, STEPS, BATCH, COMPILES, RUNS = 1e-3, 300, 64, 7, 5
 
 
 def hinges_for_balls() -> tuple[mujoco.MjSpec, list[str]]:
-    """The figure with three hinges about x, y, z where it has a ball, and the names of the balls."""
+    """The figure with three hinges about x, y, z where it has a ball, and the names of the
+    balls."""
     spec = mujoco.MjSpec.from_file(str(FIGURE))
     balls = [joint.name for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_BALL]
     for name in balls:
@@ -38,27 +41,48 @@ def hinges_for_balls() -> tuple[mujoco.MjSpec, list[str]]:
 
 def as_ball(angles, rates):
     """Quaternion and angular velocity (body axes) of hinges about x, y, z."""
-    quat, rate = jax.jvp(lambda turns: functools.reduce(quat_multiply, quat_about(jnp.eye(3), turns)), (angles,), (rates,))
+    quat, rate = jax.jvp(
+        lambda turns: functools.reduce(quat_multiply, quat_about(jnp.eye(3), turns)),
+        (angles,),
+        (rates,),
+    )
     return quat, 2 * quat_multiply(quat_conjugate(quat), rate)[1:]
 
 
 def same_motion(chains, balls, rng):
-    """One state in the coordinates of both figures: turns of at most 0.5 rad about each axis, far from where three hinges lock."""
+    """One state in the coordinates of both figures: turns of at most 0.5 rad about each axis, far
+    from where three hinges lock."""
     angles, rates = rng.uniform(-0.5, 0.5, (len(balls), 3)), rng.uniform(-1, 1, (len(balls), 3))
     quats, spins = jax.vmap(as_ball)(angles, rates)
-    bends, names = ["right_elbow", "left_elbow", "right_knee", "left_knee"], [f"{name}_{letter}" for name in balls for letter in "xyz"]
-    q, v = dict(zip(bends, rng.uniform(0.5, 1, 4))), {"base": rng.uniform(-1, 1, 6)} | dict(zip(bends, rng.uniform(-1, 1, 4)))
+    bends, names = (
+        ["right_elbow", "left_elbow", "right_knee", "left_knee"],
+        [f"{name}_{letter}" for name in balls for letter in "xyz"],
+    )
+    q, v = (
+        dict(zip(bends, rng.uniform(0.5, 1, 4))),
+        {"base": rng.uniform(-1, 1, 6)} | dict(zip(bends, rng.uniform(-1, 1, 4))),
+    )
     with_balls = chains["balls"].state(q | dict(zip(balls, quats)), v | dict(zip(balls, spins)))
-    return with_balls, chains["hinges"].state(q | dict(zip(names, angles.ravel())), v | dict(zip(names, rates.ravel())))
+    return with_balls, chains["hinges"].state(
+        q | dict(zip(names, angles.ravel())), v | dict(zip(names, rates.ravel()))
+    )
 
 
 def motion_difference(chains, states) -> str:
     """The largest distance and angle between the bodies of the two figures in half a second."""
     fine = {"rtol": 1e-10, "atol": 1e-12} if jax.config.jax_enable_x64 else {}
-    runs = [svkc.simulate(chain, s, 0.5, ts=jnp.linspace(0, 0.5, 11), **fine).states for chain, s in zip(chains.values(), states)]
-    (x, a), (y, b) = (jax.vmap(svkc.poses, (None, 0))(chain, run) for chain, run in zip(chains.values(), runs))
+    runs = [
+        svkc.simulate(chain, s, 0.5, ts=jnp.linspace(0, 0.5, 11), **fine).states
+        for chain, s in zip(chains.values(), states)
+    ]
+    (x, a), (y, b) = (
+        jax.vmap(svkc.poses, (None, 0))(chain, run) for chain, run in zip(chains.values(), runs)
+    )
     turn = 2 * jnp.linalg.norm(quat_multiply(quat_conjugate(a), b)[..., 1:], axis=-1)
-    return f"the motions differ by {float(jnp.max(jnp.linalg.norm(x - y, axis=-1))):.1e} m, {float(jnp.max(turn)):.1e} rad in 0.5 s"
+    return (
+        f"the motions differ by {float(jnp.max(jnp.linalg.norm(x - y, axis=-1))):.1e} m,"
+        f" {float(jnp.max(turn)):.1e} rad in 0.5 s"
+    )
 
 
 def forward(chain, s):
@@ -69,11 +93,14 @@ def forward(chain, s):
 
 def inverse(chain, s):
     """A step at constant velocity, and the torques at some acceleration."""
-    return svkc.State(svkc.integrate(chain, s.q, DT * s.v), s.v, s.structure), svkc.inverse_dynamics(chain, s, s.v)
+    return svkc.State(
+        svkc.integrate(chain, s.q, DT * s.v), s.v, s.structure
+    ), svkc.inverse_dynamics(chain, s, s.v)
 
 
 def measure(task, chains, states) -> dict[str, dict[str, list]]:
-    """Seconds to trace and compile and microseconds a step: {unit: {figure: [repetitions]}}. A program's first run is a warm-up."""
+    """Seconds to trace and compile and microseconds a step: {unit: {figure: [repetitions]}}. A
+    program's first run is a warm-up."""
     times = {unit: {name: [] for name in chains} for unit in ("s to compile", "us a step")}
     for _, (name, chain) in itertools.product(range(COMPILES), chains.items()):
         jax.clear_caches()
@@ -90,30 +117,75 @@ def measure(task, chains, states) -> dict[str, dict[str, list]]:
 
 
 def compare(dtype: str):
-    """Rows of the table: what is measured; median, least and most of each figure; the ratio of the medians."""
+    """Rows of the table: what is measured; median, least and most of each figure; the ratio of the
+    medians."""
     spec, balls = hinges_for_balls()
-    chains, rng = {"balls": svkc.load(str(FIGURE)), "hinges": svkc.load(spec)}, np.random.default_rng(0)
+    chains, rng = (
+        {"balls": svkc.load(str(FIGURE)), "hinges": svkc.load(spec)},
+        np.random.default_rng(0),
+    )
     lanes = [same_motion(chains, balls, rng) for _ in range(BATCH)]
-    print(dtype, [f"{len(chain.topology.parent) - 1} links with {name}" for name, chain in chains.items()], motion_difference(chains, lanes[0]), flush=True)
-    many = {name: jax.tree.map(lambda *x: jnp.stack(x), *column) for name, column in zip(chains, zip(*lanes))}
+    print(
+        dtype,
+        [f"{len(chain.topology.parent) - 1} links with {name}" for name, chain in chains.items()],
+        motion_difference(chains, lanes[0]),
+        flush=True,
+    )
+    many = {
+        name: jax.tree.map(lambda *x: jnp.stack(x), *column)
+        for name, column in zip(chains, zip(*lanes))
+    }
     for step, batch in itertools.product((forward, inverse), (1, BATCH)):
-        task = lambda chain, s, step=step: jax.lax.scan(lambda s, _: step(chain, s), s, None, length=STEPS)
-        task, states = (task, dict(zip(chains, lanes[0]))) if batch == 1 else (jax.vmap(task, (None, 0)), many)
+        task = lambda chain, s, step=step: jax.lax.scan(
+            lambda s, _: step(chain, s), s, None, length=STEPS
+        )
+        task, states = (
+            (task, dict(zip(chains, lanes[0]))) if batch == 1 else (jax.vmap(task, (None, 0)), many)
+        )
         for unit, times in measure(task, chains, states).items():
             numbers = [f(times[name]) for name in chains for f in (np.median, min, max)]
-            yield [dtype, f"{step.__name__} dynamics", batch, unit, *(f"{x:.4g}" for x in numbers), f"{numbers[3] / numbers[0]:.3f}"]
+            yield [
+                dtype,
+                f"{step.__name__} dynamics",
+                batch,
+                unit,
+                *(f"{x:.4g}" for x in numbers),
+                f"{numbers[3] / numbers[0]:.3f}",
+            ]
 
 
 if __name__ == "__main__":
-    cpu = [line.split(":")[1].strip() for line in open("/proc/cpuinfo") if line.startswith("model name")]
-    machine = {"python": platform.python_version(), "jax": jax.__version__, "svkc": svkc.__version__, "numpy": np.__version__}
+    cpu = [
+        line.split(":")[1].strip()
+        for line in open("/proc/cpuinfo")
+        if line.startswith("model name")
+    ]
+    machine = {
+        "python": platform.python_version(),
+        "jax": jax.__version__,
+        "svkc": svkc.__version__,
+        "numpy": np.__version__,
+    }
     machine |= {"backend": jax.default_backend(), "processor": cpu[0], "cores": os.cpu_count()}
     with RESULTS.open("w", newline="") as file:
         table = csv.writer(file, lineterminator="\n")
-        table.writerow(["dtype", "task", "batch", "unit", *(f"{n} {x}" for n in ("balls", "hinges") for x in ("median", "min", "max")), "ratio", *machine])
+        table.writerow(
+            [
+                "dtype",
+                "task",
+                "batch",
+                "unit",
+                *(f"{n} {x}" for n in ("balls", "hinges") for x in ("median", "min", "max")),
+                "ratio",
+                *machine,
+            ]
+        )
         for dtype in ("float64", "float32"):
             jax.config.update("jax_enable_x64", dtype == "float64")
             for row in compare(dtype):
                 table.writerow([*row, *machine.values()])
-                print("{} {} {:>2} {:12}: balls {:>6} ({} to {}), hinges {:>6} ({} to {}), ratio {}".format(*row), flush=True)
+                line = (
+                    "{} {} {:>2} {:12}: balls {:>6} ({} to {}), hinges {:>6} ({} to {}), ratio {}"
+                )
+                print(line.format(*row), flush=True)
     print(machine)

@@ -1,4 +1,5 @@
-"""A Runge-Kutta-Munthe-Kaas method, to compare with: any solver of diffrax, in a rotation vector from the start of each step.
+"""A Runge-Kutta-Munthe-Kaas method, to compare with: any solver of diffrax, in a rotation vector
+from the start of each step.
 
 What svkc does instead: quaternions as four numbers, put back to unit length after every step.
 """
@@ -14,14 +15,19 @@ from svkc.tree.configuration import integrate, rates
 
 
 def turned(chain, u, v):
-    """The rate of u where q = q0 exp(u) moves with v: the inverse of the exponential's derivative, on every ball and free joint."""
+    """The rate of u where q = q0 exp(u) moves with v: the inverse of the exponential's derivative,
+    on every ball and free joint."""
     at = chain.topology.quaternions[1][:, None] + np.arange(3)
     x, w = u[at], v[at]
     square = jnp.sum(x * x, -1, keepdims=True)
     small = square < 1e-4
     safe = jnp.where(small, 1, square)
     angle = jnp.sqrt(safe)
-    second = jnp.where(small, 1 / 12 + square / 720 + square**2 / 30240, 1 / safe - 1 / (2 * angle * jnp.tan(angle / 2)))
+    second = jnp.where(
+        small,
+        1 / 12 + square / 720 + square**2 / 30240,
+        1 / safe - 1 / (2 * angle * jnp.tan(angle / 2)),
+    )
     once = jnp.cross(x, w)
     return v.at[at].set(w + once / 2 + second * jnp.cross(x, once))
 

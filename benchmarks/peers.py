@@ -1,6 +1,8 @@
-"""Those that benchmarks/speed.py compares svkc with: MuJoCo and Pinocchio, called from here; MJX and JaxSim, each in a process and on a core of its own.
+"""Those that benchmarks/speed.py compares svkc with: MuJoCo and Pinocchio, called from here; MJX
+and JaxSim, each in a process and on a core of its own.
 
-Run as a program it is such a process: it compiles, says what that took, and runs once for every line it reads."""
+Run as a program it is such a process: it compiles, says what that took, and runs once for every
+line it reads."""
 
 import json
 import os
@@ -27,7 +29,8 @@ FLAGS, PATIENCE = os.environ.get("XLA_FLAGS", ""), 60
 
 
 def by_mujoco(model, q, v, batch: int, steps: int):
-    """`mj_step` on one core; `rollout` on all. Both leave their end where the next call begins anew."""
+    """`mj_step` on one core; `rollout` on all. Both leave their end where the next call begins
+    anew."""
     data = mujoco.MjData(model)
     if batch == 1:
 
@@ -44,19 +47,30 @@ def by_mujoco(model, q, v, batch: int, steps: int):
         data.qpos[:], data.qvel[:] = q, v[lane]
         mujoco.mj_getState(model, data, start[lane], kind)
     threads = os.cpu_count()
-    pool, workers = mujoco.rollout.Rollout(nthread=threads), [mujoco.MjData(model) for _ in range(threads)]
-    yield "MuJoCo rollout, all cores", lambda: pool.rollout([model] * batch, workers, start, nstep=steps)
+    pool, workers = (
+        mujoco.rollout.Rollout(nthread=threads),
+        [mujoco.MjData(model) for _ in range(threads)],
+    )
+    yield (
+        "MuJoCo rollout, all cores",
+        lambda: pool.rollout([model] * batch, workers, start, nstep=steps),
+    )
 
 
 def by_pinocchio(name: str, chain, state, batch: int, steps: int):
-    """Accelerations alone, called from Python one after another on one core: articulated bodies of an open chain; with grips `constraintDynamics`, a ball as
-    one point held to another, a hinge as two. Its accelerations are svkc's: asserted."""
+    """Accelerations alone, called from Python one after another on one core: articulated bodies of
+    an open chain; with grips `constraintDynamics`, a ball as one point held to another, a hinge as
+    two. Its accelerations are svkc's: asserted."""
     import pinocchio
 
     model = pinocchio.buildModelFromMJCF(figures.path(name))
     data, calls = model.createData(), steps * batch
     still = svkc.State(state.q, jnp.zeros_like(state.v), state.structure)
-    q, v, force = np.asarray(svkc.xyzw(chain, state.q))[: chain.nq], np.zeros(chain.nv), np.zeros(chain.nv)
+    q, v, force = (
+        np.asarray(svkc.xyzw(chain, state.q))[: chain.nq],
+        np.zeros(chain.nv),
+        np.zeros(chain.nv),
+    )
     held, given = pinocchio.StdVec_RigidConstraintModel(), pinocchio.StdVec_RigidConstraintData()
     for made in _points(pinocchio, model, chain, state.structure, two="ball" not in name):
         held.append(made)
@@ -66,32 +80,58 @@ def by_pinocchio(name: str, chain, state, batch: int, steps: int):
     else:
         pinocchio.initConstraintDynamics(model, data, held, given)
         proximal = pinocchio.ProximalSettings(1e-10, 1e-8, 10)
-        who, run = "Pinocchio, constraintDynamics alone", lambda: pinocchio.constraintDynamics(model, data, q, v, force, held, given, proximal)
+        who, run = (
+            "Pinocchio, constraintDynamics alone",
+            lambda: pinocchio.constraintDynamics(model, data, q, v, force, held, given, proximal),
+        )
     ours = np.asarray(svkc.forward_dynamics(chain, still, jnp.zeros(chain.nv)))[6 : chain.nv]
     # (the base's own are in other axes)
-    assert np.max(np.abs(ours - run()[6:])) < (1e-8 if ours.dtype == np.float64 else 0.1), "Pinocchio's accelerations are not svkc's"
+    assert np.max(np.abs(ours - run()[6:])) < (1e-8 if ours.dtype == np.float64 else 0.1), (
+        "Pinocchio's accelerations are not svkc's"
+    )
     yield who, lambda: [run() for _ in range(calls)]
 
 
 def _points(pinocchio, model, chain, structure, two: bool):
-    """What holds the figure: for each link that is connected a point of the body at one of the ground, or two, along the joint's axis."""
-    frame = lambda quat, pos: pinocchio.SE3(pinocchio.Quaternion(*map(float, quat)).matrix(), np.asarray(pos, float))
+    """What holds the figure: for each link that is connected a point of the body at one of the
+    ground, or two, along the joint's axis."""
+    frame = lambda quat, pos: pinocchio.SE3(
+        pinocchio.Quaternion(*map(float, quat)).matrix(), np.asarray(pos, float)
+    )
     names = {row: name for row, name in zip(chain.topology.body_row, chain.body_names, strict=True)}
     for k in np.flatnonzero(np.asarray(structure.connected)):
         body = model.frames[model.getFrameId(names[int(structure.real[k])])]
-        here, there = frame(structure.real_quat[k], structure.real_pos[k]), frame(structure.quat[k], structure.pos[k])
+        here, there = (
+            frame(structure.real_quat[k], structure.real_pos[k]),
+            frame(structure.quat[k], structure.pos[k]),
+        )
         for along in (0.0, 1.0) if two else (0.0,):
             off = pinocchio.SE3(np.eye(3), np.array([0, 0, along]))
             one, other = (body.parentJoint, body.placement * here * off), (0, there * off)
-            yield pinocchio.RigidConstraintModel(pinocchio.ContactType.CONTACT_3D, model, *one, *other, pinocchio.ReferenceFrame.LOCAL)
+            yield pinocchio.RigidConstraintModel(
+                pinocchio.ContactType.CONTACT_3D,
+                model,
+                *one,
+                *other,
+                pinocchio.ReferenceFrame.LOCAL,
+            )
 
 
 class Process:
     """A peer that is compiled as XLA does by itself, on a core of its own."""
 
     def __init__(self, kind: str, name: str, dtype: str, batch: int, steps: int):
-        env, case = os.environ | {"XLA_FLAGS": FLAGS, "JAX_ENABLE_X64": str(int(dtype == "float64"))}, (kind, name, dtype, str(batch), str(steps))
-        self.process = subprocess.Popen([sys.executable, __file__, *case], env=env, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        env, case = (
+            os.environ | {"XLA_FLAGS": FLAGS, "JAX_ENABLE_X64": str(int(dtype == "float64"))},
+            (kind, name, dtype, str(batch), str(steps)),
+        )
+        self.process = subprocess.Popen(
+            [sys.executable, __file__, *case],
+            env=env,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
         answer = json.loads(self.process.stdout.readline())
         if "missing" in answer:
             self.process.wait()
@@ -122,32 +162,51 @@ def by_mjx(name: str, batch: int, steps: int):
     v = jnp.asarray(figures.lanes(chain, state, batch).v[:, : chain.nv])
     put = mjx.put_model(model)
     data = mjx.make_data(put)
-    return of_lanes(lambda d: mjx.step(put, d), jax.vmap(lambda v: data.replace(qpos=jnp.asarray(q, v.dtype), qvel=v))(v), steps)
+    return of_lanes(
+        lambda d: mjx.step(put, d),
+        jax.vmap(lambda v: data.replace(qpos=jnp.asarray(q, v.dtype), qvel=v))(v),
+        steps,
+    )
 
 
 def by_jaxsim(name: str, batch: int, steps: int):
-    """The open figure, three hinges for each ball: JaxSim has no balls, and no joints that close loops but welds."""
+    """The open figure, three hinges for each ball: JaxSim has no balls, and no joints that close
+    loops but welds."""
     import jaxsim.api as js
     import joints
 
-    model = js.model.JaxSimModel.build_from_model_description(sdf(joints.hinges_for_balls()[0].compile()), time_step=DT, is_urdf=False)
+    model = js.model.JaxSimModel.build_from_model_description(
+        sdf(joints.hinges_for_balls()[0].compile()), time_step=DT, is_urdf=False
+    )
     v = jax.random.normal(jax.random.key(0), (batch, model.dofs())) * 0.5
     # (far above its ground, which nothing of the figure could touch)
-    states = jax.vmap(lambda v: js.data.JaxSimModelData.build(model, base_position=jnp.array([0, 0, 1e3]), joint_velocities=v))(v)
+    states = jax.vmap(
+        lambda v: js.data.JaxSimModelData.build(
+            model, base_position=jnp.array([0, 0, 1e3]), joint_velocities=v
+        )
+    )(v)
     return of_lanes(lambda d: js.model.step(model, d), states, steps)
 
 
 def sdf(model: mujoco.MjModel) -> str:
-    """Links on hinges as SDF; of several hinges on a body all but the last carry a tenth of a gramme."""
+    """Links on hinges as SDF; of several hinges on a body all but the last carry a tenth of a
+    gramme."""
     numbers = lambda *x: " ".join(repr(float(y)) for y in x)
     out, names = [], {0: None} | {b: model.body(b).name for b in range(1, model.nbody)}
 
     beside = lambda parent: f' relative_to="{parent}"'
 
     def link(name, parent, pos, mass, com, inertia):
-        tags = "".join(f"<{tag}>{value!r}</{tag}>" for tag, value in zip(("ixx", "iyy", "izz", "ixy", "ixz", "iyz"), map(float, inertia), strict=True))
+        tags = "".join(
+            f"<{tag}>{value!r}</{tag}>"
+            for tag, value in zip(
+                ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"), map(float, inertia), strict=True
+            )
+        )
         place = f"<pose{'' if parent is None else beside(parent)}>{numbers(*pos, 0, 0, 0)}</pose>"
-        about = f"<pose>{numbers(*com, 0, 0, 0)}</pose><mass>{mass!r}</mass><inertia>{tags}</inertia>"
+        about = (
+            f"<pose>{numbers(*com, 0, 0, 0)}</pose><mass>{mass!r}</mass><inertia>{tags}</inertia>"
+        )
         out.append(f'<link name="{name}">{place}<inertial>{about}</inertial></link>')
 
     for b in range(1, model.nbody):
@@ -155,23 +214,44 @@ def sdf(model: mujoco.MjModel) -> str:
         turn = np.zeros(9)
         mujoco.mju_quat2Mat(turn, model.body_iquat[b])
         full = turn.reshape(3, 3) * model.body_inertia[b] @ turn.reshape(3, 3).T
-        whole = (float(model.body_mass[b]), model.body_ipos[b], full[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]])
-        hinges = [j for j in range(model.njnt) if model.jnt_bodyid[j] == b and model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE]
+        whole = (
+            float(model.body_mass[b]),
+            model.body_ipos[b],
+            full[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]],
+        )
+        hinges = [
+            j
+            for j in range(model.njnt)
+            if model.jnt_bodyid[j] == b and model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE
+        ]
         for k, j in enumerate(hinges):
             last = k == len(hinges) - 1
             child = names[b] if last else f"{names[b]}_{k}"
-            link(child, parent, pos, *(whole if last else (1e-4, np.zeros(3), [1e-6] * 3 + [0.0] * 3)))
-            axis = f"<axis><xyz>{numbers(*model.jnt_axis[j])}</xyz><limit><lower>-1e9</lower><upper>1e9</upper></limit></axis>"
-            out.append(f'<joint name="{model.joint(j).name}" type="revolute"><parent>{parent}</parent><child>{child}</child>{axis}</joint>')
+            link(
+                child,
+                parent,
+                pos,
+                *(whole if last else (1e-4, np.zeros(3), [1e-6] * 3 + [0.0] * 3)),
+            )
+            limit = "<limit><lower>-1e9</lower><upper>1e9</upper></limit>"
+            axis = f"<axis><xyz>{numbers(*model.jnt_axis[j])}</xyz>{limit}</axis>"
+            out.append(
+                f'<joint name="{model.joint(j).name}"'
+                f' type="revolute"><parent>{parent}</parent><child>{child}</child>{axis}</joint>'
+            )
             parent, pos = child, np.zeros(3)
         if not hinges:
             link(names[b], parent, pos, *whole)
-    return f'<?xml version="1.0"?><sdf version="1.10"><model name="figure">{"".join(out)}</model></sdf>'
+    return (
+        '<?xml version="1.0"?><sdf version="1.10"><model'
+        f' name="figure">{"".join(out)}</model></sdf>'
+    )
 
 
 def main(kind: str, name: str, dtype: str, batch: int, steps: int):
     """The other end of a `Process`."""
-    # on two cores, and now and then on one, MJX's batches wait for one another for ever (mujoco-mjx 3.17.0, jax 0.10.1)
+    # on two cores, and now and then on one, MJX's batches wait for one another for ever (mujoco-mjx
+    # 3.17.0, jax 0.10.1)
     os.sched_setaffinity(0, {0})
     said = os.dup(1)
     os.dup2(2, 1)

@@ -16,7 +16,10 @@ class Program:
         stages = stages.lower()
         seconds.append(time.perf_counter())
         self.program, self.states = stages.compile(), states
-        self.made = [*np.diff([*seconds, time.perf_counter()]).tolist(), self.program.memory_analysis().temp_size_in_bytes / 1e6]
+        self.made = [
+            *np.diff([*seconds, time.perf_counter()]).tolist(),
+            self.program.memory_analysis().temp_size_in_bytes / 1e6,
+        ]
 
     def __call__(self):
         jax.block_until_ready(self.program(self.states))
@@ -30,4 +33,8 @@ def scanned(step, steps: int):
 def of_lanes(step, states, steps: int) -> Program:
     """Many steps of many lanes, or of one alone."""
     one = jax.tree.leaves(states)[0].shape[0] == 1
-    return Program(scanned(step, steps), jax.tree.map(lambda x: x[0], states)) if one else Program(scanned(jax.vmap(step), steps), states)
+    return (
+        Program(scanned(step, steps), jax.tree.map(lambda x: x[0], states))
+        if one
+        else Program(scanned(jax.vmap(step), steps), states)
+    )

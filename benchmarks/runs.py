@@ -1,11 +1,16 @@
-"""Whole runs of the high bar, events and certificate and all: one run of 10 s, and thousands whose hands let go at times of their own.
+"""Whole runs of the high bar, events and certificate and all: one run of 10 s, and thousands whose
+hands let go at times of their own.
 
-`python benchmarks/runs.py [--lanes 4096]` (two hands until 8 s, one until 9 s, then flight; in lanes 1.8 s, the right hand until 0.3 to 0.9 s, the left
-0.2 s longer; `unequal`: their ends from 0.1 to 1.8 s) prints its rows and puts them into results/runs.csv. Medians of rounds in which all that are compared
-take turns; XLA is told to make one kernel of a loop (README). MuJoCo: steps of 5 ms of the same figure by symplectic Euler, its grips soft and never let
-go. Error: root mean square over the tree's coordinates, at the end, against Dopri8 at rtol 1e-11; in lanes the median of some of them. Ten seconds of
-limbs that nothing damps are chaotic: there the error says no more than that, and the energy is what to look at. Joint ranges are left out but where they
-are named; without them limbs come to spin at 100 rad/s, and of 4096 lanes one in ten is not finite with symplectic Euler of 5 ms.
+`python benchmarks/runs.py [--lanes 4096]` (two hands until 8 s, one until 9 s, then flight; in
+lanes 1.8 s, the right hand until 0.3 to 0.9 s, the left
+0.2 s longer; `unequal`: their ends from 0.1 to 1.8 s) prints its rows and puts them into
+results/runs.csv. Medians of rounds in which all that are compared take turns; XLA is told to make
+one kernel of a loop (README). MuJoCo: steps of 5 ms of the same figure by symplectic Euler, its
+grips soft and never let go. Error: root mean square over the tree's coordinates, at the end,
+against Dopri8 at rtol 1e-11; in lanes the median of some of them. Ten seconds of
+limbs that nothing damps are chaotic: there the error says no more than that, and the energy is what
+to look at. Joint ranges are left out but where they are named; without them limbs come to spin at
+100 rad/s, and of 4096 lanes one in ten is not finite with symplectic Euler of 5 ms.
 """
 
 import argparse
@@ -23,7 +28,11 @@ import numpy as np
 import svkc
 
 BODIES = {"dynamics": svkc.Dynamics(inertia=svkc.by_bodies)}
-EULER = {"solver": svkc.SemiImplicitEuler(), "stabilization": svkc.Projection(iterations=1), **BODIES}
+EULER = {
+    "solver": svkc.SemiImplicitEuler(),
+    "stabilization": svkc.Projection(iterations=1),
+    **BODIES,
+}
 TSIT5 = {"solver": diffrax.Tsit5(), "rtol": 1e-4, "atol": 1e-6, **BODIES}
 ALONE = {"default": {}, "articulated bodies": BODIES}
 LANES = {
@@ -31,7 +40,18 @@ LANES = {
     "Tsit5, rtol 1e-4": TSIT5,
 }
 RANGED = {"with ranges: symplectic Euler, 5 ms": {"dt": 5e-3, **EULER}}
-HEAD = ["runs", "by", "s", "least", "most", "simulated s per s", "error", "energy drift J", "steps", "rejected"]
+HEAD = [
+    "runs",
+    "by",
+    "s",
+    "least",
+    "most",
+    "simulated s per s",
+    "error",
+    "energy drift J",
+    "steps",
+    "rejected",
+]
 EXACT = {"rtol": 1e-11, "atol": 1e-13, "max_steps": 100000}
 TRIED, ROUNDS, END = 8, 3, 1.8
 speed.ROUNDS = ROUNDS
@@ -50,9 +70,25 @@ def apart(chain, traj, exact) -> float:
 
 def row(label, who, seconds, simulated, error, phases):
     """What a run, or the runs of a batch, took and gave."""
-    drift, steps, rejected = (np.asarray(x) for x in (jnp.abs(jnp.sum(phases.energy_drift, -1)), phases.accepted.sum(-1), phases.rejected.sum(-1)))
+    drift, steps, rejected = (
+        np.asarray(x)
+        for x in (
+            jnp.abs(jnp.sum(phases.energy_drift, -1)),
+            phases.accepted.sum(-1),
+            phases.rejected.sum(-1),
+        )
+    )
     times = [f"{f(seconds):.3g}" for f in (np.median, min, max)]
-    return [label, who, *times, f"{simulated / np.median(seconds):.3g}", f"{error:.1e}", f"{np.median(drift):.1e}", int(np.mean(steps)), int(np.mean(rejected))]
+    return [
+        label,
+        who,
+        *times,
+        f"{simulated / np.median(seconds):.3g}",
+        f"{error:.1e}",
+        f"{np.median(drift):.1e}",
+        int(np.mean(steps)),
+        int(np.mean(rejected)),
+    ]
 
 
 def beside(chain, state, lanes: int, steps: int):
@@ -64,7 +100,9 @@ def beside(chain, state, lanes: int, steps: int):
 
 def alone(chain, state):
     """10 s at rtol 1e-8."""
-    made = lambda **how: jax.jit(lambda s: svkc.simulate(chain, s, 10.0, events=events(8.0, 9.0), **how))
+    made = lambda **how: jax.jit(
+        lambda s: svkc.simulate(chain, s, 10.0, events=events(8.0, 9.0), **how)
+    )
     programs = {who: made(rtol=1e-8, atol=1e-8, **how) for who, how in ALONE.items()}
     exact = made(**EXACT)(state)
     runs = {who: (lambda f=f: jax.block_until_ready(f(state))) for who, f in programs.items()}
@@ -72,7 +110,16 @@ def alone(chain, state):
     for who, f in programs.items():
         traj = f(state)
         yield row("one", who, seconds[who], 10.0, apart(chain, traj, exact), traj.phases)
-    yield ["one", "MuJoCo", *(f"{f(seconds['MuJoCo']):.3g}" for f in (np.median, min, max)), f"{10 / np.median(seconds['MuJoCo']):.3g}", "", "", 2000, 0]
+    yield [
+        "one",
+        "MuJoCo",
+        *(f"{f(seconds['MuJoCo']):.3g}" for f in (np.median, min, max)),
+        f"{10 / np.median(seconds['MuJoCo']):.3g}",
+        "",
+        "",
+        2000,
+        0,
+    ]
 
 
 def batch(chain, state, lanes: int, ways: dict, peers=()):
@@ -81,7 +128,10 @@ def batch(chain, state, lanes: int, ways: dict, peers=()):
     times = 0.3 + 0.6 * jax.random.uniform(jax.random.key(1), (lanes,))
     lane = lambda chain, time: {"events": events(time, time + 0.2)}
     common = {"data": times, "lane": lane, "cost": times, "progress": False, "max_steps": 2048}
-    rolled = {who: (lambda how=how: svkc.rollout(chain, states, END, **common, **how)) for who, how in ways.items()}
+    rolled = {
+        who: (lambda how=how: svkc.rollout(chain, states, END, **common, **how))
+        for who, how in ways.items()
+    }
     runs = {who: (lambda f=f: jax.block_until_ready(f())) for who, f in rolled.items()}
     seconds = speed.timed(runs | dict(peers))
     exact = jax.jit(lambda time: svkc.simulate(chain, state, END, **lane(chain, time), **EXACT))
@@ -89,11 +139,23 @@ def batch(chain, state, lanes: int, ways: dict, peers=()):
     for who, f in rolled.items():
         traj = f()
         assert bool(jnp.all(traj.result == svkc.RESULTS.successful)), who
-        errors = [apart(chain, jax.tree.map(lambda x, i=i: x[i], traj), references[i]) for i in range(TRIED)]
+        errors = [
+            apart(chain, jax.tree.map(lambda x, i=i: x[i], traj), references[i])
+            for i in range(TRIED)
+        ]
         yield row(lanes, who, seconds[who], lanes * END, np.median(errors), traj.phases)
     for name, _ in peers:
         x = seconds[name]
-        yield [lanes, name, *(f"{f(x):.3g}" for f in (np.median, min, max)), f"{lanes * END / np.median(x):.3g}", "", "", round(END / 5e-3), 0]
+        yield [
+            lanes,
+            name,
+            *(f"{f(x):.3g}" for f in (np.median, min, max)),
+            f"{lanes * END / np.median(x):.3g}",
+            "",
+            "",
+            round(END / 5e-3),
+            0,
+        ]
 
 
 def unequal(chain, state, lanes: int):
@@ -101,9 +163,16 @@ def unequal(chain, state, lanes: int):
     states = jax.tree.map(lambda x: jnp.broadcast_to(x, (lanes, *x.shape)), state)
     ends = 0.1 + 1.7 * jax.random.uniform(jax.random.key(2), (lanes,))
     lane = lambda chain, end: {"events": events(end / 2, 0.8 * end), "t1": end}
-    roll = lambda cost: svkc.rollout(chain, states, END, data=ends, lane=lane, progress=False, max_steps=2048, cost=cost, **TSIT5)
-    runs = {"Tsit5, rtol 1e-4, as they come": lambda: roll(None), "Tsit5, rtol 1e-4, sorted": lambda: roll(ends)}
-    seconds = speed.timed({who: (lambda f=f: jax.block_until_ready(f())) for who, f in runs.items()})
+    roll = lambda cost: svkc.rollout(
+        chain, states, END, data=ends, lane=lane, progress=False, max_steps=2048, cost=cost, **TSIT5
+    )
+    runs = {
+        "Tsit5, rtol 1e-4, as they come": lambda: roll(None),
+        "Tsit5, rtol 1e-4, sorted": lambda: roll(ends),
+    }
+    seconds = speed.timed(
+        {who: (lambda f=f: jax.block_until_ready(f())) for who, f in runs.items()}
+    )
     for who, f in runs.items():
         line = row(f"{lanes}, unequal", who, seconds[who], float(jnp.sum(ends)), 0.0, f().phases)
         yield [*line[:6], "", *line[7:]]
@@ -125,7 +194,9 @@ def main(lanes: int):
             table.append(line)
             print("| " + " | ".join(map(str, line)) + " |", flush=True)
         with (speed.RESULTS / "runs.csv").open("w", newline="") as file:
-            csv.writer(file, lineterminator="\n").writerows([[*HEAD, *machine], *([*line, *machine.values()] for line in table)])
+            csv.writer(file, lineterminator="\n").writerows(
+                [[*HEAD, *machine], *([*line, *machine.values()] for line in table)]
+            )
     print(machine)
 
 

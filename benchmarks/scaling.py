@@ -1,8 +1,10 @@
-"""How cost and memory grow: with links, with loops, with lanes, with the time that is simulated and with events; exponents fitted.
+"""How cost and memory grow: with links, with loops, with lanes, with the time that is simulated and
+with events; exponents fitted.
 
-`python benchmarks/scaling.py [links loops lanes time events]` (extra `bench`) prints and writes results/scaling.csv and draws results/scaling.png.
-Microseconds per `svkc.step` (links, loops, lanes) or milliseconds per run of `svkc.simulate` (time, events), medians; seconds to trace, lower and compile;
-megabytes of temporary memory. `mj_step` of MuJoCo beside the links."""
+`python benchmarks/scaling.py [links loops lanes time events]` (extra `bench`) prints and writes
+results/scaling.csv and draws results/scaling.png. Microseconds per `svkc.step` (links, loops,
+lanes) or milliseconds per run of `svkc.simulate` (time, events), medians; seconds to trace, lower
+and compile; megabytes of temporary memory. `mj_step` of MuJoCo beside the links."""
 
 import csv
 import sys
@@ -20,17 +22,37 @@ from speed import RESULTS
 
 import svkc
 
-HEAD = ["what grows", "to", "unit", "median", "least", "most", "MuJoCo", "trace s", "lower s", "compile s", "temporary MB"]
-LINK = '<body name="b{0}" pos="0 0 {1}"><joint name="j{0}" type="{2}" {3}/><geom type="capsule" fromto="0 0 0 0 0 -0.1" size="0.02" mass="0.1"/>{4}</body>'
+HEAD = [
+    "what grows",
+    "to",
+    "unit",
+    "median",
+    "least",
+    "most",
+    "MuJoCo",
+    "trace s",
+    "lower s",
+    "compile s",
+    "temporary MB",
+]
+LINK = (
+    '<body name="b{0}" pos="0 0 {1}"><joint name="j{0}" type="{2}" {3}/><geom type="capsule"'
+    ' fromto="0 0 0 0 0 -0.1" size="0.02" mass="0.1"/>{4}</body>'
+)
 
 
 def chain_of(count: int, balls: bool = False) -> str:
     """MJCF of bars in a row, on hinges whose axes take turns, or on balls."""
     text = ""
     for i in reversed(range(count)):
-        kind, axis = ("ball", "") if balls else ("hinge", f'axis="{i % 2} {(i + 1) % 2} 0" damping="0.01"')
+        kind, axis = (
+            ("ball", "") if balls else ("hinge", f'axis="{i % 2} {(i + 1) % 2} 0" damping="0.01"')
+        )
         text = LINK.format(i, -0.1 if i else 0, kind, axis, text)
-    return f'<mujoco><option timestep="{figures.DT}"><flag contact="disable"/></option><worldbody>{text}</worldbody></mujoco>'
+    return (
+        f'<mujoco><option timestep="{figures.DT}"><flag'
+        f' contact="disable"/></option><worldbody>{text}</worldbody></mujoco>'
+    )
 
 
 def stepping(chain, state, batch: int = 1):
@@ -59,7 +81,12 @@ def links():
 def loops():
     """Forty bars on balls, 1 to 20 of them held to the ground by a ball each."""
     for count in (1, 2, 5, 10, 20):
-        held = [svkc.VirtualLink(f"pin{i}", "world", f"b{40 * (i + 1) // count - 1}", "ball", real_pos=(0, 0, -0.1)) for i in range(count)]
+        held = [
+            svkc.VirtualLink(
+                f"pin{i}", "world", f"b{40 * (i + 1) // count - 1}", "ball", real_pos=(0, 0, -0.1)
+            )
+            for i in range(count)
+        ]
         chain = svkc.load(chain_of(40, balls=True), virtual_links=held)
         state = svkc.connect(chain, chain.state(connected=()), *chain.link_names, here=True)
         steps, program = stepping(chain, state)
@@ -78,7 +105,16 @@ def time():
     """The high bar without releases, 0.5 to 8 s."""
     chain, state = figures.case("high bar")
     for end in (0.5, 1.0, 2.0, 4.0, 8.0):
-        yield end, "ms a run", 1e3, {"svkc": Program(lambda s, end=end: svkc.simulate(chain, s, end, throw=False).final, state)}
+        yield (
+            end,
+            "ms a run",
+            1e3,
+            {
+                "svkc": Program(
+                    lambda s, end=end: svkc.simulate(chain, s, end, throw=False).final, state
+                )
+            },
+        )
 
 
 def events():
@@ -86,8 +122,16 @@ def events():
     chain = svkc.load(chain_of(1), cuttable="j0")
     state = chain.state({"j0": 1.0})
     for count in (1, 4, 16, 64):
-        when = [svkc.at(2 * (i + 1) / (count + 1), **({"connect": "j0", "here": True} if i % 2 else {"cut": "j0"})) for i in range(count)]
-        run = lambda s, when=when, count=count: svkc.simulate(chain, s, 2.0, events=when, max_events=count, throw=False).final
+        when = [
+            svkc.at(
+                2 * (i + 1) / (count + 1),
+                **({"connect": "j0", "here": True} if i % 2 else {"cut": "j0"}),
+            )
+            for i in range(count)
+        ]
+        run = lambda s, when=when, count=count: (
+            svkc.simulate(chain, s, 2.0, events=when, max_events=count, throw=False).final
+        )
         yield count, "ms a run", 1e3, {"svkc": Program(run, state)}
 
 
@@ -100,12 +144,21 @@ def draw(table):
     from matplotlib.ticker import NullFormatter
 
     names = list(dict.fromkeys(row[0] for row in table))
-    figure, axes = plt.subplots(1, len(names), figsize=(3.2 * len(names), 3), layout="constrained", squeeze=False)
+    figure, axes = plt.subplots(
+        1, len(names), figsize=(3.2 * len(names), 3), layout="constrained", squeeze=False
+    )
     for ax, name in zip(axes[0], names):
         rows = [row for row in table if row[0] == name]
-        ax.loglog([float(row[1]) for row in rows], [float(row[3]) for row in rows], "o-", label="svkc")
+        ax.loglog(
+            [float(row[1]) for row in rows], [float(row[3]) for row in rows], "o-", label="svkc"
+        )
         if rows[0][6]:
-            ax.loglog([float(row[1]) for row in rows], [float(row[6]) for row in rows], "s:", label="MuJoCo")
+            ax.loglog(
+                [float(row[1]) for row in rows],
+                [float(row[6]) for row in rows],
+                "s:",
+                label="MuJoCo",
+            )
             ax.legend(fontsize=8)
         low, high = ax.get_ylim()
         ax.set(xlabel=name, ylabel=rows[0][2], ylim=(min(low, high / 10), high * 1.1))
@@ -124,12 +177,27 @@ def main(asked):
             seconds = {who: x * scale for who, x in speed.timed(runs).items()}
             ours, peer = seconds["svkc"], seconds.get("MuJoCo")
             made = [f"{value:.2f}" for value in runs["svkc"].made]
-            table.append([name, size, unit, *(f"{f(ours):.3g}" for f in (np.median, min, max)), "" if peer is None else f"{np.median(peer):.3g}", *made])
+            table.append(
+                [
+                    name,
+                    size,
+                    unit,
+                    *(f"{f(ours):.3g}" for f in (np.median, min, max)),
+                    "" if peer is None else f"{np.median(peer):.3g}",
+                    *made,
+                ]
+            )
             print("| " + " | ".join(map(str, table[-1])) + " |", flush=True)
         sizes, costs = (np.log([float(row[i]) for row in table[begun:]]) for i in (1, 3))
-        print(f"{name}: exponent {np.polyfit(sizes, costs, 1)[0]:.2f} over all, {np.polyfit(sizes[-3:], costs[-3:], 1)[0]:.2f} over the last three", flush=True)
+        print(
+            f"{name}: exponent {np.polyfit(sizes, costs, 1)[0]:.2f} over all,"
+            f" {np.polyfit(sizes[-3:], costs[-3:], 1)[0]:.2f} over the last three",
+            flush=True,
+        )
     with (RESULTS / "scaling.csv").open("w", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows([[*HEAD, *speed.machine()], *([*row, *speed.machine().values()] for row in table)])
+        csv.writer(file, lineterminator="\n").writerows(
+            [[*HEAD, *speed.machine()], *([*row, *speed.machine().values()] for row in table)]
+        )
     draw(table)
 
 

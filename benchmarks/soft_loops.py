@@ -1,4 +1,5 @@
-"""MuJoCo's models of the accuracy problems, and its runs of them: loops are soft equality constraints as stiff as twice the time step lets them be."""
+"""MuJoCo's models of the accuracy problems, and its runs of them: loops are soft equality
+constraints as stiff as twice the time step lets them be."""
 
 import maximal
 import mujoco
@@ -12,48 +13,80 @@ INTEGRATORS = ("Euler", "implicitfast", "RK4")
 
 
 def mechanism(problem, given: dict, dt: float):
-    """A problem given body by body: its joints left over as `connect`s, its springs as tendons. MjModel."""
+    """A problem given body by body: its joints left over as `connect`s, its springs as tendons.
+    MjModel."""
     xml, bodies, _, loops = maximal.mjcf(given)
     numbers, soft, sites, tendons = maximal._numbers, "", {}, ""
     for joint in loops:
         parent = bodies[joint["parent"]]
         anchor = parent.turn.T @ (np.array(joint["point_world0"]) - parent.place)
-        one, other = ("world" if name == "ground" else name for name in (joint["parent"], joint["child"]))
-        soft += f'<connect body1="{one}" body2="{other}" anchor="{numbers(anchor)}" solref="{2 * dt} 1"/>'
-    for i, spring in enumerate(force for force in given.get("forces", ()) if force["type"] == "spring_damper"):
+        one, other = (
+            "world" if name == "ground" else name for name in (joint["parent"], joint["child"])
+        )
+        soft += (
+            f'<connect body1="{one}" body2="{other}" anchor="{numbers(anchor)}" solref="{2 * dt}'
+            ' 1"/>'
+        )
+    for i, spring in enumerate(
+        force for force in given.get("forces", ()) if force["type"] == "spring_damper"
+    ):
         for end in ("parent", "child"):
             body = bodies[spring[end]]
             local = body.turn.T @ (np.array(spring[f"point_{end}_world0"]) - body.place)
-            sites.setdefault(spring[end], []).append(f'<site name="{end}{i}" pos="{numbers(local)}"/>')
+            sites.setdefault(spring[end], []).append(
+                f'<site name="{end}{i}" pos="{numbers(local)}"/>'
+            )
         tendons += (
-            f'<spatial stiffness="{spring["stiffness"]}" springlength="{spring["rest_length"]}"><site site="parent{i}"/><site site="child{i}"/></spatial>'
+            f'<spatial stiffness="{spring["stiffness"]}"'
+            f' springlength="{spring["rest_length"]}"><site site="parent{i}"/><site'
+            f' site="child{i}"/></spatial>'
         )
     for name, inside in sites.items():
-        head = "<worldbody>" if name == "ground" else xml[xml.index(f'<body name="{name}"') :].split(">")[0] + ">"
+        head = (
+            "<worldbody>"
+            if name == "ground"
+            else xml[xml.index(f'<body name="{name}"') :].split(">")[0] + ">"
+        )
         xml = xml.replace(head, head + "".join(inside), 1)
-    return mujoco.MjModel.from_xml_string(xml.replace("</mujoco>", f"<tendon>{tendons}</tendon><equality>{soft}</equality></mujoco>"))
+    return mujoco.MjModel.from_xml_string(
+        xml.replace("</mujoco>", f"<tendon>{tendons}</tendon><equality>{soft}</equality></mujoco>")
+    )
 
 
 def figure(problem, spec: mujoco.MjSpec, dt: float):
-    """A model and the virtual links of the problem's start: two `connect`s for a hinge, one for a ball; a slide is a `weld` to a sled of a gram. MjModel."""
+    """A model and the virtual links of the problem's start: two `connect`s for a hinge, one for a
+    ball; a slide is a `weld` to a sled of a gram. MjModel."""
     chain, s = problem.chain, problem.state.structure
     rows = dict(zip(chain.topology.body_row, chain.body_names))
     body = lambda row: spec.worldbody if rows[int(row)] == "world" else spec.body(rows[int(row)])
     for i, name in enumerate(chain.link_names):
         turns, slides = np.flatnonzero(s.freedoms[i, :3]), np.flatnonzero(s.freedoms[i, 3:])
-        ends = [(body(s.parent[i]), s.pos[i], s.quat[i]), (body(s.real[i]), s.real_pos[i], s.real_quat[i])]
+        ends = [
+            (body(s.parent[i]), s.pos[i], s.quat[i]),
+            (body(s.real[i]), s.real_pos[i], s.real_quat[i]),
+        ]
         kind = mujoco.mjtEq.mjEQ_WELD if slides.size else mujoco.mjtEq.mjEQ_CONNECT
         if slides.size:
-            sled = ends[0][0].add_body(name=name, pos=ends[0][1], quat=ends[0][2], mass=1e-3, inertia=[1e-6] * 3)
+            sled = ends[0][0].add_body(
+                name=name, pos=ends[0][1], quat=ends[0][2], mass=1e-3, inertia=[1e-6] * 3
+            )
             sled.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=np.eye(3)[slides[0]])
             ends[0] = (sled, np.zeros(3), np.array([1.0, 0, 0, 0]))
         for side in (-0.05, 0.05) if turns.size == 1 else (0.0,):
             for label, (holder, place, quat) in zip(("parent", "real"), ends):
                 along = np.zeros(3)
-                mujoco.mju_rotVecQuat(along, side * np.eye(3)[turns[0] if turns.size else 0], np.asarray(quat, float))
-                holder.add_site(name=f"{name}{side}{label}", pos=np.asarray(place) + along, quat=np.asarray(quat, float))
+                mujoco.mju_rotVecQuat(
+                    along, side * np.eye(3)[turns[0] if turns.size else 0], np.asarray(quat, float)
+                )
+                holder.add_site(
+                    name=f"{name}{side}{label}",
+                    pos=np.asarray(place) + along,
+                    quat=np.asarray(quat, float),
+                )
             sites = {"name1": f"{name}{side}parent", "name2": f"{name}{side}real"}
-            held = spec.add_equality(name=f"{name}{side}", type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, **sites)
+            held = spec.add_equality(
+                name=f"{name}{side}", type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, **sites
+            )
             held.solref = [2 * dt, 1]
     return spec.compile()
 
@@ -61,41 +94,61 @@ def figure(problem, spec: mujoco.MjSpec, dt: float):
 MODELS = {
     "n_four_bar": lambda problem, dt: mechanism(problem, reference.n_four_bar(2), dt),
     "andrews": lambda problem, dt: mechanism(problem, reference.given("andrews")["problem"], dt),
-    "high_bar": lambda problem, dt: figure(problem, mujoco.MjSpec.from_file(str(svkc.scenes.FOLDER / "figure16.xml")), dt),
+    "high_bar": lambda problem, dt: figure(
+        problem, mujoco.MjSpec.from_file(str(svkc.scenes.FOLDER / "figure16.xml")), dt
+    ),
     "swing": lambda problem, dt: figure(problem, parts()[0], dt),
 }
 
 
 class Run:
-    """MuJoCo from the problem's start to its end; links are let go when they were in the reference. Called: qpos in the order of the chain's q.
+    """MuJoCo from the problem's start to its end; links are let go when they were in the reference.
+    Called: qpos in the order of the chain's q.
 
-    gap: the largest of the loops at releases and the end. drift: change of energy less the work of the torques, J."""
+    gap: the largest of the loops at releases and the end. drift: change of energy less the work of
+    the torques, J."""
 
     def __init__(self, problem, name: str, integrator: str, dt: float):
         chain, state = problem.chain, problem.state
         self.model = model = MODELS[name](problem, dt) if name in MODELS else chain.model.model
         self.released = {}
         for time, links in problem.released:
-            self.released.setdefault(time, []).extend(i for i in range(model.neq) if model.equality(i).name.startswith(links))
+            self.released.setdefault(time, []).extend(
+                i for i in range(model.neq) if model.equality(i).name.startswith(links)
+            )
         # whole steps to each release, and to the end
         self.stops = [*sorted(self.released), problem.end]
         self.steps = sum(round((b - a) / dt) for a, b in zip([0.0, *self.stops], self.stops))
         model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
         model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
-        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_LIMIT
-        self.data, self.dt, self.start = mujoco.MjData(model), dt, (np.zeros(model.nq), np.zeros(model.nv))
+        model.opt.disableflags |= (
+            mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_LIMIT
+        )
+        self.data, self.dt, self.start = (
+            mujoco.MjData(model),
+            dt,
+            (np.zeros(model.nq), np.zeros(model.nv)),
+        )
         self.torque, self.gap, self.drift = np.zeros(model.nv), 0.0, 0.0
         self.order = self._places(chain)
-        self.start[0][self.order[0]], self.start[1][self.order[1]] = state.q[: chain.nq], state.v[: chain.nv]
+        self.start[0][self.order[0]], self.start[1][self.order[1]] = (
+            state.q[: chain.nq],
+            state.v[: chain.nv],
+        )
         for i in (i for i in range(model.njnt) if model.joint(i).name in chain.link_names):
             row = chain.dof_names.index(model.joint(i).name)
-            self.start[0][model.jnt_qposadr[i]], self.start[1][model.jnt_dofadr[i]] = state.q[row + chain.nq - chain.nv], state.v[row]
+            self.start[0][model.jnt_qposadr[i]], self.start[1][model.jnt_dofadr[i]] = (
+                state.q[row + chain.nq - chain.nv],
+                state.v[row],
+            )
         for dof, torque in problem.torques.items():
             self.torque[model.joint(dof).dofadr] = torque
 
     def _places(self, chain):
         """Where the chain's q and v lie in qpos and qvel, sleds left out."""
-        own = [i for i in range(self.model.njnt) if self.model.joint(i).name not in chain.link_names]
+        own = [
+            i for i in range(self.model.njnt) if self.model.joint(i).name not in chain.link_names
+        ]
         width = {mujoco.mjtJoint.mjJNT_FREE: (7, 6), mujoco.mjtJoint.mjJNT_BALL: (4, 3)}
         q, v = [], []
         for i in own:

@@ -1,10 +1,13 @@
-"""Steps of the 40-freedom figure on a free base (46 freedoms), open and with two grips, and of the high bar's, beside MuJoCo, MJX, Pinocchio and JaxSim.
+"""Steps of the 40-freedom figure on a free base (46 freedoms), open and with two grips, and of the
+high bar's, beside MuJoCo, MJX, Pinocchio and JaxSim.
 
-`python benchmarks/speed.py [case ...] [--dtype ..] [--batch ..]` (extra `bench`) prints its rows, puts them into results/speed.csv and draws
-results/speed.png. One step is symplectic Euler of 2 ms with all that it needs; microseconds per step and lane, the median of rounds in which all that are
+`python benchmarks/speed.py [case ...] [--dtype ..] [--batch ..]` (extra `bench`) prints its rows,
+puts them into results/speed.csv and draws results/speed.png. One step is symplectic Euler of 2 ms
+with all that it needs; microseconds per step and lane, the median of rounds in which all that are
 compared take turns, and the least and most; `times svkc`: of svkc on as many cores.
-XLA is told to make one kernel of a loop (README). svkc on one core is `vmap` of `svkc.step` in one program, on all cores each device has its own lanes.
-Grips are hard in svkc, soft in MuJoCo and MJX. Compile seconds: trace, lower, XLA."""
+XLA is told to make one kernel of a loop (README). svkc on one core is `vmap` of `svkc.step` in one
+program, on all cores each device has its own lanes. Grips are hard in svkc, soft in MuJoCo and MJX.
+Compile seconds: trace, lower, XLA."""
 
 import argparse
 import csv
@@ -16,7 +19,10 @@ import time
 import peers  # first: its own processes go without the next line
 
 # before jax makes its first program
-os.environ["XLA_FLAGS"] = peers.FLAGS + " --xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000000"
+os.environ["XLA_FLAGS"] = (
+    peers.FLAGS
+    + " --xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000000"
+)
 
 import jax
 
@@ -36,7 +42,20 @@ import svkc
 
 RESULTS = pathlib.Path(__file__).parent / "results"
 BATCHES, ROUNDS = (1, 64, 1024, 16384), 7
-HEAD = ["case", "dtype", "batch", "by", "us per step", "least", "most", "times svkc", "trace s", "lower s", "compile s", "temporary MB"]
+HEAD = [
+    "case",
+    "dtype",
+    "batch",
+    "by",
+    "us per step",
+    "least",
+    "most",
+    "times svkc",
+    "trace s",
+    "lower s",
+    "compile s",
+    "temporary MB",
+]
 
 
 def steps_for(batch: int) -> int:
@@ -51,12 +70,21 @@ def by_svkc(chain, state, batch: int, steps: int):
     if batch == 1:
         yield "svkc", Program(run, jax.tree.map(lambda x: x[0], figures.lanes(chain, state, 1)))
         return
-    states, many = figures.lanes(chain, state, batch), scanned(jax.vmap(lambda s: svkc.step(chain, s, tau, DT)), steps)
+    states, many = (
+        figures.lanes(chain, state, batch),
+        scanned(jax.vmap(lambda s: svkc.step(chain, s, tau, DT)), steps),
+    )
     yield "svkc, vmap on one core", Program(many, states)
     cores = jax.device_count()
     if batch % cores == 0:
         mesh = jax.make_mesh((cores,), ("lanes",))
-        spread = jax.shard_map(many, mesh=mesh, in_specs=PartitionSpec("lanes"), out_specs=PartitionSpec("lanes"), check_vma=False)
+        spread = jax.shard_map(
+            many,
+            mesh=mesh,
+            in_specs=PartitionSpec("lanes"),
+            out_specs=PartitionSpec("lanes"),
+            check_vma=False,
+        )
         placed = jax.device_put(states, jax.sharding.NamedSharding(mesh, PartitionSpec("lanes")))
         yield "svkc, all cores", Program(spread, placed)
 
@@ -81,11 +109,25 @@ def compared(name: str, dtype: str, batch: int, said: set):
     """Rows of one case."""
     chain, state = figures.case(name)
     model, q, _ = figures.in_mujoco(name, chain, state)
-    v, steps, runs = np.asarray(figures.lanes(chain, state, batch).v[:, : chain.nv], float), steps_for(batch), {}
-    them = [lambda: by_svkc(chain, state, batch, steps), lambda: by_mujoco(model, q, v, batch, steps)]
+    v, steps, runs = (
+        np.asarray(figures.lanes(chain, state, batch).v[:, : chain.nv], float),
+        steps_for(batch),
+        {},
+    )
+    them = [
+        lambda: by_svkc(chain, state, batch, steps),
+        lambda: by_mujoco(model, q, v, batch, steps),
+    ]
     if batch <= 1024:
-        them += [lambda: peers.by_pinocchio(name, chain, state, batch, steps), lambda: [("MJX, one core", peers.Process("mjx", name, dtype, batch, steps))]]
-        them += [lambda: [("JaxSim, one core", peers.Process("jaxsim", name, dtype, batch, steps))]] if name == "open" else []
+        them += [
+            lambda: peers.by_pinocchio(name, chain, state, batch, steps),
+            lambda: [("MJX, one core", peers.Process("mjx", name, dtype, batch, steps))],
+        ]
+        them += (
+            [lambda: [("JaxSim, one core", peers.Process("jaxsim", name, dtype, batch, steps))]]
+            if name == "open"
+            else []
+        )
     for peer in them:
         try:
             runs |= dict(peer())
@@ -97,10 +139,26 @@ def compared(name: str, dtype: str, batch: int, said: set):
     for run in runs.values():
         if isinstance(run, peers.Process):
             run.close()
-    ours = {"all cores" in who: float(np.median(x)) for who, x in times.items() if who.startswith("svkc")}
+    ours = {
+        "all cores" in who: float(np.median(x))
+        for who, x in times.items()
+        if who.startswith("svkc")
+    }
     for who, x in times.items():
-        made = [f"{value:.2f}" for value in runs[who].made] if isinstance(runs[who], Program | peers.Process) else [""] * 4
-        yield [name, dtype, batch, who, *(f"{f(x):.3g}" for f in (np.median, min, max)), f"{np.median(x) / ours.get('all cores' in who, np.nan):.2f}", *made]
+        made = (
+            [f"{value:.2f}" for value in runs[who].made]
+            if isinstance(runs[who], Program | peers.Process)
+            else [""] * 4
+        )
+        yield [
+            name,
+            dtype,
+            batch,
+            who,
+            *(f"{f(x):.3g}" for f in (np.median, min, max)),
+            f"{np.median(x) / ours.get('all cores' in who, np.nan):.2f}",
+            *made,
+        ]
 
 
 def draw(table):
@@ -108,7 +166,9 @@ def draw(table):
     import matplotlib.pyplot as plt
 
     cases = list(dict.fromkeys(row[0] for row in table))
-    figure, axes = plt.subplots(1, len(cases), figsize=(4 * len(cases), 4), layout="constrained", squeeze=False, sharey=True)
+    figure, axes = plt.subplots(
+        1, len(cases), figsize=(4 * len(cases), 4), layout="constrained", squeeze=False, sharey=True
+    )
     kinds = {
         "svkc": "C0",
         "svkc, vmap on one core": "C0",
@@ -123,7 +183,14 @@ def draw(table):
             for dtype, style in (("float64", "o-"), ("float32", "s--")):
                 rows = [row for row in table if row[:2] == [case, dtype] and row[3] == who]
                 if rows:
-                    ax.loglog([row[2] for row in rows], [float(row[4]) for row in rows], style, color=color, markersize=4, label=f"{who}, {dtype}")
+                    ax.loglog(
+                        [row[2] for row in rows],
+                        [float(row[4]) for row in rows],
+                        style,
+                        color=color,
+                        markersize=4,
+                        label=f"{who}, {dtype}",
+                    )
         ax.set(title=case, xlabel="lanes")
         ax.grid(alpha=0.3)
     axes[0, 0].set_ylabel("us per step and lane")
@@ -133,13 +200,27 @@ def draw(table):
 
 def machine() -> dict:
     """What it was measured with."""
-    cpu = [line.split(":")[1].strip() for line in open("/proc/cpuinfo") if line.startswith("model name")]
-    versions = {"python": platform.python_version(), "jax": jax.__version__, "svkc": svkc.__version__, "mujoco": mujoco.__version__}
-    return versions | {"backend": jax.default_backend(), "processor": cpu[0], "cores": os.cpu_count()}
+    cpu = [
+        line.split(":")[1].strip()
+        for line in open("/proc/cpuinfo")
+        if line.startswith("model name")
+    ]
+    versions = {
+        "python": platform.python_version(),
+        "jax": jax.__version__,
+        "svkc": svkc.__version__,
+        "mujoco": mujoco.__version__,
+    }
+    return versions | {
+        "backend": jax.default_backend(),
+        "processor": cpu[0],
+        "cores": os.cpu_count(),
+    }
 
 
 def main(cases, dtypes, batches):
-    """Measures, prints, writes: rows of a case, a dtype and a number of lanes in place of their old ones."""
+    """Measures, prints, writes: rows of a case, a dtype and a number of lanes in place of their old
+    ones."""
     said = set()
     print("| " + " | ".join(HEAD) + " |")
     for name in cases:
@@ -169,7 +250,9 @@ def save(key: tuple, rows):
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
-    parser.add_argument("cases", nargs="*", metavar="case", help=f"of {', '.join(figures.CASES)}; none: all")
+    parser.add_argument(
+        "cases", nargs="*", metavar="case", help=f"of {', '.join(figures.CASES)}; none: all"
+    )
     parser.add_argument("--dtype", nargs="+", default=["float64", "float32"])
     parser.add_argument("--batch", nargs="+", type=int, default=BATCHES, help="lanes")
     options = parser.parse_args()

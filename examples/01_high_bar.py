@@ -1,4 +1,5 @@
-"""The high bar: a figure hangs on by two hands, lets one go, then the other, and flies. Writes a picture to the folder given (default: here)."""
+"""The high bar: a figure hangs on by two hands, lets one go, then the other, and flies. Writes a
+picture to the folder given (default: here)."""
 
 import pathlib
 import sys
@@ -16,16 +17,24 @@ chain, state = high_bar()
 
 # three structures, one program: two hands, one hand, none
 events = [svkc.at(0.9, cut="right_hand_grip"), svkc.at(1.15, cut="left_hand_grip")]
-traj = svkc.simulate(chain, state, 1.8, ts=jnp.linspace(0, 1.8, 73), events=events, rtol=1e-8, atol=1e-10)
+traj = svkc.simulate(
+    chain, state, 1.8, ts=jnp.linspace(0, 1.8, 73), events=events, rtol=1e-8, atol=1e-10
+)
 
 for phase in range(int(traj.phases.count)):
     p = traj.phases
-    print(f"{float(p.start[phase]):.2f} s to {float(p.stop[phase]):.2f} s: {int(p.joint_freedoms[phase])} joint freedoms, mobility {int(p.freedoms[phase])}")
+    print(
+        f"{float(p.start[phase]):.2f} s to {float(p.stop[phase]):.2f} s:"
+        f" {int(p.joint_freedoms[phase])} joint freedoms, mobility {int(p.freedoms[phase])}"
+    )
 
 # how far the hips fly, and how well the loops held
 positions, _ = jax.vmap(lambda s: svkc.poses(chain, s))(traj.states)
 hips = positions[:, chain.body_names.index("torso")]
-print(f"hips from {hips[0].round(2)} to {hips[-1].round(2)} m; largest loop gap {float(traj.report().gap):.1e} m")
+print(
+    f"hips from {hips[0].round(2)} to {hips[-1].round(2)} m; largest loop gap"
+    f" {float(traj.report().gap):.1e} m"
+)
 
 folder = pathlib.Path(sys.argv[1] if len(sys.argv) > 1 else ".")
 print("wrote", svkc.render(chain, traj, folder / "01_high_bar.png"))

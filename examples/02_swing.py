@@ -1,4 +1,5 @@
-"""A swing whose seat gives way: thighs slide along the plate until each has passed its edge, hands hold on. Writes a picture to the folder given."""
+"""A swing whose seat gives way: thighs slide along the plate until each has passed its edge, hands
+hold on. Writes a picture to the folder given."""
 
 import pathlib
 import sys
@@ -22,14 +23,20 @@ def passes_the_edge(link):
     return lambda t, state, args: jnp.abs(along(t, state)) - EDGE
 
 
-# two guards; the figure sits straight, so that both fire at one instant and make one change of structure
+# two guards; the figure sits straight, so that both fire at one instant and make one change of
+# structure
 events = [svkc.when(passes_the_edge(link), cut=link, direction=True) for link in thighs]
-traj = svkc.simulate(chain, state, 2.0, ts=jnp.linspace(0, 2.0, 81), events=events, rtol=1e-8, atol=1e-10)
+traj = svkc.simulate(
+    chain, state, 2.0, ts=jnp.linspace(0, 2.0, 81), events=events, rtol=1e-8, atol=1e-10
+)
 
 p = traj.phases
 for i in range(int(p.count)):
     held = [name for name, on in zip(chain.link_names, p.connected[i], strict=True) if on]
-    print(f"{float(p.start[i]):.3f} s to {float(p.stop[i]):.3f} s: {int(p.joint_freedoms[i])} joint freedoms with the swing's own, held by {', '.join(held)}")
+    print(
+        f"{float(p.start[i]):.3f} s to {float(p.stop[i]):.3f} s: {int(p.joint_freedoms[i])} joint"
+        f" freedoms with the swing's own, held by {', '.join(held)}"
+    )
 print(f"largest loop gap {float(traj.report().gap):.1e} m")
 
 folder = pathlib.Path(sys.argv[1] if len(sys.argv) > 1 else ".")

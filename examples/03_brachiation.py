@@ -1,4 +1,5 @@
-"""Brachiation: a figure travels hand over hand along three bars, catching and letting go by guards. Writes a picture to the folder given (default: here)."""
+"""Brachiation: a figure travels hand over hand along three bars, catching and letting go by guards.
+Writes a picture to the folder given (default: here)."""
 
 import pathlib
 import sys
@@ -14,15 +15,28 @@ from svkc.scenes.brachiation import brachiation
 
 chain, state = brachiation()
 joints = chain.joint_names[1:]  # all but the free base: q[7:23], v[6:22]
-to_bar2, to_bar3 = (svkc.touch(chain, link, 0.0, axes="xy") for link in ("left_hand_bar2", "right_hand_bar3"))
+to_bar2, to_bar3 = (
+    svkc.touch(chain, link, 0.0, axes="xy") for link in ("left_hand_bar2", "right_hand_bar3")
+)
 
 
 def each(side="", **numbers):
     """A number for each joint, by the end of its name; zero for the others."""
-    return jnp.array([sum((x for end, x in numbers.items() if name.startswith(side) and name.endswith(end)), 0.0) for name in joints])
+    return jnp.array(
+        [
+            sum(
+                (x for end, x in numbers.items() if name.startswith(side) and name.endswith(end)),
+                0.0,
+            )
+            for name in joints
+        ]
+    )
 
 
-right_arm, left_arm = (each(side, shoulder_flexion=1, shoulder_abduction=1, elbow=1, wrist=1) > 0 for side in ("right", "left"))
+right_arm, left_arm = (
+    each(side, shoulder_flexion=1, shoulder_abduction=1, elbow=1, wrist=1) > 0
+    for side in ("right", "left")
+)
 hanging = each(shoulder_flexion=3.0, shoulder_abduction=-0.1, elbow=0.85, wrist=0.2)
 loose = each(shoulder_flexion=1.2, elbow=0.6, hip_flexion=0.3, knee=0.4, ankle=-0.5)
 pump = each(hip_flexion=0.9, knee=0.6)
@@ -33,7 +47,8 @@ limb = jnp.diag(svkc.mass_matrix(chain, state))[6:]
 
 @jax.jit
 def control(t, state, args):
-    """Arms that hold stay bent, legs rise as the hips swing forwards (m/s: v[0]), a spring draws the free hand to the next bar."""
+    """Arms that hold stay bent, legs rise as the hips swing forwards (m/s: v[0]), a spring draws
+    the free hand to the next bar."""
     bar1, bar2, bar3 = state.structure.connected
     q, v = state.q[7:23], state.v[6:22]
     holding = (right_arm & (bar1 | bar3)) | (left_arm & bar2)
@@ -48,30 +63,54 @@ def control(t, state, args):
 
     reach = -jax.grad(stretched)(jnp.zeros_like(state.v))[6:22] - 8.0 * limb * v
     reaching = (left_arm & bar1 & ~bar2) | (right_arm & bar2 & ~bar1 & ~bar3)
-    return jnp.pad(jnp.where(reaching, reach, tau), (6, chain.dofs - 22))  # none at the base, none at the bars
+    # none at the base, none at the bars
+    return jnp.pad(jnp.where(reaching, reach, tau), (6, chain.dofs - 22))
 
 
 def swings_forward(bar):
-    """A guard: with one hand on this bar and one on bar 2, the hips turn from swinging back to swinging forwards."""
-    return lambda t, state, args: jnp.where(jnp.all(state.structure.connected[jnp.array([bar - 1, 1])]), state.v[0], 1.0)
+    """A guard: with one hand on this bar and one on bar 2, the hips turn from swinging back to
+    swinging forwards."""
+    return lambda t, state, args: jnp.where(
+        jnp.all(state.structure.connected[jnp.array([bar - 1, 1])]), state.v[0], 1.0
+    )
 
 
 events = [
-    svkc.when(svkc.touch(chain, "left_hand_bar2", 0.05, axes="xy"), connect="left_hand_bar2", here=True, direction=False),
+    svkc.when(
+        svkc.touch(chain, "left_hand_bar2", 0.05, axes="xy"),
+        connect="left_hand_bar2",
+        here=True,
+        direction=False,
+    ),
     svkc.when(swings_forward(bar=1), cut="right_hand_bar1", direction=True),
-    svkc.when(svkc.touch(chain, "right_hand_bar3", 0.05, axes="xy"), connect="right_hand_bar3", here=True, direction=False),
+    svkc.when(
+        svkc.touch(chain, "right_hand_bar3", 0.05, axes="xy"),
+        connect="right_hand_bar3",
+        here=True,
+        direction=False,
+    ),
     svkc.when(swings_forward(bar=3), cut="left_hand_bar2", direction=True),
 ]
 ts = jnp.linspace(0, 4.5, 181)
-traj = svkc.simulate(chain, state, 4.5, ts=ts, events=events, control=control, rtol=1e-6, atol=1e-8, max_events=5)
+traj = svkc.simulate(
+    chain, state, 4.5, ts=ts, events=events, control=control, rtol=1e-6, atol=1e-8, max_events=5
+)
 
 p = traj.phases
 for phase in range(int(p.count)):
-    held = ", ".join(link for link, on in zip(chain.link_names, p.connected[phase], strict=True) if on)
-    print(f"{float(p.start[phase]):.3f} s to {float(p.stop[phase]):.3f} s: {held}; mobility {int(p.freedoms[phase])}, {int(p.accepted[phase])} steps")
+    held = ", ".join(
+        link for link, on in zip(chain.link_names, p.connected[phase], strict=True) if on
+    )
+    print(
+        f"{float(p.start[phase]):.3f} s to {float(p.stop[phase]):.3f} s: {held}; mobility"
+        f" {int(p.freedoms[phase])}, {int(p.accepted[phase])} steps"
+    )
 torque = jnp.abs(jax.vmap(lambda t, s: control(t, s, None))(ts, traj.states)).max()
 first, second = traj.events.energy_lost[0], traj.events.energy_lost[2]
-print(f"the catches cost {first:.1f} J and {second:.1f} J; largest torque {torque:.0f} N m; largest loop gap {float(traj.report().gap):.1e} m")
+print(
+    f"the catches cost {first:.1f} J and {second:.1f} J; largest torque {torque:.0f} N m; largest"
+    f" loop gap {float(traj.report().gap):.1e} m"
+)
 
 folder = pathlib.Path(sys.argv[1] if len(sys.argv) > 1 else ".")
 print("wrote", svkc.render(chain, traj, folder / "03_brachiation.png", frames=7))

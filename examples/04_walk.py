@@ -1,4 +1,5 @@
-"""Walking: a foot is held where it touches the ground, and let go when the ground would have to pull. Writes a picture to the folder given."""
+"""Walking: a foot is held where it touches the ground, and let go when the ground would have to
+pull. Writes a picture to the folder given."""
 
 import pathlib
 import sys
@@ -13,7 +14,8 @@ import jax.numpy as jnp
 import svkc
 from svkc.scenes.walking import ANKLE, HIP, SOLE, STRIDE, leg, walking
 
-STEPS, PERIOD, SHARED, RAMP = 5, 0.65, 0.12, 0.6  # steps, s a step, the part of it on both feet, s to get going and to stop
+# steps, s a step, the part of it on both feet, s to get going and to stop
+STEPS, PERIOD, SHARED, RAMP = 5, 0.65, 0.12, 0.6
 END = RAMP + (STEPS + SHARED / 2) * PERIOD
 chain, state = walking()
 feet = {side: chain.link_names.index(f"{side}_foot_ground") for side in ("left", "right")}
@@ -22,11 +24,14 @@ feet = {side: chain.link_names.index(f"{side}_foot_ground") for side in ("left",
 def progress(t):
     """How many steps are done: the right foot comes down at 1, the left one at 2."""
     starting, stopping = jnp.minimum(t, RAMP), jnp.minimum(END - t, RAMP)
-    return (starting**2 - stopping**2 + RAMP**2) / (2 * RAMP * PERIOD) + (jnp.clip(t, RAMP, END - RAMP) - RAMP) / PERIOD
+    return (starting**2 - stopping**2 + RAMP**2) / (2 * RAMP * PERIOD) + (
+        jnp.clip(t, RAMP, END - RAMP) - RAMP
+    ) / PERIOD
 
 
 def plan(t, structure):
-    """Angles of the 16 joints: hips at one height, a little slower over the foot that stands; feet that hold stay where they are."""
+    """Angles of the 16 joints: hips at one height, a little slower over the foot that stands; feet
+    that hold stay where they are."""
     done, middle = progress(t), progress(t) - (1 + SHARED) / 2
     hips = STRIDE * middle - 0.007 * jnp.sin(2 * jnp.pi * middle) - SOLE
     swing, joints = 0.3 * jnp.cos(jnp.pi * (done - SHARED / 2)), {}
@@ -35,43 +40,81 @@ def plan(t, structure):
         u = jnp.clip((done - step - SHARED) / (1 - SHARED), 0, 1.2)
         part, start, stands = jnp.minimum(u, 1), structure.pos[link, 0], structure.connected[link]
         ahead = start + ((step + 1) * STRIDE - start) * part**3 * (10 - 15 * part + 6 * part**2)
-        above = 0.6 * u**2 * (1 - u) * (1.15 - u)  # comes down with some speed, and would go below the ground
-        angles = leg(jnp.where(stands, start, ahead) - SOLE - hips, HIP - ANKLE - jnp.where(stands, 0, above))
-        angles["ankle"] -= jnp.where(stands, 0, 6 * part**2 * (1 - part) ** 2)  # toes down on the way
+        # comes down with some speed, and would go below the ground
+        above = 0.6 * u**2 * (1 - u) * (1.15 - u)
+        angles = leg(
+            jnp.where(stands, start, ahead) - SOLE - hips, HIP - ANKLE - jnp.where(stands, 0, above)
+        )
+        # toes down on the way
+        angles["ankle"] -= jnp.where(stands, 0, 6 * part**2 * (1 - part) ** 2)
         angles |= {"shoulder_flexion": -swing if odd else swing, "elbow": 0.35}
         joints |= {f"{side}_{name}": angle for name, angle in angles.items()}
-    return jnp.stack([jnp.asarray(joints.get(name, 0.0), t.dtype) for name in chain.joint_names[1:]])
+    return jnp.stack(
+        [jnp.asarray(joints.get(name, 0.0), t.dtype) for name in chain.joint_names[1:]]
+    )
 
 
 def torques_on(foot, state, vdot):
     """Torques for an acceleration of all joints that leave the whole load to this foot."""
-    alone = eqx.tree_at(lambda s: (s.connected, s.rank), state.structure, (jnp.arange(2) == foot, jnp.asarray(6, jnp.int32)))
+    alone = eqx.tree_at(
+        lambda s: (s.connected, s.rank),
+        state.structure,
+        (jnp.arange(2) == foot, jnp.asarray(6, jnp.int32)),
+    )
     return svkc.actuation(chain, svkc.State(state.q, state.v, alone), vdot).tau
 
 
 def control(t, state, args):
-    """Computed torque: the plan's accelerations as nearly as the feet allow, the load led from the rear leg to the front one."""
+    """Computed torque: the plan's accelerations as nearly as the feet allow, the load led from the
+    rear leg to the front one."""
     both = lambda t: jax.jvp(lambda t: plan(t, state.structure), (t,), (jnp.ones_like(t),))
     (q, v), (_, a) = jax.jvp(both, (t,), (jnp.ones_like(t),))
     co = svkc.coordinates(chain, state)
     W, wanted = co.W[6:], a + 200 * (q - state.q[7:]) + 28 * (v - state.v[6:]) - co.bias[6:]
-    vdot = co.bias + co.W @ jnp.linalg.solve(W.T @ W + jnp.diag(jnp.where(co.independent, 0.0, 1.0)), W.T @ wanted)
-    (left, right), stands, place = feet.values(), state.structure.connected, state.structure.pos[:, 0]
+    vdot = co.bias + co.W @ jnp.linalg.solve(
+        W.T @ W + jnp.diag(jnp.where(co.independent, 0.0, 1.0)), W.T @ wanted
+    )
+    (left, right), stands, place = (
+        feet.values(),
+        state.structure.connected,
+        state.structure.pos[:, 0],
+    )
     part = jnp.clip((progress(t) - jnp.round(progress(t))) / SHARED, 0, 1)
-    front = 0.02 + 1.03 * part**2 * (3 - 2 * part)  # passes one: then the ground would have to pull the rear foot
-    on_left = jnp.where(jnp.all(stands), jnp.where(place[left] > place[right], front, 1 - front), jnp.where(stands[left], 1.0, 0.0))
-    return jnp.stack([on_left, 1 - on_left]) @ jax.vmap(torques_on, (0, None, None))(jnp.asarray([left, right]), state, vdot)
+    # passes one: then the ground would have to pull the rear foot
+    front = 0.02 + 1.03 * part**2 * (3 - 2 * part)
+    on_left = jnp.where(
+        jnp.all(stands),
+        jnp.where(place[left] > place[right], front, 1 - front),
+        jnp.where(stands[left], 1.0, 0.0),
+    )
+    return jnp.stack([on_left, 1 - on_left]) @ jax.vmap(torques_on, (0, None, None))(
+        jnp.asarray([left, right]), state, vdot
+    )
 
 
 events = []
 for link in chain.link_names:
-    events += [svkc.when(svkc.touch(chain, link, 0.0, axes="z"), connect=link, direction=False, here=True)]
+    events += [
+        svkc.when(svkc.touch(chain, link, 0.0, axes="z"), connect=link, direction=False, here=True)
+    ]
     events += [svkc.when(svkc.leaves(chain, link), cut=link, direction=False)]
-traj = svkc.simulate(chain, state, END, ts=jnp.linspace(0, END, 79), events=events, control=control, rtol=1e-6, atol=1e-8)
+traj = svkc.simulate(
+    chain,
+    state,
+    END,
+    ts=jnp.linspace(0, END, 79),
+    events=events,
+    control=control,
+    rtol=1e-6,
+    atol=1e-8,
+)
 p, e = traj.phases, traj.events
 for i in range(int(p.count)):
     held = " and ".join(side for side in feet if p.connected[i, feet[side]]) or "no foot"
-    print(f"from {float(p.start[i]):.4f} s: {held}, {int(p.joint_freedoms[i])} joint freedoms, mobility {int(p.freedoms[i])}")
+    print(
+        f"from {float(p.start[i]):.4f} s: {held}, {int(p.joint_freedoms[i])} joint freedoms,"
+        f" mobility {int(p.freedoms[i])}"
+    )
     if i < int(e.count):
         happened = f"{('left', 'right')[e.which[i] // 2]} foot {('down', 'up')[e.which[i] % 2]}"
         print(f"  at {float(e.time[i]):.4f} s: {happened}, {float(e.energy_lost[i]):.2f} J lost")

@@ -1,4 +1,5 @@
-"""Identification: what the links of an arm weigh, and what its wrist can carry, from one run in which it breaks. Writes a picture to the folder given."""
+"""Identification: what the links of an arm weigh, and what its wrist can carry, from one run in
+which it breaks. Writes a picture to the folder given."""
 
 import pathlib
 import sys
@@ -16,15 +17,22 @@ from jax.flatten_util import ravel_pytree
 
 import svkc
 
-# an arm of three links that swings about y; the wrist is a joint that can break; a body without a joint marks the end of a link
+# an arm of three links that swings about y; the wrist is a joint that can break; a body without a
+# joint marks the end of a link
 ARM = """<mujoco><worldbody>
-  <body name="upper"><joint name="shoulder" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.04" mass="3"/>
-    <body name="fore" pos="0 0 -0.5"><joint name="elbow" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.03" mass="2"/>
+  <body name="upper"><joint name="shoulder" axis="0 1 0"/><geom type="capsule"
+    fromto="0 0 0 0 0 -0.5" size="0.04" mass="3"/>
+    <body name="fore" pos="0 0 -0.5"><joint name="elbow" axis="0 1 0"/><geom type="capsule"
+      fromto="0 0 0 0 0 -0.4" size="0.03" mass="2"/>
       <body name="end of fore" pos="0 0 -0.4"/>
-      <body name="tool" pos="0 0 -0.4"><joint name="wrist" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.02" mass="1"/>
+      <body name="tool" pos="0 0 -0.4"><joint name="wrist" axis="0 1 0"/><geom type="capsule"
+        fromto="0 0 0 0 0 -0.3" size="0.02" mass="1"/>
         <body name="end of tool" pos="0 0 -0.3"/></body></body></body></worldbody></mujoco>"""
 chain = svkc.load(ARM, cuttable="wrist")
-links, seen = (np.array([chain.body_names.index(name) for name in names]) for names in (["upper", "fore", "tool"], ["fore", "end of fore", "end of tool"]))
+links, seen = (
+    np.array([chain.body_names.index(name) for name in names])
+    for names in (["upper", "fore", "tool"], ["fore", "end of fore", "end of tool"])
+)
 rows = np.array(chain.topology.body_row)[links]
 masses, limit = chain.mass[rows], 50.0  # kg, N: as drawn, and the first guess
 start = chain.state({"shoulder": -1.6, "elbow": 0.3, "wrist": 0.2})
@@ -33,24 +41,40 @@ EXACT = {"solver": diffrax.Dopri8(), "rtol": 1e-9, "atol": 1e-11}
 
 
 def control(t, state, args):
-    """A known torque (N m) at the shoulder: without one only ratios could be found, as masses and limit could all be twice as large."""
+    """A known torque (N m) at the shoulder: without one only ratios could be found, as masses and
+    limit could all be twice as large."""
     return jnp.zeros(chain.dofs).at[chain.dof_names.index("shoulder")].set(6 * jnp.sin(4 * t))
 
 
 @jax.jit
 def run(p):
-    """With masses and limit times these factors: where the ends of the links are (m; times, links, x and z), and when the overloaded wrist breaks (s)."""
+    """With masses and limit times these factors: where the ends of the links are (m; times, links,
+    x and z), and when the overloaded wrist breaks (s)."""
     scale = jnp.ones_like(chain.mass).at[rows].set(p["mass"])
-    arm = eqx.tree_at(lambda c: (c.mass, c.inertia), chain, (chain.mass * scale, chain.inertia * scale[:, None, None]))
-    events = [svkc.when(svkc.overload(arm, "wrist", force=limit * p["limit"]), cut="wrist", direction=True)]
-    traj = svkc.simulate(arm, start, ts[-1], ts=ts, events=events, control=control, max_events=1, **EXACT)
-    return jax.vmap(lambda s: svkc.poses(chain, s)[0])(traj.states)[:, seen][:, :, ::2], traj.events.time[0]
+    arm = eqx.tree_at(
+        lambda c: (c.mass, c.inertia),
+        chain,
+        (chain.mass * scale, chain.inertia * scale[:, None, None]),
+    )
+    events = [
+        svkc.when(
+            svkc.overload(arm, "wrist", force=limit * p["limit"]), cut="wrist", direction=True
+        )
+    ]
+    traj = svkc.simulate(
+        arm, start, ts[-1], ts=ts, events=events, control=control, max_events=1, **EXACT
+    )
+    return (
+        jax.vmap(lambda s: svkc.poses(chain, s)[0])(traj.states)[:, seen][:, :, ::2],
+        traj.events.time[0],
+    )
 
 
 true = {"mass": jnp.array([2.4, 1.7, 1.3]) / masses, "limit": jnp.asarray(35.0 / limit)}
 guess = {"mass": jnp.ones(3), "limit": jnp.ones(())}
 observed = run(true)[0] + noise * np.random.default_rng(0).normal(size=(len(ts), 3, 2))
-# Levenberg and Marquardt's method: few parameters, so forward mode, and one program gives the misses too
+# Levenberg and Marquardt's method: few parameters, so forward mode, and one program gives the
+# misses too
 misses = lambda p: (run(p)[0] - observed).ravel()
 x, tree = ravel_pytree(guess)
 derivatives = jax.jit(jax.jacfwd(lambda x: 2 * (misses(tree(x)),), has_aux=True))
@@ -63,15 +87,32 @@ for _ in range(12):
 found = tree(x)
 error = tree(noise * jnp.sqrt(jnp.diag(jnp.linalg.inv(J.T @ J))))
 for what, p in (("true", true), ("guess", guess), ("found", found), ("expected error", error)):
-    print(f"{what}: masses {np.asarray(masses * p['mass']).round(4)} kg, limit {limit * p['limit']:.3f} N")
+    print(
+        f"{what}: masses {np.asarray(masses * p['mass']).round(4)} kg, limit"
+        f" {limit * p['limit']:.3f} N"
+    )
     if what != "expected error":
-        print(f"  breaks at {run(p)[1]:.4f} s; misses {1e3 * jnp.sqrt(jnp.mean(misses(p) ** 2)):.2f} mm rms")
+        print(
+            f"  breaks at {run(p)[1]:.4f} s; misses {1e3 * jnp.sqrt(jnp.mean(misses(p) ** 2)):.2f}"
+            " mm rms"
+        )
 folder = pathlib.Path(sys.argv[1] if len(sys.argv) > 1 else ".")
 figure, axes = plt.subplots(figsize=(9, 7), layout="constrained")
-for i, (name, color) in enumerate((("elbow", "C0"), ("end of forearm", "C1"), ("end of tool", "C2"))):
-    for what, path, style in (("guess", run(guess)[0], "--"), ("found", run(found)[0], "-"), ("observed", observed, "o")):
+for i, (name, color) in enumerate(
+    (("elbow", "C0"), ("end of forearm", "C1"), ("end of tool", "C2"))
+):
+    for what, path, style in (
+        ("guess", run(guess)[0], "--"),
+        ("found", run(found)[0], "-"),
+        ("observed", observed, "o"),
+    ):
         axes.plot(*path[:, i].T, style, color=color, markersize=4, label=f"{name}, {what}")
-axes.set(aspect="equal", xlabel="x (m)", ylabel="z (m)", title=f"an arm whose wrist breaks, every {float(ts[1]):.2f} s")
+axes.set(
+    aspect="equal",
+    xlabel="x (m)",
+    ylabel="z (m)",
+    title=f"an arm whose wrist breaks, every {float(ts[1]):.2f} s",
+)
 figure.legend(loc="outside lower center", ncols=3)
 figure.savefig(folder / "07_identify.png", dpi=110)
 print("wrote", folder / "07_identify.png")

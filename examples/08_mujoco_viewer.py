@@ -1,4 +1,5 @@
-"""MuJoCo's viewer: a run of svkc, played in its window at its own speed. Without a display says so. (On macOS, mujoco's viewer wants `mjpython`.)"""
+"""MuJoCo's viewer: a run of svkc, played in its window at its own speed. Without a display says so.
+(On macOS, mujoco's viewer wants `mjpython`.)"""
 
 import sys
 import threading
@@ -28,13 +29,20 @@ with warnings.catch_warnings(action="ignore"):  # glfw warns before it fails
 
 events = [svkc.at(0.9, cut="right_hand_grip"), svkc.at(1.15, cut="left_hand_grip")]
 ts = np.arange(0, 1.8, 1 / 60)
-states = jax.device_get(svkc.simulate(chain, start, ts[-1], ts=jnp.asarray(ts), events=events).states)
+states = jax.device_get(
+    svkc.simulate(chain, start, ts[-1], ts=jnp.asarray(ts), events=events).states
+)
 
 import mujoco.viewer
 
 others = set(threading.enumerate())
 with mujoco.viewer.launch_passive(model, data, show_left_ui=False, show_right_ui=False) as viewer:
-    viewer.cam.lookat[:], viewer.cam.distance, viewer.cam.azimuth, viewer.cam.elevation = (0, 0, 2.2), 6.0, 90, -8
+    viewer.cam.lookat[:], viewer.cam.distance, viewer.cam.azimuth, viewer.cam.elevation = (
+        (0, 0, 2.2),
+        6.0,
+        90,
+        -8,
+    )
     begin = time.perf_counter()
     for i, t in enumerate(ts):
         svkc.to_mujoco(chain, jax.tree.map(lambda x, i=i: x[i], states), data)

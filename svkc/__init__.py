@@ -20,20 +20,42 @@ from svkc.viz.render import plot as plot, render as render
 # how bodies are and move
 from svkc.tree.configuration import difference as difference, integrate as integrate
 from svkc.tree.kinematics import poses as poses, velocities as velocities
-from svkc.tree.energy import energy as energy, kinetic_energy as kinetic_energy, momentum as momentum, potential_energy as potential_energy
-from svkc.tree.inverse_dynamics import bias_force as bias_force, inverse_dynamics as inverse_dynamics
+from svkc.tree.energy import (
+    energy as energy,
+    kinetic_energy as kinetic_energy,
+    momentum as momentum,
+    potential_energy as potential_energy,
+)
+from svkc.tree.inverse_dynamics import (
+    bias_force as bias_force,
+    inverse_dynamics as inverse_dynamics,
+)
 from svkc.tree.mass_matrix import mass_matrix as mass_matrix
 
 # loops
-from svkc.loops.constraint import jacobian as jacobian, loop_gaps as loop_gaps, velocity_gaps as velocity_gaps
+from svkc.loops.constraint import (
+    jacobian as jacobian,
+    loop_gaps as loop_gaps,
+    velocity_gaps as velocity_gaps,
+)
 from svkc.loops.coordinates import coordinates as coordinates
-from svkc.loops.forward_dynamics import forward_dynamics as forward_dynamics, loop_forces as loop_forces
+from svkc.loops.forward_dynamics import (
+    forward_dynamics as forward_dynamics,
+    loop_forces as loop_forces,
+)
 from svkc.loops.actuation import actuation as actuation
 from svkc.loops.mobility import mobility as mobility
 from svkc.loops.coordinates import prefer as prefer
 
 # changes of structure
-from svkc.transitions.transition import connect as connect, cut as cut, lock as lock, transition as transition, unbind as unbind, unlock as unlock
+from svkc.transitions.transition import (
+    connect as connect,
+    cut as cut,
+    lock as lock,
+    transition as transition,
+    unbind as unbind,
+    unlock as unlock,
+)
 from svkc.transitions.spare_links import Grip as Grip, bind as bind
 from svkc.transitions.events import at as at, when as when
 from svkc.transitions.guards import leaves as leaves, overload as overload, touch as touch
@@ -44,12 +66,28 @@ from svkc.integration.replay import Replay as Replay
 from svkc.tools.rollout import rollout as rollout
 from svkc.tools.ahead import Program as Program, compile as compile
 from svkc.tools.accuracy import error_between as error_between, halved as halved, tune as tune
-from svkc.loops.projection import dependent_change as dependent_change, inertia_change as inertia_change, least_change as least_change
-from svkc.integration.stabilization import Baumgarte as Baumgarte, Drift as Drift, Exact as Exact, Projection as Projection
+from svkc.loops.projection import (
+    dependent_change as dependent_change,
+    inertia_change as inertia_change,
+    least_change as least_change,
+)
+from svkc.integration.stabilization import (
+    Baumgarte as Baumgarte,
+    Drift as Drift,
+    Exact as Exact,
+    Projection as Projection,
+)
 from svkc.loops.constrained_dynamics import by_bodies as by_bodies
 from svkc.loops.constrained_dynamics import Dynamics as Dynamics
-from svkc.tree.mass_matrix import inertia_by_composites as inertia_by_composites, inertia_by_unit_vectors as inertia_by_unit_vectors
-from svkc.integration.integrators import RodriguesEuler as RodriguesEuler, SemiImplicitEuler as SemiImplicitEuler, step as step
+from svkc.tree.mass_matrix import (
+    inertia_by_composites as inertia_by_composites,
+    inertia_by_unit_vectors as inertia_by_unit_vectors,
+)
+from svkc.integration.integrators import (
+    RodriguesEuler as RodriguesEuler,
+    SemiImplicitEuler as SemiImplicitEuler,
+    step as step,
+)
 
 # derivatives
 from svkc.tools.gradient_check import Check as Check, check_grad as check_grad

@@ -1,6 +1,8 @@
-"""What derivatives are checked on: a function of parameters for each case, its parameters, and the relative error it is held to.
+"""What derivatives are checked on: a function of parameters for each case, its parameters, and the
+relative error it is held to.
 
-`python tests/derivatives.py` prints the table of docs/measured.md, or the rows of the cases named."""
+`python tests/derivatives.py` prints the table of docs/measured.md, or the rows of the cases named.
+"""
 
 import sys
 
@@ -21,8 +23,11 @@ FLOATS = "mass com inertia pos quat axis anchor gravity armature damping stiffne
 
 
 def model(chain, *names):
-    """Floats of the model by name, "grip": where its virtual links take hold of their real links."""
-    return {name: chain.structure.real_pos if name == "grip" else getattr(chain, name) for name in names}
+    """Floats of the model by name, "grip": where its virtual links take hold of their real
+    links."""
+    return {
+        name: chain.structure.real_pos if name == "grip" else getattr(chain, name) for name in names
+    }
 
 
 def changed(chain, x):
@@ -71,17 +76,28 @@ def algebra(chain, state):
     def f(x):
         c = changed(chain, x)
         s = start(state, x)
-        out = {"forward": svkc.forward_dynamics(c, s, x["tau"]), "inverse": svkc.inverse_dynamics(c, s, moving), "energy": svkc.energy(c, s)}
+        out = {
+            "forward": svkc.forward_dynamics(c, s, x["tau"]),
+            "inverse": svkc.inverse_dynamics(c, s, moving),
+            "energy": svkc.energy(c, s),
+        }
         stepped = svkc.step(c, s, x["tau"], 0.01)
         out |= {"stepped_q": stepped.q, "stepped_v": stepped.v}
         driven = svkc.actuation(c, s, moving)
         out |= {"actuation": driven.tau, "residual": driven.residual}
         if len(chain.link_names):
             carried = svkc.loop_forces(c, s, x["tau"])
-            out |= {"loop_force": carried.force, "loop_torque": carried.torque, "W": svkc.coordinates(c, s).W, "margin": svkc.mobility(c, s).margin}
+            out |= {
+                "loop_force": carried.force,
+                "loop_torque": carried.torque,
+                "W": svkc.coordinates(c, s).W,
+                "margin": svkc.mobility(c, s).margin,
+            }
         return out
 
-    x = {"q": state.q, "v": state.v, "tau": jnp.asarray(rng.normal(size=chain.dofs))} | model(chain, "mass", "com", "inertia", "pos", "gravity")
+    x = {"q": state.q, "v": state.v, "tau": jnp.asarray(rng.normal(size=chain.dofs))} | model(
+        chain, "mass", "com", "inertia", "pos", "gravity"
+    )
     return f, x | ({"grip": state.structure.real_pos} if len(chain.link_names) else {}), ALGEBRA
 
 
@@ -106,11 +122,14 @@ def over_constrained():
 
 
 def every_float():
-    """A tree with hinges, slides, balls, springs, dampers, rotors and offset axes, by all that its model holds."""
+    """A tree with hinges, slides, balls, springs, dampers, rotors and offset axes, by all that its
+    model holds."""
     chain = svkc.load(models.random_tree(6, seed=4))
     rng = np.random.default_rng(4)
     q = svkc.integrate(chain, chain.q_load, jnp.asarray(rng.normal(size=chain.dofs)))
-    f, x, _ = algebra(chain, svkc.State(q, jnp.asarray(rng.normal(size=chain.dofs)), chain.structure))
+    f, x, _ = algebra(
+        chain, svkc.State(q, jnp.asarray(rng.normal(size=chain.dofs)), chain.structure)
+    )
     floats = model(chain, *FLOATS)
     assert all(leaf is not None for leaf in floats.values())
     return f, x | floats, ALGEBRA
@@ -118,7 +137,13 @@ def every_float():
 
 def at_rest():
     """Identity rotations, no velocity, no load: a free body with a ball and a hinge."""
-    ball = models.bar("arm", 'type="ball"', "0.2 0 0.5", "0 0 0.1", models.bar("fore", models.Y, "0 0 0.4", "0.2 0 0.5"))
+    ball = models.bar(
+        "arm",
+        'type="ball"',
+        "0.2 0 0.5",
+        "0 0 0.1",
+        models.bar("fore", models.Y, "0 0 0.4", "0.2 0 0.5"),
+    )
     base = f'<body name="base"><freejoint name="base"/>{models.BAR.format("0.3 0 0")}{ball}</body>'
     chain = svkc.load(models.MJCF.format(base))
     state = chain.state()
@@ -127,7 +152,8 @@ def at_rest():
 
 
 def assembly():
-    """Newton's method onto the loops, from a configuration that is off them; lengths and grips of the model too."""
+    """Newton's method onto the loops, from a configuration that is off them; lengths and grips of
+    the model too."""
     chain = models.rod_on_balls()
     near = chain.state({"crank": 0.3})
     # as the user gives it: a little off, and a velocity that does not agree
@@ -140,7 +166,11 @@ def assembly():
         return {"q": state.q, "v": state.v}
 
     start = at_unit(chain, q)
-    return f, {"q": start, "v": jnp.ones(chain.nv), "pos": chain.pos, "grip": chain.structure.real_pos}, ALGEBRA
+    return (
+        f,
+        {"q": start, "v": jnp.ones(chain.nv), "pos": chain.pos, "grip": chain.structure.real_pos},
+        ALGEBRA,
+    )
 
 
 def at_unit(chain, q):
@@ -151,9 +181,15 @@ def at_unit(chain, q):
 
 def impact():
     """The velocity after a connect, declared and where it is."""
-    box = '<body name="{}" pos="{}"><freejoint name="{}"/><geom type="box" size="0.1 0.2 0.3" contype="0"/></body>'
+    box = (
+        '<body name="{}" pos="{}"><freejoint name="{}"/><geom type="box" size="0.1 0.2 0.3"'
+        ' contype="0"/></body>'
+    )
     links = [svkc.VirtualLink("hold", "a", "b", "ball", real_pos=(-0.6, 0.1, 0))]
-    chain = svkc.load(models.MJCF.format(box.format("a", "0 0 0", "a") + box.format("b", "1 0 0", "b")), virtual_links=links)
+    chain = svkc.load(
+        models.MJCF.format(box.format("a", "0 0 0", "a") + box.format("b", "1 0 0", "b")),
+        virtual_links=links,
+    )
     rng = np.random.default_rng(5)
     state = chain.state(v=rng.normal(size=12), connected=())
 
@@ -161,38 +197,76 @@ def impact():
         after = svkc.connect(changed(chain, x), start(state, x), "hold", here=True)
         return {"q": after.q, "v": after.v, "energy": svkc.kinetic_energy(changed(chain, x), after)}
 
-    return f, {"q": state.q, "v": state.v, "grip": state.structure.real_pos} | model(chain, "mass", "com", "inertia"), ALGEBRA
+    return (
+        f,
+        {"q": state.q, "v": state.v, "grip": state.structure.real_pos}
+        | model(chain, "mass", "com", "inertia"),
+        ALGEBRA,
+    )
 
 
 def pendulum_cut():
-    """Two rods, the second comes off at an angle of the first, and is taken hold of again where it is: both times, the angle and the model count."""
-    rods = models.bar("upper", models.Y, "0 0 -1", inside=models.bar("lower", models.Y, "0 0 -0.8", "0 0 -1"))
+    """Two rods, the second comes off at an angle of the first, and is taken hold of again where it
+    is: both times, the angle and the model count."""
+    rods = models.bar(
+        "upper", models.Y, "0 0 -1", inside=models.bar("lower", models.Y, "0 0 -0.8", "0 0 -1")
+    )
     chain = svkc.load(models.MJCF.format(rods), cuttable="lower")
     state = chain.state({"upper": 1.2, "lower": 0.3}, {"upper": 0.1, "lower": 0.2})
 
     def f(x):
-        events = [svkc.when(lambda t, s, args: s.q[0] - args, cut="lower"), svkc.at(x["again"], connect="lower", here=True)]
+        events = [
+            svkc.when(lambda t, s, args: s.q[0] - args, cut="lower"),
+            svkc.at(x["again"], connect="lower", here=True),
+        ]
         ts = jnp.stack([x["seen"], x["t1"]])
-        return motion(svkc.simulate(changed(chain, x), state, x["t1"], ts=ts, events=events, args=x["angle"], **TIGHT))
+        return motion(
+            svkc.simulate(
+                changed(chain, x), state, x["t1"], ts=ts, events=events, args=x["angle"], **TIGHT
+            )
+        )
 
-    x = {name: jnp.asarray(value) for name, value in {"angle": 0.4, "again": 0.55, "t1": 0.7, "seen": 0.5}.items()}
+    x = {
+        name: jnp.asarray(value)
+        for name, value in {"angle": 0.4, "again": 0.55, "t1": 0.7, "seen": 0.5}.items()
+    }
     return f, x | model(chain, "com", "gravity") | heavier(chain), RUN
 
 
 def breaking():
     """A joint that breaks under its load, and a grip made with a spare slot."""
-    rods = models.bar("upper", models.Y, "0 0 -1", inside=models.bar("lower", models.Y, "0 0 -0.8", "0 0 -1"))
+    rods = models.bar(
+        "upper", models.Y, "0 0 -1", inside=models.bar("lower", models.Y, "0 0 -0.8", "0 0 -1")
+    )
     rods += models.bar("other", models.Y, "0 0 -1", "1 0 0")
     chain = svkc.load(models.MJCF.format(rods), cuttable="lower", spare=1)
     state = chain.state({"upper": 1.2, "lower": 0.3})
 
     def f(x):
         grip = svkc.Grip("upper", "other", "ball", real_pos=x["place"])
-        events = [svkc.when(svkc.overload(chain, "lower", force=x["limit"]), cut="lower", direction=True), svkc.at(x["time"], bind=grip)]
+        events = [
+            svkc.when(svkc.overload(chain, "lower", force=x["limit"]), cut="lower", direction=True),
+            svkc.at(x["time"], bind=grip),
+        ]
         control = lambda t, s, args: args * jnp.sin(3 * t) * jnp.ones(chain.nv)
-        return motion(svkc.simulate(changed(chain, x), state, 0.6, events=events, control=control, args=x["torque"], **TIGHT))
+        return motion(
+            svkc.simulate(
+                changed(chain, x),
+                state,
+                0.6,
+                events=events,
+                control=control,
+                args=x["torque"],
+                **TIGHT,
+            )
+        )
 
-    x = {"limit": jnp.asarray(32.0), "time": jnp.asarray(0.45), "torque": jnp.asarray(0.5), "place": jnp.array([0.1, 0.0, -0.7])}
+    x = {
+        "limit": jnp.asarray(32.0),
+        "time": jnp.asarray(0.45),
+        "torque": jnp.asarray(0.5),
+        "place": jnp.array([0.1, 0.0, -0.7]),
+    }
     return f, x | model(chain, "gravity") | heavier(chain), RUN
 
 
@@ -207,9 +281,16 @@ def four_bar_turning():
         pin = chain.structure.real_pos.at[:, ::2].add(x["pin"])
         c = eqx.tree_at(lambda c: c.structure.real_pos, c, pin)
         start = c.state({"crank": x["angle"]}, {"crank": x["speed"]})
-        return c, svkc.simulate(c, start, 1.0, ts=jnp.linspace(0, 1, 9), control=control, args=x["torque"], **TIGHT)
+        return c, svkc.simulate(
+            c, start, 1.0, ts=jnp.linspace(0, 1, 9), control=control, args=x["torque"], **TIGHT
+        )
 
-    x = {"torque": jnp.array([2.0, 3.0]), "speed": jnp.asarray(6.0), "angle": jnp.asarray(0.1), "pin": jnp.zeros((1, 2))}
+    x = {
+        "torque": jnp.array([2.0, 3.0]),
+        "speed": jnp.asarray(6.0),
+        "angle": jnp.asarray(0.1),
+        "pin": jnp.zeros((1, 2)),
+    }
     x |= model(chain, "gravity") | heavier(chain)
     c, traj = run(x)
     dependent = jax.vmap(lambda s: svkc.coordinates(c, s).dependent)(traj.states)
@@ -223,32 +304,57 @@ def over_constrained_run():
     state = chain.state({"leg0": 0.3}, {"leg0": 1.0})
 
     def f(x):
-        events = [svkc.at(x["time"], cut="pin1"), svkc.at(x["time"] + 0.1, connect="pin1", here=True)]
+        events = [
+            svkc.at(x["time"], cut="pin1"),
+            svkc.at(x["time"] + 0.1, connect="pin1", here=True),
+        ]
         return motion(svkc.simulate(changed(chain, x), state, 0.5, events=events, **TIGHT))
 
     return f, {"time": jnp.asarray(0.2)} | model(chain, "gravity") | heavier(chain), RUN
 
 
 def high_bar():
-    """From rest, two hands, one, none, one again: 24, 23, 22, 23 joint freedoms, every release time and the re-catch."""
+    """From rest, two hands, one, none, one again: 24, 23, 22, 23 joint freedoms, every release time
+    and the re-catch."""
     chain, hanging = svkc.scenes.high_bar(ignore="limit")
 
     def f(x):
         c = changed(chain, x)
         right, left, again = x["times"]
-        events = [svkc.at(right, cut="right_hand_grip"), svkc.at(left, cut="left_hand_grip"), svkc.at(again, connect="left_hand_grip", here=True)]
-        control = lambda t, s, args: jnp.concatenate([jnp.zeros(6), args * jnp.sin(4 * t), jnp.zeros(chain.dofs - 22)])
-        return motion(svkc.simulate(c, c.state(hanging.q[: c.nq], x["v"]), 0.5, events=events, control=control, args=x["torque"], **TIGHT))
+        events = [
+            svkc.at(right, cut="right_hand_grip"),
+            svkc.at(left, cut="left_hand_grip"),
+            svkc.at(again, connect="left_hand_grip", here=True),
+        ]
+        control = lambda t, s, args: jnp.concatenate(
+            [jnp.zeros(6), args * jnp.sin(4 * t), jnp.zeros(chain.dofs - 22)]
+        )
+        return motion(
+            svkc.simulate(
+                c,
+                c.state(hanging.q[: c.nq], x["v"]),
+                0.5,
+                events=events,
+                control=control,
+                args=x["torque"],
+                **TIGHT,
+            )
+        )
 
     rng = np.random.default_rng(1)
-    x = {"times": jnp.array([0.2, 0.3, 0.4]), "torque": jnp.asarray(5 * rng.normal(size=16)), "v": jnp.zeros(chain.nv)}
+    x = {
+        "times": jnp.array([0.2, 0.3, 0.4]),
+        "torque": jnp.asarray(5 * rng.normal(size=16)),
+        "v": jnp.zeros(chain.nv),
+    }
     return f, x | heavier(chain), RUN
 
 
 def swing():
     """The seat gives way as each thigh slides over an edge of its own: two guards.
 
-    Both sides of the body stay alike up to the first: turned on the plate, the pelvis would open the two slides' loops to the second order only.
+    Both sides of the body stay alike up to the first: turned on the plate, the pelvis would open
+    the two slides' loops to the second order only.
     """
     from svkc.scenes.swing import EDGE, swing
 
@@ -256,80 +362,148 @@ def swing():
     back = -jnp.array([jnp.cos(0.6), 0, -jnp.sin(0.6), 0, 0, 0])
     state = chain.state(seated.q[: chain.nq], {"base": back, "pivot": 0.0})
     sides = ("right", "left")
-    parts = [name.removeprefix("right_").removeprefix("left_") for name in (*chain.body_names, *chain.link_names)]
+    parts = [
+        name.removeprefix("right_").removeprefix("left_")
+        for name in (*chain.body_names, *chain.link_names)
+    ]
     index = np.array([sorted(set(parts)).index(part) for part in parts])
 
     def slid(side, number):
         along = svkc.touch(chain, f"{side}_thigh_plate", 0.0, axes="z")
-        return svkc.when(lambda t, s, args: jnp.abs(along(t, s)) - args[1] - 0.002 * number, cut=f"{side}_thigh_plate", direction=True)
+        return svkc.when(
+            lambda t, s, args: jnp.abs(along(t, s)) - args[1] - 0.002 * number,
+            cut=f"{side}_thigh_plate",
+            direction=True,
+        )
 
     def f(x):
         arm, leg = jnp.split(x["torque"], 2)
         torque = jnp.concatenate([jnp.zeros(6), arm, arm, leg, leg, jnp.zeros(chain.dofs - 22)])
         c = changed(chain, {"heavier": x["heavier"][index]})
         events = [slid(side, number) for number, side in enumerate(sides)]
-        return motion(svkc.simulate(c, state, x["t1"], events=events, control=lambda t, s, args: args[0], args=(torque, x["edge"]), **TIGHT))
+        return motion(
+            svkc.simulate(
+                c,
+                state,
+                x["t1"],
+                events=events,
+                control=lambda t, s, args: args[0],
+                args=(torque, x["edge"]),
+                **TIGHT,
+            )
+        )
 
     x = {"t1": jnp.asarray(0.15), "torque": jnp.ones(8), "edge": jnp.asarray(EDGE)}
     return f, x | {"heavier": jnp.ones(index.max() + 1)}, RUN
 
 
 def brachiation():
-    """Hanging by one hand, the other takes hold of the next bar where it comes near, and the first lets go."""
+    """Hanging by one hand, the other takes hold of the next bar where it comes near, and the first
+    lets go."""
     from svkc.scenes.brachiation import brachiation
 
     chain, state = brachiation(ignore="limit")
-    held = {"right_shoulder_flexion": 3.0, "right_elbow": 0.85, "left_shoulder_flexion": 2.4, "left_elbow": 0.1}
+    held = {
+        "right_shoulder_flexion": 3.0,
+        "right_elbow": 0.85,
+        "left_shoulder_flexion": 2.4,
+        "left_elbow": 0.1,
+    }
     held |= {"left_hip_flexion": 0.8, "right_hip_flexion": 0.8}
     pose = jnp.array([held.get(name, 0.0) for name in chain.joint_names[1:]])
-    strong = jnp.array([60.0 if any(part in name for part in ("shoulder", "elbow", "hip")) else 5.0 for name in chain.joint_names[1:]])
+    strong = jnp.array(
+        [
+            60.0 if any(part in name for part in ("shoulder", "elbow", "hip")) else 5.0
+            for name in chain.joint_names[1:]
+        ]
+    )
 
     def control(t, s, args):
         return jnp.pad(strong * (args - s.q[7:23]) - strong / 15 * s.v[6:22], (6, chain.dofs - 22))
 
     def f(x):
         near = svkc.touch(chain, "left_hand_bar2", x["reach"], axes="xy")
-        events = [svkc.when(near, connect="left_hand_bar2", here=True, direction=False), svkc.at(x["release"], cut="right_hand_bar1")]
-        return motion(svkc.simulate(chain, state, 0.8, events=events, control=control, args=x["pose"], **TIGHT))
+        events = [
+            svkc.when(near, connect="left_hand_bar2", here=True, direction=False),
+            svkc.at(x["release"], cut="right_hand_bar1"),
+        ]
+        return motion(
+            svkc.simulate(
+                chain, state, 0.8, events=events, control=control, args=x["pose"], **TIGHT
+            )
+        )
 
     return f, {"reach": jnp.asarray(0.45), "release": jnp.asarray(0.72), "pose": pose}, RUN
 
 
 def worst(program, x, step=0.05) -> float:
-    """The largest relative error of derivatives against differences, along a random direction of each parameter, where one program has all of it.
+    """The largest relative error of derivatives against differences, along a random direction of
+    each parameter, where one program has all of it.
 
-    program(x, along): values, and their derivatives along a direction. (`svkc.check_grad` compiles the function, too.)
+    program(x, along): values, and their derivatives along a direction. (`svkc.check_grad` compiles
+    the function, too.)
     """
-    named = lambda tree: {jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(tree)}
+    named = lambda tree: {
+        jax.tree_util.keystr(path): np.asarray(leaf)
+        for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
+    }
     # (without weak types, which would compile it again for every parameter)
     x = jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype), x)
     rng, errors = np.random.default_rng(0), []
     for name, leaf in x.items():
         along = rng.normal(size=leaf.shape)
         along = jnp.asarray(along / np.linalg.norm(along) * (np.linalg.norm(leaf) or 1.0))
-        along = {other: along if other == name else jnp.zeros_like(value) for other, value in x.items()}
+        along = {
+            other: along if other == name else jnp.zeros_like(value) for other, value in x.items()
+        }
         derivative = named(program(x, along)[1])
-        difference, _ = _differences(lambda x, along=along: named(program(x, along)[0]), x, along, step)
+        difference, _ = _differences(
+            lambda x, along=along: named(program(x, along)[0]), x, along, step
+        )
         for path, expected in difference.items():
             size = max(np.abs(derivative[path]).max(), np.abs(expected).max())
-            errors.append(np.abs(derivative[path] - expected).max() / (size if size > 1e-9 else 1.0))
+            errors.append(
+                np.abs(derivative[path] - expected).max() / (size if size > 1e-9 else 1.0)
+            )
     # (of what is no number neither max nor the comparison with a bound would tell)
     return float(np.max(errors)) if np.isfinite(errors).all() else np.inf
 
 
-ALGEBRAIC = {case.__name__: case for case in (four_bar, spatial_loop, over_constrained, every_float, at_rest, assembly, impact)}
-RUNS = {case.__name__: case for case in (pendulum_cut, breaking, four_bar_turning, over_constrained_run, high_bar, swing, brachiation)}
+ALGEBRAIC = {
+    case.__name__: case
+    for case in (four_bar, spatial_loop, over_constrained, every_float, at_rest, assembly, impact)
+}
+RUNS = {
+    case.__name__: case
+    for case in (
+        pendulum_cut,
+        breaking,
+        four_bar_turning,
+        over_constrained_run,
+        high_bar,
+        swing,
+        brachiation,
+    )
+}
 CASES = ALGEBRAIC | RUNS
 
 
 def main(names):
-    """A row for each case: the worst entry in both modes, along a random direction of each parameter."""
-    print("| case | parameters | worst relative error | of | difference good to | forward against reverse |\n|---|---|---|---|---|---|")
+    """A row for each case: the worst entry in both modes, along a random direction of each
+    parameter."""
+    print(
+        "| case | parameters | worst relative error | of | difference good to | forward against"
+        " reverse |\n|---|---|---|---|---|---|"
+    )
     for name in names or CASES:
         f, x, _ = CASES[name]()
         found = svkc.check_grad(f, x, directions=1)
         worst = f"{found.output[5:]} by {found.input[1:]}".replace("'", "")
-        print(f"| {name} | {', '.join(x)} | {found.error:.1e} | {worst} | {found.uncertainty:.0e} | {found.modes:.0e} |", flush=True)
+        print(
+            f"| {name} | {', '.join(x)} | {found.error:.1e} | {worst} | {found.uncertainty:.0e} |"
+            f" {found.modes:.0e} |",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

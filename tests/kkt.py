@@ -1,4 +1,5 @@
-"""Accelerations of closed chains another way: MuJoCo's tree and point Jacobians, constraints eliminated of joint freedoms, multipliers by least squares."""
+"""Accelerations of closed chains another way: MuJoCo's tree and point Jacobians, constraints
+eliminated of joint freedoms, multipliers by least squares."""
 
 import mujoco
 import numpy as np
@@ -34,7 +35,8 @@ def acceleration(chain, state, tau) -> np.ndarray:
         free = np.asarray(s.freedoms[i])
         assert not free[3:].any(), "slides of virtual links are not part of this check"
         w = vp[:3]
-        # what a hinge or ball leaves free is not constrained; the constrained axes turn with the parent
+        # what a hinge or ball leaves free is not constrained; the constrained axes turn with the
+        # parent
         for k in range(3):
             if not free[k]:
                 n = frame[:, k]

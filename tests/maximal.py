@@ -1,4 +1,5 @@
-"""Mechanisms given body by body in the world, as the reference problems are: a spanning tree of their joints as MJCF, virtual links for those left over."""
+"""Mechanisms given body by body in the world, as the reference problems are: a spanning tree of
+their joints as MJCF, virtual links for those left over."""
 
 import numpy as np
 
@@ -26,53 +27,85 @@ class Body:
 
     def __init__(self, given=None):
         given = given or {}
-        self.place, self.turn = np.asarray(given.get("com_world0", np.zeros(3))), np.asarray(given.get("R0", np.eye(3)))
-        self.v, self.omega = np.asarray(given.get("v0", np.zeros(3))), np.asarray(given.get("omega0_world", np.zeros(3)))
+        self.place, self.turn = (
+            np.asarray(given.get("com_world0", np.zeros(3))),
+            np.asarray(given.get("R0", np.eye(3))),
+        )
+        self.v, self.omega = (
+            np.asarray(given.get("v0", np.zeros(3))),
+            np.asarray(given.get("omega0_world", np.zeros(3))),
+        )
 
     def velocity(self, point):
         return self.v + np.cross(self.omega, point - self.place)
 
 
 def load(problem: dict, **options) -> tuple[svkc.Chain, svkc.State]:
-    """Chain and state of a problem: bodies' frames at their centres of mass, named as there; joints by their child, virtual links by both."""
+    """Chain and state of a problem: bodies' frames at their centres of mass, named as there; joints
+    by their child, virtual links by both."""
     text, bodies, tree, loops = mjcf(problem)
     chain = svkc.load(text, virtual_links=[_link(joint, bodies) for joint in loops], **options)
     return chain, chain.state(v={name: _rate(joint, bodies) for name, joint in tree.items()})
 
 
 def mjcf(problem: dict) -> tuple[str, dict, dict, list]:
-    """The spanning tree as MJCF, the bodies and the tree's joints by name, and the joints left over."""
+    """The spanning tree as MJCF, the bodies and the tree's joints by name, and the joints left
+    over."""
     given = {body["name"]: body for body in problem["bodies"]}
     bodies = {"ground": Body()} | {name: Body(body) for name, body in given.items()}
     tree, loops = {}, []
     for joint in problem["joints"]:
-        open_ = joint["child"] not in tree and joint["type"] != "universal" and (joint["parent"] == "ground" or joint["parent"] in tree)
+        open_ = (
+            joint["child"] not in tree
+            and joint["type"] != "universal"
+            and (joint["parent"] == "ground" or joint["parent"] in tree)
+        )
         tree.update({joint["child"]: joint}) if open_ else loops.append(joint)
 
     def element(name):
         joint, body, mass = tree[name], bodies[name], given[name]
         parent, point = bodies[joint["parent"]], np.asarray(joint["point_world0"])
         inertia = np.asarray(mass["inertia_com_body"])
-        kind, axis = JOINTS[joint["type"]], body.turn.T @ np.asarray(joint.get("axis_world0", (0, 0, 1)))
+        kind, axis = (
+            JOINTS[joint["type"]],
+            body.turn.T @ np.asarray(joint.get("axis_world0", (0, 0, 1))),
+        )
         inside = "".join(element(child) for child, other in tree.items() if other["parent"] == name)
         return (
-            f'<body name="{name}" pos="{_numbers(parent.turn.T @ (body.place - parent.place))}" quat="{_numbers(_quat(parent.turn.T @ body.turn))}">'
-            f'<joint name="{name}" type="{kind}" pos="{_numbers(body.turn.T @ (point - body.place))}" axis="{_numbers(axis)}"/>'
-            f'<inertial pos="0 0 0" mass="{mass["mass"]!r}" fullinertia="{_numbers([*np.diag(inertia), inertia[0, 1], inertia[0, 2], inertia[1, 2]])}"/>'
+            f'<body name="{name}" pos="{_numbers(parent.turn.T @ (body.place - parent.place))}"'
+            f' quat="{_numbers(_quat(parent.turn.T @ body.turn))}">'
+            f'<joint name="{name}" type="{kind}"'
+            f' pos="{_numbers(body.turn.T @ (point - body.place))}" axis="{_numbers(axis)}"/>'
+            f'<inertial pos="0 0 0" mass="{mass["mass"]!r}"'
+            f' fullinertia="{_numbers([*np.diag(inertia), *inertia[np.triu_indices(3, 1)]])}"/>'
             f"{inside}</body>"
         )
 
-    text = f'<mujoco><compiler balanceinertia="false" inertiafromgeom="false"/><option gravity="{_numbers(problem["gravity"])}"/><worldbody>'
-    text += "".join(element(name) for name, joint in tree.items() if joint["parent"] == "ground") + "</worldbody></mujoco>"
+    text = (
+        '<mujoco><compiler balanceinertia="false" inertiafromgeom="false"/><option'
+        f' gravity="{_numbers(problem["gravity"])}"/><worldbody>'
+    )
+    text += (
+        "".join(element(name) for name, joint in tree.items() if joint["parent"] == "ground")
+        + "</worldbody></mujoco>"
+    )
     return text, bodies, tree, loops
 
 
 def _rate(joint, bodies):
     """Rate of a tree's joint from how its bodies move."""
-    parent, child, point = bodies[joint["parent"]], bodies[joint["child"]], np.asarray(joint["point_world0"])
+    parent, child, point = (
+        bodies[joint["parent"]],
+        bodies[joint["child"]],
+        np.asarray(joint["point_world0"]),
+    )
     if joint["type"] == "spherical":
         return child.turn.T @ (child.omega - parent.omega)
-    moved = child.omega - parent.omega if joint["type"] == "revolute" else child.velocity(point) - parent.velocity(point)
+    moved = (
+        child.omega - parent.omega
+        if joint["type"] == "revolute"
+        else child.velocity(point) - parent.velocity(point)
+    )
     axis = np.asarray(joint["axis_world0"])
     return float(axis @ moved / np.linalg.norm(axis))
 
@@ -83,9 +116,16 @@ def _link(joint, bodies):
     names = ["world" if joint[end] == "ground" else joint[end] for end in ("parent", "child")]
     options = {"pos": parent.turn.T @ (point - parent.place)}
     if joint["type"] == "universal":
-        # turns about x, then about y carried along: the frame whose x is the parent's axis and whose y is the child's
+        # turns about x, then about y carried along: the frame whose x is the parent's axis and
+        # whose y is the child's
         x, y = np.asarray(joint["axis_parent_world0"]), np.asarray(joint["axis_child_world0"])
         options["quat"] = _quat(parent.turn.T @ np.stack([x, y, np.cross(x, y)], 1))
     elif "axis_world0" in joint:
         options["axis"] = parent.turn.T @ np.asarray(joint["axis_world0"])
-    return svkc.VirtualLink(f"{names[0]}_{names[1]}", *names, JOINTS[joint["type"]], connected=True, **{name: tuple(value) for name, value in options.items()})
+    return svkc.VirtualLink(
+        f"{names[0]}_{names[1]}",
+        *names,
+        JOINTS[joint["type"]],
+        connected=True,
+        **{name: tuple(value) for name, value in options.items()},
+    )

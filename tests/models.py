@@ -9,11 +9,14 @@ BAR = '<geom type="capsule" fromto="0 0 0 {0}" size="0.03" contype="0" conaffini
 
 
 def random_tree(bodies: int, seed: int, kinds=("hinge", "slide", "ball", "free")) -> str:
-    """A random tree: random shapes and frames, several joints on some bodies, one to three trees."""
+    """A random tree: random shapes and frames, several joints on some bodies, one to three
+    trees."""
     rng = np.random.default_rng(seed)
     children: list[list[int]] = [[] for _ in range(bodies + 1)]
     for i in range(1, bodies + 1):
-        children[0 if i == 1 or rng.random() < 0.05 else int(rng.integers(max(1, i - 6), i))].append(i)
+        children[
+            0 if i == 1 or rng.random() < 0.05 else int(rng.integers(max(1, i - 6), i))
+        ].append(i)
 
     def numbers(x):
         return " ".join(f"{v:.6f}" for v in np.atleast_1d(x))
@@ -26,41 +29,89 @@ def random_tree(bodies: int, seed: int, kinds=("hinge", "slide", "ball", "free")
         out = ""
         for k in range(count):
             extra = f'armature="{rng.uniform(0, 0.1):.4f}" damping="{rng.uniform(0, 1):.4f}"'
-            stiff = f'stiffness="{rng.uniform(0, 5):.4f}" springref="0.2"' if kind == "hinge" else ""
-            out += f'<joint name="j{i}_{k}" type="{kind}" axis="{numbers(rng.normal(size=3))}" pos="{numbers(rng.normal(size=3) / 10)}" {extra} {stiff}/>'
+            stiff = (
+                f'stiffness="{rng.uniform(0, 5):.4f}" springref="0.2"' if kind == "hinge" else ""
+            )
+            out += (
+                f'<joint name="j{i}_{k}" type="{kind}" axis="{numbers(rng.normal(size=3))}"'
+                f' pos="{numbers(rng.normal(size=3) / 10)}" {extra} {stiff}/>'
+            )
         return out
 
     def body(i, root):
         quat = rng.normal(size=4)
-        here = f'<body name="b{i}" pos="{numbers(rng.normal(size=3) / 3)}" quat="{numbers(quat / np.linalg.norm(quat))}">{joints(i, root)}'
+        here = (
+            f'<body name="b{i}" pos="{numbers(rng.normal(size=3) / 3)}"'
+            f' quat="{numbers(quat / np.linalg.norm(quat))}">{joints(i, root)}'
+        )
         size = rng.uniform(0.03, 0.1, 3)
-        here += f'<geom type="box" size="{numbers(size)}" pos="{numbers(rng.normal(size=3) / 10)}" contype="0" conaffinity="0"/>'
+        here += (
+            f'<geom type="box" size="{numbers(size)}" pos="{numbers(rng.normal(size=3) / 10)}"'
+            ' contype="0" conaffinity="0"/>'
+        )
         return here + "".join(body(c, False) for c in children[i]) + "</body>"
 
     return MJCF.format("".join(body(i, True) for i in children[0]))
 
 
 def bar(name: str, joint: str, to: str, pos="0 0 0", inside="") -> str:
-    return f'<body name="{name}" pos="{pos}"><joint name="{name}" {joint}/>{BAR.format(to)}{inside}</body>'
+    return (
+        f'<body name="{name}" pos="{pos}"><joint name="{name}"'
+        f" {joint}/>{BAR.format(to)}{inside}</body>"
+    )
 
 
 Y = 'type="hinge" axis="0 1 0" damping="0"'
 
 
-FOUR_BAR = bar("crank", Y, "0 0 0.4", inside=bar("coupler", Y, "1 0 0.2", "0 0 0.4", bar("rocker", Y, "0.2 0 -0.6", "1 0 0.2")))
+FOUR_BAR = bar(
+    "crank",
+    Y,
+    "0 0 0.4",
+    inside=bar("coupler", Y, "1 0 0.2", "0 0 0.4", bar("rocker", Y, "0.2 0 -0.6", "1 0 0.2")),
+)
 
 
 def four_bar() -> svkc.Chain:
-    """Crank, coupler, rocker on hinges about y; closed by a hinge. In space: 3 of the 6 rows are redundant."""
-    link = svkc.VirtualLink("pin", "world", "rocker", "hinge", pos=(1.2, 0, 0), axis=(0, 1, 0), real_pos=(0.2, 0, -0.6), connected=True)
+    """Crank, coupler, rocker on hinges about y; closed by a hinge. In space: 3 of the 6 rows are
+    redundant."""
+    link = svkc.VirtualLink(
+        "pin",
+        "world",
+        "rocker",
+        "hinge",
+        pos=(1.2, 0, 0),
+        axis=(0, 1, 0),
+        real_pos=(0.2, 0, -0.6),
+        connected=True,
+    )
     return svkc.load(MJCF.format(FOUR_BAR), virtual_links=[link])
 
 
 def parallelogram(middle: bool = True) -> svkc.Chain:
-    """Two, or three, parallel bars that carry a platform: the third loop is redundant as a whole."""
-    legs = "".join(bar(f"leg{i}", Y, "0 0 1", f"{i * 0.7} 0 0", bar("plate", Y, "1.4 0 0", "0 0 1") if i == 0 else "") for i in (0, 1, 2))
+    """Two, or three, parallel bars that carry a platform: the third loop is redundant as a
+    whole."""
+    legs = "".join(
+        bar(
+            f"leg{i}",
+            Y,
+            "0 0 1",
+            f"{i * 0.7} 0 0",
+            bar("plate", Y, "1.4 0 0", "0 0 1") if i == 0 else "",
+        )
+        for i in (0, 1, 2)
+    )
     links = [
-        svkc.VirtualLink(f"pin{i}", "plate", f"leg{i}", "hinge", pos=(i * 0.7, 0, 0), real_pos=(0, 0, 1), axis=(0, 1, 0), connected=middle or i == 2)
+        svkc.VirtualLink(
+            f"pin{i}",
+            "plate",
+            f"leg{i}",
+            "hinge",
+            pos=(i * 0.7, 0, 0),
+            real_pos=(0, 0, 1),
+            axis=(0, 1, 0),
+            connected=middle or i == 2,
+        )
         for i in (1, 2)
     ]
     return svkc.load(MJCF.format(legs), virtual_links=links)
@@ -68,14 +119,28 @@ def parallelogram(middle: bool = True) -> svkc.Chain:
 
 def rod_on_balls() -> svkc.Chain:
     """Spatial R-S-S-R: a coupler with a ball at each end, free to spin about itself."""
-    crank = bar("crank", 'type="hinge" axis="1 0 0"', "0 0 0.3", inside=bar("rod", 'type="ball"', "1 0.4 0.1", "0 0 0.3"))
+    crank = bar(
+        "crank",
+        'type="hinge" axis="1 0 0"',
+        "0 0 0.3",
+        inside=bar("rod", 'type="ball"', "1 0.4 0.1", "0 0 0.3"),
+    )
     rocker = bar("rocker", 'type="hinge" axis="0 1 0"', "0 0.2 0.4", "1 0.2 0")
-    link = svkc.VirtualLink("far_ball", "rocker", "rod", "ball", pos=(0, 0.2, 0.4), real_pos=(1, 0.4, 0.1), connected=True)
+    link = svkc.VirtualLink(
+        "far_ball",
+        "rocker",
+        "rod",
+        "ball",
+        pos=(0, 0.2, 0.4),
+        real_pos=(1, 0.4, 0.1),
+        connected=True,
+    )
     return svkc.load(MJCF.format(crank + rocker), virtual_links=[link])
 
 
 def stewart() -> svkc.Chain:
-    """A platform on six legs, each a universal joint (two hinges), a slide and a ball; the first leg carries the platform."""
+    """A platform on six legs, each a universal joint (two hinges), a slide and a ball; the first
+    leg carries the platform."""
     angle = np.deg2rad([0, 60, 120, 180, 240, 300])
     feet = np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
     tops = np.stack([0.5 * np.cos(angle + 0.5), 0.5 * np.sin(angle + 0.5), 0 * angle + 1], 1)
@@ -83,15 +148,29 @@ def stewart() -> svkc.Chain:
     for i, (foot, top) in enumerate(zip(feet, tops)):
         axis, length = (top - foot) / np.linalg.norm(top - foot), np.linalg.norm(top - foot)
         z = " ".join(map(str, axis))
-        plate = '<body name="plate" pos="0 0 {0}"><joint name="plate" type="ball"/><geom type="cylinder" size="0.5 0.03" contype="0" conaffinity="0"/></body>'
+        plate = (
+            '<body name="plate" pos="0 0 {0}"><joint name="plate" type="ball"/><geom'
+            ' type="cylinder" size="0.5 0.03" contype="0" conaffinity="0"/></body>'
+        )
         leg = (
-            f'<body name="leg{i}" pos="{foot[0]} {foot[1]} 0" zaxis="{z}"><joint name="ux{i}" axis="1 0 0"/><joint name="uy{i}" axis="0 1 0"/>'
-            f'{BAR.format("0 0 0.5")}<body name="rod{i}"><joint name="slide{i}" type="slide" axis="0 0 1"/>'
-            f'<geom type="capsule" fromto="0 0 0.5 0 0 {length}" size="0.02" contype="0" conaffinity="0"/>'
+            f'<body name="leg{i}" pos="{foot[0]} {foot[1]} 0" zaxis="{z}"><joint name="ux{i}"'
+            f' axis="1 0 0"/><joint name="uy{i}" axis="0 1 0"/>{BAR.format("0 0 0.5")}<body'
+            f' name="rod{i}"><joint name="slide{i}" type="slide" axis="0 0 1"/><geom type="capsule"'
+            f' fromto="0 0 0.5 0 0 {length}" size="0.02" contype="0" conaffinity="0"/>'
         )
         xml += leg + (plate.format(length) if i == 0 else "") + "</body></body>"
         if i:
-            links.append(svkc.VirtualLink(f"top{i}", "plate", f"rod{i}", "ball", real_pos=(0, 0, length), pos=(0, 0, 0), connected=True))
+            links.append(
+                svkc.VirtualLink(
+                    f"top{i}",
+                    "plate",
+                    f"rod{i}",
+                    "ball",
+                    real_pos=(0, 0, length),
+                    pos=(0, 0, 0),
+                    connected=True,
+                )
+            )
     # places of the joints in the plate, from the load pose
     import mujoco
 
@@ -100,21 +179,41 @@ def stewart() -> svkc.Chain:
     mujoco.mj_kinematics(model, data)
     R, p = data.body("plate").xmat.reshape(3, 3), data.body("plate").xpos
     placed = [
-        svkc.VirtualLink(k.name, k.parent, k.real, "ball", pos=tuple(R.T @ (tops[i + 1] - p)), real_pos=k.real_pos, connected=True) for i, k in enumerate(links)
+        svkc.VirtualLink(
+            k.name,
+            k.parent,
+            k.real,
+            "ball",
+            pos=tuple(R.T @ (tops[i + 1] - p)),
+            real_pos=k.real_pos,
+            connected=True,
+        )
+        for i, k in enumerate(links)
     ]
     return svkc.load(MJCF.format(xml), virtual_links=placed)
 
 
 def five_bar() -> svkc.Chain:
-    """Two arms of two links that meet: mobility 2, motors on both shoulders and one elbow to choose from."""
+    """Two arms of two links that meet: mobility 2, motors on both shoulders and one elbow to choose
+    from."""
     left = bar("left_arm", Y, "0 0 0.5", "-0.3 0 0", bar("left_fore", Y, "0.3 0 0.5", "0 0 0.5"))
     right = bar("right_arm", Y, "0 0 0.5", "0.3 0 0", bar("right_fore", Y, "-0.3 0 0.5", "0 0 0.5"))
-    link = svkc.VirtualLink("tip", "left_fore", "right_fore", "hinge", pos=(0.3, 0, 0.5), real_pos=(-0.3, 0, 0.5), axis=(0, 1, 0), connected=True)
+    link = svkc.VirtualLink(
+        "tip",
+        "left_fore",
+        "right_fore",
+        "hinge",
+        pos=(0.3, 0, 0.5),
+        real_pos=(-0.3, 0, 0.5),
+        axis=(0, 1, 0),
+        connected=True,
+    )
     return svkc.load(MJCF.format(left + right), virtual_links=[link])
 
 
 def dh_loop(theta, length, twist, axes_named="j") -> svkc.Chain:
-    """A loop of hinges by Denavit and Hartenberg: joint i turns by theta[i] about z, the next is `length[i]` along x, turned by `twist[i]` about x."""
+    """A loop of hinges by Denavit and Hartenberg: joint i turns by theta[i] about z, the next is
+    `length[i]` along x, turned by `twist[i]` about x."""
     turn = lambda angle: np.array([np.cos(angle / 2), np.sin(angle / 2)])
     about_x = lambda angle: (turn(angle)[0], turn(angle)[1], 0, 0)
     xml = ""
@@ -123,12 +222,21 @@ def dh_loop(theta, length, twist, axes_named="j") -> svkc.Chain:
         (cx, sx), (cz, sz) = turn(twist[i - 1] if i else 0), turn(theta[i])
         quat = f"{cx * cz} {sx * cz} {-sx * sz} {cx * sz}"
         pos = f"{length[i - 1] if i else 0} 0 0"
-        hinge = f'<body name="{axes_named}{i}" pos="{pos}" quat="{quat}"><joint name="{axes_named}{i}" axis="0 0 1"/>'
-        xml = hinge + f'<geom type="capsule" fromto="0 0 0 {length[i]} 0 0.01" size="0.03" contype="0"/>' + xml + "</body>"
+        hinge = (
+            f'<body name="{axes_named}{i}" pos="{pos}" quat="{quat}"><joint name="{axes_named}{i}"'
+            ' axis="0 0 1"/>'
+        )
+        xml = (
+            hinge
+            + f'<geom type="capsule" fromto="0 0 0 {length[i]} 0 0.01" size="0.03" contype="0"/>'
+            + xml
+            + "</body>"
+        )
     last = len(theta) - 2
     end = svkc.VirtualLink(
-        "last", f"{axes_named}{last}", "world", "hinge", pos=(length[last], 0, 0), quat=about_x(twist[last]),
-        real_pos=(-length[-1], 0, 0), real_quat=about_x(-twist[-1]), connected=True,
+        "last", f"{axes_named}{last}", "world", "hinge", pos=(length[last], 0, 0),
+        quat=about_x(twist[last]), real_pos=(-length[-1], 0, 0), real_quat=about_x(-twist[-1]),
+        connected=True,
     )  # fmt: skip
     return svkc.load(MJCF.format(xml), virtual_links=[end])
 
@@ -138,7 +246,14 @@ def figure40() -> svkc.Chain:
     chain = svkc.load(str(svkc.scenes.FOLDER / "figure40.xml"))
     place = np.asarray(svkc.poses(chain, chain.state())[0])
     grips = [
-        svkc.VirtualLink(f"{s}_grip", "world", f"{s}_hand", "ball", pos=tuple(place[chain.body_names.index(f"{s}_hand")]), connected=True)
+        svkc.VirtualLink(
+            f"{s}_grip",
+            "world",
+            f"{s}_hand",
+            "ball",
+            pos=tuple(place[chain.body_names.index(f"{s}_hand")]),
+            connected=True,
+        )
         for s in ("right", "left")
     ]
     return svkc.load(str(svkc.scenes.FOLDER / "figure40.xml"), virtual_links=grips)
@@ -148,21 +263,40 @@ def bennett(theta=0.9) -> svkc.Chain:
     """Four skew hinges that can move only because sin(alpha) / a = sin(beta) / b."""
     alpha, a, b = np.deg2rad(30.0), 0.5, 0.8
     beta = np.arcsin(np.sin(alpha) * b / a)
-    second = 2 * np.arctan(np.sin((beta + alpha) / 2) / np.sin((beta - alpha) / 2) / np.tan(theta / 2))
+    second = 2 * np.arctan(
+        np.sin((beta + alpha) / 2) / np.sin((beta - alpha) / 2) / np.tan(theta / 2)
+    )
     return dh_loop((theta, second, -theta, -second), (a, b, a, b), (alpha, beta, alpha, beta))
 
 
 def bricard(theta=np.pi / 3) -> svkc.Chain:
-    """Six hinges, equal links, twists of 90 and -90 degrees in turn: cos t + cos u + cos t cos u = 0."""
+    """Six hinges, equal links, twists of 90 and -90 degrees in turn: cos t + cos u + cos t cos u =
+    0."""
     other = np.arccos(-np.cos(theta) / (1 + np.cos(theta)))
     quarter = np.pi / 2
     return dh_loop((theta, other) * 3, (0.5,) * 6, (quarter, -quarter) * 3)
 
 
 def sarrus() -> svkc.Chain:
-    """Two legs of three parallel hinges at right angles to each other: the platform goes straight up and down."""
+    """Two legs of three parallel hinges at right angles to each other: the platform goes straight
+    up and down."""
     X = 'type="hinge" axis="1 0 0"'
-    leg_x = bar("a1", Y, "0.5 0 0.5", "1 0 0", bar("a2", Y, "-0.5 0 0.5", "0.5 0 0.5", bar("plate", Y, "-1 0 0.01", "-0.5 0 0.5")))
+    leg_x = bar(
+        "a1",
+        Y,
+        "0.5 0 0.5",
+        "1 0 0",
+        bar("a2", Y, "-0.5 0 0.5", "0.5 0 0.5", bar("plate", Y, "-1 0 0.01", "-0.5 0 0.5")),
+    )
     leg_y = bar("b1", X, "0 0.5 0.5", "0 1 0", bar("b2", X, "0 -0.5 0.5", "0 0.5 0.5"))
-    link = svkc.VirtualLink("top", "plate", "b2", "hinge", axis=(1, 0, 0), pos=(-1, 1, 0), real_pos=(0, -0.5, 0.5), connected=True)
+    link = svkc.VirtualLink(
+        "top",
+        "plate",
+        "b2",
+        "hinge",
+        axis=(1, 0, 0),
+        pos=(-1, 1, 0),
+        real_pos=(0, -0.5, 0.5),
+        connected=True,
+    )
     return svkc.load(MJCF.format(leg_x + leg_y), virtual_links=[link])

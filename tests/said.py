@@ -1,4 +1,5 @@
-"""What the library raises, read from its sources and from the page that lists it, and what a call looks like without the tests' own type checks."""
+"""What the library raises, read from its sources and from the page that lists it, and what a call
+looks like without the tests' own type checks."""
 
 import ast
 import contextlib
@@ -22,18 +23,31 @@ def _text(node) -> str:
 
 
 def _nodes(kind):
-    return (node for path in FOLDER.rglob("*.py") for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, kind))
+    return (
+        node
+        for path in FOLDER.rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, kind)
+    )
 
 
 def messages() -> set[str]:
     """Of every exception that is raised with one, on one line."""
     raised = (node.exc for node in _nodes(ast.Raise))
-    return {" ".join(_text(call.args[0]).split()) for call in raised if isinstance(call, ast.Call) and call.args}
+    return {
+        " ".join(_text(call.args[0]).split())
+        for call in raised
+        if isinstance(call, ast.Call) and call.args
+    }
 
 
 def messages_of(function: str, argument: int) -> set[str]:
     """What calls of a function by this name, such as eqx.error_if, are given to say."""
-    calls = (node for node in _nodes(ast.Call) if isinstance(node.func, ast.Attribute) and node.func.attr == function)
+    calls = (
+        node
+        for node in _nodes(ast.Call)
+        if isinstance(node.func, ast.Attribute) and node.func.attr == function
+    )
     return {_text(call.args[argument]) for call in calls if len(call.args) > argument}
 
 

@@ -1,4 +1,5 @@
-"""The dial: orders of the integrators, what each way against drift holds, and the certificate of a run."""
+"""The dial: orders of the integrators, what each way against drift holds, and the certificate of a
+run."""
 
 import diffrax
 import equinox as eqx
@@ -16,7 +17,16 @@ from svkc.tools.accuracy import Candidate, candidates
 def arm():
     """A free body with a ball and a hinge on it, thrown and spinning: orientations all the way."""
     rods = models.bar(
-        "base", 'type="free"', "0.2 0 -0.5", inside=models.bar("ball", 'type="ball"', "0.1 0.3 -0.4", "0.2 0 -0.5", models.bar("hinge", models.Y, "0 0 -0.3"))
+        "base",
+        'type="free"',
+        "0.2 0 -0.5",
+        inside=models.bar(
+            "ball",
+            'type="ball"',
+            "0.1 0.3 -0.4",
+            "0.2 0 -0.5",
+            models.bar("hinge", models.Y, "0 0 -0.3"),
+        ),
     )
     chain = svkc.load(models.MJCF.format(rods))
     return chain, chain.state(v=np.array([0.5, 0.2, 1.0, 2.0, -3.0, 1.5, 1.0, 2.0, -2.5, 3.0]))
@@ -40,8 +50,13 @@ def arm():
 def test_orders(arm, exact, solver, order, dt):
     """Halving the step divides the error by two to the order, on balls and free joints as well."""
     chain, state = arm
-    run = jax.jit(lambda dt: svkc.simulate(chain, state, 0.4, dt=dt, solver=solver, max_steps=2000).final)
-    errors = [np.linalg.norm(svkc.difference(chain, exact.q, end.q)) + np.linalg.norm(exact.v - end.v) for end in (run(dt), run(dt / 2))]
+    run = jax.jit(
+        lambda dt: svkc.simulate(chain, state, 0.4, dt=dt, solver=solver, max_steps=2000).final
+    )
+    errors = [
+        np.linalg.norm(svkc.difference(chain, exact.q, end.q)) + np.linalg.norm(exact.v - end.v)
+        for end in (run(dt), run(dt / 2))
+    ]
     assert errors[1] > 1e-13
     # (Tsit5's leading term is so small that it goes by the sixth order here)
     assert order - 0.3 < np.log2(errors[0] / errors[1]) < order + 1.3
@@ -54,8 +69,11 @@ def exact(arm):
 
 @pytest.mark.slow
 def test_symplectic_euler_keeps_energy():
-    """A pendulum for 100 swings with 60 steps each: the energy's error does not grow, that of the explicit one does."""
-    chain = svkc.load(models.MJCF.format(models.bar("rod", models.Y, "0 0 -1")).replace("0.3 -0.2", "0 0"))
+    """A pendulum for 100 swings with 60 steps each: the energy's error does not grow, that of the
+    explicit one does."""
+    chain = svkc.load(
+        models.MJCF.format(models.bar("rod", models.Y, "0 0 -1")).replace("0.3 -0.2", "0 0")
+    )
     state, ts = chain.state({"rod": 0.5}), jnp.linspace(0, 160.0, 161)
     found = {}
     for solver in (svkc.SemiImplicitEuler(), svkc.RodriguesEuler()):
@@ -67,16 +85,24 @@ def test_symplectic_euler_keeps_energy():
     assert lost[-1] > 20 * kept.max()
 
 
-OTHERS = (pytest.param(change, marks=pytest.mark.slow) for change in (svkc.inertia_change, svkc.least_change))
+OTHERS = (
+    pytest.param(change, marks=pytest.mark.slow)
+    for change in (svkc.inertia_change, svkc.least_change)
+)
 
 
 @pytest.mark.parametrize("change", [svkc.dependent_change, *OTHERS])
 def test_each_way_back_onto_the_loops(change):
-    """One motion, loops closed to round-off; the independent coordinates stay where no other may be moved. By short steps, and by one that is too long."""
+    """One motion, loops closed to round-off; the independent coordinates stay where no other may be
+    moved. By short steps, and by one that is too long."""
     chain = models.four_bar()
     state = chain.state(v={"crank": 4.0})
-    free = lambda t1, dt: svkc.simulate(chain, state, t1, dt=dt, stabilization=svkc.Drift(), throw=False)
-    held = lambda t1, dt: svkc.simulate(chain, state, t1, dt=dt, stabilization=svkc.Projection(change=change))
+    free = lambda t1, dt: svkc.simulate(
+        chain, state, t1, dt=dt, stabilization=svkc.Drift(), throw=False
+    )
+    held = lambda t1, dt: svkc.simulate(
+        chain, state, t1, dt=dt, stabilization=svkc.Projection(change=change)
+    )
     fine = held(0.5, 1e-3)
     np.testing.assert_allclose(fine.final.q, free(0.5, 1e-3).final.q, atol=1e-7)
     assert float(fine.gaps.max()) < 1e-14
@@ -101,15 +127,36 @@ WAYS = {
 
 @pytest.fixture(scope="module")
 def swinging():
-    """Three equal bars that swing on a base too long for any of them to go round: whatever two coordinates depend on the third, they come in line."""
-    inner = models.bar("coupler", models.Y, "1 0 0", "0.6 0 0.8", models.bar("rocker", models.Y, "0.6 0 -0.8", "1 0 0"))
-    pin = svkc.VirtualLink("pin", "world", "rocker", "hinge", pos=(2.2, 0, 0), axis=(0, 1, 0), real_pos=(0.6, 0, -0.8), connected=True)
-    chain = svkc.load(models.MJCF.format(models.bar("crank", models.Y, "0.6 0 0.8", inside=inner)), virtual_links=[pin])
+    """Three equal bars that swing on a base too long for any of them to go round: whatever two
+    coordinates depend on the third, they come in line."""
+    inner = models.bar(
+        "coupler",
+        models.Y,
+        "1 0 0",
+        "0.6 0 0.8",
+        models.bar("rocker", models.Y, "0.6 0 -0.8", "1 0 0"),
+    )
+    pin = svkc.VirtualLink(
+        "pin",
+        "world",
+        "rocker",
+        "hinge",
+        pos=(2.2, 0, 0),
+        axis=(0, 1, 0),
+        real_pos=(0.6, 0, -0.8),
+        connected=True,
+    )
+    chain = svkc.load(
+        models.MJCF.format(models.bar("crank", models.Y, "0.6 0 0.8", inside=inner)),
+        virtual_links=[pin],
+    )
     start, ts = chain.state(v={"crank": 1.0}), jnp.linspace(0, 1.5, 16)
 
     def run(crank, **way):
         state = eqx.tree_at(lambda s: s.v, start, crank * start.v)
-        return svkc.simulate(chain, state, 1.5, ts=ts, rtol=1e-10, atol=1e-12, solver=diffrax.Dopri8(), **way)
+        return svkc.simulate(
+            chain, state, 1.5, ts=ts, rtol=1e-10, atol=1e-12, solver=diffrax.Dopri8(), **way
+        )
 
     return run, run(1.0)
 
@@ -136,37 +183,81 @@ def test_how_loops_are_kept_leaves_derivatives_as_they_are(swinging, way):
     forward, step = jax.jacfwd(end)(1.0), 1e-4
     differences = (end(1 + step) - end(1 - step)) / (2 * step)
     np.testing.assert_allclose(forward, differences, rtol=1e-5, atol=1e-5)
-    np.testing.assert_allclose(jax.grad(lambda x: jnp.sum(jnp.sin(end(x))))(1.0), jnp.cos(end(1.0)) @ forward, rtol=1e-10)
+    np.testing.assert_allclose(
+        jax.grad(lambda x: jnp.sum(jnp.sin(end(x))))(1.0), jnp.cos(end(1.0)) @ forward, rtol=1e-10
+    )
 
 
 def test_bad_dynamics():
     chain = models.four_bar()
-    for given, said in ((svkc.Projection, "dynamics: expected svkc.Dynamics"), (lambda: svkc.Dynamics(hold=2.0), r"dynamics.hold: got 2.0")):
+    for given, said in (
+        (svkc.Projection, "dynamics: expected svkc.Dynamics"),
+        (lambda: svkc.Dynamics(hold=2.0), r"dynamics.hold: got 2.0"),
+    ):
         with pytest.raises(ValueError, match=said):
             svkc.simulate(chain, chain.state(), 1.0, dynamics=given())
 
 
 def test_the_certificate(tmp_path):
-    """Every line of it against what is known otherwise: four bars driven round, a figure in flight, lanes."""
+    """Every line of it against what is known otherwise: four bars driven round, a figure in flight,
+    lanes."""
     chain = models.four_bar()
     control = lambda t, s, args: jnp.zeros(chain.dofs).at[0].set(3.0)
     new = svkc.Dynamics(hold=None)
-    run = jax.jit(lambda dt: svkc.simulate(chain, chain.state(v={"crank": 6.0}), 1.0, ts=jnp.linspace(0, 1, 11), control=control, dt=dt, dynamics=new))
+    run = jax.jit(
+        lambda dt: svkc.simulate(
+            chain,
+            chain.state(v={"crank": 6.0}),
+            1.0,
+            ts=jnp.linspace(0, 1, 11),
+            control=control,
+            dt=dt,
+            dynamics=new,
+        )
+    )
     coarse, fine = run(0.02), run(0.001)
     report = coarse.report()
     states = coarse.states
-    assert float(report.gap_rate) == pytest.approx(float(jnp.max(jnp.linalg.norm(jax.vmap(lambda s: svkc.velocity_gaps(chain, s))(states)[..., 3:], axis=-1))))
-    gained = svkc.energy(chain, coarse.final) - svkc.energy(chain, jax.tree.map(lambda x: x[0], states))
-    assert float(report.energy_drift) == pytest.approx(float(gained - coarse.phases.work[0]), rel=1e-9)
-    assert (int(report.accepted), int(report.rejected), int(report.evaluations), int(report.phases)) == (50, 0, 350, 1)
-    # the sum of what steps are estimated to err is an estimate of what the run does, within an order or two
+    assert float(report.gap_rate) == pytest.approx(
+        float(
+            jnp.max(
+                jnp.linalg.norm(
+                    jax.vmap(lambda s: svkc.velocity_gaps(chain, s))(states)[..., 3:], axis=-1
+                )
+            )
+        )
+    )
+    gained = svkc.energy(chain, coarse.final) - svkc.energy(
+        chain, jax.tree.map(lambda x: x[0], states)
+    )
+    assert float(report.energy_drift) == pytest.approx(
+        float(gained - coarse.phases.work[0]), rel=1e-9
+    )
+    assert (
+        int(report.accepted),
+        int(report.rejected),
+        int(report.evaluations),
+        int(report.phases),
+    ) == (50, 0, 350, 1)
+    # the sum of what steps are estimated to err is an estimate of what the run does, within an
+    # order or two
     error = float(np.sqrt(np.mean((coarse.final.q - fine.final.q) ** 2)))
     assert 0.01 * error < float(report.error) < 1000 * error
     assert int(report.swaps) > 0
-    margins = [float(svkc.mobility(chain, jax.tree.map(lambda x, i=i: x[i], states)).margin) for i in range(11)]
+    margins = [
+        float(svkc.mobility(chain, jax.tree.map(lambda x, i=i: x[i], states)).margin)
+        for i in range(11)
+    ]
     assert 0 < float(report.margin) <= min(margins) + 1e-12
     assert not bool(report.free)
-    for word in ("largest loop gap", "drift", "held to the ground", "rank margin", "350 evaluations", "successful"):
+    for word in (
+        "largest loop gap",
+        "drift",
+        "held to the ground",
+        "rank margin",
+        "350 evaluations",
+        "successful",
+    ):
         assert word in str(report)
     coarse.save(tmp_path / "run.npz")
     assert str(svkc.load_trajectory(tmp_path / "run.npz").report()) == str(report)
@@ -174,11 +265,16 @@ def test_the_certificate(tmp_path):
 
 @pytest.mark.slow
 def test_gaps_are_seen_between_saved_times(tmp_path):
-    """A loop that drifts open and is cut: no saved state shows it, the certificate does, and the run's code; a file of before that says it is not known."""
+    """A loop that drifts open and is cut: no saved state shows it, the certificate does, and the
+    run's code; a file of before that says it is not known."""
     chain = models.four_bar()
     rough = {"dt": 0.02, "solver": diffrax.Heun(), "stabilization": svkc.Drift(), "throw": False}
-    cut = svkc.simulate(chain, chain.state(v={"crank": 6.0}), 0.4, events=[svkc.at(0.2, cut="pin")], **rough)
-    whole = svkc.simulate(chain, chain.state(v={"crank": 6.0}), 0.2, ts=0.02 * np.arange(11), **rough)
+    cut = svkc.simulate(
+        chain, chain.state(v={"crank": 6.0}), 0.4, events=[svkc.at(0.2, cut="pin")], **rough
+    )
+    whole = svkc.simulate(
+        chain, chain.state(v={"crank": 6.0}), 0.2, ts=0.02 * np.arange(11), **rough
+    )
     gap = float(whole.gaps[:, 1].max())
     assert float(cut.gaps.max()) < 1e-12 < 1e-4 < float(whole.gaps[-1, 1]) < gap
     assert float(cut.report().gap) == pytest.approx(gap, rel=1e-12)
@@ -208,17 +304,30 @@ def test_the_momentum_of_what_is_free(arm):
 
 @pytest.mark.slow
 def test_what_is_not_finite_ends_its_lane_where_it_appears(arm):
-    """By control, by a guard, with fixed steps and adaptive ones: the time and the phase, the last state that was whole; other lanes are untouched."""
+    """By control, by a guard, with fixed steps and adaptive ones: the time and the phase, the last
+    state that was whole; other lanes are untouched."""
     chain, state = arm
 
     def run(times, **kw):
         """The control is no number from the first time on, the guard from the second."""
         control = lambda t, s, args: jnp.where(t > args[0], jnp.nan, 0.0) * jnp.ones(chain.dofs)
         blind = svkc.when(lambda t, s, args: jnp.where(t > args[1], jnp.nan, 1.0), stop=True)
-        return svkc.simulate(chain, state, 0.4, events=[svkc.at(0.1, cut=()), blind], control=control, args=jnp.asarray(times), **{"throw": False} | kw)
+        return svkc.simulate(
+            chain,
+            state,
+            0.4,
+            events=[svkc.at(0.1, cut=()), blind],
+            control=control,
+            args=jnp.asarray(times),
+            **{"throw": False} | kw,
+        )
 
     theirs = diffrax.RecursiveCheckpointAdjoint()
-    for kw, close in (({"dt": 0.01}, 0.011), ({"dt": 0.01, "adjoint": theirs}, 0.011), ({"rtol": 1e-6, "atol": 1e-8}, 1e-9)):
+    for kw, close in (
+        ({"dt": 0.01}, 0.011),
+        ({"dt": 0.01, "adjoint": theirs}, 0.011),
+        ({"rtol": 1e-6, "atol": 1e-8}, 1e-9),
+    ):
         batch = jax.jit(jax.vmap(lambda times, kw=kw: run(times, **kw)))
         lanes = batch(jnp.array([[1.0, 1.0], [0.25, 1.0], [0.05, 1.0]]))
         assert (lanes.result == svkc.RESULTS.non_finite).tolist() == [False, True, True]
@@ -232,7 +341,9 @@ def test_what_is_not_finite_ends_its_lane_where_it_appears(arm):
         alone = batch(jnp.ones((3, 2)))
         assert np.all(alone.result == svkc.RESULTS.successful)
         np.testing.assert_allclose(lanes.final.q[0], alone.final.q[0], atol=1e-12)
-    with pytest.raises(RuntimeError, match=r"t = 0\.2\d* s, in phase 2: A number that is not finite"):
+    with pytest.raises(
+        RuntimeError, match=r"t = 0\.2\d* s, in phase 2: A number that is not finite"
+    ):
         run([0.25, 1.0], dt=0.01, throw=True)
     traj = run([1.0, 0.2], dt=0.01)
     assert traj.result == svkc.RESULTS.non_finite
@@ -257,7 +368,8 @@ def test_what_is_not_finite_after_an_event():
 
 
 def test_tune(capsys):
-    """The fastest of those that hold the target on this scene; a target that nobody holds; bad ones."""
+    """The fastest of those that hold the target on this scene; a target that nobody holds; bad
+    ones."""
     chain = models.four_bar()
     state = chain.state(v={"crank": 4.0})
     given = [

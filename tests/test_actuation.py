@@ -1,4 +1,5 @@
-"""Inverse dynamics of closed chains: square, redundant and missing actuation; weights, bounds; the round trip through forward dynamics."""
+"""Inverse dynamics of closed chains: square, redundant and missing actuation; weights, bounds; the
+round trip through forward dynamics."""
 
 import jax
 import jax.numpy as jnp
@@ -26,9 +27,14 @@ def five_bar():
 
 
 def reached(chain, state, vdot, found):
-    """Largest difference of theta_G's accelerations from those asked for, under the torques found."""
+    """Largest difference of theta_G's accelerations from those asked for, under the torques
+    found."""
     independent = svkc.coordinates(chain, state).independent
-    return float(jnp.abs(jnp.where(independent, svkc.forward_dynamics(chain, state, found.tau) - vdot, 0)).max())
+    return float(
+        jnp.abs(
+            jnp.where(independent, svkc.forward_dynamics(chain, state, found.tau) - vdot, 0)
+        ).max()
+    )
 
 
 def test_square(five_bar):
@@ -46,7 +52,8 @@ def test_square(five_bar):
 
 
 def test_redundant(five_bar):
-    """Three motors: least norm and least weighted norm by numpy's pseudo-inverse; the null space changes the loop's load and no motion."""
+    """Three motors: least norm and least weighted norm by numpy's pseudo-inverse; the null space
+    changes the loop's load and no motion."""
     chain, state, vdot, _ = five_bar
     motors = mask(chain, "left_arm", "right_arm", "left_fore")
     found = svkc.actuation(chain, state, vdot, actuated=motors)
@@ -55,26 +62,39 @@ def test_redundant(five_bar):
     co = svkc.coordinates(chain, state)
     S = np.asarray(co.W)[motors][:, np.asarray(co.independent)]
     wanted = S.T @ np.asarray(found.tau)[motors]
-    np.testing.assert_allclose(np.asarray(found.tau)[motors], np.linalg.pinv(S.T) @ wanted, rtol=1e-10)
+    np.testing.assert_allclose(
+        np.asarray(found.tau)[motors], np.linalg.pinv(S.T) @ wanted, rtol=1e-10
+    )
     weight = np.where(mask(chain, "left_fore"), 100.0, 1.0)
     weighted = svkc.actuation(chain, state, vdot, weight, actuated=motors)
     root = np.sqrt(weight[motors])
-    np.testing.assert_allclose(np.asarray(weighted.tau)[motors], np.linalg.pinv(S.T / root) @ wanted / root, rtol=1e-9)
-    assert abs(float(weighted.tau[mask(chain, "left_fore")][0])) < abs(float(found.tau[mask(chain, "left_fore")][0]))
+    np.testing.assert_allclose(
+        np.asarray(weighted.tau)[motors], np.linalg.pinv(S.T / root) @ wanted / root, rtol=1e-9
+    )
+    assert abs(float(weighted.tau[mask(chain, "left_fore")][0])) < abs(
+        float(found.tau[mask(chain, "left_fore")][0])
+    )
     null = np.asarray(found.null_space)
     assert int(np.any(null, 0).sum()) == 1
     column = null[:, np.any(null, 0)][:, 0]
-    before, after = (svkc.forward_dynamics(chain, state, found.tau + k * column) for k in (0.0, 7.0))
+    before, after = (
+        svkc.forward_dynamics(chain, state, found.tau + k * column) for k in (0.0, 7.0)
+    )
     np.testing.assert_allclose(before, after, atol=1e-11 * float(jnp.abs(before).max()))
     load = [svkc.loop_forces(chain, state, found.tau + k * column) for k in (0.0, 1.0)]
     which = int(np.flatnonzero(np.any(null, 0))[0])
-    np.testing.assert_allclose(load[1].force - load[0].force, found.null_force[:, :, which], atol=1e-9)
-    np.testing.assert_allclose(load[1].torque - load[0].torque, found.null_torque[:, :, which], atol=1e-9)
+    np.testing.assert_allclose(
+        load[1].force - load[0].force, found.null_force[:, :, which], atol=1e-9
+    )
+    np.testing.assert_allclose(
+        load[1].torque - load[0].torque, found.null_torque[:, :, which], atol=1e-9
+    )
     assert float(jnp.abs(found.null_force).max()) > 1e-3
 
 
 def test_missing(five_bar):
-    """One motor for two freedoms: the residual is said, and the direction that nobody drives is a motion without work."""
+    """One motor for two freedoms: the residual is said, and the direction that nobody drives is a
+    motion without work."""
     chain, state, vdot, _ = five_bar
     motors = mask(chain, "left_arm")
     found = svkc.actuation(chain, state, vdot, actuated=motors)
@@ -97,7 +117,17 @@ def test_missing(five_bar):
 def test_actuated_virtual_joint():
     """A four-bar driven at its closing hinge (Fig. 6), with a spring and damper in the tree."""
     xml = models.MJCF.format(models.FOUR_BAR).replace('damping="0"', 'damping="0.2" stiffness="3"')
-    link = svkc.VirtualLink("pin", "world", "rocker", "hinge", pos=(1.2, 0, 0), axis=(0, 1, 0), real_pos=(0.2, 0, -0.6), connected=True, actuated=True)
+    link = svkc.VirtualLink(
+        "pin",
+        "world",
+        "rocker",
+        "hinge",
+        pos=(1.2, 0, 0),
+        axis=(0, 1, 0),
+        real_pos=(0.2, 0, -0.6),
+        connected=True,
+        actuated=True,
+    )
     chain = svkc.load(xml, virtual_links=[link])
     state, vdot = moving(chain)
     assert bool(chain.actuated[-1])
@@ -122,12 +152,16 @@ def test_over_constrained():
     stresses = np.concatenate([force, torque], 1).reshape(12, -1)
     assert np.linalg.matrix_rank(stresses) == int(np.any(stresses, 0).sum()) == 7
     assert np.abs(felt).max() < 1e-12
-    assert svkc.loop_forces(chain, chain.state(connected=["pin2"]), found.tau).unique.tolist() == [True, False]
+    assert svkc.loop_forces(chain, chain.state(connected=["pin2"]), found.tau).unique.tolist() == [
+        True,
+        False,
+    ]
 
 
 @pytest.mark.slow
 def test_both_hands_on_the_bar(high_bar):
-    """16 motors, 12 freedoms, of which the swing about the bar is nobody's: reached by the others, over-actuated by five."""
+    """16 motors, 12 freedoms, of which the swing about the bar is nobody's: reached by the others,
+    over-actuated by five."""
     chain, state = high_bar
     state, vdot = moving(chain, q=state.q[: chain.nq])
     found = svkc.actuation(chain, state, vdot)
@@ -142,7 +176,8 @@ def test_both_hands_on_the_bar(high_bar):
 
 
 def test_bounds(five_bar):
-    """Loose bounds change nothing; tighter ones are kept, and the acceleration with them; too tight ones say what is missing."""
+    """Loose bounds change nothing; tighter ones are kept, and the acceleration with them; too tight
+    ones say what is missing."""
     chain, state, vdot, _ = five_bar
     motors = mask(chain, "left_arm", "right_arm", "left_fore")
     free = svkc.actuation(chain, state, vdot, actuated=motors)
@@ -160,7 +195,9 @@ def test_bounds(five_bar):
     step = null[:, np.any(null, 0)][:, 0]
     for k in (-1e-3, 1e-3):
         other = np.asarray(tight.tau) + k * step
-        assert np.any(np.abs(other) > limit) or np.sum(other**2) > np.sum(np.asarray(tight.tau) ** 2)
+        assert np.any(np.abs(other) > limit) or np.sum(other**2) > np.sum(
+            np.asarray(tight.tau) ** 2
+        )
     never = svkc.actuation(chain, state, 1e3 * vdot, actuated=motors, bounds=(-1.0, 1.0))
     assert float(jnp.abs(never.residual).max()) > 1
     assert float(jnp.abs(never.tau).max()) <= 1
@@ -168,18 +205,34 @@ def test_bounds(five_bar):
 
 @pytest.mark.slow
 def test_open_chain_and_derivative(five_bar):
-    """Without loops actuation is inverse dynamics; the torques' derivative by q against differences, in both modes."""
+    """Without loops actuation is inverse dynamics; the torques' derivative by q against
+    differences, in both modes."""
     tree = svkc.load(models.random_tree(4, 3, kinds=("hinge", "ball")))
     state, vdot = moving(tree)
     found = svkc.actuation(tree, state, vdot)
-    np.testing.assert_allclose(found.tau, svkc.inverse_dynamics(tree, state, vdot), rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(
+        found.tau, svkc.inverse_dynamics(tree, state, vdot), rtol=1e-10, atol=1e-12
+    )
     chain, state, vdot, _ = five_bar
     state = svkc.prefer(chain, state, "left_arm", "right_arm")
-    along = svkc.coordinates(chain, state).W @ jnp.where(svkc.coordinates(chain, state).independent, 1.0, 0.0)
+    along = svkc.coordinates(chain, state).W @ jnp.where(
+        svkc.coordinates(chain, state).independent, 1.0, 0.0
+    )
 
     at = state.structure
-    for motors in (mask(chain, "left_arm"), mask(chain, "left_arm", "right_arm"), mask(chain, "left_arm", "right_arm", "left_fore")):
-        f = lambda step, m=motors: svkc.actuation(chain, svkc.State(svkc.integrate(chain, state.q, step * along), state.v, at), vdot, actuated=m).tau
+    for motors in (
+        mask(chain, "left_arm"),
+        mask(chain, "left_arm", "right_arm"),
+        mask(chain, "left_arm", "right_arm", "left_fore"),
+    ):
+        f = lambda step, m=motors: (
+            svkc.actuation(
+                chain,
+                svkc.State(svkc.integrate(chain, state.q, step * along), state.v, at),
+                vdot,
+                actuated=m,
+            ).tau
+        )
         forward = jax.jacfwd(f)(0.0)
         np.testing.assert_allclose(jax.jacrev(f)(0.0), forward, rtol=1e-9, atol=1e-9)
         h = 1e-5

@@ -1,4 +1,5 @@
-"""Bricard's rectangular mechanism, IFToMM's A04: five rods along the edges of a cube, six hinges, one row of the loop redundant wherever it is. Ten
+"""Bricard's rectangular mechanism, IFToMM's A04: five rods along the edges of a cube, six hinges,
+one row of the loop redundant wherever it is. Ten
 seconds against Lagrange's equation of its one freedom."""
 
 import jax
@@ -25,13 +26,28 @@ def mechanism():
     for k in reversed(range(5)):
         edge = CORNERS[k + 1] - CORNERS[k]
         inertia = (1 - edge**2) / 12 + THIN
-        inertial = f'<inertial pos="{numbers(edge / 2)}" mass="1" diaginertia="{numbers(inertia)}"/>'
+        inertial = (
+            f'<inertial pos="{numbers(edge / 2)}" mass="1" diaginertia="{numbers(inertia)}"/>'
+        )
         start = CORNERS[k] - CORNERS[max(k - 1, 0)]
-        nested = f'<body name="rod{k}" pos="{numbers(start)}"><joint name="hinge{k}" axis="{numbers(AXES[k])}"/>{inertial}{nested}</body>'
+        nested = (
+            f'<body name="rod{k}" pos="{numbers(start)}"><joint name="hinge{k}"'
+            f' axis="{numbers(AXES[k])}"/>{inertial}{nested}</body>'
+        )
     last = svkc.VirtualLink(
-        "last", parent="world", real="rod4", joint="hinge", axis=tuple(AXES[5]), pos=tuple(CORNERS[5]), real_pos=tuple(CORNERS[5] - CORNERS[4]), connected=True
+        "last",
+        parent="world",
+        real="rod4",
+        joint="hinge",
+        axis=tuple(AXES[5]),
+        pos=tuple(CORNERS[5]),
+        real_pos=tuple(CORNERS[5] - CORNERS[4]),
+        connected=True,
     )
-    return svkc.load(f'<mujoco><option gravity="0 {-GRAVITY} 0"/><worldbody>{nested}</worldbody></mujoco>', virtual_links=[last])
+    return svkc.load(
+        f'<mujoco><option gravity="0 {-GRAVITY} 0"/><worldbody>{nested}</worldbody></mujoco>',
+        virtual_links=[last],
+    )
 
 
 def turned(axis, angle):
@@ -40,7 +56,8 @@ def turned(axis, angle):
 
 
 def angles(a):
-    """Of the hinges: sin a + sin b = sin a sin b, by Bricard's relation of angles that are counted from the cube."""
+    """Of the hinges: sin a + sin b = sin a sin b, by Bricard's relation of angles that are counted
+    from the cube."""
     b = jnp.arcsin(jnp.sin(a) / (jnp.sin(a) - 1))
     return jnp.stack([a, b, a, b, a])
 
@@ -55,7 +72,8 @@ def corners(a):
 
 
 def by_hand(ends):
-    """The first hinge's angle at each time: a thin rod's energy is that of its ends, (x'x' + x'y' + y'y') / 6."""
+    """The first hinge's angle at each time: a thin rod's energy is that of its ends, (x'x' + x'y' +
+    y'y') / 6."""
 
     def inertia(a):
         rate = jax.jacfwd(corners)(a)
@@ -67,15 +85,32 @@ def by_hand(ends):
     @jax.jit
     def rates(y):
         a, rate = y
-        return jnp.stack([rate, -(jax.grad(inertia)(a) * rate**2 / 2 + GRAVITY * jax.grad(height)(a)) / inertia(a)])
+        return jnp.stack(
+            [
+                rate,
+                -(jax.grad(inertia)(a) * rate**2 / 2 + GRAVITY * jax.grad(height)(a)) / inertia(a),
+            ]
+        )
 
-    return solve_ivp(lambda t, y: np.asarray(rates(y)), (0, ends[-1]), [0.0, 0.0], method="DOP853", t_eval=ends, rtol=1e-12, atol=1e-13).y[0]
+    return solve_ivp(
+        lambda t, y: np.asarray(rates(y)),
+        (0, ends[-1]),
+        [0.0, 0.0],
+        method="DOP853",
+        t_eval=ends,
+        rtol=1e-12,
+        atol=1e-13,
+    ).y[0]
 
 
 @pytest.mark.parametrize("inertia", [None, svkc.by_bodies], ids=["pivots", "by_bodies"])
 def test_bricards_mechanism(inertia):
     chain, times = mechanism(), jnp.linspace(0, 10, 101)
-    traj = svkc.simulate(chain, chain.state(), 10.0, ts=times, rtol=1e-11, dynamics=svkc.Dynamics(inertia=inertia))
-    np.testing.assert_allclose(traj.states.q[:, :5], jax.vmap(angles)(jnp.array(by_hand(times))), atol=1e-8)
+    traj = svkc.simulate(
+        chain, chain.state(), 10.0, ts=times, rtol=1e-11, dynamics=svkc.Dynamics(inertia=inertia)
+    )
+    np.testing.assert_allclose(
+        traj.states.q[:, :5], jax.vmap(angles)(jnp.array(by_hand(times))), atol=1e-8
+    )
     assert np.min(traj.states.q[:, 0]) < -3
     assert svkc.mobility(chain, traj.final).freedoms == 1

@@ -1,4 +1,5 @@
-"""How large the programs are that users wait for: instructions before XLA's passes, the same on every machine. `benchmarks/compile.py` has seconds."""
+"""How large the programs are that users wait for: instructions before XLA's passes, the same on
+every machine. `benchmarks/compile.py` has seconds."""
 
 import pathlib
 import sys
@@ -16,7 +17,9 @@ BUDGETS = {"forward dynamics": 2900, "main job": 14500, "four bar": 14500}
 SLOW = {"arm and ball": 16700, "gradient": 43600, "arm and ball gradient": 53900}
 
 
-@pytest.mark.parametrize("name", [*BUDGETS, *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)])
+@pytest.mark.parametrize(
+    "name", [*BUDGETS, *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)]
+)
 def test_a_program_is_no_larger_than_it_was(name):
     function, args = compiled.PROGRAMS[name]()
     count = counting.counted(jax.jit(function).lower(*args).compiler_ir("hlo").as_hlo_text())

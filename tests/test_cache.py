@@ -42,7 +42,10 @@ def test_a_folder_of_the_users_own(tmp_path, monkeypatch):
     assert jax.config.jax_compilation_cache_dir == str(folder)
     assert mode(folder) == mode(folder.parent) == 0o700
     assert cache.use_cache() == folder
-    for system, place in {"darwin": tmp_path / "Library" / "Caches", "win32": tmp_path / "usual"}.items():
+    for system, place in {
+        "darwin": tmp_path / "Library" / "Caches",
+        "win32": tmp_path / "usual",
+    }.items():
         monkeypatch.setattr(sys, "platform", system)
         assert cache._top() == place / "svkc"
 
@@ -105,7 +108,8 @@ def test_processors_and_their_features_differ(tmp_path):
 
 
 def test_entries_are_whole(tmp_path):
-    """Over one that was cut short too; nothing else is left, and where nothing can be written nothing is said."""
+    """Over one that was cut short too; nothing else is left, and where nothing can be written
+    nothing is said."""
     entries = lru_cache.LRUCache(str(tmp_path), max_size=-1)
     (tmp_path / "program-cache").write_bytes(b"ha")
     cache._put(entries, "program", b"half and half")
@@ -133,7 +137,10 @@ def test_the_oldest_go(tmp_path, monkeypatch):
 
 def test_preferences_are_not_complaints(monkeypatch, capfd):
     """What else XLA says stays, an instruction that the processor lacks above all."""
-    line = "E1 cpu_aot_loader.cc:195] Loading XLA:CPU AOT result. Target machine feature +{} is not  supported on the host machine. [+prefer-no-gather]\n"
+    line = (
+        "E1 cpu_aot_loader.cc:195] Loading XLA:CPU AOT result. Target machine feature +{} is not "
+        " supported on the host machine. [+prefer-no-gather]\n"
+    )
     said = [line.format(name) for name in ("prefer-no-gather", "avx512f", "prefer-no-scatter")]
 
     def load(key):

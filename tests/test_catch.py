@@ -1,4 +1,5 @@
-"""Catching: a figure in flight takes hold of the bar, by declared grips and where it is; momentum through every kind of event; batches of scenes."""
+"""Catching: a figure in flight takes hold of the bar, by declared grips and where it is; momentum
+through every kind of event; batches of scenes."""
 
 import equinox as eqx
 import jax
@@ -16,10 +17,20 @@ SIDES = (("right", -GRIP, "ball"), ("left", GRIP, "hinge"))
 
 @pytest.fixture(scope="module")
 def figure():
-    """The figure below the bar, arms up and hands on it, not holding: a hinge for one hand, a ball for the other."""
+    """The figure below the bar, arms up and hands on it, not holding: a hinge for one hand, a ball
+    for the other."""
     spec = mujoco.MjSpec.from_file(str(FOLDER / "figure16.xml"))
     links = [
-        svkc.VirtualLink(f"{s}_grip", "world", f"{s}_hand", joint, axis=(0, 1, 0), pos=(0, y, BAR_HEIGHT), real_pos=(0, 0, -PALM), real_quat=(1, 0, 0, 0))
+        svkc.VirtualLink(
+            f"{s}_grip",
+            "world",
+            f"{s}_hand",
+            joint,
+            axis=(0, 1, 0),
+            pos=(0, y, BAR_HEIGHT),
+            real_pos=(0, 0, -PALM),
+            real_quat=(1, 0, 0, 0),
+        )
         for s, y, joint in SIDES
     ]
     chain = svkc.load(spec, virtual_links=links, ignore="limit")
@@ -28,11 +39,17 @@ def figure():
 
 
 def tossed(chain, state, up, roll):
-    """Thrown up from there, rolling about x through the point between the hands, with rigid limbs."""
+    """Thrown up from there, rolling about x through the point between the hands, with rigid
+    limbs."""
     hips = np.asarray(state.q[:3])
     linear = np.array([0, 0, up]) + np.cross([roll, 0, 0], hips - np.array([0, 0, BAR_HEIGHT]))
-    q = {name: float(state.q[i]) for name, i in zip(chain.joint_names[1:], range(7, chain.nq), strict=True)}
-    return chain.state(q | {"base": np.asarray(state.q[:7])}, {"base": [*linear, roll, 0, 0]}, connected=())
+    q = {
+        name: float(state.q[i])
+        for name, i in zip(chain.joint_names[1:], range(7, chain.nq), strict=True)
+    }
+    return chain.state(
+        q | {"base": np.asarray(state.q[:7])}, {"base": [*linear, roll, 0, 0]}, connected=()
+    )
 
 
 @pytest.fixture(scope="module")
@@ -43,8 +60,21 @@ def catches(figure):
     @eqx.filter_jit
     def run(state):
         grips = [f"{s}_grip" for s, _, _ in SIDES]
-        events = [svkc.when(svkc.touch(chain, g, 0.04, axes="xy"), connect=g, direction=False, here=True) for g in grips]
-        return svkc.simulate(chain, state, 0.5, ts=jnp.linspace(0, 0.5, 21), events=events, rtol=1e-8, atol=1e-10, max_events=3, throw=False)
+        events = [
+            svkc.when(svkc.touch(chain, g, 0.04, axes="xy"), connect=g, direction=False, here=True)
+            for g in grips
+        ]
+        return svkc.simulate(
+            chain,
+            state,
+            0.5,
+            ts=jnp.linspace(0, 0.5, 21),
+            events=events,
+            rtol=1e-8,
+            atol=1e-10,
+            max_events=3,
+            throw=False,
+        )
 
     return run
 
@@ -54,7 +84,11 @@ def test_caught_by_one_hand_then_the_other(figure, catches):
     chain, state = figure
     traj = catches(tossed(chain, state, 1.4, 0.25))
     assert int(traj.events.count) == 2
-    assert traj.phases.joint_freedoms[:3].tolist() == [22, 25 if int(traj.events.which[0]) == 0 else 23, 26]
+    assert traj.phases.joint_freedoms[:3].tolist() == [
+        22,
+        25 if int(traj.events.which[0]) == 0 else 23,
+        26,
+    ]
     assert 0.01 < float(traj.events.time[1] - traj.events.time[0]) < 0.2
     assert np.all(np.asarray(traj.events.energy_lost[:2]) > 0)
     assert float(traj.gaps.max()) < 1e-9
@@ -62,12 +96,17 @@ def test_caught_by_one_hand_then_the_other(figure, catches):
     # each hand is where it took hold: within reach of the bar's axis
     for side in (0, 1):
         grip = traj.final.structure.pos[side]
-        assert 0.03 < float(jnp.linalg.norm(grip[jnp.array([0, 2])] - jnp.array([0.0, BAR_HEIGHT]))) < 0.05
+        assert (
+            0.03
+            < float(jnp.linalg.norm(grip[jnp.array([0, 2])] - jnp.array([0.0, BAR_HEIGHT])))
+            < 0.05
+        )
 
 
 @pytest.mark.slow
 def test_caught_by_both_at_once(figure, catches):
-    """Thrown straight up the rigid figure comes back: two guards at one instant, at the time of the parabola; declared grips at the place itself."""
+    """Thrown straight up the rigid figure comes back: two guards at one instant, at the time of the
+    parabola; declared grips at the place itself."""
     chain, state = figure
     start = tossed(chain, state, 1.4, 0.0)
     traj = catches(start)
@@ -88,28 +127,40 @@ def test_caught_by_both_at_once(figure, catches):
 PAIR = models.MJCF.format(
     '<body name="a"><freejoint name="a"/><geom type="box" size="0.1 0.2 0.3" contype="0"/>'
     + models.bar("limb", models.Y, "0.4 0 0", "0.1 0 0")
-    + '</body><body name="b" pos="1 0 0"><freejoint name="b"/><geom type="box" size="0.3 0.1 0.2" contype="0"/></body>'
+    + '</body><body name="b" pos="1 0 0"><freejoint name="b"/><geom type="box" size="0.3 0.1 0.2"'
+    ' contype="0"/></body>'
 )
 
 
 @pytest.fixture(scope="module")
 def pair():
-    """Two free bodies, one with a limb that may come off, a weld between them, and a spare slot; no gravity."""
+    """Two free bodies, one with a limb that may come off, a weld between them, and a spare slot; no
+    gravity."""
     links = [svkc.VirtualLink("weld", "a", "b", "weld", real_pos=(-0.6, 0.1, 0))]
-    return svkc.load(PAIR.replace("0.3 -0.2 -9.81", "0 0 0"), virtual_links=links, cuttable="limb", spare=1)
+    return svkc.load(
+        PAIR.replace("0.3 -0.2 -9.81", "0 0 0"), virtual_links=links, cuttable="limb", spare=1
+    )
 
 
 @pytest.mark.slow
 def test_momentum_through_every_kind_of_event(pair):
-    """Connect, cut, bind, unbind, lock, unlock, a joint coming off and made again: 1e-12 each; energy never grows, cuts change no velocity."""
+    """Connect, cut, bind, unbind, lock, unlock, a joint coming off and made again: 1e-12 each;
+    energy never grows, cuts change no velocity."""
     rng = np.random.default_rng(7)
-    state = pair.state({"limb": 0.3}, {"a": rng.normal(size=6), "b": rng.normal(size=6), "limb": 1.0})
+    state = pair.state(
+        {"limb": 0.3}, {"a": rng.normal(size=6), "b": rng.normal(size=6), "limb": 1.0}
+    )
     steps = [
         ("connect", lambda s: svkc.connect(pair, s, "weld", here=True)),
         ("lock", lambda s: svkc.lock(pair, s, "limb")),
         ("unlock", lambda s: svkc.unlock(pair, s, "limb")),
         ("cut", lambda s: svkc.cut(pair, s, "weld")),
-        ("grip", lambda s: svkc.connect(pair, svkc.bind(pair, s, "spare_0", "limb", "b", joint="ball"), "spare_0", here=True)),
+        (
+            "grip",
+            lambda s: svkc.connect(
+                pair, svkc.bind(pair, s, "spare_0", "limb", "b", joint="ball"), "spare_0", here=True
+            ),
+        ),
         ("cut", lambda s: svkc.cut(pair, s, "limb")),
         ("cut", lambda s: svkc.unbind(pair, s, "spare_0")),
         ("move", lambda s: svkc.simulate(pair, s, 0.1, rtol=1e-9, atol=1e-11).final),
@@ -117,7 +168,12 @@ def test_momentum_through_every_kind_of_event(pair):
     ]
     for name, step in steps:
         after = step(state)
-        for a, b, tight in zip(svkc.momentum(pair, state), svkc.momentum(pair, after), (1e-12, 1e-8 if name == "move" else 1e-12), strict=True):
+        for a, b, tight in zip(
+            svkc.momentum(pair, state),
+            svkc.momentum(pair, after),
+            (1e-12, 1e-8 if name == "move" else 1e-12),
+            strict=True,
+        ):
             np.testing.assert_allclose(b, a, atol=tight * float(jnp.abs(a).max()), err_msg=name)
         gain = float(svkc.kinetic_energy(pair, after) - svkc.kinetic_energy(pair, state))
         assert gain <= 1e-12 or name == "move"
@@ -138,9 +194,12 @@ def test_connecting_what_is_connected_changes_nothing(pair):
 
 @pytest.mark.slow
 def test_a_batch_of_scenes_is_its_single_runs(pair):
-    """Another starting structure, grip and event times in each lane: the numbers of the single runs to 1e-10."""
+    """Another starting structure, grip and event times in each lane: the numbers of the single runs
+    to 1e-10."""
     rng = np.random.default_rng(3)
-    start = pair.state({"limb": 0.3}, {"a": rng.normal(size=6), "b": rng.normal(size=6), "limb": 1.0})
+    start = pair.state(
+        {"limb": 0.3}, {"a": rng.normal(size=6), "b": rng.normal(size=6), "limb": 1.0}
+    )
     starts = [start, svkc.connect(pair, start, "weld", here=True), svkc.cut(pair, start, "limb")]
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *starts)
     first, second = jnp.array([0.05, 0.12, 0.2]), jnp.array([0.22, 0.04, 0.15])
@@ -153,7 +212,9 @@ def test_a_batch_of_scenes_is_its_single_runs(pair):
             svkc.at(second, cut=("weld", "limb")),
             svkc.at(0.25, unbind="spare_0"),
         ]
-        return svkc.simulate(pair, state, 0.3, ts=jnp.linspace(0, 0.3, 4), events=events, dt=0.01, throw=False)
+        return svkc.simulate(
+            pair, state, 0.3, ts=jnp.linspace(0, 0.3, 4), events=events, dt=0.01, throw=False
+        )
 
     batch = eqx.filter_vmap(run)(stacked, first, second, place)
     for i in range(3):
@@ -167,37 +228,67 @@ def test_a_batch_of_scenes_is_its_single_runs(pair):
 
 def box():
     """A box of 2 kg on the ground, which holds it; it can move up."""
-    xml = models.MJCF.format('<body name="box"><joint name="z" type="slide" axis="0 0 1"/><geom type="box" size="0.1 0.1 0.1" mass="2"/></body>')
+    xml = models.MJCF.format(
+        '<body name="box"><joint name="z" type="slide" axis="0 0 1"/><geom type="box" size="0.1 0.1'
+        ' 0.1" mass="2"/></body>'
+    )
     xml = xml.replace("0.3 -0.2 -9.81", "0 0 -10")
-    return svkc.load(xml, virtual_links=[svkc.VirtualLink("ground", "world", "box", "weld", connected=True)])
+    return svkc.load(
+        xml, virtual_links=[svkc.VirtualLink("ground", "world", "box", "weld", connected=True)]
+    )
 
 
 def test_guards_say_what_they_are_to():
-    """Called by hand: the ground carries 20 N less what pulls; over a limit of 10 N that is once too much; the box is where the ground is."""
+    """Called by hand: the ground carries 20 N less what pulls; over a limit of 10 N that is once
+    too much; the box is where the ground is."""
     chain = box()
     state, pull = chain.state(), jnp.array([5.0])
     np.testing.assert_allclose(svkc.leaves(chain, "ground")(0.0, state, tau=pull), 15, rtol=1e-12)
-    np.testing.assert_allclose(svkc.overload(chain, "ground", force=10.0)(0.0, state, tau=pull), 0.5, rtol=1e-12)
-    np.testing.assert_allclose(svkc.touch(chain, "ground", 0.02, axes="z")(0.0, state), -0.02, rtol=1e-12)
+    np.testing.assert_allclose(
+        svkc.overload(chain, "ground", force=10.0)(0.0, state, tau=pull), 0.5, rtol=1e-12
+    )
+    np.testing.assert_allclose(
+        svkc.touch(chain, "ground", 0.02, axes="z")(0.0, state), -0.02, rtol=1e-12
+    )
 
 
 @pytest.mark.slow
 def test_a_support_that_can_only_push():
-    """A box thrown on the ground under a growing pull: it sticks, and is let go when the ground would have to pull; the force by Newton's law.
+    """A box thrown on the ground under a growing pull: it sticks, and is let go when the ground
+    would have to pull; the force by Newton's law.
 
     Told on the way are when it is pressed with less than 10 N, and when it is at a height.
     """
     chain = box()
     pull = lambda t, state, args: jnp.where(jnp.arange(1) == 0, 40 * t, 0.0)
-    told = [svkc.when(svkc.overload(chain, "ground", force=10.0), direction=False), svkc.when(svkc.touch(chain, "ground", 0.02, axes="z"), direction=True)]
+    told = [
+        svkc.when(svkc.overload(chain, "ground", force=10.0), direction=False),
+        svkc.when(svkc.touch(chain, "ground", 0.02, axes="z"), direction=True),
+    ]
 
     def run(t0, t1, again):
-        events = [svkc.at(again, connect="ground"), svkc.when(svkc.leaves(chain, "ground"), cut="ground", direction=False), *told]
-        return svkc.simulate(chain, chain.state(), t1, t0=t0, control=pull, events=events, rtol=1e-9, atol=1e-11, max_events=6)
+        events = [
+            svkc.at(again, connect="ground"),
+            svkc.when(svkc.leaves(chain, "ground"), cut="ground", direction=False),
+            *told,
+        ]
+        return svkc.simulate(
+            chain,
+            chain.state(),
+            t1,
+            t0=t0,
+            control=pull,
+            events=events,
+            rtol=1e-9,
+            atol=1e-11,
+            max_events=6,
+        )
 
     traj = run(0.0, 0.7, 2.0)
     assert traj.events.which[: int(traj.events.count)].tolist() == [2, 1, 3]
-    np.testing.assert_allclose(traj.events.time[:3], [0.25, 0.5, 0.5 + (0.02 * 6 / 20) ** (1 / 3)], atol=1e-9)
+    np.testing.assert_allclose(
+        traj.events.time[:3], [0.25, 0.5, 0.5 + (0.02 * 6 / 20) ** (1 / 3)], atol=1e-9
+    )
     # z'' = 20 t - 10 from 0.5 s on
     np.testing.assert_allclose(traj.final.q[0], 20 / 6 * 0.2**3, rtol=1e-8)
     # one that would have to pull from the first moment leaves at once

@@ -1,4 +1,5 @@
-"""Structure changes: the velocity after, two ways; momentum, energy; cuts, locks, grips where the hand is."""
+"""Structure changes: the velocity after, two ways; momentum, energy; cuts, locks, grips where the
+hand is."""
 
 import jax
 import jax.numpy as jnp
@@ -13,11 +14,14 @@ from svkc.transitions.transition import change
 
 @pytest.fixture(scope="module")
 def flight(high_bar):
-    """The figure in flight beside the bar, spinning, its hands still where the grips are; with gravity off."""
+    """The figure in flight beside the bar, spinning, its hands still where the grips are; with
+    gravity off."""
     chain, state = high_bar
     rng = np.random.default_rng(2)
     free = svkc.cut(chain, state, "right_hand_grip", "left_hand_grip")
-    return chain, svkc.State(free.q, free.v.at[: chain.nv].set(jnp.asarray(rng.normal(size=chain.nv))), free.structure)
+    return chain, svkc.State(
+        free.q, free.v.at[: chain.nv].set(jnp.asarray(rng.normal(size=chain.nv))), free.structure
+    )
 
 
 def test_both_forms_of_the_impact_agree(flight):
@@ -25,7 +29,9 @@ def test_both_forms_of_the_impact_agree(flight):
     for name in ("left_hand_grip", "right_hand_grip"):
         v, F = velocity_by_impulse(chain, state, name)
         after = svkc.connect(chain, state, name)
-        np.testing.assert_allclose(after.v[: chain.nv], v[: chain.nv], atol=1e-10 * float(jnp.abs(v).max()))
+        np.testing.assert_allclose(
+            after.v[: chain.nv], v[: chain.nv], atol=1e-10 * float(jnp.abs(v).max())
+        )
         hinge = chain.dofs - 2 + chain.link_names.index(name)
         np.testing.assert_allclose(after.v[hinge], v[hinge], atol=1e-10 * float(jnp.abs(v).max()))
         # the new joint's freedom carries nothing: J_r^T F = 0 for a hinge about y
@@ -53,7 +59,9 @@ def test_one_by_one_or_together_is_the_same(flight):
     """Plastic latches are projections; their order does not matter."""
     chain, state = flight
     together = svkc.connect(chain, state, "left_hand_grip", "right_hand_grip")
-    left_first = svkc.connect(chain, svkc.connect(chain, state, "left_hand_grip"), "right_hand_grip")
+    left_first = svkc.connect(
+        chain, svkc.connect(chain, state, "left_hand_grip"), "right_hand_grip"
+    )
     np.testing.assert_allclose(together.v, left_first.v, atol=1e-10)
 
 
@@ -74,20 +82,37 @@ def test_a_cut_keeps_every_bit(high_bar):
     m = svkc.mobility(chain, after)
     assert (int(m.joint_freedoms), int(m.rank), int(m.freedoms)) == (23, 6, 17)
     for mask in ([True, True], np.array([True, True])):
-        np.testing.assert_allclose(svkc.transition(chain, after, jnp.asarray(mask)).v, state.v, atol=1e-12)
+        np.testing.assert_allclose(
+            svkc.transition(chain, after, jnp.asarray(mask)).v, state.v, atol=1e-12
+        )
 
 
 TWO = models.MJCF.format(
-    '<body name="a"><freejoint name="a"/><geom type="box" size="0.1 0.2 0.3" contype="0"/></body>'
-    '<body name="b" pos="1 0 0"><freejoint name="b"/><geom type="box" size="0.3 0.1 0.2" contype="0"/></body>'
+    '<body name="a"><freejoint name="a"/><geom type="box" size="0.1 0.2 0.3"'
+    ' contype="0"/></body><body name="b" pos="1 0 0"><freejoint name="b"/><geom type="box"'
+    ' size="0.3 0.1 0.2" contype="0"/></body>'
 )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("joint", ["hinge", "weld", "ball", "slide"])
 def test_momentum_across_a_connect(joint):
-    """Two free bodies caught together: momentum stays to 1e-12, energy never grows, the joint's freedoms take nothing."""
-    chain = svkc.load(TWO, virtual_links=[svkc.VirtualLink("grip", "a", "b", joint, pos=(0.4, 0.1, 0), real_pos=(-0.6, 0.1, 0), axis=(0.2, 0.5, 1))])
+    """Two free bodies caught together: momentum stays to 1e-12, energy never grows, the joint's
+    freedoms take nothing."""
+    chain = svkc.load(
+        TWO,
+        virtual_links=[
+            svkc.VirtualLink(
+                "grip",
+                "a",
+                "b",
+                joint,
+                pos=(0.4, 0.1, 0),
+                real_pos=(-0.6, 0.1, 0),
+                axis=(0.2, 0.5, 1),
+            )
+        ],
+    )
     rng = np.random.default_rng(1)
     state = chain.state(v=rng.normal(size=12))
     after = svkc.connect(chain, state, "grip")
@@ -100,8 +125,14 @@ def test_momentum_across_a_connect(joint):
 
 
 def test_grip_where_it_is():
-    """Bodies away from the declared placement: refused by name and distance; here=True makes the joint where the real link is."""
-    chain = svkc.load(TWO, virtual_links=[svkc.VirtualLink("grip", "a", "b", "hinge", pos=(0, 0, 0), real_pos=(-0.6, 0.1, 0))])
+    """Bodies away from the declared placement: refused by name and distance; here=True makes the
+    joint where the real link is."""
+    chain = svkc.load(
+        TWO,
+        virtual_links=[
+            svkc.VirtualLink("grip", "a", "b", "hinge", pos=(0, 0, 0), real_pos=(-0.6, 0.1, 0))
+        ],
+    )
     state = chain.state(v=np.arange(12.0))
     with pytest.raises(ValueError, match=r"away from where the joint is declared.*here=True"):
         svkc.connect(chain, state, "grip")
@@ -131,7 +162,10 @@ def test_lock_and_unlock(high_bar):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda c, s: svkc.connect(c, s, "third_hand"), "third_hand.*virtual links: right_hand_grip"),
+        (
+            lambda c, s: svkc.connect(c, s, "third_hand"),
+            "third_hand.*virtual links: right_hand_grip",
+        ),
         (lambda c, s: svkc.cut(c, s, "nose"), "nose"),
         (lambda c, s: svkc.transition(c, s, np.array([1, 0])), "Booleans"),
         (lambda c, s: svkc.lock(c, s, "neck"), "neck"),
@@ -142,7 +176,12 @@ def test_lock_and_unlock(high_bar):
         (lambda c, s: c.state(q={"base": [0, 0, 0, 2, 0, 0, 0]}), "norm 2"),
         (lambda c, s: c.state(v=np.full(c.nv, np.nan)), "finite"),
         (lambda c, s: c.state(v=["x"] * c.nv), "real numbers"),
-        (lambda c, s: c.state(q={"base": [9, 0, 0, 1, 0, 0, 0], "left_knee": 0.1}, connected="foot"), "foot"),
+        (
+            lambda c, s: c.state(
+                q={"base": [9, 0, 0, 1, 0, 0, 0], "left_knee": 0.1}, connected="foot"
+            ),
+            "foot",
+        ),
         (lambda c, s: svkc.forward_dynamics(c, s, jnp.zeros(3)), "expected 24 joint torques"),
         (lambda c, s: svkc.inverse_dynamics(c, s, jnp.zeros(3)), "expected 22"),
     ],
@@ -162,7 +201,9 @@ def test_states_and_changes_under_jit_and_vmap(high_bar):
     @jax.vmap
     def lanes(v):
         moving = chain.state(state.q[: chain.nq], v)
-        return moving, svkc.connect(chain, svkc.cut(chain, moving, "left_hand_grip"), "left_hand_grip")
+        return moving, svkc.connect(
+            chain, svkc.cut(chain, moving, "left_hand_grip"), "left_hand_grip"
+        )
 
     moving, again = lanes(v)
     np.testing.assert_allclose(moving.v[1], chain.state(state.q[: chain.nq], v[1]).v, atol=1e-12)
@@ -171,7 +212,18 @@ def test_states_and_changes_under_jit_and_vmap(high_bar):
 
 def test_loops_that_cannot_be_closed():
     """Two links too short to reach: says which loop, and by how much."""
-    xml = models.MJCF.format(models.bar("short", models.Y, "0 0 0.2", inside=models.bar("tip", models.Y, "0.2 0 0.1", "0 0 0.2")))
-    chain = svkc.load(xml, virtual_links=[svkc.VirtualLink("far", "world", "tip", "ball", pos=(3, 0, 0), real_pos=(0.2, 0, 0), connected=True)])
+    xml = models.MJCF.format(
+        models.bar(
+            "short", models.Y, "0 0 0.2", inside=models.bar("tip", models.Y, "0.2 0 0.1", "0 0 0.2")
+        )
+    )
+    chain = svkc.load(
+        xml,
+        virtual_links=[
+            svkc.VirtualLink(
+                "far", "world", "tip", "ball", pos=(3, 0, 0), real_pos=(0.2, 0, 0), connected=True
+            )
+        ],
+    )
     with pytest.raises(ValueError, match=r"cannot be closed.*far by \d\.\d+ m and"):
         chain.state()

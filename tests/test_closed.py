@@ -1,4 +1,5 @@
-"""Closed chains: accelerations against multipliers, whatever coordinates are chosen; redundant loops; the loop forces."""
+"""Closed chains: accelerations against multipliers, whatever coordinates are chosen; redundant
+loops; the loop forces."""
 
 import equinox as eqx
 import jax
@@ -9,9 +10,17 @@ import pytest
 from kkt import acceleration
 
 import svkc
-from svkc.loops.forward_dynamics import acceleration as accelerated, forward_dynamics_by_unit_vectors
+from svkc.loops.forward_dynamics import (
+    acceleration as accelerated,
+    forward_dynamics_by_unit_vectors,
+)
 
-CASES = {"four_bar": models.four_bar, "parallelogram": models.parallelogram, "rod_on_balls": models.rod_on_balls, "stewart": models.stewart}
+CASES = {
+    "four_bar": models.four_bar,
+    "parallelogram": models.parallelogram,
+    "rod_on_balls": models.rod_on_balls,
+    "stewart": models.stewart,
+}
 CASES |= {"figure40": models.figure40}
 MOBILITY = {"four_bar": 1, "parallelogram": 1, "rod_on_balls": 2, "stewart": 6, "figure40": 40}
 
@@ -19,13 +28,24 @@ MOBILITY = {"four_bar": 1, "parallelogram": 1, "rod_on_balls": 2, "stewart": 6, 
 FAST = ("four_bar",)
 
 
-@pytest.fixture(params=[name if name in FAST else pytest.param(name, marks=pytest.mark.slow) for name in (*CASES, "two_hands")], scope="module")
+@pytest.fixture(
+    params=[
+        name if name in FAST else pytest.param(name, marks=pytest.mark.slow)
+        for name in (*CASES, "two_hands")
+    ],
+    scope="module",
+)
 def case(request, high_bar):
     """Chain, and a state in motion: velocities at random, projected on what the loops allow."""
     rng = np.random.default_rng(3)
     chain = high_bar[0] if request.param == "two_hands" else CASES[request.param]()
     q = high_bar[1].q[: chain.nq] if request.param == "two_hands" else None
-    return request.param, chain, chain.state(q, rng.normal(size=chain.nv)), jnp.asarray(rng.normal(size=chain.dofs))
+    return (
+        request.param,
+        chain,
+        chain.state(q, rng.normal(size=chain.nv)),
+        jnp.asarray(rng.normal(size=chain.dofs)),
+    )
 
 
 def test_acceleration_is_that_of_the_multipliers(case):
@@ -43,19 +63,34 @@ def test_acceleration_is_that_of_the_multipliers(case):
 
 @pytest.mark.slow
 def test_articulated_bodies_carry_what_acts_on_virtual_joints(case):
-    """The same with torques at the joints of the loops, and with a joint of the tree locked; and its derivative by masses and along the loops, on each side."""
+    """The same with torques at the joints of the loops, and with a joint of the tree locked; and
+    its derivative by masses and along the loops, on each side."""
     name, chain, state, tau = case
-    locked = svkc.lock(chain, state, chain.joint_names[-1]) if name in ("stewart", "two_hands") else state
+    locked = (
+        svkc.lock(chain, state, chain.joint_names[-1])
+        if name in ("stewart", "two_hands")
+        else state
+    )
     along = svkc.coordinates(chain, locked).W @ jnp.linspace(-1.0, 1.0, chain.dofs)
 
     def both(scale):
-        c = eqx.tree_at(lambda c: c.mass, chain, chain.mass * (1 + scale * jnp.linspace(0.0, 3.0, chain.mass.shape[0])))
+        c = eqx.tree_at(
+            lambda c: c.mass,
+            chain,
+            chain.mass * (1 + scale * jnp.linspace(0.0, 3.0, chain.mass.shape[0])),
+        )
         q = svkc.integrate(chain, locked.q, scale * along)
-        return [accelerated(c, locked.structure, q, locked.v, tau, way) for way in (None, svkc.by_bodies)]
+        return [
+            accelerated(c, locked.structure, q, locked.v, tau, way)
+            for way in (None, svkc.by_bodies)
+        ]
 
     for usual, bodies in (both(0.0), jax.jvp(both, (0.0,), (1.0,))[1]):
         assert np.abs(bodies - usual).max() < 1e-9 * np.abs(usual).max()
-    back = [jax.grad(lambda x, i=i: jnp.sum(both(x)[i] * jnp.linspace(-1.0, 2.0, chain.dofs)))(0.0) for i in (0, 1)]
+    back = [
+        jax.grad(lambda x, i=i: jnp.sum(both(x)[i] * jnp.linspace(-1.0, 2.0, chain.dofs)))(0.0)
+        for i in (0, 1)
+    ]
     np.testing.assert_allclose(*back, rtol=1e-8)
 
 
@@ -63,7 +98,9 @@ def test_the_choice_of_coordinates_does_not_matter(case):
     """Asking for what was dependent gives another choice of theta_G and the same acceleration."""
     _, chain, state, tau = case
     first = svkc.coordinates(chain, state)
-    asked = eqx.tree_at(lambda s: s.structure.independent, state, first.dependent, is_leaf=lambda x: x is None)
+    asked = eqx.tree_at(
+        lambda s: s.structure.independent, state, first.dependent, is_leaf=lambda x: x is None
+    )
     second = svkc.coordinates(chain, asked)
     assert bool(jnp.any(first.independent != second.independent))
     a, b = svkc.forward_dynamics(chain, state, tau), svkc.forward_dynamics(chain, asked, tau)
@@ -71,7 +108,8 @@ def test_the_choice_of_coordinates_does_not_matter(case):
 
 
 def test_velocities_and_accelerations_keep_the_loops(case):
-    """J_C W = 0 and J_C vdot + Jdot_C v = 0, the latter against the derivative of J_C v along the motion."""
+    """J_C W = 0 and J_C vdot + Jdot_C v = 0, the latter against the derivative of J_C v along the
+    motion."""
     name, chain, state, tau = case
     assert float(jnp.max(jnp.abs(svkc.loop_gaps(chain, state)))) < 1e-12
     assert float(jnp.max(jnp.abs(svkc.velocity_gaps(chain, state)))) < 1e-12
@@ -89,14 +127,17 @@ def test_velocities_and_accelerations_keep_the_loops(case):
 
 
 def test_loop_forces_and_torques_explain_the_acceleration(case):
-    """What the tree needs beyond what is applied is J^T of the loop forces: checked as power on any velocity of the cut-open tree."""
+    """What the tree needs beyond what is applied is J^T of the loop forces: checked as power on any
+    velocity of the cut-open tree."""
     _, chain, state, tau = case
     force, torque = svkc.loop_forces(chain, state, tau)
     vdot = svkc.forward_dynamics(chain, state, tau)
     missing = svkc.inverse_dynamics(chain, state, vdot) - tau[: chain.nv]
     rng = np.random.default_rng(0)
     v = jnp.asarray(rng.normal(size=chain.nv))
-    moved = svkc.State(state.q, jnp.concatenate([v, jnp.zeros(chain.dofs - chain.nv)]), state.structure)
+    moved = svkc.State(
+        state.q, jnp.concatenate([v, jnp.zeros(chain.dofs - chain.nv)]), state.structure
+    )
     relative = svkc.velocity_gaps(chain, moved)
     power = -jnp.sum(relative[:, :3] * torque) - jnp.sum(relative[:, 3:] * force)
     assert abs(float(missing @ v - power)) < 1e-8 * max(1.0, float(jnp.max(jnp.abs(force))))
@@ -112,26 +153,43 @@ def test_redundant_loop_moves_like_its_minimal_form():
     assert int(jnp.sum(m.redundant)) == 12 - int(m.rank)
     tau = jnp.zeros(chain.dofs)
     a, b = svkc.forward_dynamics(chain, both, tau), svkc.forward_dynamics(chain, one, tau)
-    # the leg that is let go swings by itself; the others must not notice only if it moves the same: compare with it held
+    # the leg that is let go swings by itself; the others must not notice only if it moves the same:
+    # compare with it held
     held = np.array([n in ("leg0", "plate", "leg2") for n in chain.joint_names])
     assert float(jnp.abs(svkc.velocity_gaps(chain, both)).max()) < 1e-13
     expected = acceleration(chain, one, tau)
     np.testing.assert_allclose(np.asarray(b)[: chain.nv][held], expected[held], rtol=1e-9)
-    np.testing.assert_allclose(np.asarray(a)[: chain.nv], acceleration(chain, both, tau), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(
+        np.asarray(a)[: chain.nv], acceleration(chain, both, tau), rtol=1e-9, atol=1e-12
+    )
 
 
-JOINTS = ["weld", "hinge", "slide", "cylinder", "universal", "planar", "ball", "free", (True, False, True, False, True, False)]
+JOINTS = [
+    "weld",
+    "hinge",
+    "slide",
+    "cylinder",
+    "universal",
+    "planar",
+    "ball",
+    "free",
+    (True, False, True, False, True, False),
+]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("joint", JOINTS)
 def test_every_kind_of_virtual_joint(joint):
-    """Two free bodies joined by the joint: rank, acceleration that keeps the loop, coordinates read off and back."""
+    """Two free bodies joined by the joint: rank, acceleration that keeps the loop, coordinates read
+    off and back."""
     xml = models.MJCF.format(
-        '<body name="a" pos="0 0 1"><freejoint/><geom type="box" size="0.1 0.2 0.3" contype="0"/></body>'
-        '<body name="b" pos="0.5 0.1 1" quat="0.8 0 0.6 0"><freejoint/><geom type="box" size="0.2 0.1 0.15" contype="0"/></body>'
+        '<body name="a" pos="0 0 1"><freejoint/><geom type="box" size="0.1 0.2 0.3"'
+        ' contype="0"/></body><body name="b" pos="0.5 0.1 1" quat="0.8 0 0.6 0"><freejoint/><geom'
+        ' type="box" size="0.2 0.1 0.15" contype="0"/></body>'
     )
-    link = svkc.VirtualLink("j", "a", "b", joint, pos=(0.3, 0, 0), axis=(0.2, 0.3, 1), connected=True)
+    link = svkc.VirtualLink(
+        "j", "a", "b", joint, pos=(0.3, 0, 0), axis=(0.2, 0.3, 1), connected=True
+    )
     chain = svkc.load(xml, virtual_links=[link])
     rng = np.random.default_rng(5)
     q = np.array(chain.q_load)
@@ -150,7 +208,13 @@ def test_every_kind_of_virtual_joint(joint):
 
     _, change = jax.jvp(relative, (state.q, state.v), (rates(chain, state.q, state.v), vdot))
     assert float(jnp.max(jnp.abs(change))) < 1e-9 * max(1, float(jnp.max(jnp.abs(vdot))))
-    if joint not in ("weld", "universal", "cylinder", "ball", (True, False, True, False, True, False)):
+    if joint not in (
+        "weld",
+        "universal",
+        "cylinder",
+        "ball",
+        (True, False, True, False, True, False),
+    ):
         return
     final = svkc.simulate(chain, state, 0.3, rtol=1e-9, atol=1e-11).final
     assert float(jnp.max(jnp.abs(svkc.loop_gaps(chain, final)))) < 1e-12
@@ -167,7 +231,18 @@ def test_every_kind_of_virtual_joint(joint):
 def test_spare_slots_change_nothing():
     numbers = []
     for spare in (0, 1, 4):
-        links = [svkc.VirtualLink("pin", "world", "rocker", "hinge", pos=(1.2, 0, 0), axis=(0, 1, 0), real_pos=(0.2, 0, -0.6), connected=True)]
+        links = [
+            svkc.VirtualLink(
+                "pin",
+                "world",
+                "rocker",
+                "hinge",
+                pos=(1.2, 0, 0),
+                axis=(0, 1, 0),
+                real_pos=(0.2, 0, -0.6),
+                connected=True,
+            )
+        ]
         xml = models.FOUR_BAR
         chain = svkc.load(models.MJCF.format(xml), virtual_links=links, spare=spare)
         state = chain.state(v={"crank": 1.0})
@@ -184,21 +259,27 @@ GRIP = svkc.Grip("world", "rocker", joint="ball", real_pos=(0.2, 0, -0.6))
 
 @pytest.fixture(scope="module")
 def gripped():
-    """A four-bar whose pin is a grip in a spare slot: the chain, its state before the grip, and with it; the four-bar with a declared pin and its state."""
+    """A four-bar whose pin is a grip in a spare slot: the chain, its state before the grip, and
+    with it; the four-bar with a declared pin and its state."""
     declared = models.four_bar()
     a = declared.state(v={"crank": 1.0})
     chain = svkc.load(models.MJCF.format(models.FOUR_BAR), spare=1)
     open_ = chain.state(v=np.asarray(a.v)[:3])
-    bound = svkc.bind(chain, open_, "spare_0", GRIP.parent, GRIP.real, joint=GRIP.joint, real_pos=GRIP.real_pos)
+    bound = svkc.bind(
+        chain, open_, "spare_0", GRIP.parent, GRIP.real, joint=GRIP.joint, real_pos=GRIP.real_pos
+    )
     return chain, open_, svkc.connect(chain, bound, "spare_0", here=True), declared, a
 
 
 def test_bind_a_spare_slot(gripped):
-    """A grip between bodies not known beforehand: the same motion as the declared link. Given up it leaves an empty slot, and the motion as it was."""
+    """A grip between bodies not known beforehand: the same motion as the declared link. Given up it
+    leaves an empty slot, and the motion as it was."""
     chain, _, gripped, declared, a = gripped
     np.testing.assert_allclose(gripped.v[:3], a.v[:3], atol=1e-12)
     f = svkc.forward_dynamics
-    np.testing.assert_allclose(f(chain, gripped, jnp.zeros(3))[:3], f(declared, a, jnp.zeros(3))[:3], rtol=1e-9)
+    np.testing.assert_allclose(
+        f(chain, gripped, jnp.zeros(3))[:3], f(declared, a, jnp.zeros(3))[:3], rtol=1e-9
+    )
     empty = svkc.unbind(chain, gripped, "spare_0")
     assert empty.structure.connected.tolist() == [False]
     np.testing.assert_array_equal(empty.structure.real, chain.structure.real)
@@ -210,5 +291,9 @@ def test_bind_a_spare_slot_in_a_run(gripped):
     """At the start of a run, as by verbs."""
     chain, open_, gripped, *_ = gripped
     traj = svkc.simulate(chain, open_, 1e-3, dt=1e-3, events=[svkc.at(0.0, bind=GRIP)])
-    for ours, theirs in zip(jax.tree.leaves(jax.tree.map(lambda x: x[0], traj.states)), jax.tree.leaves(gripped), strict=True):
+    for ours, theirs in zip(
+        jax.tree.leaves(jax.tree.map(lambda x: x[0], traj.states)),
+        jax.tree.leaves(gripped),
+        strict=True,
+    ):
         np.testing.assert_allclose(ours, theirs, atol=1e-12)

@@ -9,9 +9,12 @@ import svkc
 pytestmark = pytest.mark.slow
 
 ROD = """<mujoco><worldbody>
-  <body name="rod" pos="0 0 1"><joint name="pivot" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0.5 0 0" size="0.03"/></body>
-  <body name="hook" pos="0.5 0 1"><joint name="slider" type="slide" axis="1 0 0"/><geom size="0.02" mass="0.1"/></body>
-</worldbody><equality><connect name="pin" body1="rod" body2="hook" anchor="0.5 0 0"/></equality></mujoco>"""
+  <body name="rod" pos="0 0 1"><joint name="pivot" axis="0 1 0"/><geom type="capsule"
+    fromto="0 0 0 0.5 0 0" size="0.03"/></body>
+  <body name="hook" pos="0.5 0 1"><joint name="slider" type="slide" axis="1 0 0"/><geom size="0.02"
+    mass="0.1"/></body>
+</worldbody><equality><connect name="pin" body1="rod" body2="hook" anchor="0.5 0 0"/></equality>
+</mujoco>"""
 
 
 def command(*args):
@@ -22,7 +25,19 @@ def test_a_model_of_ones_own(tmp_path):
     """Let go and caught by name and time; what was written opens again."""
     (tmp_path / "rod.xml").write_text(ROD)
     out = tmp_path / "out"
-    done = command("run", tmp_path / "rod.xml", "--t1", "0.3", "--release", "pin@0.1", "--catch", "pin@0.2", "--out", out, "--mp4")
+    done = command(
+        "run",
+        tmp_path / "rod.xml",
+        "--t1",
+        "0.3",
+        "--release",
+        "pin@0.1",
+        "--catch",
+        "pin@0.2",
+        "--out",
+        out,
+        "--mp4",
+    )
     assert done.returncode == 0, done.stderr
     assert "events at 0.100000 s, 0.200000 s" in done.stdout, done.stdout
     assert {"rod.npz", "rod.png", "rod_curves.png"} <= {path.name for path in out.iterdir()}
@@ -30,7 +45,9 @@ def test_a_model_of_ones_own(tmp_path):
     assert traj.phases.freedoms[:3].tolist() == [0, 2, 0]
     for name in ("rod.png", "rod_curves.png"):
         test_house._looks_drawn(out / name)
-    assert ("libegl1" in done.stdout) or {"rod.gif", "rod.mp4"} <= {path.name for path in out.iterdir()}
+    assert ("libegl1" in done.stdout) or {"rod.gif", "rod.mp4"} <= {
+        path.name for path in out.iterdir()
+    }
     assert "libegl1" in done.stdout or (out / "rod.mp4").read_bytes()[4:8] == b"ftyp"
     seen = command("view", out / "rod.npz", "--no-open")
     assert seen.returncode == 0, seen.stdout + seen.stderr

@@ -1,4 +1,5 @@
-"""Joints of the tree that may be cut (Fig. 15): before the cut the plain tree, after it two free systems; joints that break; slots bound in a run."""
+"""Joints of the tree that may be cut (Fig. 15): before the cut the plain tree, after it two free
+systems; joints that break; slots bound in a run."""
 
 import equinox as eqx
 import jax
@@ -12,10 +13,22 @@ from svkc.loops.forward_dynamics import acceleration
 from svkc.scenes import FOLDER
 
 FIGURE = str(FOLDER / "figure16.xml")
-PENDULUM = models.MJCF.format(models.bar("arm", models.Y, "0 0 -1", inside=models.bar("tip", 'type="ball"', "0 0 -0.5", "0 0 -1")))
+PENDULUM = models.MJCF.format(
+    models.bar(
+        "arm", models.Y, "0 0 -1", inside=models.bar("tip", 'type="ball"', "0 0 -0.5", "0 0 -1")
+    )
+)
 # name: model, what may be cut (the first is), state by joint name
 CASES = {
-    "arm": (FIGURE, ["right_shoulder_flexion"], {"base": [0, 0, 2, 0.8, 0.6, 0, 0], "right_shoulder_flexion": 0.6, "right_shoulder_abduction": 0.3}),
+    "arm": (
+        FIGURE,
+        ["right_shoulder_flexion"],
+        {
+            "base": [0, 0, 2, 0.8, 0.6, 0, 0],
+            "right_shoulder_flexion": 0.6,
+            "right_shoulder_abduction": 0.3,
+        },
+    ),
     "pivot": (PENDULUM, ["arm", "tip"], {"arm": 0.7, "tip": [0.9, 0.1, 0.3, 0.3]}),
 }
 
@@ -29,7 +42,8 @@ def state_of(chain, q, seed=1):
 
 @pytest.fixture(params=CASES, scope="module")
 def case(request):
-    """The plain tree and the one with a joint that may be cut, in the same state, springs, ranges and motors included."""
+    """The plain tree and the one with a joint that may be cut, in the same state, springs, ranges
+    and motors included."""
     xml, cut, q = CASES[request.param]
     plain, chain = svkc.load(xml), svkc.load(xml, cuttable=cut)
     return plain, chain, cut[0], state_of(plain, q), state_of(chain, q)
@@ -39,25 +53,37 @@ def case(request):
 def test_before_the_cut_it_is_the_plain_tree(case):
     """Poses, velocities, energy, mobility, acceleration and 0.3 s of motion, to 1e-9."""
     plain, chain, _, a, b = case
-    for x, y in zip(svkc.poses(plain, a) + svkc.velocities(plain, a), svkc.poses(chain, b) + svkc.velocities(chain, b), strict=True):
+    for x, y in zip(
+        svkc.poses(plain, a) + svkc.velocities(plain, a),
+        svkc.poses(chain, b) + svkc.velocities(chain, b),
+        strict=True,
+    ):
         np.testing.assert_allclose(x, y, atol=1e-13)
     np.testing.assert_allclose(svkc.energy(plain, a), svkc.energy(chain, b), rtol=1e-13)
     assert int(svkc.mobility(plain, a).freedoms) == int(svkc.mobility(chain, b).freedoms)
-    # where the plain tree's coordinates stand in this one; the plain tree's arrays are understood too
+    # where the plain tree's coordinates stand in this one; the plain tree's arrays are understood
+    # too
     at = np.array(chain.topology.model_v)
     tau = np.zeros(chain.dofs)
     tau[at] = np.random.default_rng(0).normal(size=plain.nv)
     vdot = svkc.forward_dynamics(plain, a, jnp.asarray(tau[at]))
-    np.testing.assert_allclose(svkc.forward_dynamics(chain, b, jnp.asarray(tau))[at], vdot, atol=1e-9 * max(1, float(jnp.abs(vdot).max())))
+    np.testing.assert_allclose(
+        svkc.forward_dynamics(chain, b, jnp.asarray(tau))[at],
+        vdot,
+        atol=1e-9 * max(1, float(jnp.abs(vdot).max())),
+    )
     np.testing.assert_allclose(chain.state(a.q, a.v).v, b.v, atol=1e-12)
-    ends = [svkc.simulate(c, s, 0.3, rtol=1e-11, atol=1e-13).final for c, s in ((plain, a), (chain, b))]
+    ends = [
+        svkc.simulate(c, s, 0.3, rtol=1e-11, atol=1e-13).final for c, s in ((plain, a), (chain, b))
+    ]
     for x, y in zip(svkc.poses(plain, ends[0]), svkc.poses(chain, ends[1]), strict=True):
         np.testing.assert_allclose(x, y, atol=1e-9)
 
 
 @pytest.mark.slow
 def test_after_it_there_are_two_systems(case):
-    """Nothing jumps at the cut; without gravity the momentum of everything that hangs on nothing is kept to 1e-12."""
+    """Nothing jumps at the cut; without gravity the momentum of everything that hangs on nothing is
+    kept to 1e-12."""
     _, chain, cut, _, state = case
     free = svkc.cut(chain, state, cut)
     assert bool(jnp.all(free.q == state.q))
@@ -65,9 +91,20 @@ def test_after_it_there_are_two_systems(case):
     lost = svkc.mobility(chain, free).freedoms - svkc.mobility(chain, state).freedoms
     assert int(lost) == 6 - sum(chain.topology.link_freedoms[0])
     weightless = eqx.tree_at(lambda c: c.gravity, chain, jnp.zeros(3))
-    traj = svkc.simulate(weightless, state, 0.4, events=[svkc.at(0.2, cut=cut)], ts=jnp.array([0.2, 0.4]), rtol=1e-10, atol=1e-12)
+    traj = svkc.simulate(
+        weightless,
+        state,
+        0.4,
+        events=[svkc.at(0.2, cut=cut)],
+        ts=jnp.array([0.2, 0.4]),
+        rtol=1e-10,
+        atol=1e-12,
+    )
     part = carried(chain)
-    at_cut, later = (part_momentum(weightless, jax.tree.map(lambda x, i=i: x[i], traj.states), part) for i in (0, 1))
+    at_cut, later = (
+        part_momentum(weightless, jax.tree.map(lambda x, i=i: x[i], traj.states), part)
+        for i in (0, 1)
+    )
     np.testing.assert_allclose(later[0], at_cut[0], atol=1e-12 * max(1, np.abs(at_cut[0]).max()))
     np.testing.assert_allclose(later[1], at_cut[1], atol=1e-9 * max(1, np.abs(at_cut[1]).max()))
 
@@ -82,7 +119,8 @@ def carried(chain):
 
 
 def part_momentum(chain, state, part):
-    """Linear and angular momentum of some bodies, from poses, velocities and the model's own inertias, in numpy."""
+    """Linear and angular momentum of some bodies, from poses, velocities and the model's own
+    inertias, in numpy."""
     model = chain.model.model
     pos, quat = (np.asarray(x) for x in svkc.poses(chain, state))
     lin, ang = (np.asarray(x) for x in svkc.velocities(chain, state))
@@ -97,20 +135,42 @@ def part_momentum(chain, state, part):
         c = R @ model.body_ipos[b]
         u = lin[b] + np.cross(ang[b], c)
         p += model.body_mass[b] * u
-        L += np.cross(pos[b] + c, model.body_mass[b] * u) + Ri @ (model.body_inertia[b] * (Ri.T @ ang[b]))
+        L += np.cross(pos[b] + c, model.body_mass[b] * u) + Ri @ (
+            model.body_inertia[b] * (Ri.T @ ang[b])
+        )
     return p, L
 
 
 @pytest.mark.slow
 def test_a_link_in_the_middle_of_a_loop():
-    """A four-bar whose coupler joint is cut: the loop at the rocker still holds, the crank swings alone; then the joint is made again."""
-    link = svkc.VirtualLink("pin", "world", "rocker", "hinge", pos=(1.2, 0, 0), axis=(0, 1, 0), real_pos=(0.2, 0, -0.6), connected=True)
+    """A four-bar whose coupler joint is cut: the loop at the rocker still holds, the crank swings
+    alone; then the joint is made again."""
+    link = svkc.VirtualLink(
+        "pin",
+        "world",
+        "rocker",
+        "hinge",
+        pos=(1.2, 0, 0),
+        axis=(0, 1, 0),
+        real_pos=(0.2, 0, -0.6),
+        connected=True,
+    )
     chain = svkc.load(models.MJCF.format(models.FOUR_BAR), virtual_links=[link], cuttable="coupler")
     state = chain.state(v={"crank": 2.0})
     plain = models.four_bar()
-    np.testing.assert_allclose(svkc.poses(plain, plain.state(v={"crank": 2.0}))[0], svkc.poses(chain, state)[0], atol=1e-12)
+    np.testing.assert_allclose(
+        svkc.poses(plain, plain.state(v={"crank": 2.0}))[0], svkc.poses(chain, state)[0], atol=1e-12
+    )
     assert int(svkc.mobility(chain, state).freedoms) == 1
-    traj = svkc.simulate(chain, state, 0.3, events=[svkc.at(0.1, cut="coupler")], ts=jnp.linspace(0, 0.3, 7), rtol=1e-10, atol=1e-12)
+    traj = svkc.simulate(
+        chain,
+        state,
+        0.3,
+        events=[svkc.at(0.1, cut="coupler")],
+        ts=jnp.linspace(0, 0.3, 7),
+        rtol=1e-10,
+        atol=1e-12,
+    )
     assert traj.phases.freedoms[:2].tolist() == [1, 3]
     assert float(traj.gaps.max()) < 1e-12
     assert float(jnp.abs(traj.phases.energy_drift[:2]).max()) < 1e-8
@@ -122,27 +182,40 @@ def test_a_link_in_the_middle_of_a_loop():
 
 @pytest.mark.slow
 def test_springs_ranges_armature_and_motors_go_with_the_joint():
-    """A hinge with all of them, with ref: the same motion while it holds, nothing of them acts when it is cut."""
-    xml = """<mujoco><compiler angle="radian"/><worldbody><body name="a"><joint name="a" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -1" size="0.05"/>
-      <body name="b" pos="0 0 -1" euler="0.2 0 0.1"><joint name="b" axis="0.3 1 0" pos="0.02 0 0" ref="0.3" damping="0.2" stiffness="4" springref="0.5"
-       armature="0.05" range="-0.2 0.6" limited="true"/><geom type="capsule" fromto="0 0 0 0 0 -1" size="0.05"/></body></body></worldbody>
+    """A hinge with all of them, with ref: the same motion while it holds, nothing of them acts when
+    it is cut."""
+    xml = """<mujoco><compiler angle="radian"/><worldbody><body name="a"><joint name="a"
+      axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -1" size="0.05"/>
+      <body name="b" pos="0 0 -1" euler="0.2 0 0.1"><joint name="b" axis="0.3 1 0" pos="0.02 0 0"
+        ref="0.3" damping="0.2" stiffness="4" springref="0.5"
+       armature="0.05" range="-0.2 0.6" limited="true"/><geom type="capsule" fromto="0 0 0 0 0 -1"
+         size="0.05"/></body></body></worldbody>
       <actuator><motor joint="b" gear="3"/></actuator></mujoco>"""
     plain, chain = svkc.load(xml), svkc.load(xml, cuttable="b")
     a, b = (c.state({"a": 0.4, "b": 0.55}, {"a": 1.0, "b": 2.0}) for c in (plain, chain))
     np.testing.assert_allclose(svkc.energy(plain, a), svkc.energy(chain, b), rtol=1e-13)
     u = jnp.array([0.7])
     tau = jnp.linspace(-1.0, 2.0, chain.dofs)
-    usual, bodies = (acceleration(chain, b.structure, b.q, b.v, tau, way) for way in (None, svkc.by_bodies))
+    usual, bodies = (
+        acceleration(chain, b.structure, b.q, b.v, tau, way) for way in (None, svkc.by_bodies)
+    )
     np.testing.assert_allclose(bodies, usual, atol=1e-10 * float(jnp.abs(usual).max()))
-    motors = {c.dofs: (lambda t, s, args, c=c: c.motors(u)) for c in (plain, chain)}
+    motors = {c.dofs: lambda t, s, args, c=c: c.motors(u) for c in (plain, chain)}
     run = lambda c, s, t1: svkc.simulate(c, s, t1, control=motors[c.dofs], rtol=1e-11, atol=1e-13)
     ends = [run(c, s, 0.5) for c, s in ((plain, a), (chain, b))]
-    np.testing.assert_allclose(svkc.poses(plain, ends[0].final)[0], svkc.poses(chain, ends[1].final)[0], atol=1e-9)
+    np.testing.assert_allclose(
+        svkc.poses(plain, ends[0].final)[0], svkc.poses(chain, ends[1].final)[0], atol=1e-9
+    )
     np.testing.assert_allclose(ends[0].phases.work, ends[1].phases.work, rtol=1e-8)
     free = svkc.cut(chain, b, "b")
     # its centre of mass falls freely
     alone = run(chain, free, 0.2).final
-    com = lambda s: svkc.poses(chain, s)[0][2] + svkc.tree.spatial.quat_rotate(svkc.poses(chain, s)[1][2], jnp.asarray(chain.model.model.body_ipos[2]))
+    com = lambda s: (
+        svkc.poses(chain, s)[0][2]
+        + svkc.tree.spatial.quat_rotate(
+            svkc.poses(chain, s)[1][2], jnp.asarray(chain.model.model.body_ipos[2])
+        )
+    )
     lin, ang = svkc.velocities(chain, free)
     u0 = lin[2] + jnp.cross(ang[2], com(free) - svkc.poses(chain, free)[0][2])
     np.testing.assert_allclose(com(alone), com(free) + 0.2 * u0 + 0.02 * chain.gravity, atol=1e-9)
@@ -152,15 +225,24 @@ def test_springs_ranges_armature_and_motors_go_with_the_joint():
 
 @pytest.mark.slow
 def test_a_joint_that_breaks():
-    """The pivot of a pendulum breaks where it carries 50 N: the load at that moment by the pendulum's own law, then free fall."""
-    xml = models.MJCF.format(models.bar("arm", models.Y, "0 0 -1")).replace('gravity="0.3 -0.2 -9.81"', 'gravity="0 0 -10"')
+    """The pivot of a pendulum breaks where it carries 50 N: the load at that moment by the
+    pendulum's own law, then free fall."""
+    xml = models.MJCF.format(models.bar("arm", models.Y, "0 0 -1")).replace(
+        'gravity="0.3 -0.2 -9.81"', 'gravity="0 0 -10"'
+    )
     chain = svkc.load(xml, cuttable="arm")
     limit = 50.0
     start = chain.state({"arm": 1.5})
-    events = [svkc.when(svkc.overload(chain, "arm", force=limit), cut="arm", direction=True, stop=True)]
+    events = [
+        svkc.when(svkc.overload(chain, "arm", force=limit), cut="arm", direction=True, stop=True)
+    ]
     traj = svkc.simulate(chain, start, 1.0, events=events, rtol=1e-10, atol=1e-12)
     model = chain.model.model
-    m, c, inertia = float(model.body_mass[1]), float(-model.body_ipos[1, 2]), 1 / float(model.dof_invweight0[0])
+    m, c, inertia = (
+        float(model.body_mass[1]),
+        float(-model.body_ipos[1, 2]),
+        1 / float(model.dof_invweight0[0]),
+    )
     angles = np.linspace(1.5, 0, 200001)
     rate2 = 2 * m * 10 * c * (np.cos(angles) - np.cos(1.5)) / inertia
     turn = -m * 10 * c * np.sin(angles) / inertia
@@ -175,7 +257,12 @@ def test_a_joint_that_breaks():
 
 
 @pytest.mark.parametrize(
-    ("cut", "message"), [("nose", "no joint 'nose'; joints: base"), ("base", "'base' belongs to body 'torso'"), (["left_knee", "chin"], "chin")]
+    ("cut", "message"),
+    [
+        ("nose", "no joint 'nose'; joints: base"),
+        ("base", "'base' belongs to body 'torso'"),
+        (["left_knee", "chin"], "chin"),
+    ],
 )
 def test_what_cannot_be_cut(cut, message):
     with pytest.raises(ValueError, match=message):
@@ -183,13 +270,16 @@ def test_what_cannot_be_cut(cut, message):
 
 
 SPARE = models.MJCF.format(
-    models.bar("arm", models.Y, "0 0 -1") + '<body name="ball" pos="0.8 0 -0.6"><freejoint name="ball"/><geom size="0.1" contype="0"/></body>'
+    models.bar("arm", models.Y, "0 0 -1")
+    + '<body name="ball" pos="0.8 0 -0.6"><freejoint name="ball"/><geom size="0.1"'
+    ' contype="0"/></body>'
 )
 
 
 @pytest.fixture(scope="module")
 def gripped():
-    """A chain with one slot, a state, and the run of six grips and givings up of it at these times, past the end of the run never."""
+    """A chain with one slot, a state, and the run of six grips and givings up of it at these times,
+    past the end of the run never."""
     chain = svkc.load(SPARE, spare=1)
     state = chain.state({"arm": -0.9})
 
@@ -202,14 +292,24 @@ def gripped():
             svkc.at(times[4], unbind="spare_0"),
             svkc.at(times[5], bind=svkc.Grip("world", "arm", slot="spare_0")),
         ]
-        return svkc.simulate(chain, state, 0.6, ts=jnp.linspace(0, 0.6, 13), events=events, rtol=1e-9, atol=1e-11, **kw)
+        return svkc.simulate(
+            chain,
+            state,
+            0.6,
+            ts=jnp.linspace(0, 0.6, 13),
+            events=events,
+            rtol=1e-9,
+            atol=1e-11,
+            **kw,
+        )
 
     return chain, state, run
 
 
 @pytest.mark.slow
 def test_grips_bound_during_a_run(gripped):
-    """One slot, three grips one after another between bodies that the model does not join, unbound in between; one program."""
+    """One slot, three grips one after another between bodies that the model does not join, unbound
+    in between; one program."""
     chain, state, run = gripped
     traj = run((0.1, 0.2, 0.3, 0.35, 0.4, 0.5))
     # what is gripped already stays as it is: no change at 0.35
@@ -220,15 +320,25 @@ def test_grips_bound_during_a_run(gripped):
     assert np.linalg.norm(traj.events.impulse[0, 0]) > 0.1
     # the same, by hand
     held = svkc.simulate(chain, state, 0.1, rtol=1e-9, atol=1e-11).final
-    by_hand = svkc.connect(chain, svkc.bind(chain, held, "spare_0", "arm", "ball", joint="hinge", axis=(0, 1, 0)), "spare_0", here=True)
-    np.testing.assert_allclose(svkc.simulate(chain, by_hand, 0.1, rtol=1e-9, atol=1e-11).final.v[:7], traj.states.v[4, :7], atol=1e-7)
+    by_hand = svkc.connect(
+        chain,
+        svkc.bind(chain, held, "spare_0", "arm", "ball", joint="hinge", axis=(0, 1, 0)),
+        "spare_0",
+        here=True,
+    )
+    np.testing.assert_allclose(
+        svkc.simulate(chain, by_hand, 0.1, rtol=1e-9, atol=1e-11).final.v[:7],
+        traj.states.v[4, :7],
+        atol=1e-7,
+    )
     emptied = svkc.unbind(chain, by_hand, "spare_0")
     assert int(svkc.mobility(chain, emptied).freedoms) == 7
 
 
 @pytest.mark.slow
 def test_no_slot_left(gripped):
-    """Capacity exceeded: a code, the state of that moment, and the grip that was there still holds."""
+    """Capacity exceeded: a code, the state of that moment, and the grip that was there still
+    holds."""
     _, _, run = gripped
     times = (0.1, 9.0, 0.2, 9.0, 9.0, 9.0)
     traj = run(times, throw=False)
@@ -243,7 +353,10 @@ def test_no_slot_left(gripped):
     ("make", "message"),
     [
         (lambda: svkc.at(0.1, bind=svkc.Grip("arm", "nose")), "no body 'nose'"),
-        (lambda: svkc.at(0.1, bind=svkc.Grip("arm", "ball", joint="universal")), "no coordinates for 'universal'"),
+        (
+            lambda: svkc.at(0.1, bind=svkc.Grip("arm", "ball", joint="universal")),
+            "no coordinates for 'universal'",
+        ),
         (lambda: svkc.at(0.1, bind=svkc.Grip("arm", "ball", axis=(0, 0, 0))), "axis"),
         (lambda: svkc.at(0.1, bind=svkc.Grip("arm", "ball", real_pos=(0, 0))), "real_pos"),
         (lambda: svkc.at(0.1, bind=svkc.Grip("arm", "ball", slot="x")), "no virtual link 'x'"),

@@ -1,4 +1,5 @@
-"""Public functions that are compiled for compile time where they are called eagerly: the same under every transformation, and within one another."""
+"""Public functions that are compiled for compile time where they are called eagerly: the same under
+every transformation, and within one another."""
 
 import jax
 import jax.numpy as jnp
@@ -21,13 +22,16 @@ def linkage():
 
 
 def every(chain, traj, x):
-    """What each of the functions says of the linkage at a crank angle, each given what another made."""
+    """What each of the functions says of the linkage at a crank angle, each given what another
+    made."""
     state = chain.state({"crank": x}, {"crank": 2.0 + x})
     tau = jnp.zeros(chain.dofs).at[0].set(x)
     found = svkc.coordinates(chain, state)
     again = svkc.connect(chain, svkc.cut(chain, state, "pin"), "pin")
     free = svkc.mobility(chain, again)
-    wrench = svkc.loop_forces(chain, again, svkc.actuation(chain, again, jnp.where(free.independent, tau, 0)).tau)
+    wrench = svkc.loop_forces(
+        chain, again, svkc.actuation(chain, again, jnp.where(free.independent, tau, 0)).tau
+    )
     report = traj.report()
     return {
         "state": state.v,
@@ -42,7 +46,13 @@ def every(chain, traj, x):
 
 def close(got, wanted):
     for name in wanted:
-        np.testing.assert_allclose(got[name], wanted[name], rtol=1e-9, atol=1e-9 * (1 + float(np.abs(wanted[name]).max())), err_msg=name)
+        np.testing.assert_allclose(
+            got[name],
+            wanted[name],
+            rtol=1e-9,
+            atol=1e-9 * (1 + float(np.abs(wanted[name]).max())),
+            err_msg=name,
+        )
 
 
 @pytest.fixture(scope="module")
@@ -67,14 +77,24 @@ def test_derivatives_of_each(linkage):
     slopes = jax.tree.map(lambda a, b: np.asarray(a - b) / (2 * h), one(x + h), one(x - h))
     forwards = jax.jacfwd(one)(x)
     for name, slope in slopes.items():
-        np.testing.assert_allclose(forwards[name], slope, rtol=1e-6, atol=1e-6 * (1 + np.abs(slope).max()), err_msg=name)
-    weights = {name: np.cos(np.arange(np.size(s))).reshape(np.shape(s)) for name, s in slopes.items()}
+        np.testing.assert_allclose(
+            forwards[name], slope, rtol=1e-6, atol=1e-6 * (1 + np.abs(slope).max()), err_msg=name
+        )
+    weights = {
+        name: np.cos(np.arange(np.size(s))).reshape(np.shape(s)) for name, s in slopes.items()
+    }
     backwards = jax.grad(lambda x: sum(jnp.sum(v * weights[name]) for name, v in one(x).items()))(x)
-    np.testing.assert_allclose(backwards, sum(np.sum(np.asarray(forwards[name]) * w) for name, w in weights.items()), rtol=1e-9)
+    np.testing.assert_allclose(
+        backwards,
+        sum(np.sum(np.asarray(forwards[name]) * w) for name, w in weights.items()),
+        rtol=1e-9,
+    )
 
 
 def test_options_that_jaxlib_does_not_know_are_left_out(monkeypatch):
-    monkeypatch.setattr(eager, "_OPTIONS", {"xla_no_such_option": 1, "xla_backend_optimization_level": 0})
+    monkeypatch.setattr(
+        eager, "_OPTIONS", {"xla_no_such_option": 1, "xla_backend_optimization_level": 0}
+    )
     assert float(eager.eager_jit(lambda x: 2 * x)(jnp.asarray(3.0))) == 6
     assert eager._OPTIONS == {"xla_backend_optimization_level": 0}
 
@@ -104,20 +124,30 @@ def test_options_are_given_to_the_outermost_call_alone():
 @pytest.mark.slow
 @pytest.mark.parametrize("make", [models.sarrus, models.bennett])
 def test_the_derivative_of_a_state_closed_from_afar(make):
-    """Open, the loops of an over-constrained linkage have a higher rank than closed: what is differentiated is the way that Newton's method went."""
+    """Open, the loops of an over-constrained linkage have a higher rank than closed: what is
+    differentiated is the way that Newton's method went."""
     chain = make()
     rng = np.random.default_rng(0)
-    start, along = jnp.asarray(0.04 * rng.normal(size=chain.nv)), jnp.asarray(rng.normal(size=chain.nv))
-    tree = lambda dv: svkc.integrate(chain, chain.q_load, jnp.pad(dv, (0, chain.dofs - chain.nv)))[: chain.nq]
+    start, along = (
+        jnp.asarray(0.04 * rng.normal(size=chain.nv)),
+        jnp.asarray(rng.normal(size=chain.nv)),
+    )
+    tree = lambda dv: svkc.integrate(chain, chain.q_load, jnp.pad(dv, (0, chain.dofs - chain.nv)))[
+        : chain.nq
+    ]
     closed = lambda x: chain.state(tree(start + x * along)).q
     x, h = jnp.asarray(0.0), 1e-5
     difference = (closed(h) - closed(-h)) / (2 * h)
     assert float(jnp.abs(difference).max()) > 0.1
     for derivative in (jax.jacfwd(closed)(x), jax.jacrev(closed)(x)):
-        np.testing.assert_allclose(derivative, difference, atol=1e-6 * float(jnp.abs(difference).max()))
+        np.testing.assert_allclose(
+            derivative, difference, atol=1e-6 * float(jnp.abs(difference).max())
+        )
 
 
 def test_a_state_that_cannot_be_closed_is_an_error_under_a_derivative():
     chain = models.four_bar()
     with pytest.raises(Exception, match="cannot be closed"):
-        jax.grad(lambda x: jnp.sum(chain.state({"crank": x, "coupler": 3.0 + x, "rocker": 3.0}).q))(0.1)
+        jax.grad(lambda x: jnp.sum(chain.state({"crank": x, "coupler": 3.0 + x, "rocker": 3.0}).q))(
+            0.1
+        )

@@ -1,4 +1,5 @@
-"""docs/errors.md: every message of the library is on the page, and every one of them is provoked, here or where the page's list says."""
+"""docs/errors.md: every message of the library is on the page, and every one of them is provoked,
+here or where the page's list says."""
 
 import pathlib
 import re
@@ -36,7 +37,9 @@ class Setting:
         self.state = self.four.state()
         self.spare = svkc.load(models.MJCF.format(models.FOUR_BAR), spare=1)
         self.empty = self.spare.state()
-        self.motor = models.MJCF.format(models.bar("arm", models.Y, "0 0 -1")).replace("</mujoco>", '<actuator><motor joint="arm"/></actuator></mujoco>')
+        self.motor = models.MJCF.format(models.bar("arm", models.Y, "0 0 -1")).replace(
+            "</mujoco>", '<actuator><motor joint="arm"/></actuator></mujoco>'
+        )
 
     def simulate(self, chain=None, **kw):
         chain = chain or self.four
@@ -53,7 +56,9 @@ class Setting:
             self.simulate(t1=1e-3, dt=1e-3).save(path)
         with np.load(path) as file:
             arrays = dict(file) | changed
-        np.savez(self.folder / "changed.npz", **{name: x for name, x in arrays.items() if x is not None})
+        np.savez(
+            self.folder / "changed.npz", **{name: x for name, x in arrays.items() if x is not None}
+        )
         return svkc.load_trajectory(self.folder / "changed.npz")
 
     def bound(self, *args, **kw):
@@ -88,7 +93,9 @@ def crowded(s):
 
 def undrawn(s):
     traj = s.simulate(t1=1e-3, dt=1e-3)
-    with mock.patch.dict("sys.modules", {"mujoco.egl": None, "mujoco.osmesa": None, "mujoco.glfw": None}):
+    with mock.patch.dict(
+        "sys.modules", {"mujoco.egl": None, "mujoco.osmesa": None, "mujoco.glfw": None}
+    ):
         svkc.render(s.four, traj, s.folder / "x.gif")
 
 
@@ -123,12 +130,18 @@ def undrawable(s):
 CASES = {
     "pictures need": undrawable,
     "... holds no model": nameless,
-    "camera: no": lambda s: svkc.render(s.four, s.simulate(t1=1e-3, dt=1e-3), s.folder / "x.gif", camera="nobody's"),
+    "camera: no": lambda s: svkc.render(
+        s.four, s.simulate(t1=1e-3, dt=1e-3), s.folder / "x.gif", camera="nobody's"
+    ),
     "mp4 needs": without_ffmpeg,
     "run: no scene": lambda s: commands._scene("nowhere", ()),
     "run: no virtual": lambda s: commands._asked(s.four, [("release", "nobody", 0.1)]),
-    "trails: no": lambda s: svkc.render(s.four, s.simulate(t1=1e-3, dt=1e-3), s.folder / "x.gif", trails=("nobody",)),
-    "... is not linear": lambda s: jax.linear_transpose(operation("odd", jnp.sin, lambda p, t: (p[0], t[0])), jnp.ones(2))(jnp.ones(2)),
+    "trails: no": lambda s: svkc.render(
+        s.four, s.simulate(t1=1e-3, dt=1e-3), s.folder / "x.gif", trails=("nobody",)
+    ),
+    "... is not linear": lambda s: jax.linear_transpose(
+        operation("odd", jnp.sin, lambda p, t: (p[0], t[0])), jnp.ones(2)
+    )(jnp.ones(2)),
     "no library to draw with": undrawn,
     "state and chain are float64": single,
     "states: ... lanes": crowded,
@@ -144,13 +157,21 @@ CASES = {
     "...: got shape ..., expected (...,); for many use": lambda s: svkc.xyzw(s.four, jnp.zeros(9)),
     "...: got ..., expected a positive": lambda s: s.simulate(dt=-1.0),
     "...: got shape ..., expected (...,) for the tree": lambda s: s.four.state(np.zeros(7)),
-    "...: got shape ..., expected a number or": lambda s: svkc.actuation(s.four, s.state, jnp.zeros(4), bounds=(np.zeros(2), np.ones(2))),
-    "...: got shape ..., expected ... numbers": lambda s: svkc.render(s.four, s.simulate(t1=1e-3, dt=1e-3), s.folder / "x.gif", lookat=(1, 2)),
+    "...: got shape ..., expected a number or": lambda s: svkc.actuation(
+        s.four, s.state, jnp.zeros(4), bounds=(np.zeros(2), np.ones(2))
+    ),
+    "...: got shape ..., expected ... numbers": lambda s: svkc.render(
+        s.four, s.simulate(t1=1e-3, dt=1e-3), s.folder / "x.gif", lookat=(1, 2)
+    ),
     "...: got shape ..., expected one number": lambda s: s.simulate(t1=jnp.ones(2)),
     "...[...]: got": lambda s: s.four.state({"crank": [1.0, 2.0]}),
-    "actuated: expected": lambda s: svkc.actuation(s.four, s.state, jnp.zeros(4), actuated=np.ones(2, bool)),
+    "actuated: expected": lambda s: svkc.actuation(
+        s.four, s.state, jnp.zeros(4), actuated=np.ones(2, bool)
+    ),
     "adjoint: expected": lambda s: s.simulate(adjoint="replay"),
-    "adjoint: svkc.Replay": lambda s: s.simulate(stepsize_controller=diffrax.StepTo(jnp.linspace(0, 1, 5)), adjoint=svkc.Replay()),
+    "adjoint: svkc.Replay": lambda s: s.simulate(
+        stepsize_controller=diffrax.StepTo(jnp.linspace(0, 1, 5)), adjoint=svkc.Replay()
+    ),
     "at: got time": lambda s: s.simulate(events=[svkc.at(-1.0, cut="pin")]),
     "at: time must": lambda s: s.simulate(events=[svkc.at(jnp.ones(2), cut="pin")]),
     "bind: ... is not": lambda s: svkc.bind(s.four, s.state, "pin", "world", "rocker"),
@@ -158,24 +179,42 @@ CASES = {
     "bind: axis": lambda s: s.bound("world", "rocker", joint="hinge", axis=(0, 0, 0)),
     "bind: expected": lambda s: svkc.at(0.5, bind="rocker"),
     "bind: no body": lambda s: s.bound("world", "nobody"),
-    "bind: ...: expected three": lambda s: s.simulate(s.spare, events=[svkc.at(0.5, bind=[svkc.Grip("world", "rocker", real_pos=jnp.zeros(2))])]),
-    "bind: the chain": lambda s: s.simulate(events=[svkc.at(0.5, bind=[svkc.Grip("world", "rocker")])]),
+    "bind: ...: expected three": lambda s: s.simulate(
+        s.spare, events=[svkc.at(0.5, bind=[svkc.Grip("world", "rocker", real_pos=jnp.zeros(2))])]
+    ),
+    "bind: the chain": lambda s: s.simulate(
+        events=[svkc.at(0.5, bind=[svkc.Grip("world", "rocker")])]
+    ),
     "bounds: expected (": lambda s: svkc.actuation(s.four, s.state, jnp.zeros(4), bounds=3),
-    "bounds: expected lower": lambda s: svkc.actuation(s.four, s.state, jnp.zeros(4), bounds=(1.0, -1.0)),
-    "bounds: the bounded": lambda s: jax.jit(lambda x: svkc.actuation(s.four, s.state, x, bounds=(-1.0, 1.0)))(jnp.zeros(4)),
+    "bounds: expected lower": lambda s: svkc.actuation(
+        s.four, s.state, jnp.zeros(4), bounds=(1.0, -1.0)
+    ),
+    "bounds: the bounded": lambda s: jax.jit(
+        lambda x: svkc.actuation(s.four, s.state, x, bounds=(-1.0, 1.0))
+    )(jnp.zeros(4)),
     "chain: expected": lambda s: svkc.poses(3, s.state),
     "check_grad: f(x) has": lambda s: svkc.check_grad(lambda x: 1, jnp.asarray(1.0)),
     "check_grad: f(x)...": lambda s: svkc.check_grad(lambda x: jnp.log(x), jnp.asarray(-1.0)),
     "check_grad: x has": lambda s: svkc.check_grad(lambda x: x, jnp.asarray(1)),
     "connect: the bodies": away,
     "connected: expected": lambda s: s.four.state(connected=np.ones(3)),
-    "cost: got": lambda s: svkc.rollout(s.four, jax.tree.map(lambda x: x[None], s.state), 1.0, cost=jnp.ones((1, 2))),
+    "cost: got": lambda s: svkc.rollout(
+        s.four, jax.tree.map(lambda x: x[None], s.state), 1.0, cost=jnp.ones((1, 2))
+    ),
     "cuttable: ... belongs": lambda s: s.load(
-        models.MJCF.format('<body name="b"><joint name="x" type="slide"/><joint name="y" type="slide"/><geom size="0.1"/></body>'), cuttable="x"
+        models.MJCF.format(
+            '<body name="b"><joint name="x" type="slide"/><joint name="y" type="slide"/><geom'
+            ' size="0.1"/></body>'
+        ),
+        cuttable="x",
     ),
     "cuttable: no joint": lambda s: s.load(cuttable="nobody"),
-    "data: got": lambda s: svkc.to_mujoco(s.four, s.state, type("Data", (), {"qpos": np.zeros(1), "qvel": np.zeros(1)})()),
-    "devices: expected": lambda s: svkc.rollout(s.four, jax.tree.map(lambda x: x[None], s.state), 1.0, devices=[]),
+    "data: got": lambda s: svkc.to_mujoco(
+        s.four, s.state, type("Data", (), {"qpos": np.zeros(1), "qvel": np.zeros(1)})()
+    ),
+    "devices: expected": lambda s: svkc.rollout(
+        s.four, jax.tree.map(lambda x: x[None], s.state), 1.0, devices=[]
+    ),
     "dt: got": lambda s: s.simulate(dt=1e-12),
     "dt asks": lambda s: s.simulate(dt=0.1, rtol=1e-3),
     "dynamics.hold": lambda s: s.simulate(dynamics=svkc.Dynamics(hold=2.0)),
@@ -184,7 +223,9 @@ CASES = {
     "here: ...": lambda s: svkc.at(0.5, connect="pin", here="other"),
     "ignore: got": lambda s: s.load(ignore=("nothing",)),
     "joint: got": lambda s: link(joint="screw"),
-    "lane: expected a dict": lambda s: svkc.rollout(s.four, jax.tree.map(lambda x: x[None], s.state), 1.0, lane=lambda chain, data: 3),
+    "lane: expected a dict": lambda s: svkc.rollout(
+        s.four, jax.tree.map(lambda x: x[None], s.state), 1.0, lane=lambda chain, data: 3
+    ),
     "load_trajectory: expected": lambda s: svkc.load_trajectory(3),
     "leaves: axis": lambda s: svkc.leaves(s.four, "pin", axis=(0, 0, 0)),
     "mode: got": lambda s: svkc.check_grad(lambda x: x, jnp.asarray(1.0), mode="sideways"),
@@ -193,32 +234,66 @@ CASES = {
     "source: no such file": lambda s: s.load("nowhere.xml"),
     "no virtual link": lambda s: svkc.cut(s.four, s.state, "nobody"),
     "overload: give": lambda s: svkc.overload(s.four, "pin"),
-    "q: the quaternion": lambda s: s.load(models.MJCF.format(models.bar("b", 'type="ball"', "0 0 1"))).state([1.0, 1.0, 0, 0]),
-    "render: a picture": lambda s: svkc.render(s.four, jax.tree.map(lambda x: x[None], s.simulate(t1=1e-3, dt=1e-3)), s.folder / "x.html"),
+    "q: the quaternion": (
+        lambda s: s.load(models.MJCF.format(models.bar("b", 'type="ball"', "0 0 1"))).state(
+            [1.0, 1.0, 0, 0]
+        )
+    ),
+    "render: a picture": lambda s: svkc.render(
+        s.four, jax.tree.map(lambda x: x[None], s.simulate(t1=1e-3, dt=1e-3)), s.folder / "x.html"
+    ),
     "render: ... should": lambda s: svkc.render(s.four, s.simulate(t1=1e-3, dt=1e-3), "x.bmp"),
-    "rtol and atol": lambda s: s.simulate(rtol=1e-3, stepsize_controller=diffrax.PIDController(rtol=1e-3, atol=1e-6)),
+    "rtol and atol": lambda s: s.simulate(
+        rtol=1e-3, stepsize_controller=diffrax.PIDController(rtol=1e-3, atol=1e-6)
+    ),
     "simulate stopped": lambda s: s.simulate(t1=1e-2, dt=1e-3, max_steps=2),
     "solver: ... does not": lambda s: s.simulate(solver=diffrax.Euler()),
     "solver: expected": lambda s: s.simulate(solver="euler"),
     "source: expected": lambda s: svkc.load(3),
-    "source: names of": lambda s: s.load(models.MJCF.format(models.bar("joint_1", models.Y, "0 0 -1", inside=models.bar("", models.Y, "0 0 -1")))),
+    "source: names of": lambda s: s.load(
+        models.MJCF.format(
+            models.bar("joint_1", models.Y, "0 0 -1", inside=models.bar("", models.Y, "0 0 -1"))
+        )
+    ),
     "source: the model has no joints": lambda s: svkc.load("<mujoco/>"),
     "source: the model has numbers": lambda s: svkc.load(endless()),
     "stepsize_controller": lambda s: s.simulate(stepsize_controller=3),
     "progress_meter": lambda s: s.simulate(progress_meter=3),
     "source: the model cannot": lambda s: s.load("<mujoco><nonsense/></mujoco>"),
     "stabilization": lambda s: s.simulate(stabilization=3),
-    "state....: got": lambda s: s.simulate(state=svkc.State(jnp.zeros(2), s.state.v, s.state.structure)),
-    "state.q is": lambda s: s.simulate(state=eqx.tree_at(lambda x: (x.q, x.v), s.state, replace_fn=lambda x: x.astype(jnp.float32))),
+    "state....: got": lambda s: s.simulate(
+        state=svkc.State(jnp.zeros(2), s.state.v, s.state.structure)
+    ),
+    "state.q is": lambda s: s.simulate(
+        state=eqx.tree_at(lambda x: (x.q, x.v), s.state, replace_fn=lambda x: x.astype(jnp.float32))
+    ),
     "state: expected": lambda s: svkc.poses(s.four, 3),
-    "state: q and v": lambda s: s.simulate(state=svkc.State(s.state.q * jnp.nan, s.state.v, s.state.structure)),
-    "states, data, cost": lambda s: svkc.rollout(s.four, jax.tree.map(lambda x: x[None], s.state), 1.0, data=jnp.zeros(3)),
+    "state: q and v": lambda s: s.simulate(
+        state=svkc.State(s.state.q * jnp.nan, s.state.v, s.state.structure)
+    ),
+    "states, data, cost": lambda s: svkc.rollout(
+        s.four, jax.tree.map(lambda x: x[None], s.state), 1.0, data=jnp.zeros(3)
+    ),
     "states: expected": lambda s: svkc.rollout(s.four, 3, 1.0),
     "t1: got": lambda s: s.simulate(t1=-1.0),
-    "target: ... cannot": lambda s: svkc.tune(s.four, s.state, 1e-2, target=1e-3, control=lambda t, x, args: jnp.full(s.four.dofs, jnp.nan)),
+    "target: ... cannot": lambda s: svkc.tune(
+        s.four,
+        s.state,
+        1e-2,
+        target=1e-3,
+        control=lambda t, x, args: jnp.full(s.four.dofs, jnp.nan),
+    ),
     "tau: got": lambda s: svkc.forward_dynamics(s.four, s.state, jnp.zeros(9)),
-    "the loops cannot": lambda s: s.load(virtual_links=[link(pos=(50, 0, 0), real_pos=(0, 0, 0), connected=True)]).state(),
-    "the model has elements": lambda s: s.load(s.motor.replace("</worldbody>", '<site name="s"/></worldbody>').replace("<motor", "<position")),
+    "the loops cannot": (
+        lambda s: s.load(
+            virtual_links=[link(pos=(50, 0, 0), real_pos=(0, 0, 0), connected=True)]
+        ).state()
+    ),
+    "the model has elements": lambda s: s.load(
+        s.motor.replace("</worldbody>", '<site name="s"/></worldbody>').replace(
+            "<motor", "<position"
+        )
+    ),
     "to_mjcf: MuJoCo": twice,
     "to_mjcf: the": lambda s: svkc.load(s.four.model.model).to_mjcf(),
     "traj: expected": lambda s: svkc.render(s.four, 3, "x.gif"),
@@ -248,7 +323,12 @@ def setting(tmp_path_factory):
 
 def _row(opening: str) -> str:
     """The one row that begins so, and with no longer opening of another case."""
-    rows = [row for row in ROWS if row.startswith(opening) and not any(len(o) > len(opening) and row.startswith(o) for o in (*CASES, *ELSEWHERE))]
+    rows = [
+        row
+        for row in ROWS
+        if row.startswith(opening)
+        and not any(len(o) > len(opening) and row.startswith(o) for o in (*CASES, *ELSEWHERE))
+    ]
     assert len(rows) == 1, (opening, rows)
     return rows[0]
 
@@ -265,9 +345,14 @@ def test_the_page_has_every_message():
 
 @pytest.mark.parametrize("opening", CASES)
 def test_each_message(setting, opening):
-    with said.as_users_see(), pytest.raises((ValueError, RuntimeError, NotImplementedError)) as caught:
+    with (
+        said.as_users_see(),
+        pytest.raises((ValueError, RuntimeError, NotImplementedError)) as caught,
+    ):
         CASES[opening](setting)
-    assert re.fullmatch(said.pattern(_row(opening)), " ".join(str(caught.value).split())), caught.value
+    assert re.fullmatch(said.pattern(_row(opening)), " ".join(str(caught.value).split())), (
+        caught.value
+    )
 
 
 @pytest.mark.slow
@@ -277,9 +362,13 @@ def test_inside_compiled_programs(setting):
     apart = setting.load(virtual_links=[link(pos=(5, 0, 0), real_pos=(0, 0, 0))])
     beyond = setting.load(virtual_links=[link(pos=(50, 0, 0), real_pos=(0, 0, 0), connected=True)])
     calls = {
-        "connect: the bodies": lambda: jax.jit(lambda s: svkc.connect(apart, s, "x"))(apart.state()),
+        "connect: the bodies": lambda: jax.jit(lambda s: svkc.connect(apart, s, "x"))(
+            apart.state()
+        ),
         "the loops of": lambda: jax.jit(lambda q: beyond.state({"crank": q}))(0.1),
-        str(svkc.RESULTS[svkc.RESULTS.max_steps]): lambda: jax.jit(lambda t: setting.simulate(t1=t, dt=1e-3, max_steps=2).t_final)(1e-2),
+        str(svkc.RESULTS[svkc.RESULTS.max_steps]): lambda: jax.jit(
+            lambda t: setting.simulate(t1=t, dt=1e-3, max_steps=2).t_final
+        )(1e-2),
     }
     for row in said.COMPILED:
         assert any(row.startswith(opening) for opening in calls)
@@ -293,7 +382,9 @@ def test_warnings_and_what_others_raise(setting, tmp_path):
     assert said.messages_of("warn", 0) == {warned, again}
     # it takes two compilations: tests/test_functions.py
     assert "a new function object" in again
-    assert "a new function object" in (pathlib.Path(__file__).parent / "test_functions.py").read_text()
+    assert (
+        "a new function object" in (pathlib.Path(__file__).parent / "test_functions.py").read_text()
+    )
     with jax.enable_x64(False):
         chain = models.four_bar()
         with pytest.warns(UserWarning, match=said.pattern(warned)):

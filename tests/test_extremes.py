@@ -1,4 +1,5 @@
-"""Extremes: sizes, masses, speeds, stiffness, counts and coincidences at the ends of what a scene may hold, each with the bound that it keeps."""
+"""Extremes: sizes, masses, speeds, stiffness, counts and coincidences at the ends of what a scene
+may hold, each with the bound that it keeps."""
 
 import diffrax
 import jax
@@ -11,7 +12,10 @@ import svkc
 
 pytestmark = pytest.mark.slow
 
-SPACE = '<mujoco><compiler balanceinertia="false" boundmass="0" boundinertia="0"/><option gravity="0 0 -9.81"/><worldbody>{}</worldbody></mujoco>'
+SPACE = (
+    '<mujoco><compiler balanceinertia="false" boundmass="0" boundinertia="0"/><option gravity="0 0'
+    ' -9.81"/><worldbody>{}</worldbody></mujoco>'
+)
 FINE = {"rtol": 1e-9, "atol": 1e-11}
 
 
@@ -21,7 +25,10 @@ def rods(masses, lengths):
     for i, (m, l) in reversed(list(enumerate(zip(masses, lengths, strict=True)))):
         inertia, above = m * l * l / 12, 0.0 if i == 0 else -lengths[i - 1]
         joint = f'<joint name="j{i}" axis="0 1 0"/>'
-        inertial = f'<inertial pos="0 0 {-l / 2!r}" mass="{m!r}" diaginertia="{inertia!r} {inertia!r} {inertia!r}"/>'
+        inertial = (
+            f'<inertial pos="0 0 {-l / 2!r}" mass="{m!r}" diaginertia="{inertia!r} {inertia!r}'
+            f' {inertia!r}"/>'
+        )
         out = f'<body name="b{i}" pos="0 0 {above!r}">{joint}{inertial}{out}</body>'
     return svkc.load(SPACE.format(out))
 
@@ -41,7 +48,9 @@ TIMES = jnp.linspace(0, 1.0, 11)
 
 
 @pytest.mark.parametrize(
-    "masses", [10.0 ** (6 - 2.0 * np.arange(7)), np.tile([1e6, 1e-6], 4)[:7], np.tile([1e-6, 1e6], 4)[:7]], ids=["falling", "heavy", "light"]
+    "masses",
+    [10.0 ** (6 - 2.0 * np.arange(7)), np.tile([1e6, 1e-6], 4)[:7], np.tile([1e-6, 1e6], 4)[:7]],
+    ids=["falling", "heavy", "light"],
 )
 def test_masses_from_a_milligram_to_a_thousand_tons(masses):
     chain = rods([float(m) for m in masses], [1.0] * 7)
@@ -52,7 +61,9 @@ def test_masses_from_a_milligram_to_a_thousand_tons(masses):
 def test_masses_in_a_loop():
     """A four-bar whose bars weigh a milligram, a kilogram and a thousand tons, in every order."""
     chain = models.four_bar()
-    run = jax.jit(lambda chain: svkc.simulate(chain, chain.state(v={"crank": 4.0}), 1.0, ts=TIMES, **FINE))
+    run = jax.jit(
+        lambda chain: svkc.simulate(chain, chain.state(v={"crank": 4.0}), 1.0, ts=TIMES, **FINE)
+    )
     for order in ((1e-6, 1.0, 1e6), (1e6, 1e-6, 1.0), (1.0, 1e6, 1e-6)):
         part = chain.mass[1:4] / np.array(order)
         heavier = jax.tree.map(lambda x: x, chain)
@@ -66,21 +77,48 @@ def test_masses_in_a_loop():
 
 def four_bar_on_a_bar(small):
     """A four-bar of links of some `small` metres at the end of a bar of 1 / small."""
-    bar = lambda *p: f'<geom type="capsule" fromto="0 0 0 {" ".join(repr(x * small) for x in p)}" size="{0.03 * small}" mass="1" contype="0"/>'
-    at = lambda *p: " ".join(repr(x * small) for x in p)
-    rocker = f'<body name="rocker" pos="{at(1, 0, 0.2)}"><joint name="rocker" axis="0 1 0"/>{bar(0.2, 0, -0.6)}</body>'
-    coupler = f'<body name="coupler" pos="{at(0, 0, 0.4)}"><joint name="coupler" axis="0 1 0"/>{bar(1, 0, 0.2)}{rocker}</body>'
-    crank = f'<body name="crank" pos="0 0 {-1 / small}"><joint name="crank" axis="0 1 0"/>{bar(0, 0, 0.4)}{coupler}</body>'
-    long = f'<geom type="capsule" fromto="0 0 0 0 0 {-1 / small}" size="{0.01 / small}" mass="1" contype="0"/>'
-    pin = svkc.VirtualLink(
-        "pin", "big", "rocker", "hinge", axis=(0, 1, 0), pos=(1.2 * small, 0, -1 / small), real_pos=(0.2 * small, 0, -0.6 * small), connected=True
+    bar = lambda *p: (
+        f'<geom type="capsule" fromto="0 0 0 {" ".join(repr(x * small) for x in p)}"'
+        f' size="{0.03 * small}" mass="1" contype="0"/>'
     )
-    return svkc.load(SPACE.format(f'<body name="big"><joint name="big" axis="0 1 0"/>{long}{crank}</body>'), virtual_links=[pin])
+    at = lambda *p: " ".join(repr(x * small) for x in p)
+    rocker = (
+        f'<body name="rocker" pos="{at(1, 0, 0.2)}"><joint name="rocker" axis="0 1'
+        f' 0"/>{bar(0.2, 0, -0.6)}</body>'
+    )
+    coupler = (
+        f'<body name="coupler" pos="{at(0, 0, 0.4)}"><joint name="coupler" axis="0 1'
+        f' 0"/>{bar(1, 0, 0.2)}{rocker}</body>'
+    )
+    crank = (
+        f'<body name="crank" pos="0 0 {-1 / small}"><joint name="crank" axis="0 1'
+        f' 0"/>{bar(0, 0, 0.4)}{coupler}</body>'
+    )
+    long = (
+        f'<geom type="capsule" fromto="0 0 0 0 0 {-1 / small}" size="{0.01 / small}" mass="1"'
+        ' contype="0"/>'
+    )
+    pin = svkc.VirtualLink(
+        "pin",
+        "big",
+        "rocker",
+        "hinge",
+        axis=(0, 1, 0),
+        pos=(1.2 * small, 0, -1 / small),
+        real_pos=(0.2 * small, 0, -0.6 * small),
+        connected=True,
+    )
+    return svkc.load(
+        SPACE.format(f'<body name="big"><joint name="big" axis="0 1 0"/>{long}{crank}</body>'),
+        virtual_links=[pin],
+    )
 
 
 def test_lengths_from_a_millimetre_to_a_kilometre():
-    """A four-bar of a kilometre at the end of a millimetre's bar; one of a millimetre at the end of a kilometre's, where its inertia about the far
-    root is 1e12 times its own and round-off of it shows: energy drifts by 9e-3 of the kinetic energy."""
+    """A four-bar of a kilometre at the end of a millimetre's bar; one of a millimetre at the end of
+    a kilometre's, where its inertia about the far
+    root is 1e12 times its own and round-off of it shows: energy drifts by 9e-3 of the kinetic
+    energy."""
     chain = four_bar_on_a_bar(1e3)
     traj = svkc.simulate(chain, chain.state(v={"crank": 4.0}), 1.0, ts=TIMES, **FINE)
     assert drift(chain, traj) < 1e-8
@@ -94,14 +132,24 @@ def test_lengths_from_a_millimetre_to_a_kilometre():
 
 def two_bars():
     """Two bars on a hinge, thrown."""
-    return svkc.load(models.MJCF.format(models.bar("a", 'type="free"', "0 0 -0.5", inside=models.bar("b", models.Y, "0.3 0 -0.3", "0 0 -.5"))))
+    return svkc.load(
+        models.MJCF.format(
+            models.bar(
+                "a",
+                'type="free"',
+                "0 0 -0.5",
+                inside=models.bar("b", models.Y, "0.3 0 -0.3", "0 0 -.5"),
+            )
+        )
+    )
 
 
 THROWN = [0.5, 0.1, 0.2, 1, 2, 3, 1.5]
 
 
 def test_far_away_and_fast():
-    """1e6 m from the origin at 1e3 m/s: turned and moving as at the origin, to the digits that positions of 1e6 m leave."""
+    """1e6 m from the origin at 1e3 m/s: turned and moving as at the origin, to the digits that
+    positions of 1e6 m leave."""
     thrown = two_bars()
     q, v = np.array(thrown.q_load), np.array(THROWN)
     near = svkc.simulate(thrown, thrown.state(q, v), 1.0, **FINE)
@@ -114,7 +162,9 @@ def test_far_away_and_fast():
     np.testing.assert_allclose(far.final.q[:3] - there - speed, near.final.q[:3], atol=1e-6)
 
 
-WEIGHTLESS = SPACE.replace("0 0 -9.81", "0 0 0").format(models.bar("a", 'type="free"', "0.2 0.3 -0.5"))
+WEIGHTLESS = SPACE.replace("0 0 -9.81", "0 0 0").format(
+    models.bar("a", 'type="free"', "0.2 0.3 -0.5")
+)
 SPIN = [0, 0, 0, 1e3, 20, -30.0]
 
 
@@ -122,7 +172,9 @@ def test_fast_spin():
     """1e3 rad/s for 160 turns: energy to 1e-7 and momentum to 1e-7 of themselves at rtol 1e-10."""
     chain = svkc.load(WEIGHTLESS)
     state = chain.state(v=np.array(SPIN))
-    traj = svkc.simulate(chain, state, 1.0, ts=TIMES, rtol=1e-10, atol=1e-12, solver=diffrax.Dopri8())
+    traj = svkc.simulate(
+        chain, state, 1.0, ts=TIMES, rtol=1e-10, atol=1e-12, solver=diffrax.Dopri8()
+    )
     assert drift(chain, traj) < 1e-7
     linear, angular = svkc.momentum(chain, state)
     assert float(traj.report().angular_momentum_drift) < 1e-7 * float(jnp.linalg.norm(angular))
@@ -140,16 +192,28 @@ def legs(count):
     bodies = ""
     for i in range(count + 1):
         plate = models.bar("plate", models.Y, "20 0 0", "0 0 1") if i == 0 else ""
-        bodies += models.bar(f"leg{i}", models.Y, "0 0 1", f"{i if count > 1 else 20 * i} 0 0", plate)
+        bodies += models.bar(
+            f"leg{i}", models.Y, "0 0 1", f"{i if count > 1 else 20 * i} 0 0", plate
+        )
     links = [
-        svkc.VirtualLink(f"pin{i}", "plate", f"leg{i}", "hinge", pos=(i if count > 1 else 20.0, 0, 0), real_pos=(0, 0, 1), axis=(0, 1, 0), connected=True)
+        svkc.VirtualLink(
+            f"pin{i}",
+            "plate",
+            f"leg{i}",
+            "hinge",
+            pos=(i if count > 1 else 20.0, 0, 0),
+            real_pos=(0, 0, 1),
+            axis=(0, 1, 0),
+            connected=True,
+        )
         for i in range(1, count + 1)
     ]
     return svkc.load(SPACE.format(bodies), virtual_links=links)
 
 
 def test_twenty_loops():
-    """Twenty-one parallel legs under one plate, all loops but one redundant: one freedom, that of the two-legged one."""
+    """Twenty-one parallel legs under one plate, all loops but one redundant: one freedom, that of
+    the two-legged one."""
     chain = legs(20)
     state = chain.state({"leg0": 0.3})
     assert svkc.mobility(chain, state).freedoms == 1
@@ -164,14 +228,20 @@ def sprung_and_rigid():
     """A pendulum on a spring of 1e9 N/m, and on a rigid pivot."""
     slide = '<joint name="a" type="slide" axis="0 0 1" stiffness="1e9" damping="1e4"/>'
     ball = '<geom size=".1" mass="1" contype="0"/>'
-    pendulum = '<body name="b" pos="0 0 -1"><joint name="b" axis="0 1 0"/><geom size=".1" mass="1" pos="0 0 -.5" contype="0"/></body>'
+    pendulum = (
+        '<body name="b" pos="0 0 -1"><joint name="b" axis="0 1 0"/><geom size=".1" mass="1" pos="0'
+        ' 0 -.5" contype="0"/></body>'
+    )
     sprung = svkc.load(SPACE.format(f'<body name="a">{slide}{ball}{pendulum}</body>'))
     return sprung, svkc.load(SPACE.format(pendulum))
 
 
-@pytest.mark.parametrize("solver", [diffrax.Tsit5(), diffrax.Kvaerno5()], ids=["explicit", "implicit"])
+@pytest.mark.parametrize(
+    "solver", [diffrax.Tsit5(), diffrax.Kvaerno5()], ids=["explicit", "implicit"]
+)
 def test_stiff_springs(solver):
-    """1e9 N/m under a pendulum: as on a rigid pivot, to the stretch of the spring; the implicit solver needs fewer steps."""
+    """1e9 N/m under a pendulum: as on a rigid pivot, to the stretch of the spring; the implicit
+    solver needs fewer steps."""
     chain, rigid = sprung_and_rigid()
     traj = svkc.simulate(chain, chain.state({"b": 0.5}), 0.1, solver=solver)
     expected = svkc.simulate(rigid, rigid.state({"b": 0.5}), 0.1, **FINE)
@@ -180,11 +250,16 @@ def test_stiff_springs(solver):
 
 
 def test_no_inertia_at_the_end_of_a_ball():
-    """A body without inertia that a ball would have to turn is refused, by name; a tiny one is simulated, at the defaults too.
+    """A body without inertia that a ball would have to turn is refused, by name; a tiny one is
+    simulated, at the defaults too.
 
-    Its spin's inertia is 4e-12 of its swing's, so the round-off of its acceleration is 5e-5: asked for less than that, solvers take ever more steps.
+    Its spin's inertia is 4e-12 of its swing's, so the round-off of its acceleration is 5e-5: asked
+    for less than that, solvers take ever more steps.
     """
-    point = '<body name="tip"><joint name="tip" type="ball"/><inertial pos="0 0 -{}" mass="{}" diaginertia="{} {} {}"/></body>'
+    point = (
+        '<body name="tip"><joint name="tip" type="ball"/><inertial pos="0 0 -{}" mass="{}"'
+        ' diaginertia="{} {} {}"/></body>'
+    )
     with pytest.raises(ValueError, match="tip"):
         svkc.load(SPACE.format(point.format(0.5, 1, 0, 0, 0)))
     chain = svkc.load(SPACE.format(point.format(0.5, 1, 1e-12, 1e-12, 1e-12)))
@@ -197,16 +272,28 @@ def test_no_inertia_at_the_end_of_a_ball():
     # asked for more, in 23 thousand steps
     traj = svkc.simulate(chain, state, 1.0, ts=TIMES, solver=diffrax.Tsit5(), **FINE)
     assert drift(chain, traj) < 1e-7
-    assert svkc.simulate(chain, state, 1.0, rtol=1e-11, atol=1e-13, throw=False).result == svkc.RESULTS.max_steps
+    assert (
+        svkc.simulate(chain, state, 1.0, rtol=1e-11, atol=1e-13, throw=False).result
+        == svkc.RESULTS.max_steps
+    )
 
 
 def test_chattering_ends_with_a_code():
-    """A joint locked and let go infinitely often before 0.1 s: as many events as allowed, then the code, the last state kept."""
-    body = '<body name="ball"><joint name="z" type="slide" axis="0 0 1"/><geom size="0.1" mass="1" contype="0"/></body>'
+    """A joint locked and let go infinitely often before 0.1 s: as many events as allowed, then the
+    code, the last state kept."""
+    body = (
+        '<body name="ball"><joint name="z" type="slide" axis="0 0 1"/><geom size="0.1" mass="1"'
+        ' contype="0"/></body>'
+    )
     chain = svkc.load(SPACE.format(body))
     wave = lambda t, s, args: jnp.sin(1.0 / (0.1001 - t))
-    events = [svkc.when(wave, lock="z", direction=True), svkc.when(wave, unlock="z", direction=False)]
-    traj = svkc.simulate(chain, chain.state(), 0.2, events=events, max_events=12, dt=1e-4, throw=False)
+    events = [
+        svkc.when(wave, lock="z", direction=True),
+        svkc.when(wave, unlock="z", direction=False),
+    ]
+    traj = svkc.simulate(
+        chain, chain.state(), 0.2, events=events, max_events=12, dt=1e-4, throw=False
+    )
     assert traj.result == svkc.RESULTS.max_events
     assert int(traj.events.count) == 12
     assert np.isfinite(traj.final.q).all()

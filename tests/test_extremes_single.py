@@ -24,7 +24,8 @@ def single():
 
 
 def test_single_precision():
-    """float32: the N four-bar and a chain of unlike masses, with bounds of their own; float64 input where x64 is off warns once."""
+    """float32: the N four-bar and a chain of unlike masses, with bounds of their own; float64 input
+    where x64 is off warns once."""
     with jax.enable_x64(False):
         chain, state = maximal.load(n_four_bar(2))
         assert state.q.dtype == jnp.float32
@@ -41,7 +42,10 @@ def test_single_precision():
         svkc.simulate(chain, state, np.float64(0.1), ts=np.linspace(0, 0.1, 3))
     wide = models.four_bar()
     state = wide.state()
-    with jax.enable_x64(False), pytest.raises(ValueError, match="float64, but jax_enable_x64 is off"):
+    with (
+        jax.enable_x64(False),
+        pytest.raises(ValueError, match="float64, but jax_enable_x64 is off"),
+    ):
         svkc.simulate(wide, state, 0.1)
 
 
@@ -58,20 +62,24 @@ def test_the_high_bar_in_single_precision():
 
 @pytest.mark.usefixtures("single")
 def test_lengths_from_a_millimetre_to_a_kilometre():
-    """A kilometre at the end of a millimetre is kept. A millimetre at the end of a kilometre is below what float32 can tell apart there: said by a code."""
+    """A kilometre at the end of a millimetre is kept. A millimetre at the end of a kilometre is
+    below what float32 can tell apart there: said by a code."""
     chain = extremes.four_bar_on_a_bar(1e3)
     traj = svkc.simulate(chain, chain.state(v={"crank": 4.0}), 1.0, ts=TIMES)
     assert extremes.drift(chain, traj) < 3e-4
     assert float(traj.gaps[:, 1].max()) < 1e-3
     chain = extremes.four_bar_on_a_bar(1e-3)
-    traj = svkc.simulate(chain, chain.state(v={"crank": 4.0}), 0.05, ts=0.05 * TIMES, dt=1e-4, throw=False)
+    traj = svkc.simulate(
+        chain, chain.state(v={"crank": 4.0}), 0.05, ts=0.05 * TIMES, dt=1e-4, throw=False
+    )
     assert traj.result == svkc.RESULTS.non_finite
     assert np.isfinite(traj.states.q).all()
 
 
 @pytest.mark.usefixtures("single")
 def test_far_away_and_fast():
-    """1e6 m from the origin, where places are told apart by 6 cm: a metre's figure turns as at the origin to 5e-3."""
+    """1e6 m from the origin, where places are told apart by 6 cm: a metre's figure turns as at the
+    origin to 5e-3."""
     chain = extremes.two_bars()
     run = jax.jit(lambda state: svkc.simulate(chain, state, 1.0, throw=False))
     q, v = np.array(chain.q_load), np.array(extremes.THROWN, np.float32)
@@ -89,12 +97,15 @@ def test_fast_spin():
     state = chain.state(v=np.array(extremes.SPIN, np.float32))
     traj = svkc.simulate(chain, state, 1.0, ts=TIMES)
     assert extremes.drift(chain, traj) < 1e-2
-    assert float(traj.report().angular_momentum_drift) < 1e-3 * float(jnp.linalg.norm(svkc.momentum(chain, state)[1]))
+    assert float(traj.report().angular_momentum_drift) < 1e-3 * float(
+        jnp.linalg.norm(svkc.momentum(chain, state)[1])
+    )
 
 
 @pytest.mark.usefixtures("single")
 def test_two_hundred_links():
-    """Twenty metres of links of ten centimetres, by fixed steps: their accelerations are good to some 1e-2, finer than which no tolerance can ask."""
+    """Twenty metres of links of ten centimetres, by fixed steps: their accelerations are good to
+    some 1e-2, finer than which no tolerance can ask."""
     chain = extremes.rods([0.1] * 200, [0.1] * 200)
     traj = svkc.simulate(chain, extremes.zigzag(chain, 0.05), 0.1, ts=0.1 * TIMES, dt=1e-3)
     assert extremes.drift(chain, traj) < 5e-2
@@ -122,9 +133,17 @@ def test_stiff_springs():
 
 @pytest.mark.usefixtures("single")
 def test_a_hundred_thousand_steps():
-    """The loop stays closed; the steps are those that time in float32 can tell apart, a thousandth off at the end of ten seconds."""
+    """The loop stays closed; the steps are those that time in float32 can tell apart, a thousandth
+    off at the end of ten seconds."""
     chain = models.four_bar()
-    traj = svkc.simulate(chain, chain.state(v={"crank": 4.0}), 10.0, ts=10 * TIMES, dt=1e-4, solver=svkc.SemiImplicitEuler())
+    traj = svkc.simulate(
+        chain,
+        chain.state(v={"crank": 4.0}),
+        10.0,
+        ts=10 * TIMES,
+        dt=1e-4,
+        solver=svkc.SemiImplicitEuler(),
+    )
     assert int(traj.report().accepted) == pytest.approx(100_000, rel=2e-3)
     assert float(traj.report().gap) < 2e-5
     assert extremes.drift(chain, traj) < 1e-2
@@ -133,7 +152,11 @@ def test_a_hundred_thousand_steps():
 @pytest.mark.parametrize("name", ["four_bar", "two_bars", "deep"])
 def test_both_precisions_in_one_process(name):
     """One model in float64, then in float32, then in float64 again: each as if it were alone."""
-    make = {"four_bar": models.four_bar, "two_bars": extremes.two_bars, "deep": lambda: extremes.rods([0.1] * 40, [0.1] * 40)}[name]
+    make = {
+        "four_bar": models.four_bar,
+        "two_bars": extremes.two_bars,
+        "deep": lambda: extremes.rods([0.1] * 40, [0.1] * 40),
+    }[name]
 
     def found():
         chain = make()
@@ -141,7 +164,14 @@ def test_both_precisions_in_one_process(name):
         fast = svkc.Dynamics(inertia=svkc.by_bodies)
         stepped = svkc.step(chain, state, jnp.zeros(chain.nv), 1e-3)
         run = svkc.simulate(chain, state, 0.01, dt=2e-3, dynamics=fast)
-        return [np.asarray(x, float) for x in (svkc.forward_dynamics(chain, state, jnp.zeros(chain.nv)), stepped.v, run.final.q)]
+        return [
+            np.asarray(x, float)
+            for x in (
+                svkc.forward_dynamics(chain, state, jnp.zeros(chain.nv)),
+                stepped.v,
+                run.final.q,
+            )
+        ]
 
     double = found()
     with jax.enable_x64(False):

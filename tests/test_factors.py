@@ -1,4 +1,5 @@
-"""Factors and solves in a batch: what they give, and that devices of one process do not wait for each other for ever."""
+"""Factors and solves in a batch: what they give, and that devices of one process do not wait for
+each other for ever."""
 
 import subprocess
 import sys
@@ -21,12 +22,19 @@ def test_batches_are_their_single_solves(lanes, size):
     triangle = lambda trans: lambda A, x: solve_triangle(A, x, trans)
     for _ in lanes:
         positive = jax.vmap(positive)
-    np.testing.assert_allclose(positive(A, x), np.linalg.solve(np.asarray(A), np.asarray(x)[..., None])[..., 0], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(
+        positive(A, x),
+        np.linalg.solve(np.asarray(A), np.asarray(x)[..., None])[..., 0],
+        rtol=1e-9,
+        atol=1e-12,
+    )
     for trans in False, True:
         solve, upper = triangle(trans), np.triu(np.asarray(A))
         for _ in lanes:
             solve = jax.vmap(solve)
-        expected = np.linalg.solve(np.swapaxes(upper, -1, -2) if trans else upper, np.asarray(x)[..., None])[..., 0]
+        expected = np.linalg.solve(
+            np.swapaxes(upper, -1, -2) if trans else upper, np.asarray(x)[..., None]
+        )[..., 0]
         np.testing.assert_allclose(solve(A, x), expected, rtol=1e-9, atol=1e-12)
 
 
@@ -38,11 +46,15 @@ from svkc._jax.batched_lapack import factor_positive
 
 rng = np.random.default_rng(0)
 A = rng.normal(size=(2 * 127, 24, 24)).astype(np.float32)
-A, x = A @ A.transpose(0, 2, 1) + 24 * np.eye(24, dtype=np.float32), rng.normal(size=A.shape).astype(np.float32)
+A = A @ A.transpose(0, 2, 1) + 24 * np.eye(24, dtype=np.float32)
+x = rng.normal(size=A.shape).astype(np.float32)
 one = lambda A, x: jax.lax.fori_loop(0, 300, lambda _, y: x + 0.1 * factor_positive(A)(y), x)
 spec = PartitionSpec("lanes")
-solve = lambda mesh: jax.jit(jax.shard_map(jax.vmap(one), mesh=Mesh(np.array(mesh), ("lanes",)), in_specs=spec, out_specs=spec))
-np.testing.assert_allclose(solve(jax.devices())(A, x), solve(jax.devices()[:1])(A, x), rtol=1e-4, atol=1e-5)
+lanes = jax.vmap(one)
+on = lambda devices: Mesh(np.array(devices), ("lanes",))
+solve = lambda mesh: jax.jit(jax.shard_map(lanes, mesh=mesh, in_specs=spec, out_specs=spec))
+both, single = (solve(on(devices))(A, x) for devices in (jax.devices(), jax.devices()[:1]))
+np.testing.assert_allclose(both, single, rtol=1e-4, atol=1e-5)
 """
 
 

@@ -11,11 +11,18 @@ import svkc
 
 @pytest.mark.slow
 def test_a_long_floor_does_not_make_the_figure_small(tmp_path):
-    """What is fixed is shown no further than a metre beyond what moves: however long the floor, the picture is the same."""
+    """What is fixed is shown no further than a metre beyond what moves: however long the floor, the
+    picture is the same."""
 
     def drawn(half: float):
-        floor = f'<geom type="capsule" size=".02" contype="0" conaffinity="0" fromto="{-half} 0 0 {half} 0 0"/>'
-        chain = svkc.load(f'<mujoco><worldbody>{floor}<body pos="0 0 1"><freejoint/>{models.BAR.format("0 0 0.3")}</body></worldbody></mujoco>')
+        floor = (
+            f'<geom type="capsule" size=".02" contype="0" conaffinity="0" fromto="{-half} 0 0'
+            f' {half} 0 0"/>'
+        )
+        chain = svkc.load(
+            f'<mujoco><worldbody>{floor}<body pos="0 0'
+            f' 1"><freejoint/>{models.BAR.format("0 0 0.3")}</body></worldbody></mujoco>'
+        )
         traj = svkc.simulate(chain, chain.state(), 0.1, ts=jnp.linspace(0, 0.1, 3), dt=0.05)
         return matplotlib.image.imread(svkc.render(chain, traj, tmp_path / f"{half}.png"))
 
@@ -25,10 +32,21 @@ def test_a_long_floor_does_not_make_the_figure_small(tmp_path):
 def test_curves_have_what_a_run_has():
     """Lines over the saved times, the axes named, an event marked."""
     chain = svkc.load(models.MJCF.format(models.bar("arm", models.Y, "0 0 -1")))
-    traj = svkc.simulate(chain, chain.state({"arm": 0.5}), 0.1, ts=jnp.linspace(0, 0.1, 3), dt=0.05, events=[svkc.at(0.05)])
+    traj = svkc.simulate(
+        chain,
+        chain.state({"arm": 0.5}),
+        0.1,
+        ts=jnp.linspace(0, 0.1, 3),
+        dt=0.05,
+        events=[svkc.at(0.05)],
+    )
     figure = svkc.plot(traj, chain)
     for axes in figure.axes:
         assert axes.get_ylabel()
     lines = [line for axes in figure.axes for line in axes.lines]
-    assert any(np.array_equal(line.get_xdata(), traj.ts) and np.allclose(line.get_ydata(), traj.states.q[:, 0]) for line in lines)
+    assert any(
+        np.array_equal(line.get_xdata(), traj.ts)
+        and np.allclose(line.get_ydata(), traj.states.q[:, 0])
+        for line in lines
+    )
     assert any(np.allclose(line.get_xdata(), 0.05) for line in lines)

@@ -1,4 +1,5 @@
-"""Functions made anew by a loop: programs are shared where the functions can be compared, and results are those of each function."""
+"""Functions made anew by a loop: programs are shared where the functions can be compared, and
+results are those of each function."""
 
 import enum
 import functools
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 
 import svkc
+
 from svkc._jax.functions import Function, comparable
 
 DT = {"dt": 0.05, "solver": svkc.SemiImplicitEuler(), "max_events": 1, "max_steps": 8}
@@ -106,21 +108,73 @@ def test_what_is_compared():
     """By type and value, arrays of floats not at all, those of whole numbers by content."""
     small, large, key = np.ones(2), 3 * np.ones(2), jax.random.key(0)
     makers = {
-        torque: [(small, large), (jnp.ones(2), jnp.zeros(2)), ({"a": small, "b": [1, 2]}, {"a": large, "b": [1, 2]}), (math.nan, math.nan)],
-        nested: [(small, large), (1.5, 1.5), ((1, "a", None, b"c"), (1, "a", None, b"c")), (slice(1, 2), slice(1, 2)), (Kind.ONE, Kind.ONE)],
-        lambda x: nested(1, x): [(small, large), (1.5, 1.5), (np.float64(1), np.float64(2)), (np.dtype("f4"), np.dtype("f4"))],
+        torque: [
+            (small, large),
+            (jnp.ones(2), jnp.zeros(2)),
+            ({"a": small, "b": [1, 2]}, {"a": large, "b": [1, 2]}),
+            (math.nan, math.nan),
+        ],
+        nested: [
+            (small, large),
+            (1.5, 1.5),
+            ((1, "a", None, b"c"), (1, "a", None, b"c")),
+            (slice(1, 2), slice(1, 2)),
+            (Kind.ONE, Kind.ONE),
+        ],
+        lambda x: nested(1, x): [
+            (small, large),
+            (1.5, 1.5),
+            (np.float64(1), np.float64(2)),
+            (np.dtype("f4"), np.dtype("f4")),
+        ],
         lambda x: functools.partial(fixed_torque, args=x): [(small, large), (2, 2)],
         lambda x: torque(Pair(x)): [(small, large)],
         lambda x: torque(Pair(x).torque): [(small, large)],
         lambda x: torque(eqx.nn.MLP(1, 1, 2, 1, key=x)): [(key, jax.random.key(1))],
-        lambda x: torque([x, jnp.where, np.sin, math.sin, len, jax, jax.lax.scan, jnp.float32, jax.nn.relu, wrapped, svkc.touch, jnp.add]): [(small, large)],
+        lambda x: torque(
+            [
+                x,
+                jnp.where,
+                np.sin,
+                math.sin,
+                len,
+                jax,
+                jax.lax.scan,
+                jnp.float32,
+                jax.nn.relu,
+                wrapped,
+                svkc.touch,
+                jnp.add,
+            ]
+        ): [(small, large)],
     }
     for make, cases in makers.items():
         for one, other in cases:
             assert same(make(one), make(other)), (make, one)
-    different = [(1, 1.0), (1, True), (0.0, -0.0), (1j, 2j), ([1], [2]), ({"a": 1}, {"b": 1}), ((1,), [1]), (Kind.ONE, Kind.TWO), (slice(1), slice(2))]
-    different += [({"a": 1, "b": 2}, {"b": 2, "a": 1}), (np.array([1]), np.array([2])), (np.array([True]), np.array([False])), (jnp.sin, jnp.cos)]
-    different += [(np.int32(1), np.int64(1)), (Pair(small), Pair(small, 2.0)), (torque(1), torque(2)), (Pair(small), small), (None, small)]
+    different = [
+        (1, 1.0),
+        (1, True),
+        (0.0, -0.0),
+        (1j, 2j),
+        ([1], [2]),
+        ({"a": 1}, {"b": 1}),
+        ((1,), [1]),
+        (Kind.ONE, Kind.TWO),
+        (slice(1), slice(2)),
+    ]
+    different += [
+        ({"a": 1, "b": 2}, {"b": 2, "a": 1}),
+        (np.array([1]), np.array([2])),
+        (np.array([True]), np.array([False])),
+        (jnp.sin, jnp.cos),
+    ]
+    different += [
+        (np.int32(1), np.int64(1)),
+        (Pair(small), Pair(small, 2.0)),
+        (torque(1), torque(2)),
+        (Pair(small), small),
+        (None, small),
+    ]
     for one, other in different:
         assert not same(torque(one), torque(other)), (one, other)
     assert same(torque(np.array([1])), torque(np.array([1])))
@@ -155,9 +209,30 @@ def test_what_is_not():
 
     attributed.count, attributed_too, loop = 1, 2, [1]
     loop.append(loop)
-    inside = [Opaque(), Opaque, Opaque().torque, models, iter([1]), {1}, [].append, loop, np.array([None]), jax.jit(lambda x: x), np.ma.ones(2)]
+    inside = [
+        Opaque(),
+        Opaque,
+        Opaque().torque,
+        models,
+        iter([1]),
+        {1},
+        [].append,
+        loop,
+        np.array([None]),
+        jax.jit(lambda x: x),
+        np.ma.ones(2),
+    ]
     unhashable = Pair(jnp.ones(1), scale=[1])
-    for function in (writes, deletes, imports, recursive, attributed, Opaque().torque, torque(recursive), *map(torque, (*inside, unhashable))):
+    for function in (
+        writes,
+        deletes,
+        imports,
+        recursive,
+        attributed,
+        Opaque().torque,
+        torque(recursive),
+        *map(torque, (*inside, unhashable)),
+    ):
         assert static(function) is None, function
     late = 1
 
@@ -174,7 +249,8 @@ def test_what_is_not():
 
 
 def test_what_globals_are():
-    """Of the module those that the code names, also through other functions; a function object keeps what it was."""
+    """Of the module those that the code names, also through other functions; a function object
+    keeps what it was."""
     global GAIN, LIST
     read = lambda: [static(f) for f in (lambda: GAIN * 2, lambda: helper(), lambda: LIST[0] + 1)]
     first, kept = read(), lambda: GAIN + 1
@@ -204,7 +280,11 @@ def test_what_globals_are():
 def test_a_loop_compiles_once(arm, expected, programs):
     """Whatever holds the arrays; each run is that of its own ones."""
     module = lambda pair: lambda t, state, args: pair.torque(t, state, args)
-    holds = [nested, lambda g: functools.partial(lambda g, t, s, a: g * jnp.ones_like(s.v), g), lambda g: module(Pair(g))]
+    holds = [
+        nested,
+        lambda g: functools.partial(lambda g, t, s, a: g * jnp.ones_like(s.v), g),
+        lambda g: module(Pair(g)),
+    ]
     for hold in holds:
         for kind in (np.asarray, jnp.asarray):
             assert [end(arm, hold(kind([gain]))) for gain in (1.0, 2.0)] == expected
@@ -234,9 +314,15 @@ def test_a_list_that_counts(arm, expected, programs):
 
 
 def test_arrays_that_python_looks_at(arm, expected, programs):
-    """Each value has its own program, the right one, and the next goes there at once; other errors are told as they are."""
-    conditional = lambda gain: lambda t, s, a: float(np.linalg.norm(gain)) * jnp.ones_like(s.v) if gain[0] > 0 else None
-    assert [end(arm, conditional(np.asarray([gain]))) for gain in (1.0, 2.0, 2.0)] == [*expected, expected[1]]
+    """Each value has its own program, the right one, and the next goes there at once; other errors
+    are told as they are."""
+    conditional = lambda gain: (
+        lambda t, s, a: float(np.linalg.norm(gain)) * jnp.ones_like(s.v) if gain[0] > 0 else None
+    )
+    assert [end(arm, conditional(np.asarray([gain]))) for gain in (1.0, 2.0, 2.0)] == [
+        *expected,
+        expected[1],
+    ]
     # the first was tried with the array as data
     assert len(programs) == 3
     with pytest.raises(ZeroDivisionError):
@@ -251,7 +337,15 @@ def test_guards(arm, programs):
     chain, state = arm
 
     def time(level):
-        return float(svkc.simulate(chain, state, 0.5, events=[svkc.when(lambda t, state, args: state.q[0] - level, stop=True)], **DT).t_final)
+        return float(
+            svkc.simulate(
+                chain,
+                state,
+                0.5,
+                events=[svkc.when(lambda t, state, args: state.q[0] - level, stop=True)],
+                **DT,
+            ).t_final
+        )
 
     assert time(np.asarray(0.25)) < time(np.asarray(0.2)) < time(np.asarray(0.1)) < 0.5
     assert len(programs) == 1
@@ -265,8 +359,21 @@ def test_rollout(arm, programs):
 
     def run(gain):
         guard = svkc.when(lambda t, state, args: state.q[0] - gain, stop=True)
-        lane, control = lambda chain, x: {"args": x}, lambda t, state, args: args * gain * jnp.ones_like(state.v)
-        return svkc.rollout(chain, starts, 0.1, data=jnp.arange(3.0), lane=lane, control=control, events=guard, progress=False, **DT).final.q[:, 0]
+        lane, control = (
+            lambda chain, x: {"args": x},
+            lambda t, state, args: args * gain * jnp.ones_like(state.v),
+        )
+        return svkc.rollout(
+            chain,
+            starts,
+            0.1,
+            data=jnp.arange(3.0),
+            lane=lane,
+            control=control,
+            events=guard,
+            progress=False,
+            **DT,
+        ).final.q[:, 0]
 
     first, seen = run(np.asarray(5.0)), len(programs)
     assert np.all(np.diff(run(np.asarray(6.0)) - first) > 0)
@@ -282,7 +389,10 @@ def test_things_that_cannot_be_compared(arm):
         return end(arm, lambda t, state, args: thing.torque(t, state, args), **kw)
 
     run()
-    warned = r"^control: a new function object .* is compiled again; an object of type Opaque cannot be compared. Define it outside the loop.$"
+    warned = (
+        r"^control: a new function object .* is compiled again; an object of type Opaque cannot be"
+        r" compared. Define it outside the loop.$"
+    )
     with pytest.warns(UserWarning, match=warned):
         run()
     run()
@@ -296,12 +406,18 @@ def test_things_that_cannot_be_compared(arm):
 def test_derivatives_and_lanes(arm):
     """By what is closed over, in lanes, as differences of a run by `args` give them."""
     chain, state = arm
-    closed = lambda gain: svkc.simulate(chain, state, 0.1, control=lambda t, s, a: gain**2 * jnp.ones_like(s.v), **DT).final.q[0]
+    closed = lambda gain: svkc.simulate(
+        chain, state, 0.1, control=lambda t, s, a: gain**2 * jnp.ones_like(s.v), **DT
+    ).final.q[0]
     gains, step = np.array([1.5, 3.0]), 1e-4
     values, slopes = jax.vmap(jax.value_and_grad(closed))(jnp.asarray(gains))
-    by_args = lambda gains: np.array([end(arm, fixed_torque, args=jnp.asarray(gain**2)) for gain in gains])
+    by_args = lambda gains: np.array(
+        [end(arm, fixed_torque, args=jnp.asarray(gain**2)) for gain in gains]
+    )
     np.testing.assert_allclose(values, by_args(gains), rtol=1e-12)
-    np.testing.assert_allclose(slopes, (by_args(gains + step) - by_args(gains - step)) / (2 * step), rtol=1e-7)
+    np.testing.assert_allclose(
+        slopes, (by_args(gains + step) - by_args(gains - step)) / (2 * step), rtol=1e-7
+    )
 
 
 @pytest.mark.slow
@@ -310,8 +426,16 @@ def test_nothing_stays():
     found, tracers, gone = [], [], []
 
     def traced(x):
-        for make in (torque, lambda x: torque({"a": [x]}), nested, lambda x: functools.partial(fixed_torque, args=x), lambda x: torque(Pair(x))):
-            assert [y is x for y in jax.tree.leaves(eqx.filter(comparable(make(x)), eqx.is_array))] == [True]
+        for make in (
+            torque,
+            lambda x: torque({"a": [x]}),
+            nested,
+            lambda x: functools.partial(fixed_torque, args=x),
+            lambda x: torque(Pair(x)),
+        ):
+            assert [
+                y is x for y in jax.tree.leaves(eqx.filter(comparable(make(x)), eqx.is_array))
+            ] == [True]
             found.append(static(make(x)))
         tracers.append(x)
         return x

@@ -1,9 +1,12 @@
-"""Random calls of the public functions: what comes out is a good value, a message of docs/errors.md, or a NaN that can be seen.
+"""Random calls of the public functions: what comes out is a good value, a message of
+docs/errors.md, or a NaN that can be seen.
 
-The suite makes a few hundred, the same every time; `SVKC_FUZZ=10000 python -m pytest tests/test_fuzz.py -n 0` makes that many, others each time.
-What counts is what users see: annotations are not checked while these tests call (`said.as_users_see`), as they are in all other tests, and jax promotes
-types as it does by default. Programs are compiled for a handful of fixed scenes alone; where a call would compile another (`simulate`, `rollout`, `tune`),
-it is only traced.
+The suite makes a few hundred, the same every time; `SVKC_FUZZ=10000 python -m pytest
+tests/test_fuzz.py -n 0` makes that many, others each time.
+What counts is what users see: annotations are not checked while these tests call
+(`said.as_users_see`), as they are in all other tests, and jax promotes types as it does by default.
+Programs are compiled for a handful of fixed scenes alone; where a call would compile another
+(`simulate`, `rollout`, `tune`), it is only traced.
 """
 
 import functools
@@ -51,7 +54,9 @@ def examples(share: float):
 
 def is_documented(error: Exception) -> bool:
     text = " ".join(str(error).split())
-    return isinstance(error, ValueError | RuntimeError) and any(row.fullmatch(text) for row in DOCUMENTED)
+    return isinstance(error, ValueError | RuntimeError) and any(
+        row.fullmatch(text) for row in DOCUMENTED
+    )
 
 
 NOTHING = object()
@@ -60,7 +65,11 @@ NOTHING = object()
 def outcome(call, *others):
     """What the call gives; NOTHING where it raises what the page, or the list `others`, has."""
     CALLS["count"] += 1
-    with warnings.catch_warnings(), jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+    with (
+        warnings.catch_warnings(),
+        jax.numpy_dtype_promotion("standard"),
+        jax.numpy_rank_promotion("allow"),
+    ):
         warnings.simplefilter("ignore")
         try:
             return call()
@@ -85,7 +94,24 @@ def all_finite(tree) -> bool:
 # ---- what is given
 
 ODD = [math.nan, math.inf, -math.inf, 1e300, -1e300, 5e-324, 1e-12, 0.0, -1.0, 1.0, 10**30]
-TEXTS = ["", "pin", "nobody", "crank", "spare_0", "world", "rocker", "all", "\u00e9\n\0", "weld", "hinge", "universal", "xyz", "a.b", "x" * 5000, "\ud800"]
+TEXTS = [
+    "",
+    "pin",
+    "nobody",
+    "crank",
+    "spare_0",
+    "world",
+    "rocker",
+    "all",
+    "\u00e9\n\0",
+    "weld",
+    "hinge",
+    "universal",
+    "xyz",
+    "a.b",
+    "x" * 5000,
+    "\ud800",
+]
 THINGS = [
     None,
     True,
@@ -127,13 +153,23 @@ THINGS = [
     diffrax.Tsit5(),
 ]
 arrays = st.builds(
-    lambda n, kind, fill: np.full(n, fill, dtype=kind) if kind != np.int32 else np.arange(n, dtype=np.int32),
+    lambda n, kind, fill: (
+        np.full(n, fill, dtype=kind) if kind != np.int32 else np.arange(n, dtype=np.int32)
+    ),
     st.integers(0, 8),
     st.sampled_from([np.float64, np.float32, np.int32]),
     st.sampled_from([0.0, 1.0, 0.3, math.nan, math.inf]),
 )
-anything = st.one_of(st.sampled_from(THINGS), st.sampled_from(TEXTS), st.sampled_from(ODD), arrays, st.text(max_size=6))
-vectors = lambda n: st.lists(st.one_of(st.floats(-1.5, 1.5), st.sampled_from(ODD[:-1])), min_size=n, max_size=n)
+anything = st.one_of(
+    st.sampled_from(THINGS),
+    st.sampled_from(TEXTS),
+    st.sampled_from(ODD),
+    arrays,
+    st.text(max_size=6),
+)
+vectors = lambda n: st.lists(
+    st.one_of(st.floats(-1.5, 1.5), st.sampled_from(ODD[:-1])), min_size=n, max_size=n
+)
 
 
 def or_anything(good, part: int = 3):
@@ -149,12 +185,16 @@ def some_of(**strategies):
 # ---- models
 
 number = st.one_of(
-    st.floats(0.01, 2).map("{:.3f}".format), st.sampled_from("0 -1 1e-14 1e-300 1e300 1e160 nan inf -inf 1e999 abc".split()), st.floats(-2, 2).map(str)
+    st.floats(0.01, 2).map("{:.3f}".format),
+    st.sampled_from("0 -1 1e-14 1e-300 1e300 1e160 nan inf -inf 1e999 abc".split()),
+    st.floats(-2, 2).map(str),
 )
 good_number = st.floats(0.05, 2).map("{:.3f}".format)
 label = st.one_of(
     st.integers(0, 9).map("b{}".format),
-    st.sampled_from(["", "world", "joint_0", "joint_1", "body_1", "b1_free", "a.b", "\u00e9", "a b", "spare_0"]),
+    st.sampled_from(
+        ["", "world", "joint_0", "joint_1", "body_1", "b1_free", "a.b", "\u00e9", "a b", "spare_0"]
+    ),
     st.text(max_size=3),
 )
 
@@ -173,15 +213,25 @@ def attributes(draw, usual: dict, odd: dict):
     return "".join(f' {name}="{escaped(value)}"' for name, value in chosen.items())
 
 
-several = lambda n: st.lists(st.one_of(good_number, good_number, good_number, number), min_size=n, max_size=n).map(" ".join)
+several = lambda n: st.lists(
+    st.one_of(good_number, good_number, good_number, number), min_size=n, max_size=n
+).map(" ".join)
 
 
 @st.composite
 def joints(draw):
     kind = draw(st.sampled_from(["hinge", "slide", "ball", "free", "hinge", "wheel"]))
-    odd = {n: number for n in ("stiffness", "damping", "armature", "ref", "springref", "frictionloss")}
-    odd |= {"axis": several(3), "pos": several(3), "range": several(2), "limited": st.sampled_from(["true", "false", "maybe"])}
-    return f"<joint{draw(attributes({'type': kind, 'name': draw(label)} if draw(st.booleans()) else {'type': kind}, odd))}/>"
+    odd = {
+        n: number for n in ("stiffness", "damping", "armature", "ref", "springref", "frictionloss")
+    }
+    odd |= {
+        "axis": several(3),
+        "pos": several(3),
+        "range": several(2),
+        "limited": st.sampled_from(["true", "false", "maybe"]),
+    }
+    fixed = {"type": kind, "name": draw(label)} if draw(st.booleans()) else {"type": kind}
+    return f"<joint{draw(attributes(fixed, odd))}/>"
 
 
 @st.composite
@@ -190,11 +240,22 @@ def bodies(draw, budget: int):
     own = "".join(draw(st.lists(joints(), max_size=3)))
     geoms = st.builds(
         "<geom{}/>".format,
-        attributes({"size": "0.1 0.1 0.1"}, {"size": several(3), "mass": number, "density": number, "type": st.sampled_from(["box", "sphere", "mesh"])}),
+        attributes(
+            {"size": "0.1 0.1 0.1"},
+            {
+                "size": several(3),
+                "mass": number,
+                "density": number,
+                "type": st.sampled_from(["box", "sphere", "mesh"]),
+            },
+        ),
     )
     inertials = st.builds(
         "<inertial{}/>".format,
-        attributes({"pos": "0 0 0", "mass": "1", "diaginertia": "1 1 1"}, {"mass": number, "diaginertia": several(3), "pos": several(3)}),
+        attributes(
+            {"pos": "0 0 0", "mass": "1", "diaginertia": "1 1 1"},
+            {"mass": number, "diaginertia": several(3), "pos": several(3)},
+        ),
     )
     mass = "".join(draw(st.lists(st.one_of(geoms, geoms, inertials), max_size=2)))
     children = draw(st.integers(0, 2)) if budget > 1 else 0
@@ -229,11 +290,15 @@ def texts(draw):
     text = f"<mujoco>{draw(st.sampled_from(EXTRAS))}<worldbody>{inside}</worldbody></mujoco>"
     if kind == 0:
         links = "".join(
-            f"<link name='{escaped(draw(label))}'><inertial><mass value='{draw(number)}'/><inertia ixx='1' iyy='1' izz='{draw(number)}'/></inertial></link>"
+            f"<link name='{escaped(draw(label))}'><inertial><mass value='{draw(number)}'/><inertia"
+            f" ixx='1' iyy='1' izz='{draw(number)}'/></inertial></link>"
             for _ in range(2)
         )
         kind = draw(st.sampled_from(["revolute", "fixed", "floating", "x"]))
-        text = f"<robot name='r'>{links}<joint name='j' type='{kind}'><parent link='b1'/><child link='b2'/></joint></robot>"
+        text = (
+            f"<robot name='r'>{links}<joint name='j' type='{kind}'><parent link='b1'/><child"
+            " link='b2'/></joint></robot>"
+        )
     elif kind == 1:
         text = text[: draw(st.integers(0, len(text)))]
     elif kind == 2:
@@ -249,7 +314,13 @@ def load_options(link):
         virtual_links=or_anything(st.lists(link, max_size=2)),
         cuttable=or_anything(st.lists(label, max_size=2)),
         spare=or_anything(st.integers(-1, 3)),
-        ignore=or_anything(st.one_of(st.just("all"), st.lists(st.sampled_from(["all", "equality", "limit", "nothing"]), max_size=2)), 6),
+        ignore=or_anything(
+            st.one_of(
+                st.just("all"),
+                st.lists(st.sampled_from(["all", "equality", "limit", "nothing"]), max_size=2),
+            ),
+            6,
+        ),
     )
 
 
@@ -257,7 +328,12 @@ link_arguments = some_of(
     name=or_anything(label),
     parent=or_anything(st.sampled_from(["world", "b1", "crank", ""])),
     real=or_anything(st.sampled_from(["b2", "rocker"])),
-    joint=or_anything(st.one_of(st.sampled_from(["weld", "hinge", "free", "planar", "screw"]), st.lists(st.booleans(), min_size=5, max_size=6))),
+    joint=or_anything(
+        st.one_of(
+            st.sampled_from(["weld", "hinge", "free", "planar", "screw"]),
+            st.lists(st.booleans(), min_size=5, max_size=6),
+        )
+    ),
     pos=or_anything(vectors(3)),
     quat=or_anything(st.just((1, 0, 0, 0))),
     real_pos=or_anything(vectors(3)),
@@ -269,7 +345,9 @@ link_arguments = some_of(
 
 
 def made_link(given):
-    return outcome(lambda: svkc.VirtualLink(**({"name": "x", "parent": "world", "real": "rocker"} | given)))
+    return outcome(
+        lambda: svkc.VirtualLink(**({"name": "x", "parent": "world", "real": "rocker"} | given))
+    )
 
 
 links = link_arguments.map(made_link)
@@ -279,11 +357,21 @@ def look_at(chain):
     """Every chain that loads is whole."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(chain):
         assert not np.isnan(leaf).any(), path
-        assert np.isfinite(leaf).all() or jax.tree_util.keystr(path) in (".control_range", ".force_range", ".limit"), path
+        assert np.isfinite(leaf).all() or jax.tree_util.keystr(path) in (
+            ".control_range",
+            ".force_range",
+            ".limit",
+        ), path
     assert len(set(chain.dof_names)) <= len(chain.dof_names) == chain.dofs
     assert len(set(chain.body_names)) == len(chain.body_names)
     assert len(set(chain.joint_names)) == len(chain.joint_names)
-    assert len(chain.parent) == len(chain.child) == len(chain.brother) == len(chain.real) == len(chain.body_names) + len(chain.link_names)
+    assert (
+        len(chain.parent)
+        == len(chain.child)
+        == len(chain.brother)
+        == len(chain.real)
+        == len(chain.body_names) + len(chain.link_names)
+    )
 
 
 @examples(0.5)
@@ -305,7 +393,9 @@ def test_files_that_are_no_models(tmp_path_factory, data, folder):
 @examples(0.1)
 @hypothesis.given(st.lists(links, max_size=2), load_options(links))
 def test_links(given, options):
-    chain = outcome(lambda: svkc.load(models.MJCF.format(models.FOUR_BAR), **options | {"virtual_links": given}))
+    chain = outcome(
+        lambda: svkc.load(models.MJCF.format(models.FOUR_BAR), **options | {"virtual_links": given})
+    )
     if chain is not NOTHING:
         look_at(chain)
 
@@ -313,17 +403,36 @@ def test_links(given, options):
 # ---- states of fixed scenes
 
 TREE = models.MJCF.format(
-    models.bar("base", 'type="free"', "0 0 1", inside=models.bar("arm", models.Y + ' stiffness="2" range="-1 1" limited="true"', "0 0 1", "0 0 1"))
+    models.bar(
+        "base",
+        'type="free"',
+        "0 0 1",
+        inside=models.bar(
+            "arm", models.Y + ' stiffness="2" range="-1 1" limited="true"', "0 0 1", "0 0 1"
+        ),
+    )
     + models.bar("b", 'type="ball"', "0.5 0 1")
 )
 
 
 @functools.cache
 def scenes() -> dict:
-    """Names to (chain, state): a closed loop; a tree that has none, nor slots; a loop and an empty slot."""
+    """Names to (chain, state): a closed loop; a tree that has none, nor slots; a loop and an empty
+    slot."""
     pin = dict(pos=(1.2, 0, 0), axis=(0, 1, 0), real_pos=(0.2, 0, -0.6), connected=True)
-    spare = svkc.load(models.MJCF.format(models.FOUR_BAR), virtual_links=[svkc.VirtualLink("pin", "world", "rocker", "hinge", **pin)], spare=1)
-    return {name: (chain, chain.state()) for name, chain in (("four", models.four_bar()), ("tree", svkc.load(TREE)), ("spare", spare))}
+    spare = svkc.load(
+        models.MJCF.format(models.FOUR_BAR),
+        virtual_links=[svkc.VirtualLink("pin", "world", "rocker", "hinge", **pin)],
+        spare=1,
+    )
+    return {
+        name: (chain, chain.state())
+        for name, chain in (
+            ("four", models.four_bar()),
+            ("tree", svkc.load(TREE)),
+            ("spare", spare),
+        )
+    }
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -333,7 +442,9 @@ def ready():
     with said.as_users_see():
         yield
     if LONG:
-        print(f"\n{CALLS['count']} calls, of which {CALLS['raised']} raised what docs/errors.md has")
+        print(
+            f"\n{CALLS['count']} calls, of which {CALLS['raised']} raised what docs/errors.md has"
+        )
 
 
 scene = st.sampled_from(["four", "tree", "spare"])
@@ -348,9 +459,16 @@ def coordinates_given(draw, which: int, name: str):
     size = draw(st.sampled_from([NUMBER_OF[name][which], TREE_NUMBER_OF[name][which], 2]))
     if draw(st.booleans()):
         good = np.asarray(state.v if which else state.q)[:size].copy()
-        return (good + 1e-2 * draw(st.integers(0, 1)) * np.arange(len(good))).astype(draw(st.sampled_from([np.float64, np.float32, np.int64])))
+        return (good + 1e-2 * draw(st.integers(0, 1)) * np.arange(len(good))).astype(
+            draw(st.sampled_from([np.float64, np.float32, np.int64]))
+        )
     joint = st.sampled_from([*chain.joint_names, "pin", "nobody", ""])
-    return draw(st.one_of(vectors(size), st.dictionaries(joint, st.one_of(st.floats(-1, 1), vectors(4), anything), max_size=2)))
+    return draw(
+        st.one_of(
+            vectors(size),
+            st.dictionaries(joint, st.one_of(st.floats(-1, 1), vectors(4), anything), max_size=2),
+        )
+    )
 
 
 @examples(0.06)
@@ -358,8 +476,21 @@ def coordinates_given(draw, which: int, name: str):
 def test_states(data):
     name = data.draw(scene)
     chain, _ = scenes()[name]
-    given = data.draw(some_of(q=or_anything(coordinates_given(0, name)), v=or_anything(coordinates_given(1, name))))
-    given |= data.draw(some_of(connected=or_anything(st.one_of(st.just("pin"), st.lists(st.booleans(), max_size=2).map(lambda x: np.array(x, bool))))))
+    given = data.draw(
+        some_of(
+            q=or_anything(coordinates_given(0, name)), v=or_anything(coordinates_given(1, name))
+        )
+    )
+    given |= data.draw(
+        some_of(
+            connected=or_anything(
+                st.one_of(
+                    st.just("pin"),
+                    st.lists(st.booleans(), max_size=2).map(lambda x: np.array(x, bool)),
+                )
+            )
+        )
+    )
     state = outcome(lambda: chain.state(**given))
     if state is not NOTHING:
         assert all_finite(state)
@@ -367,7 +498,9 @@ def test_states(data):
         norms = np.linalg.norm(np.asarray(state.q)[starts[:, None] + np.arange(4)], axis=1)
         np.testing.assert_allclose(norms, 1, atol=1e-12)
         # (lengths up to 1e300 m are let through: what is closed is so in their round-off)
-        assert np.abs(svkc.loop_gaps(chain, state)).max(initial=0) < 1e-6 * max(1, np.abs(state.q).max())
+        assert np.abs(svkc.loop_gaps(chain, state)).max(initial=0) < 1e-6 * max(
+            1, np.abs(state.q).max()
+        )
 
 
 # ---- verbs
@@ -402,22 +535,31 @@ WITHOUT_STATE = ("integrate", "difference", "tangent", "xyzw")
 
 @st.composite
 def arguments(draw, name: str):
-    """One argument of a verb, and whether it is good: finite, of the right size, or good but for a NaN."""
+    """One argument of a verb, and whether it is good: finite, of the right size, or good but for a
+    NaN."""
     sizes = {"tau": NUMBER_OF, "v": NUMBER_OF, "q": NUMBER_OF}
 
     def one(kind):
         if kind == "dt":
-            return draw(st.sampled_from([(1e-3, ""), (0.1, ""), (0.1, ""), (math.nan, "x"), ("a", None)]))
+            return draw(
+                st.sampled_from([(1e-3, ""), (0.1, ""), (0.1, ""), (math.nan, "x"), ("a", None)])
+            )
         n = sizes[kind][name][0 if kind == "q" else 1]
         how = draw(st.integers(0, 7))
         if how == 0:
             return draw(anything), None
-        good = np.asarray(scenes()[name][1].q) if kind == "q" else np.array(draw(st.lists(st.floats(-3, 3), min_size=n, max_size=n)))
+        good = (
+            np.asarray(scenes()[name][1].q)
+            if kind == "q"
+            else np.array(draw(st.lists(st.floats(-3, 3), min_size=n, max_size=n)))
+        )
         if how == 1:
             good = good.copy()
             good[0] = draw(st.sampled_from([math.nan, math.inf]))
             return good, "x"
-        return (jnp.asarray(good), list(good), good, good.astype(np.float32), good.astype(int))[how % 5], "" if how % 5 != 4 or kind != "q" else None
+        return (jnp.asarray(good), list(good), good, good.astype(np.float32), good.astype(int))[
+            how % 5
+        ], ("" if how % 5 != 4 or kind != "q" else None)
 
     return one
 
@@ -440,13 +582,20 @@ def broken(state, how: str, value):
     }[how]
 
 
-wrongs = st.sampled_from(["", "", "", "", "", "q", "v", "thing", "q of a thing", "structure", "whole", "lanes"])
+wrongs = st.sampled_from(
+    ["", "", "", "", "", "q", "v", "thing", "q of a thing", "structure", "whole", "lanes"]
+)
 
 
 @examples(0.14)
 @hypothesis.given(st.data())
 def test_verbs(data):
-    name, verb, wrong, value = data.draw(st.sampled_from(["tree", "spare"])), data.draw(st.sampled_from(sorted(VERBS))), data.draw(wrongs), data.draw(anything)
+    name, verb, wrong, value = (
+        data.draw(st.sampled_from(["tree", "spare"])),
+        data.draw(st.sampled_from(sorted(VERBS))),
+        data.draw(wrongs),
+        data.draw(anything),
+    )
     chain, state = scenes()[name]
     kinds, shows = VERBS[verb]
     if verb in WITHOUT_STATE:
@@ -457,7 +606,11 @@ def test_verbs(data):
     called = data.draw(or_anything(st.just(chain), 20))
     done = outcome(lambda: getattr(svkc, verb)(called, *first, *rest))
     if done is NOTHING:
-        assert called is not chain or wrong not in ("", "q", "v") or None in kept, (verb, wrong, rest)
+        assert called is not chain or wrong not in ("", "q", "v") or None in kept, (
+            verb,
+            wrong,
+            rest,
+        )
     elif wrong == "" and not any(kept) and None not in kept:
         assert all_finite(done), (verb, rest)
     elif ("x" in kept and "x" in shows) or (wrong in shows and wrong != ""):
@@ -473,12 +626,19 @@ def test_changes_of_structure(data):
     given = broken(state, wrong, value)
     body = or_anything(st.sampled_from(["world", "rocker", "crank"]), 6)
     calls = {
-        "connect": lambda: svkc.connect(chain, given, *data.draw(st.lists(name, max_size=2)), here=data.draw(or_anything(st.booleans()))),
+        "connect": lambda: svkc.connect(
+            chain,
+            given,
+            *data.draw(st.lists(name, max_size=2)),
+            here=data.draw(or_anything(st.booleans())),
+        ),
         "cut": lambda: svkc.cut(chain, given, *data.draw(st.lists(name, max_size=2))),
         "lock": lambda: svkc.lock(chain, given, data.draw(name)),
         "unlock": lambda: svkc.unlock(chain, given, data.draw(name)),
         "unbind": lambda: svkc.unbind(chain, given, data.draw(name)),
-        "transition": lambda: svkc.transition(chain, given, data.draw(or_anything(st.just("pin"), 2))),
+        "transition": lambda: svkc.transition(
+            chain, given, data.draw(or_anything(st.just("pin"), 2))
+        ),
         "prefer": lambda: svkc.prefer(chain, given, data.draw(name)),
         "bind": lambda: svkc.bind(
             chain,
@@ -487,7 +647,12 @@ def test_changes_of_structure(data):
             data.draw(body),
             data.draw(body),
             **data.draw(
-                some_of(joint=or_anything(st.just("ball")), axis=or_anything(vectors(3)), pos=or_anything(vectors(3)), real_pos=or_anything(vectors(3)))
+                some_of(
+                    joint=or_anything(st.just("ball")),
+                    axis=or_anything(vectors(3)),
+                    pos=or_anything(vectors(3)),
+                    real_pos=or_anything(vectors(3)),
+                )
             ),
         ),
     }
@@ -507,7 +672,9 @@ class Asked(Exception):
 @pytest.fixture
 def only_traced(monkeypatch):
     """Runs are traced for their shapes, and not compiled."""
-    whole = functools.partial(eqx.filter_eval_shape, sys.modules["svkc.simulation.simulate"]._run.__wrapped__)
+    whole = functools.partial(
+        eqx.filter_eval_shape, sys.modules["svkc.simulation.simulate"]._run.__wrapped__
+    )
 
     def run(*args):
         whole(*args)
@@ -515,7 +682,9 @@ def only_traced(monkeypatch):
 
     monkeypatch.setattr(sys.modules["svkc.simulation.simulate"], "_run", run)
     rollout = sys.modules["svkc.tools.rollout"]
-    monkeypatch.setattr(rollout, "_piece", functools.partial(eqx.filter_eval_shape, rollout._piece.__wrapped__))
+    monkeypatch.setattr(
+        rollout, "_piece", functools.partial(eqx.filter_eval_shape, rollout._piece.__wrapped__)
+    )
 
 
 RETURNS = [
@@ -581,7 +750,13 @@ def sensors(draw):
     call = draw(
         st.sampled_from(
             [
-                lambda: svkc.touch(chain, link, **draw(some_of(distance=number, axes=or_anything(st.sampled_from(["xy", "z"]))))),
+                lambda: svkc.touch(
+                    chain,
+                    link,
+                    **draw(
+                        some_of(distance=number, axes=or_anything(st.sampled_from(["xy", "z"])))
+                    ),
+                ),
                 lambda: svkc.leaves(chain, link, **draw(some_of(axis=or_anything(vectors(3))))),
                 lambda: svkc.overload(chain, link, **draw(some_of(force=number, torque=number))),
             ]
@@ -604,15 +779,29 @@ simulations = dict(
     dt=or_anything(st.sampled_from([0.1, 1e-2, jnp.asarray(0.1)])),
     rtol=or_anything(st.sampled_from([1e-3, jnp.asarray(1e-3)])),
     atol=or_anything(st.just(1e-6)),
-    solver=one_of_these(diffrax.Tsit5, lambda: diffrax.Tsit5, diffrax.Euler, svkc.RodriguesEuler, diffrax.Kvaerno3),
+    solver=one_of_these(
+        diffrax.Tsit5, lambda: diffrax.Tsit5, diffrax.Euler, svkc.RodriguesEuler, diffrax.Kvaerno3
+    ),
     stepsize_controller=one_of_these(
-        lambda: diffrax.PIDController(rtol=1e-3, atol=1e-6), diffrax.ConstantStepSize, lambda: diffrax.StepTo(jnp.linspace(0, 1, 3))
+        lambda: diffrax.PIDController(rtol=1e-3, atol=1e-6),
+        diffrax.ConstantStepSize,
+        lambda: diffrax.StepTo(jnp.linspace(0, 1, 3)),
     ),
     stabilization=one_of_these(
-        svkc.Projection, svkc.Exact, svkc.Drift, svkc.Baumgarte, lambda: svkc.Baumgarte("a"), lambda: svkc.Projection(-1), lambda: svkc.Projection(1, "a")
+        svkc.Projection,
+        svkc.Exact,
+        svkc.Drift,
+        svkc.Baumgarte,
+        lambda: svkc.Baumgarte("a"),
+        lambda: svkc.Projection(-1),
+        lambda: svkc.Projection(1, "a"),
     ),
     dynamics=one_of_these(
-        svkc.Dynamics, lambda: svkc.Dynamics(svkc.by_bodies), lambda: svkc.Dynamics(3), lambda: svkc.Dynamics(hold="a"), lambda: svkc.Dynamics(hold=math.nan)
+        svkc.Dynamics,
+        lambda: svkc.Dynamics(svkc.by_bodies),
+        lambda: svkc.Dynamics(3),
+        lambda: svkc.Dynamics(hold="a"),
+        lambda: svkc.Dynamics(hold=math.nan),
     ),
     adjoint=one_of_these(
         svkc.Replay,
@@ -643,9 +832,22 @@ def test_requests(only_traced, t1, options, wrong, value):
     outcome(lambda: svkc.simulate(chain, given, t1, **options), Asked)
 
 
-LANES = [{}, {"t1": 0.1}, {"t1": "a"}, {"events": 3}, {"control": 3}, 3, None, [("t1", 0.1)], {"args": 1.0}, {"chain": 3}]
+LANES = [
+    {},
+    {"t1": 0.1},
+    {"t1": "a"},
+    {"events": 3},
+    {"control": 3},
+    3,
+    None,
+    [("t1", 0.1)],
+    {"args": 1.0},
+    {"chain": 3},
+]
 rollouts = dict(
-    data=or_anything(st.sampled_from([jnp.zeros(2), np.zeros((2, 3)), {"a": jnp.ones(2)}, jnp.zeros(3), ()])),
+    data=or_anything(
+        st.sampled_from([jnp.zeros(2), np.zeros((2, 3)), {"a": jnp.ones(2)}, jnp.zeros(3), ()])
+    ),
     lane=or_anything(st.sampled_from(LANES).map(lambda own: lambda chain, data: own)),
     cost=or_anything(st.sampled_from([[1.0, 2.0], np.zeros(2), np.zeros((2, 2)), [math.nan, 1.0]])),
     chunk=or_anything(st.integers(0, 3)),
@@ -657,16 +859,37 @@ rollouts = dict(
 
 
 @examples(0.02)
-@hypothesis.given(t1=or_anything(times, 6), options=few(rollouts), states=or_anything(st.just("lanes"), 4))
+@hypothesis.given(
+    t1=or_anything(times, 6), options=few(rollouts), states=or_anything(st.just("lanes"), 4)
+)
 def test_rollouts_and_tuning(only_traced, t1, options, states):
     chain, state = scenes()["spare"]
-    lanes = jax.tree.map(lambda x: jnp.stack([x, x]), state) if isinstance(states, str) and states == "lanes" else states
+    lanes = (
+        jax.tree.map(lambda x: jnp.stack([x, x]), state)
+        if isinstance(states, str) and states == "lanes"
+        else states
+    )
     outcome(lambda: svkc.rollout(chain, lanes, t1, progress=False, **options), Asked)
 
 
 SEEN = ["size", "lookat", "distance", "azimuth", "camera", "trails"]
 calls = st.sampled_from(
-    ["tune", "halved", "check_grad", "to_mujoco", "from_mujoco", "render", "motors", "bounds", "weight", "actuated", "load_trajectory", "save", "plot", *SEEN]
+    [
+        "tune",
+        "halved",
+        "check_grad",
+        "to_mujoco",
+        "from_mujoco",
+        "render",
+        "motors",
+        "bounds",
+        "weight",
+        "actuated",
+        "load_trajectory",
+        "save",
+        "plot",
+        *SEEN,
+    ]
 )
 
 
@@ -677,16 +900,25 @@ def test_other_calls(only_traced, place, call, value, other):
     zero, path = np.zeros(chain.dofs), place.with_name("seen.gif")
     traj = svkc.load_trajectory(place)
     # (what is no fault is drawn)
-    seen = {name: lambda name=name: svkc.render(chain, traj, path, **({"size": (64, 48)} | {name: value})) for name in SEEN}
+    seen = {
+        name: lambda name=name: svkc.render(
+            chain, traj, path, **({"size": (64, 48)} | {name: value})
+        )
+        for name in SEEN
+    }
     made = {
         "tune": lambda: svkc.tune(chain, state, value, target=other),
         "halved": lambda: svkc.halved(chain, state, value, dt=other),
-        "check_grad": lambda: svkc.check_grad(jnp.sin if isinstance(value, float) else value, other),
+        "check_grad": lambda: svkc.check_grad(
+            jnp.sin if isinstance(value, float) else value, other
+        ),
         "to_mujoco": lambda: svkc.to_mujoco(chain, state, value),
         "from_mujoco": lambda: svkc.from_mujoco(chain, value),
         "render": lambda: svkc.render(chain, value, other if isinstance(other, str) else "x.png"),
         "motors": lambda: chain.motors(value),
-        "bounds": lambda: svkc.actuation(chain, state, zero, bounds=(value, other) if isinstance(other, float) else value),
+        "bounds": lambda: svkc.actuation(
+            chain, state, zero, bounds=(value, other) if isinstance(other, float) else value
+        ),
         "weight": lambda: svkc.actuation(chain, state, zero, weight=value),
         "actuated": lambda: svkc.actuation(chain, state, zero, actuated=value),
         "load_trajectory": lambda: svkc.load_trajectory(value),
@@ -734,7 +966,19 @@ def test_runs(q, v, pull, t1, dt, at, lossy):
     state = outcome(lambda: chain.state({"crank": q}, {"crank": v}))
     event = [svkc.at(jnp.asarray(at), cut="pin")]
     steps = {"dt": jnp.asarray(dt)} if lossy else {"rtol": jnp.asarray(min(max(dt, 1e-9), 1.0))}
-    traj = outcome(lambda: svkc.simulate(chain, state, t1, events=event, control=pulled, args=jnp.asarray(pull), max_steps=400, throw=False, **steps))
+    traj = outcome(
+        lambda: svkc.simulate(
+            chain,
+            state,
+            t1,
+            events=event,
+            control=pulled,
+            args=jnp.asarray(pull),
+            max_steps=400,
+            throw=False,
+            **steps,
+        )
+    )
     assert traj is not NOTHING
     good = bool((traj.result == svkc.RESULTS.successful) | (traj.result == svkc.RESULTS.stopped))
     assert all_finite((traj.states, traj.final)), svkc.RESULTS[traj.result]
@@ -770,10 +1014,20 @@ def test_files(kept, data):
             st.one_of(
                 st.none(),
                 st.sampled_from(
-                    [np.zeros(3), np.array("{}"), np.array('{"schema": "a"}'), np.array("[4]"), np.array("a"), np.zeros((2, 2), complex), np.array(4)]
+                    [
+                        np.zeros(3),
+                        np.array("{}"),
+                        np.array('{"schema": "a"}'),
+                        np.array("[4]"),
+                        np.array("a"),
+                        np.zeros((2, 2), complex),
+                        np.array(4),
+                    ]
                 ),
             )
         )
-        arrays = {n: x for n, x in arrays.items() if n != name} | ({} if new is None else {name: new})
+        arrays = {n: x for n, x in arrays.items() if n != name} | (
+            {} if new is None else {name: new}
+        )
         np.savez(path, **arrays)
     outcome(lambda: svkc.load_trajectory(path))

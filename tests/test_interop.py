@@ -20,18 +20,25 @@ from scipy.spatial.transform import Rotation
 import svkc
 from svkc.model.topology import V_SIZE
 
-XML = """<mujoco><worldbody><body name="a" pos="0 0 1"><joint name="a" axis="0 1 0"/><geom size="0.1" pos="0.1 0 0"/>
-<body name="c" pos="0 0 -0.5"><joint name="c" type="ball"/><geom size="0.1" pos="0 0 -0.2"/></body></body>
-<body name="b" pos="1 0.2 1" quat="0.8 0 0.6 0"><freejoint name="b"/><geom size="0.1" pos="0 0.1 0"/></body></worldbody>
+XML = """<mujoco><worldbody><body name="a" pos="0 0 1"><joint name="a" axis="0 1 0"/><geom
+  size="0.1" pos="0.1 0 0"/>
+<body name="c" pos="0 0 -0.5"><joint name="c" type="ball"/><geom size="0.1" pos="0 0 -0.2"/></body>
+</body>
+<body name="b" pos="1 0.2 1" quat="0.8 0 0.6 0"><freejoint name="b"/><geom size="0.1"
+  pos="0 0.1 0"/></body></worldbody>
 <equality><weld name="w" body1="a" body2="b" active="false"/></equality></mujoco>"""
 
 
 @pytest.mark.parametrize("cuttable", [(), pytest.param("c", marks=pytest.mark.slow)])
 def test_there_and_back(cuttable):
-    """MuJoCo puts the bodies where svkc has them and moves them so; with a joint that may be cut as well; <equality> as they hold."""
+    """MuJoCo puts the bodies where svkc has them and moves them so; with a joint that may be cut as
+    well; <equality> as they hold."""
     chain, rng = svkc.load(XML, cuttable=cuttable), np.random.default_rng(0)
     quat = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_quat(scalar_first=True)
-    state = chain.state({"a": 0.4, "c": quat, "b": [1, 2, 3, *quat]}, {"a": 1.0, "c": rng.normal(size=3), "b": rng.normal(size=6)})
+    state = chain.state(
+        {"a": 0.4, "c": quat, "b": [1, 2, 3, *quat]},
+        {"a": 1.0, "c": rng.normal(size=3), "b": rng.normal(size=6)},
+    )
     data = mujoco.MjData(chain.model.model)
     svkc.to_mujoco(chain, state, data)
     mujoco.mj_forward(chain.model.model, data)
@@ -40,8 +47,12 @@ def test_there_and_back(cuttable):
     np.testing.assert_allclose(np.abs(np.sum(data.xquat * np.asarray(quats), 1)), 1, atol=1e-14)
     # [.., 3:] in world axes at the body's origin
     velocity = np.zeros(6)
-    mujoco.mj_objectVelocity(chain.model.model, data, mujoco.mjtObj.mjOBJ_XBODY, data.body("b").id, velocity, 0)
-    np.testing.assert_allclose(velocity[3:], svkc.velocities(chain, state)[0][chain.body_names.index("b")], atol=1e-13)
+    mujoco.mj_objectVelocity(
+        chain.model.model, data, mujoco.mjtObj.mjOBJ_XBODY, data.body("b").id, velocity, 0
+    )
+    np.testing.assert_allclose(
+        velocity[3:], svkc.velocities(chain, state)[0][chain.body_names.index("b")], atol=1e-13
+    )
     assert data.eq_active.tolist() == [0]
     again = svkc.from_mujoco(chain, data)
     np.testing.assert_allclose(again.q, state.q, atol=1e-14)
@@ -56,9 +67,16 @@ def test_there_and_back(cuttable):
 
 def test_data_of_another_model():
     chain = svkc.load(XML)
-    other = mujoco.MjData(mujoco.MjModel.from_xml_string(models.MJCF.format(models.bar("arm", models.Y, "0 0 -1"))))
-    for call in (lambda: svkc.to_mujoco(chain, chain.state(), other), lambda: svkc.from_mujoco(chain, other)):
-        with pytest.raises(ValueError, match="data: got 1 qpos and 1 qvel, the chain's model has 12 and 10"):
+    other = mujoco.MjData(
+        mujoco.MjModel.from_xml_string(models.MJCF.format(models.bar("arm", models.Y, "0 0 -1")))
+    )
+    for call in (
+        lambda: svkc.to_mujoco(chain, chain.state(), other),
+        lambda: svkc.from_mujoco(chain, other),
+    ):
+        with pytest.raises(
+            ValueError, match="data: got 1 qpos and 1 qvel, the chain's model has 12 and 10"
+        ):
             call()
 
 
@@ -83,17 +101,37 @@ def test_an_equality_without_a_name():
     assert bool(svkc.from_mujoco(chain, data).structure.connected[0])
 
 
-TWO = models.bar("a", models.Y, "0 0 -1") + '<body name="b" pos="1 0.2 1" quat="0.8 0 0.6 0"><freejoint name="b"/><geom size="0.1" pos="0 0.1 0"/></body>'
-UNNAMED = """<body pos="0.4 0 1"><freejoint/><geom type="box" size="0.2 0.1 0.02" pos="0.1 0 0"/></body>
+TWO = (
+    models.bar("a", models.Y, "0 0 -1")
+    + '<body name="b" pos="1 0.2 1" quat="0.8 0 0.6 0"><freejoint name="b"/><geom size="0.1" pos="0'
+    ' 0.1 0"/></body>'
+)
+UNNAMED = """<body pos="0.4 0 1"><freejoint/><geom type="box" size="0.2 0.1 0.02" pos="0.1 0 0"/>
+</body>
 <body pos="0 1 1"><joint axis="1 0 0"/><geom size="0.1"/></body>"""
 # any angles, none of them a number of few digits
-TURNED, SIDEWAYS = (tuple(Rotation.from_rotvec(r).as_quat(scalar_first=True).tolist()) for r in ([0.3, -0.2, 0.5], [0, 0.7, 0.1]))
-WELDED = svkc.VirtualLink("held", "a", "b", "weld", pos=(0.1, 0, -1 / 3), quat=TURNED, real_pos=(0, -0.1, 1 / 7), real_quat=SIDEWAYS, connected=True)
+TURNED, SIDEWAYS = (
+    tuple(Rotation.from_rotvec(r).as_quat(scalar_first=True).tolist())
+    for r in ([0.3, -0.2, 0.5], [0, 0.7, 0.1])
+)
+WELDED = svkc.VirtualLink(
+    "held",
+    "a",
+    "b",
+    "weld",
+    pos=(0.1, 0, -1 / 3),
+    quat=TURNED,
+    real_pos=(0, -0.1, 1 / 7),
+    real_quat=SIDEWAYS,
+    connected=True,
+)
 OPEN = svkc.VirtualLink("open", "world", "a", "ball", pos=(0, 0, -3), real_pos=(0, 0, -1))
 
 
 def with_cut():
-    ball = svkc.VirtualLink("catch", "b", "a", "ball", pos=(0.2, 0, 0), real_pos=(0, 0, -1), connected=True)
+    ball = svkc.VirtualLink(
+        "catch", "b", "a", "ball", pos=(0.2, 0, 0), real_pos=(0, 0, -1), connected=True
+    )
     return svkc.load(models.MJCF.format(TWO), virtual_links=[ball], cuttable="a")
 
 
@@ -104,8 +142,17 @@ SCENES = {
     "weld": lambda: (svkc.load(models.MJCF.format(TWO), virtual_links=[WELDED, OPEN]), {}),
     "cuttable": lambda: (with_cut(), {"cuttable": "a"}),
     "equalities": lambda: (svkc.load(XML.replace('active="false"', "")), {}),
-    "no names": lambda: (svkc.load(models.MJCF.format(UNNAMED), virtual_links=[svkc.VirtualLink("w", "body_1", "body_2", "weld", connected=True)]), {}),
-    "spec": lambda: (svkc.load(mujoco.MjSpec.from_string(models.MJCF.format(TWO)), virtual_links=[WELDED, OPEN]), {}),
+    "no names": lambda: (
+        svkc.load(
+            models.MJCF.format(UNNAMED),
+            virtual_links=[svkc.VirtualLink("w", "body_1", "body_2", "weld", connected=True)],
+        ),
+        {},
+    ),
+    "spec": lambda: (
+        svkc.load(mujoco.MjSpec.from_string(models.MJCF.format(TWO)), virtual_links=[WELDED, OPEN]),
+        {},
+    ),
     "hinge": lambda: (models.four_bar(), {}),
 }
 
@@ -123,11 +170,23 @@ def residual(chain, state):
 @pytest.mark.slow
 @pytest.mark.parametrize("scene", SCENES)
 def test_a_scene_as_mjcf_and_back(scene):
-    """The same bodies, joints, links, masses to the last digit; the same loops and motion; MuJoCo finds the loops closed."""
+    """The same bodies, joints, links, masses to the last digit; the same loops and motion; MuJoCo
+    finds the loops closed."""
     chain, how = SCENES[scene]()
     again = svkc.load(chain.to_mjcf(), **how)
     assert (again.body_names, again.joint_names) == (chain.body_names, chain.joint_names)
-    for name in ("pos", "quat", "axis", "mass", "com", "inertia", "gravity", "q_load", "armature", "damping"):
+    for name in (
+        "pos",
+        "quat",
+        "axis",
+        "mass",
+        "com",
+        "inertia",
+        "gravity",
+        "q_load",
+        "armature",
+        "damping",
+    ):
         a, b = getattr(chain, name), getattr(again, name)
         size = chain.nq if name == "q_load" else chain.nv if name == "damping" else None
         assert (a is None and b is None) or bool(jnp.all(a[:size] == b[:size])), name
@@ -135,32 +194,59 @@ def test_a_scene_as_mjcf_and_back(scene):
     state = chain.state(None, rng.normal(size=chain.nv))
     # by name they are kept; the links' own velocities may be counted otherwise
     top = chain.topology
-    kept = {n: state.v[top.v_start[row] : top.v_start[row] + V_SIZE[top.kind[row]]] for n, row in zip(top.joint_names, top.joint_row)}
+    kept = {
+        n: state.v[top.v_start[row] : top.v_start[row] + V_SIZE[top.kind[row]]]
+        for n, row in zip(top.joint_names, top.joint_row)
+    }
     other = again.state(state.q[: chain.nq], kept)
     if scene == "hinge":
-        assert again.link_names == tuple(name + end for name in chain.link_names for end in ("", "_axis"))
+        assert again.link_names == tuple(
+            name + end for name in chain.link_names for end in ("", "_axis")
+        )
     else:
         assert again.link_names == chain.link_names
         assert bool(jnp.all(again.structure.connected == chain.structure.connected))
     assert int(svkc.mobility(again, other).freedoms) == int(svkc.mobility(chain, state).freedoms)
-    for x, y in zip(svkc.poses(chain, state) + svkc.velocities(chain, state), svkc.poses(again, other) + svkc.velocities(again, other), strict=True):
+    for x, y in zip(
+        svkc.poses(chain, state) + svkc.velocities(chain, state),
+        svkc.poses(again, other) + svkc.velocities(again, other),
+        strict=True,
+    ):
         np.testing.assert_allclose(x, y, atol=1e-11)
     tau = jnp.asarray(rng.normal(size=chain.nv))
-    a, b = (svkc.forward_dynamics(c, s, tau)[: chain.nv] for c, s in ((chain, state), (again, other)))
+    a, b = (
+        svkc.forward_dynamics(c, s, tau)[: chain.nv] for c, s in ((chain, state), (again, other))
+    )
     np.testing.assert_allclose(a, b, atol=1e-9 * float(jnp.abs(a).max()))
     assert residual(again, other) < 1e-9
 
 
 def test_what_has_no_mjcf_is_said():
-    """Other joints, motors on virtual joints, slots and what may be cut: a comment, from which the links can be declared; connected is the chain's."""
-    screw = svkc.VirtualLink("rail--1", "world", "b", "slide", axis=(1, 0, 0), pos=(1, 0.2, -1), connected=True, actuated=True)
+    """Other joints, motors on virtual joints, slots and what may be cut: a comment, from which the
+    links can be declared; connected is the chain's."""
+    screw = svkc.VirtualLink(
+        "rail--1",
+        "world",
+        "b",
+        "slide",
+        axis=(1, 0, 0),
+        pos=(1, 0.2, -1),
+        connected=True,
+        actuated=True,
+    )
     driven = svkc.VirtualLink("wrist", "a", "b", "ball", actuated=True)
     scene = models.MJCF.format(TWO).replace("<mujoco>", "<mujoco><!-- by hand -->")
     chain = svkc.load(scene, virtual_links=[screw, driven], cuttable="a", spare=2)
-    chain = eqx.tree_at(lambda c: c.structure.connected, chain, jnp.array([True, True, True, False, False]))
+    chain = eqx.tree_at(
+        lambda c: c.structure.connected, chain, jnp.array([True, True, True, False, False])
+    )
     text = chain.to_mjcf()
     comment = re.search("<!--(.*?)-->", text, re.S).group(1)
-    for words in ("by hand", "no <equality> is like svkc.VirtualLink('rail- -1'", "motors on the virtual joint of svkc.VirtualLink('wrist'"):
+    for words in (
+        "by hand",
+        "no <equality> is like svkc.VirtualLink('rail- -1'",
+        "motors on the virtual joint of svkc.VirtualLink('wrist'",
+    ):
         assert words in comment, comment
     for words in ("2 spare slots, svkc.load(..., spare=2)", "svkc.load(..., cuttable=['a'])"):
         assert words in comment, comment
@@ -173,8 +259,12 @@ def test_what_has_no_mjcf_is_said():
 
 def test_names_that_are_taken():
     """Sites and second connects keep out of the way of the scene's own."""
-    hinges = [svkc.VirtualLink(name, "a", "b", "hinge", connected=True) for name in ("pin", "pin_axis")]
-    scene = models.MJCF.format(TWO).replace('<freejoint name="b"/>', '<freejoint name="b"/><site name="pin_real"/>')
+    hinges = [
+        svkc.VirtualLink(name, "a", "b", "hinge", connected=True) for name in ("pin", "pin_axis")
+    ]
+    scene = models.MJCF.format(TWO).replace(
+        '<freejoint name="b"/>', '<freejoint name="b"/><site name="pin_real"/>'
+    )
     again = svkc.load(svkc.load(scene, virtual_links=hinges).to_mjcf())
     assert again.link_names == ("pin", "pin_axis_", "pin_axis", "pin_axis_axis")
 
@@ -192,14 +282,21 @@ def test_the_viewer_without_a_display():
     """Says so, and is no failure."""
     if not sys.platform.startswith("linux"):
         pytest.skip("other systems have a display")
-    env = {name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY")}
-    done = subprocess.run([sys.executable, VIEWER], capture_output=True, text=True, timeout=300, check=False, env=env)
+    env = {
+        name: value
+        for name, value in os.environ.items()
+        if name not in ("DISPLAY", "WAYLAND_DISPLAY")
+    }
+    done = subprocess.run(
+        [sys.executable, VIEWER], capture_output=True, text=True, timeout=300, check=False, env=env
+    )
     assert (done.returncode, done.stdout) == (0, "no display to open a window on\n"), done.stderr
 
 
 @pytest.mark.slow
 def test_the_viewer_is_shown_every_state(monkeypatch, capsys):
-    """The example as it stands, but for the window: what a window would draw is where svkc has the bodies, at each saved time."""
+    """The example as it stands, but for the window: what a window would draw is where svkc has the
+    bodies, at each saved time."""
     glfw, shown = pytest.importorskip("glfw"), []
 
     class Window:
@@ -226,7 +323,9 @@ def test_the_viewer_is_shown_every_state(monkeypatch, capsys):
     monkeypatch.setattr("time.sleep", lambda _: None)
     done = runpy.run_path(str(VIEWER))
     assert "played 108 of 108 states" in capsys.readouterr().out
-    places = jax.vmap(lambda s: svkc.poses(done["chain"], s)[0])(jax.tree.map(jnp.asarray, done["states"]))
+    places = jax.vmap(lambda s: svkc.poses(done["chain"], s)[0])(
+        jax.tree.map(jnp.asarray, done["states"])
+    )
     np.testing.assert_allclose(shown, places, atol=1e-12)
     assert np.ptp(places, 0).max() > 1
     # no longer than an example may be, and of public names alone

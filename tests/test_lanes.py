@@ -1,4 +1,5 @@
-"""A `vmap` with the lanes last against jax's own: every operation that has a rule, those that have none, and `svkc.step` in all transformations."""
+"""A `vmap` with the lanes last against jax's own: every operation that has a rule, those that have
+none, and `svkc.step` in all transformations."""
 
 import jax
 import jax.numpy as jnp
@@ -13,17 +14,25 @@ KEY = jax.random.key(3)
 
 
 def several(x, y, which):
-    """Calls, gathers by numbers that all lanes share and that each has, products of all kinds, loops, solves, choices."""
+    """Calls, gathers by numbers that all lanes share and that each has, products of all kinds,
+    loops, solves, choices."""
     rows = x[np.array([2, 0, 1])] + x[which][None] + jnp.eye(3)[which][None]
-    left = jnp.einsum("ij,kj->ik", x, y) + jnp.einsum("bij,bjk->bik", x[:, None, :], y.T[:, :, None])[:, 0]
+    left = (
+        jnp.einsum("ij,kj->ik", x, y)
+        + jnp.einsum("bij,bjk->bik", x[:, None, :], y.T[:, :, None])[:, 0]
+    )
     symmetric = x @ x.T + 3 * jnp.eye(3)
-    solved = jax.lax.custom_linear_solve(lambda v: symmetric @ v, y[0], lambda _, v: jnp.linalg.solve(symmetric, v), symmetric=True)
+    solved = jax.lax.custom_linear_solve(
+        lambda v: symmetric @ v, y[0], lambda _, v: jnp.linalg.solve(symmetric, v), symmetric=True
+    )
 
     def step(carry, row):
         i, total, kept = carry
         return (i + 1, total + row, jnp.where(i == 1, row, kept)), jnp.sum(row) * i.astype(float)
 
-    (count, total, kept), along = jax.lax.scan(step, (jnp.int32(0), jnp.zeros(3), jnp.ones(3)), x, reverse=True)
+    (count, total, kept), along = jax.lax.scan(
+        step, (jnp.int32(0), jnp.zeros(3), jnp.ones(3)), x, reverse=True
+    )
     more = (
         jax.nn.relu(x)
         + jnp.cumsum(y, 1)
@@ -31,8 +40,22 @@ def several(x, y, which):
         + jnp.linalg.cholesky(symmetric)
         + jax.lax.cond(which > 1, jnp.sin, jnp.cos, y)
     )
-    parts = jnp.concatenate([rows[0], jnp.max(left, 1), solved, jnp.stack([total, kept])[1], along, jnp.split(x, 3)[1][0], jnp.pad(x, 1)[1]])
-    return parts.at[which].add(1.0), (more[::-1], jnp.argmax(x, 0), jnp.any(x > y), count), jnp.float32(1.5)
+    parts = jnp.concatenate(
+        [
+            rows[0],
+            jnp.max(left, 1),
+            solved,
+            jnp.stack([total, kept])[1],
+            along,
+            jnp.split(x, 3)[1][0],
+            jnp.pad(x, 1)[1],
+        ]
+    )
+    return (
+        parts.at[which].add(1.0),
+        (more[::-1], jnp.argmax(x, 0), jnp.any(x > y), count),
+        jnp.float32(1.5),
+    )
 
 
 @pytest.mark.slow
@@ -42,8 +65,15 @@ def test_every_rule(count):
     which = jnp.arange(count) % 3
     one = rules.with_lanes_last(several)
     for axes in ((0, 0, 0), (0, None, None), (None, 0, 0), (0, 0, None)):
-        args = [value if axis == 0 else value[0] for value, axis in zip((x, y, which), axes, strict=True)]
-        for expected, got in zip(jax.tree.leaves(jax.jit(jax.vmap(several, axes))(*args)), jax.tree.leaves(jax.jit(jax.vmap(one, axes))(*args)), strict=True):
+        args = [
+            value if axis == 0 else value[0]
+            for value, axis in zip((x, y, which), axes, strict=True)
+        ]
+        for expected, got in zip(
+            jax.tree.leaves(jax.jit(jax.vmap(several, axes))(*args)),
+            jax.tree.leaves(jax.jit(jax.vmap(one, axes))(*args)),
+            strict=True,
+        ):
             np.testing.assert_allclose(got, expected, rtol=1e-13, atol=1e-13)
             assert got.dtype == expected.dtype
 
@@ -60,13 +90,20 @@ def test_no_lanes_and_whole_numbers():
 
 
 def test_no_operation_of_a_step_goes_the_other_way(monkeypatch):
-    """All that `svkc.step` is made of has a rule: what has none would put its lanes first and last again."""
+    """All that `svkc.step` is made of has a rule: what has none would put its lanes first and last
+    again."""
     seen = []
     as_jax_does = rules._as_jax_does
-    monkeypatch.setattr(rules, "_as_jax_does", lambda primitive, *rest: (seen.append(primitive.name), as_jax_does(primitive, *rest))[1])
+    monkeypatch.setattr(
+        rules,
+        "_as_jax_does",
+        lambda primitive, *rest: (seen.append(primitive.name), as_jax_does(primitive, *rest))[1],
+    )
     for chain in (models.four_bar(), svkc.load(models.random_tree(8, 1))):
         states = jax.tree.map(lambda x: jnp.stack([x, x]), chain.state())
-        jax.eval_shape(jax.vmap(lambda s, chain=chain: svkc.step(chain, s, jnp.zeros(chain.nv), 1e-3)), states)
+        jax.eval_shape(
+            jax.vmap(lambda s, chain=chain: svkc.step(chain, s, jnp.zeros(chain.nv), 1e-3)), states
+        )
     assert not seen
 
 
@@ -81,29 +118,47 @@ def test_a_step_in_every_transformation():
     np.testing.assert_allclose(jax.vmap(jax.vmap(v))(tau), alone, rtol=1e-12, atol=1e-12)
     slopes = jnp.stack([jax.jacrev(v)(one) for one in tau[0]])
     np.testing.assert_allclose(jax.vmap(jax.jacrev(v))(tau[0]), slopes, rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(jax.jacfwd(jax.vmap(v))(tau[0])[np.arange(3), :, np.arange(3)], slopes, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(
+        jax.jacfwd(jax.vmap(v))(tau[0])[np.arange(3), :, np.arange(3)],
+        slopes,
+        rtol=1e-12,
+        atol=1e-12,
+    )
     each = jax.grad(lambda tau: jnp.sum(jax.vmap(v)(tau) ** 2))(tau[0])
-    np.testing.assert_allclose(each, 2 * jnp.einsum("nji,nj->ni", slopes, alone[0]), rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(
+        each, 2 * jnp.einsum("nji,nj->ni", slopes, alone[0]), rtol=1e-12, atol=1e-12
+    )
     assert svkc.check_grad(lambda tau: jnp.sum(v(tau) ** 2), tau[0, 0]).error < 1e-8
 
 
 @pytest.mark.slow
 def test_runs_by_articulated_bodies():
-    """A batch of runs in which every lane differs, its accelerations and its way back onto the loops lanes last: its single runs."""
+    """A batch of runs in which every lane differs, its accelerations and its way back onto the
+    loops lanes last: its single runs."""
     chain = models.four_bar()
     start = chain.state(v={"crank": 4.0})
 
-    # 1e-12: after its first, very short steps a run's error estimate is round-off alone, and the lengths that follow hang on it: a batch and
+    # 1e-12: after its first, very short steps a run's error estimate is round-off alone, and the
+    # lengths that follow hang on it: a batch and
     # a single run take steps a few percent different, and agree as far as either is accurate
     def run(time, speed):
         state = svkc.State(start.q, speed * start.v, start.structure)
         events = [svkc.at(time, cut=chain.link_names[0])]
-        traj = svkc.simulate(chain, state, 0.3, events=events, dynamics=svkc.Dynamics(inertia=svkc.by_bodies), rtol=1e-12)
+        traj = svkc.simulate(
+            chain,
+            state,
+            0.3,
+            events=events,
+            dynamics=svkc.Dynamics(inertia=svkc.by_bodies),
+            rtol=1e-12,
+        )
         return traj.final.q, traj.final.v, traj.phases.energy_drift, jnp.max(jnp.abs(traj.gaps))
 
     times, speeds = jnp.array([0.05, 0.1, 0.25, 0.5]), jnp.array([1.0, -0.7, 0.3, 1.2])
     *batch, gap = jax.jit(jax.vmap(run))(times, speeds)
     single = [run(*lane) for lane in zip(times, speeds, strict=True)]
-    for got, expected in zip(batch, map(jnp.stack, zip(*(lane[:-1] for lane in single), strict=True)), strict=True):
+    for got, expected in zip(
+        batch, map(jnp.stack, zip(*(lane[:-1] for lane in single), strict=True)), strict=True
+    ):
         np.testing.assert_allclose(got, expected, rtol=0, atol=1e-12)
     assert float(jnp.max(gap)) < 1e-12

@@ -1,4 +1,5 @@
-"""The layout: imports only go down, internals of JAX are touched in one package, files and functions are small."""
+"""The layout: imports only go down, internals of JAX are touched in one package, files and
+functions are small."""
 
 import ast
 import functools
@@ -15,8 +16,18 @@ CONVENIENCE = {
     ("simulation/trajectory", "save", "simulation/archive"),
     ("simulation/trajectory", "plot", "viz/render"),
 }
-INTERNALS = ("jax.interpreters", "jax.extend", "jax._src", "equinox.internal", "jax.custom_batching")
-FILES = sorted(str(path.relative_to(ROOT).with_suffix("")) for path in ROOT.rglob("*.py") if path.parent != ROOT)
+INTERNALS = (
+    "jax.interpreters",
+    "jax.extend",
+    "jax._src",
+    "equinox.internal",
+    "jax.custom_batching",
+)
+FILES = sorted(
+    str(path.relative_to(ROOT).with_suffix(""))
+    for path in ROOT.rglob("*.py")
+    if path.parent != ROOT
+)
 
 
 @functools.cache
@@ -59,7 +70,9 @@ def test_imports_only_go_down():
     for file in FILES:
         for target, function in targets(file):
             if (file, function, target) not in CONVENIENCE:
-                assert ORDER.index(package(target)) <= ORDER.index(package(file)), f"{file} imports {target}, which is above it"
+                assert ORDER.index(package(target)) <= ORDER.index(package(file)), (
+                    f"{file} imports {target}, which is above it"
+                )
 
 
 def test_every_exception_is_one():
@@ -69,19 +82,36 @@ def test_every_exception_is_one():
 
 
 def test_no_file_imports_itself_by_way_of_others():
-    below = {file: {t for t, function in targets(file) if (file, function, t) not in CONVENIENCE} for file in FILES}
+    below = {
+        file: {t for t, function in targets(file) if (file, function, t) not in CONVENIENCE}
+        for file in FILES
+    }
     while free := {file for file, needed in below.items() if not needed}:
         below = {file: needed - free for file, needed in below.items() if file not in free}
     assert not below, f"in a cycle of imports: {sorted(below)}"
 
 
 def test_each_package_keeps_to_its_subject():
-    """JAX's internals stay in `_jax`, MuJoCo in what reads, writes and draws its models, and no package is a way into another."""
+    """JAX's internals stay in `_jax`, MuJoCo in what reads, writes and draws its models, and no
+    package is a way into another."""
     for file in FILES:
         names, room = [name for name, _ in imports(file)], package(file)
         if room != "_jax":
-            assert not [name for name, inside in itertools.product(names, INTERNALS) if name.startswith(inside)], file
-        if room in ("_jax", "model", "tree", "loops", "transitions", "integration", "simulation", "tools"):
+            assert not [
+                name
+                for name, inside in itertools.product(names, INTERNALS)
+                if name.startswith(inside)
+            ], file
+        if room in (
+            "_jax",
+            "model",
+            "tree",
+            "loops",
+            "transitions",
+            "integration",
+            "simulation",
+            "tools",
+        ):
             assert not [name for name in names if name.split(".")[0] == "mujoco"], file
         if room in ("tree", "loops", "transitions", "integration"):
             assert not [target for target, _ in targets(file) if package(target) == "mjcf"], file
@@ -101,5 +131,10 @@ def test_files_and_functions_are_small():
         assert text.count("\n") <= 300, path
         for node in ast.walk(ast.parse(text)):
             if isinstance(node, ast.FunctionDef):
-                lines = node.end_lineno - node.lineno + 1 - len((ast.get_docstring(node) or "").splitlines())
+                lines = (
+                    node.end_lineno
+                    - node.lineno
+                    + 1
+                    - len((ast.get_docstring(node) or "").splitlines())
+                )
                 assert lines <= 60, f"{path}: {node.name}"

@@ -19,7 +19,13 @@ PENDULUM = models.MJCF.format(models.bar("arm", models.Y, "0 0 -1"))
 def test_four_ways_in(tmp_path):
     path = tmp_path / "model.xml"
     path.write_text(PENDULUM)
-    sources = [PENDULUM, path, str(path), mujoco.MjSpec.from_string(PENDULUM), mujoco.MjModel.from_xml_string(PENDULUM)]
+    sources = [
+        PENDULUM,
+        path,
+        str(path),
+        mujoco.MjSpec.from_string(PENDULUM),
+        mujoco.MjModel.from_xml_string(PENDULUM),
+    ]
     for chain in map(svkc.load, sources):
         assert chain.body_names == ("world", "arm")
         assert chain.joint_names == ("arm",)
@@ -39,15 +45,29 @@ def test_pointers():
 
 
 def test_ends_of_virtual_links_by_sites():
-    """The same links by bodies and by sites, turned ones too; a site without a placement is the placement."""
-    sites = '<site name="tip" pos="0.1 0.2 -0.3" quat="0.6 0.8 0 0"/>', '<site name="foot" pos="0 0.1 0" quat="0.8 0 0.6 0"/>'
-    model = models.MJCF.format(
-        f'<body name="a"><joint/><geom size="0.1"/>{sites[0]}</body><body name="b" pos="1 0 0"><freejoint/><geom size="0.1"/>{sites[1]}</body>'
+    """The same links by bodies and by sites, turned ones too; a site without a placement is the
+    placement."""
+    sites = (
+        '<site name="tip" pos="0.1 0.2 -0.3" quat="0.6 0.8 0 0"/>',
+        '<site name="foot" pos="0 0.1 0" quat="0.8 0 0.6 0"/>',
     )
-    by_sites = svkc.load(model, virtual_links=[svkc.VirtualLink("x", "tip", "foot", "hinge", pos=(0, 0, 0.5)), svkc.VirtualLink("y", "tip", "b")]).structure
+    model = models.MJCF.format(
+        f'<body name="a"><joint/><geom size="0.1"/>{sites[0]}</body><body name="b" pos="1 0'
+        f' 0"><freejoint/><geom size="0.1"/>{sites[1]}</body>'
+    )
+    by_sites = svkc.load(
+        model,
+        virtual_links=[
+            svkc.VirtualLink("x", "tip", "foot", "hinge", pos=(0, 0, 0.5)),
+            svkc.VirtualLink("y", "tip", "b"),
+        ],
+    ).structure
     # 0.5 along the z of a frame turned about x by the angle of cosine 0.28
     place, turned = (0.1, 0.2 - 0.48, -0.3 - 0.14), (0.6, 0.8, 0, 0)
-    links = [svkc.VirtualLink("x", "a", "b", "hinge", place, turned, (0, 0.1, 0)), svkc.VirtualLink("y", "a", "b", "weld", (0.1, 0.2, -0.3), turned)]
+    links = [
+        svkc.VirtualLink("x", "a", "b", "hinge", place, turned, (0, 0.1, 0)),
+        svkc.VirtualLink("y", "a", "b", "weld", (0.1, 0.2, -0.3), turned),
+    ]
     by_bodies = svkc.load(model, virtual_links=links).structure
     assert by_sites.parent.tolist() == by_bodies.parent.tolist()
     assert by_sites.real.tolist() == by_bodies.real.tolist()
@@ -56,9 +76,12 @@ def test_ends_of_virtual_links_by_sites():
 
 
 def test_equalities_become_virtual_links():
-    xml = """<mujoco><worldbody><body name="a" pos="0 0 1"><joint name="a" axis="0 1 0"/><geom size="0.1"/></body>
-    <body name="b" pos="1 0.2 1" quat="0.8 0 0.6 0"><freejoint/><geom size="0.1"/></body></worldbody>
-    <equality><connect name="c" body1="a" body2="b" anchor="1 0.2 0"/><weld name="w" body1="a" body2="b" active="false"/></equality></mujoco>"""
+    xml = """<mujoco><worldbody><body name="a" pos="0 0 1"><joint name="a" axis="0 1 0"/><geom
+      size="0.1"/></body>
+    <body name="b" pos="1 0.2 1" quat="0.8 0 0.6 0"><freejoint/><geom size="0.1"/></body>
+    </worldbody>
+    <equality><connect name="c" body1="a" body2="b" anchor="1 0.2 0"/>
+    <weld name="w" body1="a" body2="b" active="false"/></equality></mujoco>"""
     chain = svkc.load(xml)
     assert chain.link_names == ("c", "w")
     state = chain.state()
@@ -66,12 +89,22 @@ def test_equalities_become_virtual_links():
     assert int(svkc.mobility(chain, state).freedoms) == 7 - 3
     assert int(svkc.mobility(chain, chain.state(connected=["w"])).freedoms) == 7 - 6
     # both hold in the load pose, where MuJoCo wrote them
-    np.testing.assert_allclose(chain.state(connected=["c", "w"]).q[: chain.nq], chain.model.model.qpos0, atol=1e-12)
+    np.testing.assert_allclose(
+        chain.state(connected=["c", "w"]).q[: chain.nq], chain.model.model.qpos0, atol=1e-12
+    )
 
 
 def test_motors():
-    xml = models.MJCF.format(models.bar("arm", models.Y, "0 0 -1", inside=models.bar("ball", 'type="ball"', "0 0 -1", "0 0 -1")))
-    xml = xml.replace("</mujoco>", '<actuator><motor joint="arm" gear="3" ctrlrange="-1 1"/><motor joint="ball" gear="0 2 1"/></actuator></mujoco>')
+    xml = models.MJCF.format(
+        models.bar(
+            "arm", models.Y, "0 0 -1", inside=models.bar("ball", 'type="ball"', "0 0 -1", "0 0 -1")
+        )
+    )
+    xml = xml.replace(
+        "</mujoco>",
+        '<actuator><motor joint="arm" gear="3" ctrlrange="-1 1"/><motor joint="ball" gear="0 2'
+        ' 1"/></actuator></mujoco>',
+    )
     chain = svkc.load(xml)
     data = mujoco.MjData(chain.model.model)
     data.ctrl[:] = 5, 0.5
@@ -84,7 +117,9 @@ def test_motors():
 
 
 def test_what_is_not_simulated_is_listed_once():
-    xml = PENDULUM.replace("<worldbody>", '<option density="1.2"/><worldbody>').replace('name="arm" type="hinge"', 'name="arm" frictionloss="0.1" type="hinge"')
+    xml = PENDULUM.replace("<worldbody>", '<option density="1.2"/><worldbody>').replace(
+        'name="arm" type="hinge"', 'name="arm" frictionloss="0.1" type="hinge"'
+    )
     xml = xml.replace("</mujoco>", '<actuator><position joint="arm" kp="3"/></actuator></mujoco>')
     with pytest.raises(ValueError) as caught:
         svkc.load(xml)
@@ -97,7 +132,9 @@ def test_what_is_not_simulated_is_listed_once():
 
 def test_limits_and_springs_are_the_models():
     """A spring as MuJoCo has it; a range that holds a pendulum up against gravity."""
-    xml = PENDULUM.replace('damping="0"', 'damping="2" range="-0.5 0.5" limited="true"').replace("<mujoco>", '<mujoco><compiler angle="radian"/>')
+    xml = PENDULUM.replace('damping="0"', 'damping="2" range="-0.5 0.5" limited="true"').replace(
+        "<mujoco>", '<mujoco><compiler angle="radian"/>'
+    )
     chain = svkc.load(xml)
     end = svkc.simulate(chain, chain.state(), 3.0).final
     free = svkc.simulate(svkc.load(xml, ignore="limit"), chain.state(), 3.0).final
@@ -105,13 +142,19 @@ def test_limits_and_springs_are_the_models():
     assert np.isfinite(float(free.q[0]))
 
 
-GRIPPER = models.MJCF.format(models.bar("left", models.Y, "0 0 1") + models.bar("right", models.Y, "0 0 1", "1 0 0")).replace(
-    "</mujoco>", '<equality><joint joint1="left" joint2="right"/><connect body1="left" body2="right" anchor="0.5 0 1"/></equality></mujoco>'
+GRIPPER = models.MJCF.format(
+    models.bar("left", models.Y, "0 0 1") + models.bar("right", models.Y, "0 0 1", "1 0 0")
+).replace(
+    "</mujoco>",
+    '<equality><joint joint1="left" joint2="right"/><connect body1="left" body2="right" anchor="0.5'
+    ' 0 1"/></equality></mujoco>',
 )
 
 
 def test_ignored_equalities_are_those_that_are_not_simulated():
-    with pytest.raises(ValueError, match=r"equality: equality constraints: joint .*\n.*ignore=\('equality',\)"):
+    with pytest.raises(
+        ValueError, match=r"equality: equality constraints: joint .*\n.*ignore=\('equality',\)"
+    ):
         svkc.load(GRIPPER)
     for ignore in ("equality", "all"):
         assert svkc.load(GRIPPER, ignore=ignore).link_names == ("equality_1",)
@@ -120,25 +163,34 @@ def test_ignored_equalities_are_those_that_are_not_simulated():
 OFF_TETRAHEDRON = "v 0 0 0\nv 0.3 0 0\nv 0 0.2 0\nv 0 0 0.4\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
 # of that tetrahedron of density 1000 about its centre of mass
 MASS, COM = 1000 * 0.3 * 0.2 * 0.4 / 6, np.array([0.3, 0.2, 0.4]) / 4
-INERTIA = MASS / 80 * np.array([[3 * 0.2, 0.06, 0.12], [0.06, 3 * 0.25, 0.08], [0.12, 0.08, 3 * 0.13]])
-INERTIA[np.diag_indices(3)] = MASS * 3 / 80 * np.array([0.2**2 + 0.4**2, 0.3**2 + 0.4**2, 0.3**2 + 0.2**2])
+INERTIA = (
+    MASS / 80 * np.array([[3 * 0.2, 0.06, 0.12], [0.06, 3 * 0.25, 0.08], [0.12, 0.08, 3 * 0.13]])
+)
+INERTIA[np.diag_indices(3)] = (
+    MASS * 3 / 80 * np.array([0.2**2 + 0.4**2, 0.3**2 + 0.4**2, 0.3**2 + 0.2**2])
+)
 
 
 @pytest.mark.slow
 def test_mesh_include_and_defaults(tmp_path):
-    """A scene of two files: classes of defaults, a mesh in a folder of its own, a weld; and the text made of it, which is read anywhere."""
+    """A scene of two files: classes of defaults, a mesh in a folder of its own, a weld; and the
+    text made of it, which is read anywhere."""
     (tmp_path / "parts" / "shapes").mkdir(parents=True)
     (tmp_path / "parts" / "shapes" / "wedge.obj").write_text(OFF_TETRAHEDRON)
     (tmp_path / "parts" / "arm.xml").write_text(
         """<mujoco><compiler meshdir="parts/shapes" angle="radian"/>
-        <default><joint damping="0.1"/><geom contype="0" conaffinity="0"/><default class="stiff"><joint stiffness="5" armature="0.01"/></default></default>
+        <default><joint damping="0.1"/><geom contype="0" conaffinity="0"/><default class="stiff">
+        <joint stiffness="5" armature="0.01"/></default></default>
         <asset><mesh name="wedge" file="wedge.obj"/></asset>
-        <worldbody><body name="arm" pos="0 0 1"><joint name="arm" axis="0 1 0"/><geom type="mesh" mesh="wedge"/>
-        <body name="hand" pos="0.3 0 0" childclass="stiff"><joint name="hand" axis="0 1 0"/><geom type="sphere" size="0.05"/></body></body></worldbody>
+        <worldbody><body name="arm" pos="0 0 1"><joint name="arm" axis="0 1 0"/><geom type="mesh"
+          mesh="wedge"/>
+        <body name="hand" pos="0.3 0 0" childclass="stiff"><joint name="hand" axis="0 1 0"/><geom
+          type="sphere" size="0.05"/></body></body></worldbody>
         </mujoco>"""
     )
     (tmp_path / "scene.xml").write_text(
-        """<mujoco><include file="parts/arm.xml"/><worldbody><body name="cup" pos="0.3 0 1"><freejoint/><geom size="0.05" mass="1"/></body></worldbody>
+        """<mujoco><include file="parts/arm.xml"/><worldbody><body name="cup" pos="0.3 0 1">
+        <freejoint/><geom size="0.05" mass="1"/></body></worldbody>
         <equality><weld name="hold" body1="hand" body2="cup"/></equality></mujoco>"""
     )
     first = svkc.load(tmp_path / "scene.xml")
@@ -167,18 +219,23 @@ def test_mesh_include_and_defaults(tmp_path):
     ],
 )
 def test_urdf_with_a_mesh(tmp_path, written, stands):
-    """By path: the mesh is found, of a ROS package too; the link that is fixed is kept for a grip; and the text made of it."""
+    """By path: the mesh is found, of a ROS package too; the link that is fixed is kept for a grip;
+    and the text made of it."""
     for file in (tmp_path / stands, tmp_path / "arm" / "urdf" / "arm.urdf"):
         file.parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / stands).write_text(OFF_TETRAHEDRON)
     file.write_text(
         f"""<robot name="arm"><link name="base"/>
-        <link name="fore"><inertial><origin xyz="0.1 0 0"/><mass value="2"/><inertia ixx="0.01" iyy="0.02" izz="0.025" ixy="0" ixz="0" iyz="0"/></inertial>
-        <collision><geometry><mesh filename="{written}" scale="2 2 2"/></geometry></collision></link>
+        <link name="fore"><inertial><origin xyz="0.1 0 0"/><mass value="2"/><inertia ixx="0.01"
+          iyy="0.02" izz="0.025" ixy="0" ixz="0" iyz="0"/></inertial>
+        <collision><geometry><mesh filename="{written}" scale="2 2 2"/></geometry></collision>
+        </link>
         <link name="tip"/>
-        <joint name="turn" type="revolute"><parent link="base"/><child link="fore"/><origin xyz="0 0 1"/><axis xyz="0 1 0"/>
+        <joint name="turn" type="revolute"><parent link="base"/><child link="fore"/><origin
+          xyz="0 0 1"/><axis xyz="0 1 0"/>
         <limit lower="-1" upper="1" effort="10" velocity="1"/></joint>
-        <joint name="weld" type="fixed"><parent link="fore"/><child link="tip"/><origin xyz="0.5 0 0"/></joint></robot>"""
+        <joint name="weld" type="fixed"><parent link="fore"/><child link="tip"/>
+        <origin xyz="0.5 0 0"/></joint></robot>"""
     )
     grip = svkc.VirtualLink("grip", "world", "tip", "hinge", pos=(0.5, 0, 1), axis=(0, 1, 0))
     first = svkc.load(file, virtual_links=[grip], ignore="all")
@@ -194,7 +251,8 @@ def test_urdf_with_a_mesh(tmp_path, written, stands):
 
 @pytest.mark.slow
 def test_a_scene_written_in_python():
-    """A five-bar as mujoco.MjSpec, part of it attached from another, its loop a virtual link; the spec stays the caller's own."""
+    """A five-bar as mujoco.MjSpec, part of it attached from another, its loop a virtual link; the
+    spec stays the caller's own."""
 
     def arm(side):
         spec = mujoco.MjSpec()
@@ -203,21 +261,38 @@ def test_a_scene_written_in_python():
         fore = upper.add_body(name="fore", pos=[0, 0, 0.5])
         fore.add_joint(name="elbow", axis=[0, 1, 0])
         for body, end in ((upper, [0, 0, 0.5]), (fore, [-0.3 * side, 0, 0.5])):
-            body.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=[0, 0, 0, *end], size=[0.03, 0, 0])
+            body.add_geom(
+                type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=[0, 0, 0, *end], size=[0.03, 0, 0]
+            )
         return spec
 
     spec = mujoco.MjSpec()
     spec.option.gravity = [0.3, -0.2, -9.81]
     for name, side in (("left", -1), ("right", 1)):
-        spec.attach(arm(side), prefix=f"{name}_", frame=spec.worldbody.add_frame(pos=[0.3 * side, 0, 0]))
+        spec.attach(
+            arm(side), prefix=f"{name}_", frame=spec.worldbody.add_frame(pos=[0.3 * side, 0, 0])
+        )
     before = spec.to_xml()
-    tip = svkc.VirtualLink("tip", "left_fore", "right_fore", "hinge", pos=(0.3, 0, 0.5), real_pos=(-0.3, 0, 0.5), axis=(0, 1, 0), connected=True)
+    tip = svkc.VirtualLink(
+        "tip",
+        "left_fore",
+        "right_fore",
+        "hinge",
+        pos=(0.3, 0, 0.5),
+        real_pos=(-0.3, 0, 0.5),
+        axis=(0, 1, 0),
+        connected=True,
+    )
     chain, by_text = svkc.load(spec, virtual_links=[tip]), models.five_bar()
     assert spec.to_xml() == before
     assert int(svkc.mobility(chain, chain.state()).freedoms) == 2
     tau = jnp.arange(float(chain.nv))
     expected = svkc.forward_dynamics(by_text, by_text.state(), tau)
-    np.testing.assert_allclose(svkc.forward_dynamics(chain, chain.state(), tau), expected, atol=1e-9 * float(jnp.abs(expected).max()))
+    np.testing.assert_allclose(
+        svkc.forward_dynamics(chain, chain.state(), tau),
+        expected,
+        atol=1e-9 * float(jnp.abs(expected).max()),
+    )
     # a change of the caller's afterwards is not the chain's
     spec.worldbody.add_body(name="late").add_geom(size=[0.1, 0, 0])
     assert svkc.load(chain.to_mjcf()).body_names == chain.body_names
@@ -235,22 +310,30 @@ def test_the_example_of_the_gallery_runs():
 
 @pytest.mark.slow
 def test_a_robot_of_others():
-    """Minitaur's URDF, loops as virtual links: balls find its axes parallel to five digits only, balls that slide along them leave each leg its two motors."""
+    """Minitaur's URDF, loops as virtual links: balls find its axes parallel to five digits only,
+    balls that slide along them leave each leg its two motors."""
     feet = {}
     for slide in (False, True):
         feet[slide] = [
             svkc.VirtualLink(
-                f"foot_{leg}", f"lower_leg_{leg}R_link", f"lower_leg_{leg}L_link", (True, True, True, False, slide, False),
-                pos=(0, 0.005, 0.2), real_pos=(0, 0.01, 0.2), connected=True,
+                f"foot_{leg}",
+                f"lower_leg_{leg}R_link",
+                f"lower_leg_{leg}L_link",
+                (True, True, True, False, slide, False),
+                pos=(0, 0.005, 0.2),
+                real_pos=(0, 0.01, 0.2),
+                connected=True,
             )
             for leg in ("front_left", "back_left", "front_right", "back_right")
-        ]  # fmt: skip
+        ]
     angles = {"motor": -np.pi / 2, "knee": 2.1834}
     sign = lambda name: -1 if "right" in name else 1
     for slide, freedoms, least in ((False, 4, 1e-5), (True, 8, 0.1)):
         chain = svkc.load(ROOT / "tests" / "robots" / "minitaur_v1.urdf", virtual_links=feet[slide])
         assert (len(chain.body_names), chain.nv) == (28, 16)
-        state = chain.state({name: sign(name) * angles[name.split("_")[0]] for name in chain.joint_names})
+        state = chain.state(
+            {name: sign(name) * angles[name.split("_")[0]] for name in chain.joint_names}
+        )
         mobility = svkc.mobility(chain, state)
         assert int(mobility.freedoms) == freedoms
         assert least < float(mobility.margin) < 10 * least
@@ -266,11 +349,20 @@ def test_a_robot_of_others():
         (lambda: svkc.load("/no/such/file.xml"), "no such file"),
         (lambda: svkc.load(3), "expected MJCF or URDF"),
         (lambda: svkc.load(PENDULUM, ignore=("tendons!",)), "ignore"),
-        (lambda: svkc.load(PENDULUM, virtual_links=[svkc.VirtualLink("a", "arm", "leg")]), "'leg', neither a body nor a site"),
-        (lambda: svkc.load(PENDULUM, virtual_links=[svkc.VirtualLink("a", "\ud800", "arm")]), "neither a body nor a site"),
+        (
+            lambda: svkc.load(PENDULUM, virtual_links=[svkc.VirtualLink("a", "arm", "leg")]),
+            "'leg', neither a body nor a site",
+        ),
+        (
+            lambda: svkc.load(PENDULUM, virtual_links=[svkc.VirtualLink("a", "\ud800", "arm")]),
+            "neither a body nor a site",
+        ),
         (lambda: svkc.load(PENDULUM, spare=[[1.0], [1.0, 2.0]]), "whole number"),
         (lambda: svkc.load(PENDULUM, virtual_links=["a"]), "VirtualLink"),
-        (lambda: svkc.load(PENDULUM, virtual_links=[svkc.VirtualLink("a", "world", "arm")] * 2), "differ"),
+        (
+            lambda: svkc.load(PENDULUM, virtual_links=[svkc.VirtualLink("a", "world", "arm")] * 2),
+            "differ",
+        ),
         (lambda: svkc.VirtualLink("a", "world", "arm", "rubber"), "rubber"),
         (lambda: svkc.VirtualLink("a", "world", "arm", quat=(1, 1, 0, 0)), "unit quaternion"),
         (lambda: svkc.VirtualLink("a", "world", "arm", axis=(0, 0, 0)), "axis"),

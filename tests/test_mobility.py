@@ -1,4 +1,5 @@
-"""Mobility where counting freedoms goes wrong, the table, and the loop forces of redundant loops."""
+"""Mobility where counting freedoms goes wrong, the table, and the loop forces of redundant
+loops."""
 
 import jax.numpy as jnp
 import models
@@ -18,7 +19,17 @@ OVERCONSTRAINED = {
 }
 
 
-@pytest.fixture(params=["bricard", *(pytest.param(name, marks=pytest.mark.slow) for name in OVERCONSTRAINED if name != "bricard")], scope="module")
+@pytest.fixture(
+    params=[
+        "bricard",
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in OVERCONSTRAINED
+            if name != "bricard"
+        ),
+    ],
+    scope="module",
+)
 def linkage(request):
     make, joints, rank, counted = OVERCONSTRAINED[request.param]
     chain = make()
@@ -36,7 +47,8 @@ def test_one_freedom_where_counting_says_none(linkage):
 
 @pytest.mark.slow
 def test_it_moves_a_finite_way(linkage):
-    """Not only to first order: pushed along its freedom it goes through 0.6 s and tenths of a radian, loop closed, energy kept, rank as it was."""
+    """Not only to first order: pushed along its freedom it goes through 0.6 s and tenths of a
+    radian, loop closed, energy kept, rank as it was."""
     chain, state, _, rank, _ = linkage
     W = svkc.coordinates(chain, state).W
     direction = np.asarray(W)[:, np.any(W != 0, 0)][:, 0]
@@ -44,7 +56,9 @@ def test_it_moves_a_finite_way(linkage):
     traj = svkc.simulate(chain, start, 0.6, rtol=1e-9, atol=1e-11)
     assert float(jnp.abs(svkc.difference(chain, start.q, traj.final.q)).max()) > 0.3
     assert float(traj.gaps.max()) < 1e-12
-    assert abs(float(traj.phases.energy_drift[0])) < 1e-6 * (1 + abs(float(traj.phases.energy[0, 0])))
+    assert abs(float(traj.phases.energy_drift[0])) < 1e-6 * (
+        1 + abs(float(traj.phases.energy[0, 0]))
+    )
     there = chain.state(traj.final.q)
     assert int(svkc.mobility(chain, there).rank) == rank
     expected = acceleration(chain, start, np.zeros(chain.nv))
@@ -71,28 +85,42 @@ def test_the_table_names_things():
 
 @pytest.mark.slow
 def test_loop_forces_are_the_multipliers():
-    """Against numpy's multipliers of the same rows: equal where unique, of least norm and said not to be unique where not."""
-    for make, unique in ((models.rod_on_balls, [True]), (models.stewart, [True] * 5), (models.four_bar, [False]), (models.parallelogram, [False, False])):
+    """Against numpy's multipliers of the same rows: equal where unique, of least norm and said not
+    to be unique where not."""
+    for make, unique in (
+        (models.rod_on_balls, [True]),
+        (models.stewart, [True] * 5),
+        (models.four_bar, [False]),
+        (models.parallelogram, [False, False]),
+    ):
         chain = make()
         rng = np.random.default_rng(4)
         state = chain.state(v=rng.normal(size=chain.nv))
-        tau = jnp.concatenate([jnp.asarray(rng.normal(size=chain.nv)), jnp.zeros(chain.dofs - chain.nv)])
+        tau = jnp.concatenate(
+            [jnp.asarray(rng.normal(size=chain.nv)), jnp.zeros(chain.dofs - chain.nv)]
+        )
         carried = svkc.loop_forces(chain, state, tau)
         assert carried.unique.tolist() == unique
         linear, angular = (np.asarray(x) for x in svkc.jacobian(chain, state))
         J = np.concatenate([angular, linear / float(chain.length)], 1).reshape(-1, chain.dofs)
         vdot = acceleration(chain, state, tau)
         excess = np.zeros(chain.dofs)
-        excess[: chain.nv] = np.asarray(svkc.inverse_dynamics(chain, state, jnp.asarray(vdot))) - np.asarray(tau)[: chain.nv]
+        excess[: chain.nv] = (
+            np.asarray(svkc.inverse_dynamics(chain, state, jnp.asarray(vdot)))
+            - np.asarray(tau)[: chain.nv]
+        )
         # on the real link from the virtual one: the other sign
         wrench = -np.linalg.lstsq(J.T, excess, rcond=1e-9)[0].reshape(-1, 6)
         scale = max(1.0, np.abs(wrench).max())
         np.testing.assert_allclose(carried.torque, wrench[:, :3], atol=1e-9 * scale)
-        np.testing.assert_allclose(carried.force, wrench[:, 3:] / float(chain.length), atol=1e-9 * scale)
+        np.testing.assert_allclose(
+            carried.force, wrench[:, 3:] / float(chain.length), atol=1e-9 * scale
+        )
 
 
 def test_of_columns_that_are_equal_the_first_is_chosen():
-    """Limbs that mirror each other are equal but for round-off, which other machines have otherwise."""
+    """Limbs that mirror each other are equal but for round-off, which other machines have
+    otherwise."""
     rng = np.random.default_rng(0)
     half = rng.normal(size=(6, 8))
     J = np.concatenate([half, -half], 1) * (1 + 1e-13 * rng.normal(size=(6, 16)))

@@ -28,8 +28,10 @@ KINDS = """<mujoco><asset>
   <geom type="plane" size="0 0 1"/><geom type="hfield" hfield="hill" pos="-3 0 0"/>
   <body name="one" pos="0 0 1"><joint name="turn" axis="1 0 0"/>
     <geom type="sphere" size=".2" material="green"/><geom type="capsule" size=".1 .3" pos="1 0 0"/>
-    <geom type="ellipsoid" size=".1 .2 .3" pos="2 0 0" rgba="1 0 0 .5"/><geom type="cylinder" size=".1 .3" pos="3 0 0"/>
-    <geom type="box" size=".1 .2 .3" pos="4 0 0"/><geom type="mesh" mesh="wedge" pos="5 0 0"/><geom type="mesh" mesh="wedge" pos="6 0 0" group="2"/>
+    <geom type="ellipsoid" size=".1 .2 .3" pos="2 0 0" rgba="1 0 0 .5"/><geom type="cylinder"
+      size=".1 .3" pos="3 0 0"/>
+    <geom type="box" size=".1 .2 .3" pos="4 0 0"/><geom type="mesh" mesh="wedge" pos="5 0 0"/><geom
+      type="mesh" mesh="wedge" pos="6 0 0" group="2"/>
     <geom type="sphere" size="9" group="3"/><geom type="sphere" size="8" rgba="1 1 1 0"/>
   </body>
 </worldbody></mujoco>"""
@@ -40,7 +42,9 @@ def release(high_bar):
     """Two hands, one, none, in half a second."""
     chain, state = high_bar
     events = [svkc.at(t, cut=link) for t, link in CUTS.items()]
-    return chain, svkc.simulate(chain, state, 0.5, ts=jnp.linspace(0, 0.5, 21), events=events, dt=0.0125)
+    return chain, svkc.simulate(
+        chain, state, 0.5, ts=jnp.linspace(0, 0.5, 21), events=events, dt=0.0125
+    )
 
 
 @pytest.fixture(scope="module")
@@ -48,26 +52,46 @@ def stopped():
     """A four-bar that is let go and caught again, to a stop of the run before its time."""
     chain = models.four_bar()
     events = [svkc.at(0.023, cut="pin"), svkc.at(0.035, connect="pin", here=True, stop=True)]
-    return chain, svkc.simulate(chain, chain.state({"crank": 0.4}), 0.1, ts=jnp.linspace(0, 0.1, 11), events=events, dt=0.005)
+    return chain, svkc.simulate(
+        chain,
+        chain.state({"crank": 0.4}),
+        0.1,
+        ts=jnp.linspace(0, 0.1, 11),
+        events=events,
+        dt=0.005,
+    )
 
 
 @pytest.fixture(scope="module")
 def pendulum():
     """Nothing virtual in it, and a body whose name would end the script, were it let."""
-    body = f'<body name="{html.escape(NAME)}"><joint name="j" axis="0 1 0"/>{models.BAR.format("0 0 -1")}</body>'
+    body = (
+        f'<body name="{html.escape(NAME)}"><joint name="j" axis="0 1'
+        f' 0"/>{models.BAR.format("0 0 -1")}</body>'
+    )
     return svkc.load(f"<mujoco><worldbody>{body}</worldbody></mujoco>")
 
 
 @pytest.fixture(scope="module")
 def browser():
     """Chromium without a window."""
-    playwright = pytest.importorskip("playwright.sync_api", reason="the page is tried in a browser: pip install playwright")
+    playwright = pytest.importorskip(
+        "playwright.sync_api", reason="the page is tried in a browser: pip install playwright"
+    )
     program = next(filter(None, map(shutil.which, BROWSERS)), None)
     if program is None:
-        pytest.skip("the page is tried in a browser: apt-get install --no-install-recommends chromium")
+        pytest.skip(
+            "the page is tried in a browser: apt-get install --no-install-recommends chromium"
+        )
     with playwright.sync_playwright() as play:
         chromium = play.chromium.launch(
-            executable_path=program, args=["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+            executable_path=program,
+            args=[
+                "--no-sandbox",
+                "--use-gl=angle",
+                "--use-angle=swiftshader",
+                "--enable-unsafe-swiftshader",
+            ],
         )
         yield chromium
         chromium.close()
@@ -96,7 +120,11 @@ def visit(browser):
 
 def contents(path) -> dict:
     """The run inside a page."""
-    inside = re.findall(r'<script type="application/json" id="run">(.*?)</script>', pathlib.Path(path).read_text(), re.S)
+    inside = re.findall(
+        r'<script type="application/json" id="run">(.*?)</script>',
+        pathlib.Path(path).read_text(),
+        re.S,
+    )
     assert len(inside) == 1
     return json.loads(inside[0])
 
@@ -108,8 +136,12 @@ def picture(page):
     from PIL import Image
 
     # two frames: the one that was asked for, and the one in which it is shown
-    page.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
-    return np.asarray(Image.open(io.BytesIO(page.locator("canvas").screenshot())).convert("RGB"), int)
+    page.evaluate(
+        "() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
+    )
+    return np.asarray(
+        Image.open(io.BytesIO(page.locator("canvas").screenshot())).convert("RGB"), int
+    )
 
 
 def changed(one, other) -> int:
@@ -128,7 +160,9 @@ def test_the_file_has_everything_in_it(release, tmp_path):
     assert path == tmp_path / "run.html"
     text, run = path.read_text(), contents(path)
     # nothing is fetched, the licence goes with what it is for, every part was put in
-    assert not re.search(r'src=|<link(?! rel="icon" href="data:,")|@import|url\(', text.split("<script", 1)[0])
+    assert not re.search(
+        r'src=|<link(?! rel="icon" href="data:,")|@import|url\(', text.split("<script", 1)[0]
+    )
     assert set(re.findall(r"https?://[\w./]+", text)) <= {"http://www.w3.org/1999/xhtml"}
     assert "The above copyright notice and this permission notice shall be included" in text
     assert "{{" not in text.replace("/*! three", "").split("</script>")[-1]
@@ -136,13 +170,23 @@ def test_the_file_has_everything_in_it(release, tmp_path):
     assert tuple(run["bodies"]) == chain.body_names
     np.testing.assert_array_equal(run["times"], traj.ts)
     np.testing.assert_array_equal(run["gaps"], traj.gaps)
-    np.testing.assert_allclose(run["energy"], jax.vmap(lambda s: svkc.energy(chain, s))(traj.states), rtol=1e-12)
-    poses = np.frombuffer(base64.b64decode(run["poses"]), "<f4").reshape(21, len(chain.body_names), 7)
+    np.testing.assert_allclose(
+        run["energy"], jax.vmap(lambda s: svkc.energy(chain, s))(traj.states), rtol=1e-12
+    )
+    poses = np.frombuffer(base64.b64decode(run["poses"]), "<f4").reshape(
+        21, len(chain.body_names), 7
+    )
     positions, quats = svkc.poses(chain, jax.tree.map(lambda x: x[13], traj.states))
     np.testing.assert_allclose(poses[13], np.concatenate([positions, quats], -1), atol=1e-6)
     assert [p["mobility"] for p in run["phases"]] == [12, 17, 22] == traj.phases.freedoms.tolist()
-    assert [[link["name"] for link in p["links"]] for p in run["phases"]] == [["right_hand_grip", "left_hand_grip"], ["left_hand_grip"], []]
-    assert [(e["time"], e["text"], e["lost"]) for e in run["events"]] == [(t, f"cut {link}", 0) for t, link in CUTS.items()]
+    assert [[link["name"] for link in p["links"]] for p in run["phases"]] == [
+        ["right_hand_grip", "left_hand_grip"],
+        ["left_hand_grip"],
+        [],
+    ]
+    assert [(e["time"], e["text"], e["lost"]) for e in run["events"]] == [
+        (t, f"cut {link}", 0) for t, link in CUTS.items()
+    ]
     # both ends of a link that holds are at one place
     (parent, at), (real, there) = run["phases"][0]["links"][0]["ends"]
     assert (chain.body_names[parent], chain.body_names[real]) == ("world", "right_hand")
@@ -156,7 +200,16 @@ def test_ten_seconds_are_below_five_megabytes(release, tmp_path):
     chain, traj = release
     again = np.arange(401) % 21
     parts = lambda t: (t.ts, t.states, t.gaps, t.t_final)
-    long = eqx.tree_at(parts, traj, (jnp.linspace(0, 10, 401), jax.tree.map(lambda x: x[again], traj.states), traj.gaps[again], jnp.asarray(10.0)))
+    long = eqx.tree_at(
+        parts,
+        traj,
+        (
+            jnp.linspace(0, 10, 401),
+            jax.tree.map(lambda x: x[again], traj.states),
+            traj.gaps[again],
+            jnp.asarray(10.0),
+        ),
+    )
     path = svkc.render(chain, long, tmp_path / "long.html")
     assert len(contents(path)["times"]) == 401
     assert path.stat().st_size < 5e6
@@ -164,7 +217,9 @@ def test_ten_seconds_are_below_five_megabytes(release, tmp_path):
 
 def test_names_stay_names(pendulum, tmp_path):
     chain = pendulum
-    path = svkc.render(chain, svkc.simulate(chain, chain.state(), 0.01, dt=0.01), tmp_path / "a <b> & c.html")
+    path = svkc.render(
+        chain, svkc.simulate(chain, chain.state(), 0.01, dt=0.01), tmp_path / "a <b> & c.html"
+    )
     assert contents(path)["bodies"][1] == chain.body_names[1] == NAME
     assert '<b id="x">' not in path.read_text()
     assert "<title>a &lt;b&gt; &amp; c</title>" in path.read_text()
@@ -172,7 +227,8 @@ def test_names_stay_names(pendulum, tmp_path):
 
 @pytest.mark.slow
 def test_a_run_that_stopped_ends_where_it_did(stopped, tmp_path):
-    """Times asked for past the end are left out, what the last event made is there, what is no number is null."""
+    """Times asked for past the end are left out, what the last event made is there, what is no
+    number is null."""
     chain, traj = stopped
     run = contents(svkc.render(chain, traj, tmp_path / "stopped.html"))
     np.testing.assert_allclose(run["times"], [0, 0.01, 0.02, 0.03, 0.035])
@@ -180,7 +236,9 @@ def test_a_run_that_stopped_ends_where_it_did(stopped, tmp_path):
     assert [e["text"] for e in run["events"]] == ["cut pin", "connect pin"]
     assert run["events"][1]["lost"] == float(traj.events.energy_lost[1])
     assert run["phases"][2]["links"][0]["ends"] is not None
-    broken = eqx.tree_at(lambda t: (t.ts, t.gaps), traj, (traj.ts.at[4:].set(jnp.nan), traj.gaps.at[1].set(jnp.inf)))
+    broken = eqx.tree_at(
+        lambda t: (t.ts, t.gaps), traj, (traj.ts.at[4:].set(jnp.nan), traj.gaps.at[1].set(jnp.inf))
+    )
     run = contents(svkc.render(chain, broken, tmp_path / "broken.html"))
     assert len(run["times"]) == 5
     assert run["gaps"][1] == [None, None]
@@ -203,7 +261,17 @@ def kinds():
 
 def test_every_kind_of_geom(tmp_path):
     run = contents(svkc.render(*kinds(), tmp_path / "kinds.html"))
-    assert [g["kind"] for g in run["geoms"]] == ["plane", "mesh", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh", "mesh"]
+    assert [g["kind"] for g in run["geoms"]] == [
+        "plane",
+        "mesh",
+        "sphere",
+        "capsule",
+        "ellipsoid",
+        "cylinder",
+        "box",
+        "mesh",
+        "mesh",
+    ]
     # the material's colour; a mesh that is used twice is there once
     assert run["geoms"][2]["rgba"] == [0, 1, 0, 1]
     assert [g.get("mesh") for g in run["geoms"]].count(1) == 2
@@ -217,8 +285,10 @@ def test_every_kind_of_geom(tmp_path):
 
 def test_nothing_of_it_is_read_before_it_is_asked_for():
     code = (
-        "import sys; opened = []; sys.addaudithook(lambda name, args: opened.append(str(args[0])) if name == 'open' else None);"
-        "import svkc.page; assert any('render' in path for path in opened); assert not [path for path in opened if 'three.min' in path or 'page.html' in path]"
+        "import sys; opened = []; sys.addaudithook(lambda name, args: opened.append(str(args[0]))"
+        " if name == 'open' else None);import svkc.page; assert any('render' in path for path in"
+        " opened); assert not [path for path in opened if 'three.min' in path or 'page.html' in"
+        " path]"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -234,12 +304,22 @@ def test_it_plays_and_goes_through_time(release, visit, tmp_path):
     assert number(page, "time") == 0
     # by hand: a click into each phase
     bar, seen = page.locator("#track").bounding_box(), []
-    for t, mobility, held in ((0.1, 12, "right_hand_grip\nleft_hand_grip"), (0.25, 17, "left_hand_grip"), (0.45, 22, "nothing")):
+    for t, mobility, held in (
+        (0.1, 12, "right_hand_grip\nleft_hand_grip"),
+        (0.25, 17, "left_hand_grip"),
+        (0.45, 22, "nothing"),
+    ):
         page.mouse.click(bar["x"] + bar["width"] * t / 0.5, bar["y"] + bar["height"] / 2)
         assert number(page, "time") == pytest.approx(t, abs=2e-3)
         assert number(page, "mobility") == mobility
         assert page.inner_text("#links").strip() == held
-        seen.append((picture(page), page.inner_text("#gap"), page.evaluate("svkc.bodies[5].matrixWorld.elements")))
+        seen.append(
+            (
+                picture(page),
+                page.inner_text("#gap"),
+                page.evaluate("svkc.bodies[5].matrixWorld.elements"),
+            )
+        )
     assert all(changed(seen[i][0], seen[j][0]) > 500 for i, j in ((0, 1), (1, 2)))
     assert len({gap for _, gap, _ in seen}) == 3
     assert seen[0][2] != seen[1][2]
@@ -286,7 +366,9 @@ def test_events_are_marked(release, visit, tmp_path):
     assert marks.count() == len(CUTS)
     for i, (t, link) in enumerate(CUTS.items()):
         middle = marks.nth(i).bounding_box()
-        assert middle["x"] + middle["width"] / 2 == pytest.approx(bar["x"] + bar["width"] * t / 0.5, abs=1)
+        assert middle["x"] + middle["width"] / 2 == pytest.approx(
+            bar["x"] + bar["width"] * t / 0.5, abs=1
+        )
         assert marks.nth(i).get_attribute("aria-label") == f"{t:.3f} s  cut {link}"
         label = f"getComputedStyle(document.querySelectorAll('.mark')[{i}], '::after').display"
         page.mouse.move(5, 5)
@@ -338,8 +420,10 @@ def test_the_camera_turns_and_everything_is_seen(release, visit, tmp_path):
     page.mouse.move(450, 330, steps=3)
     page.mouse.up()
     assert changed(first, picture(page)) > 1000
-    corners = """() => { const out = []; svkc.bodies.forEach(body => body.children.forEach(thing => {
-        const c = thing.localToWorld(thing.position.clone().set(0, 0, 0)).project(svkc.camera); out.push(Math.abs(c.x), Math.abs(c.y)); }));
+    corners = """() => { const out = [];
+        svkc.bodies.forEach(body => body.children.forEach(thing => {
+        const c = thing.localToWorld(thing.position.clone().set(0, 0, 0)).project(svkc.camera);
+        out.push(Math.abs(c.x), Math.abs(c.y)); }));
         return Math.max(...out); }"""
     for size in ((1000, 640), (380, 700)):
         narrow = visit(path, *size)
@@ -350,7 +434,13 @@ def test_the_camera_turns_and_everything_is_seen(release, visit, tmp_path):
         assert narrow.evaluate("document.documentElement.scrollWidth <= innerWidth")
     narrow.set_viewport_size({"width": 900, "height": 500})
     picture(narrow)
-    assert narrow.evaluate("Math.abs(svkc.camera.aspect - document.querySelector('canvas').clientWidth / document.querySelector('canvas').clientHeight)") < 0.01
+    assert (
+        narrow.evaluate(
+            "Math.abs(svkc.camera.aspect - document.querySelector('canvas').clientWidth /"
+            " document.querySelector('canvas').clientHeight)"
+        )
+        < 0.01
+    )
     assert narrow.evaluate(corners) < 1
 
 
@@ -386,7 +476,9 @@ def test_a_notebook_shows_it(release, visit, tmp_path):
     shown = svkc.page.show(*release, height=400)
     cell = shown._repr_html_()
     assert html.unescape(re.search(r'srcdoc="([^"]*)"', cell).group(1)) == shown.text
-    (tmp_path / "cell.html").write_text(f"<!DOCTYPE html><meta charset=utf-8><link rel=icon href='data:,'>{cell}{cell}")
+    (tmp_path / "cell.html").write_text(
+        f"<!DOCTYPE html><meta charset=utf-8><link rel=icon href='data:,'>{cell}{cell}"
+    )
     page = visit(tmp_path / "cell.html")
     page.frame_locator("iframe").nth(1).locator("#mobility").wait_for()
     page.frames[2].evaluate("svkc.seek(0.4)")

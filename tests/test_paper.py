@@ -1,4 +1,5 @@
-"""The paper's own examples and formulas: section VII-A to the printed digit, attachment in flight, Rodrigues' integration."""
+"""The paper's own examples and formulas: section VII-A to the printed digit, attachment in flight,
+Rodrigues' integration."""
 
 import importlib.util
 import itertools
@@ -23,7 +24,16 @@ def links():
 def test_printed_matrices(links):
     """(45)-(48): J_C, rank 6, mobility 2, W and S for theta_G = (theta_1, theta_7)."""
     chain, state = links
-    assert chain.dof_names == ("base.x", "base.y", "base.z", "base.rx", "base.ry", "base.rz", "link1", "link1v")
+    assert chain.dof_names == (
+        "base.x",
+        "base.y",
+        "base.z",
+        "base.rx",
+        "base.ry",
+        "base.rz",
+        "link1",
+        "link1v",
+    )
     linear, angular = svkc.jacobian(chain, state)
     J = [[1, 0, 0, 0, 0, -2, -1, 0], [0, 1, 0, 0, 0, 0, 0, 0], [0, 0, 1, 2, 0, 0, 0, 0]]
     J += [[0, 0, 0, 1, 0, 0, 0, 0], [0, 0, 0, 0, 1, 0, 0, 0], [0, 0, 0, 0, 0, 1, 1, -1]]
@@ -33,13 +43,20 @@ def test_printed_matrices(links):
     co = svkc.coordinates(chain, svkc.prefer(chain, state, "base.x", "link1"))
     W = [[1, 0], [0, 0], [0, 0], [0, 0], [0, 0], [0.5, -0.5], [0, 1]]
     np.testing.assert_allclose(co.W[:7][:, co.independent], W, atol=1e-15)
-    np.testing.assert_allclose(co.S[co.actuated][:, co.independent], [[0, 1], [0.5, 0.5]], atol=1e-15)
-    np.testing.assert_allclose(co.H[co.dependent][:, co.independent], [[0, 0], [0, 0], [0, 0], [0, 0], [0.5, -0.5], [0.5, 0.5]], atol=1e-15)
+    np.testing.assert_allclose(
+        co.S[co.actuated][:, co.independent], [[0, 1], [0.5, 0.5]], atol=1e-15
+    )
+    np.testing.assert_allclose(
+        co.H[co.dependent][:, co.independent],
+        [[0, 0], [0, 0], [0, 0], [0, 0], [0.5, -0.5], [0.5, 0.5]],
+        atol=1e-15,
+    )
 
 
 @pytest.mark.slow
 def test_every_admissible_pair_gives_the_same_motion(links):
-    """Of the 28 pairs those of theta_1, theta_6, theta_7, theta_8 can be theta_G, and no others; all six give one motion."""
+    """Of the 28 pairs those of theta_1, theta_6, theta_7, theta_8 can be theta_G, and no others;
+    all six give one motion."""
     chain, _ = links
     state = chain.state(v={"base": [0.9, 0, 0, 0, 0, 0.2], "link1": 0.5})
     admissible, asked = [], []
@@ -52,13 +69,16 @@ def test_every_admissible_pair_gives_the_same_motion(links):
             asked.append(wish)
     assert admissible == list(itertools.combinations((0, 5, 6, 7), 2))
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *asked)
-    final = jax.vmap(lambda s: svkc.simulate(chain, s, 1.0, rtol=1e-11, atol=1e-13, throw=False).final)(stacked)
+    final = jax.vmap(
+        lambda s: svkc.simulate(chain, s, 1.0, rtol=1e-11, atol=1e-13, throw=False).final
+    )(stacked)
     assert float(jnp.abs(final.q - final.q[:1]).max()) < 1e-9
     assert float(jnp.abs(final.v - final.v[:1]).max()) < 1e-9
 
 
 def planar_impact(model, x, theta, v):
-    """Velocities [base x, y, turn; link turn] after the tip of link 1 is pinned to the ground, by Newton and Euler: three planar impulses."""
+    """Velocities [base x, y, turn; link turn] after the tip of link 1 is pinned to the ground, by
+    Newton and Euler: three planar impulses."""
     m = model.body_mass[1:]
     inertia = [np.max(i) for i in model.body_inertia[1:]]
     c = [b[1] for b in model.body_ipos[1:]]
@@ -69,12 +89,18 @@ def planar_impact(model, x, theta, v):
     w1, w2 = v[2], v[2] + v[3]
     u1 = v[:2] + w1 * turn(c[0] * elbow)
     u2 = v[:2] + w1 * turn(elbow) + w2 * turn(c[1] * tip)
-    # unknowns: u1, w1, u2, w2 after, the impulse P from link 1 on the base, and G from the ground on link 1
+    # unknowns: u1, w1, u2, w2 after, the impulse P from link 1 on the base, and G from the ground
+    # on link 1
     A, b = np.zeros((10, 10)), np.zeros(10)
     r1, r2, r2e = (1 - c[0]) * elbow, (1 - c[1]) * tip, -c[1] * tip
     A[0:2, 0:2], A[0:2, 6:8], b[0:2] = m[0] * np.eye(2), -np.eye(2), m[0] * u1
     A[2, 2], A[2, 6:8], b[2] = inertia[0], -turn(r1), inertia[0] * w1
-    A[3:5, 3:5], A[3:5, 6:8], A[3:5, 8:10], b[3:5] = m[1] * np.eye(2), np.eye(2), -np.eye(2), m[1] * u2
+    A[3:5, 3:5], A[3:5, 6:8], A[3:5, 8:10], b[3:5] = (
+        m[1] * np.eye(2),
+        np.eye(2),
+        -np.eye(2),
+        m[1] * u2,
+    )
     A[5, 5], A[5, 6:8], A[5, 8:10], b[5] = inertia[1], turn(r2e), -turn(r2), inertia[1] * w2
     A[6:8, 0:2], A[6:8, 2], A[6:8, 3:5], A[6:8, 5] = np.eye(2), turn(r1), -np.eye(2), -turn(r2e)
     A[8:10, 3:5], A[8:10, 5] = np.eye(2), turn(r2)
@@ -82,14 +108,18 @@ def planar_impact(model, x, theta, v):
     return np.array([*(np.array([u1x, u1y]) - w1 * turn(c[0] * elbow)), w1, w2 - w1])
 
 
-SERIAL = """<mujoco><option gravity="0 -9.81 0"/><worldbody><body name="link1" pos="0 2 0"><joint name="ground" axis="0 0 1"/>
-  <geom type="capsule" fromto="0 -1 0 0 0 0" size="0.03" mass="0.6" contype="0"/><body name="base" pos="0 -1 0"><joint name="elbow" axis="0 0 1"/>
-  <geom type="capsule" fromto="0 -1 0 0 0 0" size="0.03" mass="1.0" contype="0"/></body></body></worldbody></mujoco>"""
+SERIAL = """<mujoco><option gravity="0 -9.81 0"/><worldbody><body name="link1" pos="0 2 0"><joint
+  name="ground" axis="0 0 1"/>
+  <geom type="capsule" fromto="0 -1 0 0 0 0" size="0.03" mass="0.6" contype="0"/><body name="base"
+    pos="0 -1 0"><joint name="elbow" axis="0 0 1"/>
+  <geom type="capsule" fromto="0 -1 0 0 0 0" size="0.03" mass="1.0" contype="0"/></body></body>
+  </worldbody></mujoco>"""
 
 
 @pytest.mark.slow
 def test_attached_in_flight_it_is_the_serial_chain(links):
-    """Fig. 13: flight, the tip pinned to the ground as it passes, then the motion of the serial two-joint chain for 5 s, to 1e-9."""
+    """Fig. 13: flight, the tip pinned to the ground as it passes, then the motion of the serial
+    two-joint chain for 5 s, to 1e-9."""
     chain, _ = links
     theta, v = np.array([0.5, -0.9]), np.array([0.4, 1.1, 0.7, -1.3])
     along = lambda a: np.array([-np.sin(a), np.cos(a)])
@@ -97,7 +127,12 @@ def test_attached_in_flight_it_is_the_serial_chain(links):
     q = {"base": [*foot, 0, np.cos(theta[0] / 2), 0, 0, np.sin(theta[0] / 2)], "link1": theta[1]}
     tol = {"rtol": 1e-12, "atol": 1e-13}
     # back in time from the moment of contact, then forth
-    early = svkc.simulate(chain, chain.state(q, {"base": [-v[0], -v[1], 0, 0, 0, -v[2]], "link1": -v[3]}, connected=()), 0.3, **tol).final
+    early = svkc.simulate(
+        chain,
+        chain.state(q, {"base": [-v[0], -v[1], 0, 0, 0, -v[2]], "link1": -v[3]}, connected=()),
+        0.3,
+        **tol,
+    ).final
     start = svkc.State(early.q, -early.v, early.structure)
     ts = jnp.linspace(0, 5.3, 54)
     traj = svkc.simulate(chain, start, 5.3, ts=ts, events=[svkc.at(0.3, connect="link1v")], **tol)
@@ -108,50 +143,71 @@ def test_attached_in_flight_it_is_the_serial_chain(links):
     assert np.linalg.norm(traj.events.impulse[0]) > 0.1
     serial = svkc.load(SERIAL)
     # the serial chain's joints turn link 1 first, then the base
-    there = serial.state({"ground": theta[0] + theta[1], "elbow": -theta[1]}, {"ground": after[2] + after[3], "elbow": -after[3]})
+    there = serial.state(
+        {"ground": theta[0] + theta[1], "elbow": -theta[1]},
+        {"ground": after[2] + after[3], "elbow": -after[3]},
+    )
     same = svkc.simulate(serial, there, 5.0, ts=ts[3:] - 0.3, **tol)
     ours, _ = jax.vmap(lambda s: svkc.poses(chain, s))(traj.states)
     theirs, _ = jax.vmap(lambda s: svkc.poses(serial, s))(same.states)
-    np.testing.assert_allclose(ours[3:, chain.body_names.index("link1")], theirs[:, serial.body_names.index("base")], atol=1e-9)
+    np.testing.assert_allclose(
+        ours[3:, chain.body_names.index("link1")],
+        theirs[:, serial.body_names.index("base")],
+        atol=1e-9,
+    )
     assert float(traj.gaps.max()) < 1e-12
 
 
 FREE_TOP = (
-    '<mujoco><option gravity="0 0 0"/><worldbody><body name="top"><freejoint name="top"/><geom type="box" size="0.1 0.2 0.3"/></body></worldbody></mujoco>'
+    '<mujoco><option gravity="0 0 0"/><worldbody><body name="top"><freejoint name="top"/><geom'
+    ' type="box" size="0.1 0.2 0.3"/></body></worldbody></mujoco>'
 )
 
 
 @pytest.mark.slow
 def test_rodrigues_euler_is_of_first_order():
-    """(39)-(44) on a tumbling free top: halving the step halves the error of orientation and velocity."""
+    """(39)-(44) on a tumbling free top: halving the step halves the error of orientation and
+    velocity."""
     chain = svkc.load(FREE_TOP)
     state = chain.state(v=np.array([0, 0, 0, 3.0, 0.1, 2.0]))
     exact = svkc.simulate(chain, state, 1.0, rtol=1e-12, atol=1e-13).final
     errors = []
     for dt in (4e-3, 2e-3, 1e-3):
         final = svkc.simulate(chain, state, 1.0, dt=dt, solver=svkc.RodriguesEuler()).final
-        errors.append([float(jnp.abs(svkc.difference(chain, exact.q, final.q)).max()), float(jnp.abs(final.v - exact.v).max())])
+        errors.append(
+            [
+                float(jnp.abs(svkc.difference(chain, exact.q, final.q)).max()),
+                float(jnp.abs(final.v - exact.v).max()),
+            ]
+        )
     ratios = np.array(errors)[:-1] / np.array(errors)[1:]
     assert np.all((ratios > 1.85) & (ratios < 2.15)), ratios
 
 
 @pytest.mark.slow
 def test_rodrigues_euler_keeps_quaternions_at_unit_length():
-    """1e5 steps of a tumbling top: the length is one to round-off at the end, and Rodrigues' formula by itself loses no more than adds up of round-off."""
+    """1e5 steps of a tumbling top: the length is one to round-off at the end, and Rodrigues'
+    formula by itself loses no more than adds up of round-off."""
     chain = svkc.load(FREE_TOP)
     state = chain.state(v=np.array([0, 0, 0, 3.0, 0.1, 2.0]))
-    traj = svkc.simulate(chain, state, 100.0, dt=1e-3, solver=svkc.RodriguesEuler(), max_steps=100001)
+    traj = svkc.simulate(
+        chain, state, 100.0, dt=1e-3, solver=svkc.RodriguesEuler(), max_steps=100001
+    )
     assert int(traj.report().accepted) == 100000
     assert abs(float(jnp.linalg.norm(traj.final.q[3:7])) - 1) < 5e-16
     turn = quat_exp(jnp.array([3e-3, 1e-4, 2e-3]))
-    bare = jax.lax.fori_loop(0, 100000, lambda i, q: quat_multiply(q, turn), jnp.array([1.0, 0, 0, 0]))
+    bare = jax.lax.fori_loop(
+        0, 100000, lambda i, q: quat_multiply(q, turn), jnp.array([1.0, 0, 0, 0])
+    )
     assert abs(float(jnp.linalg.norm(bare)) - 1) < 100000 * 2.3e-16
 
 
 @pytest.fixture(scope="module")
 def benchmark():
     """benchmarks/joints.py, which builds both figures."""
-    spec = importlib.util.spec_from_file_location("joints", pathlib.Path(__file__).parent.parent / "benchmarks" / "joints.py")
+    spec = importlib.util.spec_from_file_location(
+        "joints", pathlib.Path(__file__).parent.parent / "benchmarks" / "joints.py"
+    )
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
@@ -166,7 +222,10 @@ def test_the_figure_of_40_freedoms(benchmark):
     assert (links, len(balls), chains["balls"].nv) == ({"balls": 17, "hinges": 41}, 12, 46)
     assert abs(float(chains["balls"].mass.sum()) - 73) < 0.01
     states = benchmark.same_motion(chains, balls, np.random.default_rng(2))
-    ends = [svkc.simulate(chain, state, 0.2, rtol=1e-10, atol=1e-12).final for chain, state in zip(chains.values(), states, strict=True)]
+    ends = [
+        svkc.simulate(chain, state, 0.2, rtol=1e-10, atol=1e-12).final
+        for chain, state in zip(chains.values(), states, strict=True)
+    ]
     places = [svkc.poses(chain, end)[0] for chain, end in zip(chains.values(), ends, strict=True)]
     np.testing.assert_allclose(places[0], places[1], atol=1e-9)
 
@@ -180,7 +239,10 @@ def test_rodrigues_euler_on_the_figure():
     run = lambda dt: svkc.simulate(chain, state, 0.1, dt=dt, solver=svkc.RodriguesEuler())
     fine, coarse = run(5e-4), run(1e-3)
     exact = svkc.simulate(chain, state, 0.1, rtol=1e-9, atol=1e-11).final
-    error = [float(jnp.abs(svkc.difference(chain, exact.q, traj.final.q)).max()) for traj in (coarse, fine)]
+    error = [
+        float(jnp.abs(svkc.difference(chain, exact.q, traj.final.q)).max())
+        for traj in (coarse, fine)
+    ]
     assert 1.8 < error[0] / error[1] < 2.2
     assert float(fine.gaps.max()) < 1e-9
     at = chain.topology.quaternions[0][:, None] + np.arange(4)

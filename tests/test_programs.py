@@ -1,4 +1,5 @@
-"""What the programs are made of: no calls back to Python, float32 throughout where that is asked, no LAPACK in steps by articulated bodies."""
+"""What the programs are made of: no calls back to Python, float32 throughout where that is asked,
+no LAPACK in steps by articulated bodies."""
 
 import re
 
@@ -19,7 +20,8 @@ def lowered(function, *args) -> str:
 
 
 def calls(text: str) -> set[str]:
-    """Names of what is called that is no operation of XLA's own; those that only mark or arrange are left out."""
+    """Names of what is called that is no operation of XLA's own; those that only mark or arrange
+    are left out."""
     return set(re.findall(r"custom_call @(\w+)", text)) - {"Sharding", "annotate_device_placement"}
 
 
@@ -30,7 +32,10 @@ def precision(request):
 
 
 def run(chain, state, **how):
-    events = [svkc.at(0.02, cut="pin"), svkc.when(lambda t, s, args: s.q[0] - 0.3, connect="pin", here=True)]
+    events = [
+        svkc.at(0.02, cut="pin"),
+        svkc.when(lambda t, s, args: s.q[0] - 0.3, connect="pin", here=True),
+    ]
     return svkc.simulate(chain, state, 0.1, events=events, throw=False, **how)
 
 
@@ -38,11 +43,17 @@ def test_programs(precision):
     chain = models.four_bar()
     state, tau = chain.state(v={"crank": 4.0}), jnp.zeros(chain.nv)
     batch = jax.tree.map(lambda x: jnp.stack([x, x]), state)
-    gradient = lambda how: lambda v: jax.grad(lambda v: jnp.sum(run(chain, svkc.State(state.q, v, state.structure), **how).final.q))(v)
+    gradient = lambda how: (
+        lambda v: jax.grad(
+            lambda v: jnp.sum(run(chain, svkc.State(state.q, v, state.structure), **how).final.q)
+        )(v)
+    )
     programs = {
         "step": lowered(lambda s: svkc.step(chain, s, tau, 1e-3), state),
         "steps of lanes": lowered(jax.vmap(lambda s: svkc.step(chain, s, tau, 1e-3)), batch),
-        "phase by bodies": lowered(lambda s: svkc.simulate(chain, s, 0.1, throw=False, **BODIES), state),
+        "phase by bodies": lowered(
+            lambda s: svkc.simulate(chain, s, 0.1, throw=False, **BODIES), state
+        ),
         "run": lowered(lambda s: run(chain, s), state),
         "gradient": lowered(gradient({}), state.v),
     }

@@ -1,4 +1,5 @@
-"""Chains and states are plain pytrees: optimisers, root finders, files and training states of others take them as they are."""
+"""Chains and states are plain pytrees: optimisers, root finders, files and training states of
+others take them as they are."""
 
 import equinox as eqx
 import jax
@@ -34,7 +35,8 @@ def four_bar():
 
 
 def test_optax_moves_a_leaf_of_a_chain(four_bar):
-    """The floats of a chain are an optimiser's parameters: centres of mass that give the energy asked for; the rest stays bit for bit."""
+    """The floats of a chain are an optimiser's parameters: centres of mass that give the energy
+    asked for; the rest stays bit for bit."""
     chain, _, state = four_bar
     free, rest = only(chain, lambda c: c.com)
     loss = lambda free: (svkc.potential_energy(eqx.combine(free, rest), state) - 1.0) ** 2
@@ -71,10 +73,14 @@ def test_optax_moves_a_state(four_bar):
 
 @pytest.mark.slow
 def test_optimistix_finds_a_throw():
-    """A root through a whole run, over a State: the rate with which a hanging rod must begin to be level at 0.4 s."""
+    """A root through a whole run, over a State: the rate with which a hanging rod must begin to be
+    level at 0.4 s."""
     chain = svkc.load(models.MJCF.format(ROD))
     free, rest = only(eqx.tree_at(lambda s: s.v, chain.state(), jnp.array([6.0])), lambda s: s.v)
-    level = lambda free, args: svkc.simulate(chain, eqx.combine(free, rest), 0.4, dt=0.02, throw=False).final.q - jnp.pi / 2
+    level = lambda free, args: (
+        svkc.simulate(chain, eqx.combine(free, rest), 0.4, dt=0.02, throw=False).final.q
+        - jnp.pi / 2
+    )
     found = optimistix.root_find(level, optimistix.Newton(rtol=1e-10, atol=1e-10), free)
     assert isinstance(found.value, svkc.State)
     np.testing.assert_allclose(level(found.value, None), 0, atol=1e-9)
@@ -84,7 +90,16 @@ def test_optimistix_finds_a_throw():
 @pytest.mark.slow
 def test_optimistix_finds_where_a_chain_rests():
     """The least of the potential energy over a State; there nothing accelerates."""
-    chain = svkc.load(models.MJCF.format(models.bar("upper", models.Y, "0 0 -1", inside=models.bar("lower", models.Y, "0 0 -1", "0 0 -1"))))
+    chain = svkc.load(
+        models.MJCF.format(
+            models.bar(
+                "upper",
+                models.Y,
+                "0 0 -1",
+                inside=models.bar("lower", models.Y, "0 0 -1", "0 0 -1"),
+            )
+        )
+    )
     free, rest = only(chain.state({"upper": 0.5, "lower": -0.8}), lambda s: s.q)
     energy = lambda free, args: svkc.potential_energy(chain, eqx.combine(free, rest))
     found = optimistix.minimise(energy, optimistix.BFGS(rtol=1e-10, atol=1e-10), free)
@@ -101,7 +116,9 @@ def test_optimistix_finds_masses(four_bar):
     measured = torques(eqx.tree_at(lambda c: c.mass, chain, 1.3 * chain.mass))
     free, rest = only(chain, lambda c: c.mass)
     misses = lambda free, args: torques(eqx.combine(free, rest)) - measured
-    found = optimistix.least_squares(misses, optimistix.LevenbergMarquardt(rtol=1e-10, atol=1e-10), free)
+    found = optimistix.least_squares(
+        misses, optimistix.LevenbergMarquardt(rtol=1e-10, atol=1e-10), free
+    )
     assert isinstance(found.value, svkc.Chain)
     np.testing.assert_allclose(torques(eqx.combine(found.value, rest)), measured, rtol=1e-6)
 
@@ -117,7 +134,8 @@ def test_equinox_writes_and_reads_bit_for_bit(four_bar, tmp_path):
 
 
 def test_leaves_alone_make_the_same_thing_again(four_bar):
-    """As libraries do that know nothing of svkc: flattened, moved through jit and scan, and put together."""
+    """As libraries do that know nothing of svkc: flattened, moved through jit and scan, and put
+    together."""
     chain, rest, state = four_bar
     for thing in (chain, state):
         leaves, tree = jax.tree.flatten(thing)

@@ -1,4 +1,5 @@
-"""Independent solutions of other people's problems (tests/reference: where each comes from), and what they hold this library to."""
+"""Independent solutions of other people's problems (tests/reference: where each comes from), and
+what they hold this library to."""
 
 import json
 import os
@@ -16,7 +17,10 @@ import pytest
 import svkc
 
 FOLDER = pathlib.Path(__file__).parent / "reference"
-ROTATION = '<mujoco><compiler balanceinertia="false"/><option gravity="{}"/><worldbody><body name="top"><joint name="top" type="ball"/>'
+ROTATION = (
+    '<mujoco><compiler balanceinertia="false"/><option gravity="{}"/><worldbody><body'
+    ' name="top"><joint name="top" type="ball"/>'
+)
 ROTATION += '<inertial pos="{}" mass="{}" diaginertia="{}"/></body></worldbody></mujoco>'
 
 
@@ -34,7 +38,9 @@ def numbers(x):
 
 def places(chain, traj, body):
     """[times 3] of the body's frame."""
-    return np.asarray(jax.vmap(lambda s: svkc.poses(chain, s)[0])(traj.states))[:, chain.body_names.index(body)]
+    return np.asarray(jax.vmap(lambda s: svkc.poses(chain, s)[0])(traj.states))[
+        :, chain.body_names.index(body)
+    ]
 
 
 def turned_alike(q, expected):
@@ -45,20 +51,46 @@ def turned_alike(q, expected):
 
 @pytest.mark.parametrize("case", given("free_top")["cases"], ids=lambda case: case["name"])
 def test_free_top(case):
-    """1e-9; where the motion itself amplifies round-off, three times what a plain integration in double precision loses."""
+    """1e-9; where the motion itself amplifies round-off, three times what a plain integration in
+    double precision loses."""
     chain = svkc.load(ROTATION.format("0 0 0", "0 0 0", 1, numbers(case["inertia"])))
-    traj = svkc.simulate(chain, chain.state(v={"top": case["omega0_body"]}), case["t_end"], ts=jnp.array(case["t"]), **tight(1e-13))
+    traj = svkc.simulate(
+        chain,
+        chain.state(v={"top": case["omega0_body"]}),
+        case["t_end"],
+        ts=jnp.array(case["t"]),
+        **tight(1e-13),
+    )
     bound = max(1e-9, 3 * case["plain"])
-    np.testing.assert_allclose(*turned_alike(traj.states.q, case["quat_wxyz_body_to_world"]), atol=bound)
-    np.testing.assert_allclose(traj.states.v, case["omega_body"], atol=3 * bound * np.max(np.abs(case["omega_body"])))
+    np.testing.assert_allclose(
+        *turned_alike(traj.states.q, case["quat_wxyz_body_to_world"]), atol=bound
+    )
+    np.testing.assert_allclose(
+        traj.states.v, case["omega_body"], atol=3 * bound * np.max(np.abs(case["omega_body"]))
+    )
 
 
 @pytest.mark.parametrize("case", given("heavy_top")["cases"], ids=lambda case: case["name"])
 def test_heavy_top(case):
     model = given("heavy_top")["model"]
-    chain = svkc.load(ROTATION.format(numbers(model["gravity"]), numbers(model["com_body"]), model["mass"], numbers(model["inertia_com_body"])))
-    traj = svkc.simulate(chain, chain.state(v={"top": case["omega0_body"]}), case["t_end"], ts=jnp.array(case["t"]), **tight(1e-13))
-    np.testing.assert_allclose(*turned_alike(traj.states.q, case["quat_wxyz_body_to_world"]), atol=1e-9)
+    chain = svkc.load(
+        ROTATION.format(
+            numbers(model["gravity"]),
+            numbers(model["com_body"]),
+            model["mass"],
+            numbers(model["inertia_com_body"]),
+        )
+    )
+    traj = svkc.simulate(
+        chain,
+        chain.state(v={"top": case["omega0_body"]}),
+        case["t_end"],
+        ts=jnp.array(case["t"]),
+        **tight(1e-13),
+    )
+    np.testing.assert_allclose(
+        *turned_alike(traj.states.q, case["quat_wxyz_body_to_world"]), atol=1e-9
+    )
 
 
 def n_four_bar(windows):
@@ -68,10 +100,17 @@ def n_four_bar(windows):
     hinge = {"type": "revolute", "axis_world0": [0, 0, 1]}
     bodies = [upright | {"name": f"vert{i}", "com_world0": [i, 0.5, 0]} for i in range(windows + 1)]
     bodies += [level | {"name": f"horiz{i}", "com_world0": [i + 0.5, 1, 0]} for i in range(windows)]
-    joints = [hinge | {"parent": "ground", "child": f"vert{i}", "point_world0": [i, 0, 0]} for i in range(windows + 1)]
+    joints = [
+        hinge | {"parent": "ground", "child": f"vert{i}", "point_world0": [i, 0, 0]}
+        for i in range(windows + 1)
+    ]
     for i in range(windows):
-        joints.append(hinge | {"parent": f"vert{i}", "child": f"horiz{i}", "point_world0": [i, 1, 0]})
-        joints.append(hinge | {"parent": f"horiz{i}", "child": f"vert{i + 1}", "point_world0": [i + 1, 1, 0]})
+        joints.append(
+            hinge | {"parent": f"vert{i}", "child": f"horiz{i}", "point_world0": [i, 1, 0]}
+        )
+        joints.append(
+            hinge | {"parent": f"horiz{i}", "child": f"vert{i + 1}", "point_world0": [i + 1, 1, 0]}
+        )
     return problem | {"bodies": bodies, "joints": joints}
 
 
@@ -81,14 +120,23 @@ ERROR_AT = {1e-9: 1e-5, 1e-12: 1e-8}
 
 @pytest.mark.parametrize(
     ("windows", "tolerances"),
-    [(1, [1e-9]), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((1, [1e-12]), (2, [1e-9, 1e-12]), (5, [1e-9])))],
+    [
+        (1, [1e-9]),
+        *(
+            pytest.param(*case, marks=pytest.mark.slow)
+            for case in ((1, [1e-12]), (2, [1e-9, 1e-12]), (5, [1e-9]))
+        ),
+    ],
 )
 def test_n_four_bar_through_its_singular_configurations(windows, tolerances):
-    """10 s, two windows 20 s, some forty times through configurations where the rank drops: angle, energy, loops; coordinates are swapped."""
+    """10 s, two windows 20 s, some forty times through configurations where the rank drops: angle,
+    energy, loops; coordinates are swapped."""
     case = next(case for case in given("n_four_bar")["cases"] if case["N"] == windows)
     chain, state = maximal.load(n_four_bar(windows))
     ts = jnp.array([*case["t"], 20.0] if windows == 2 else case["t"])
-    run = jax.jit(lambda state, tolerance: svkc.simulate(chain, state, ts[-1], ts=ts, **tight(tolerance)))
+    run = jax.jit(
+        lambda state, tolerance: svkc.simulate(chain, state, ts[-1], ts=ts, **tight(tolerance))
+    )
     for tolerance in tolerances:
         traj = run(state, tolerance)
         found = 2 * places(chain, traj, "vert0")[: len(case["t"]), :2]
@@ -96,7 +144,9 @@ def test_n_four_bar_through_its_singular_configurations(windows, tolerances):
         energy = jax.vmap(lambda s: svkc.energy(chain, s))(traj.states)
         assert np.max(np.abs(energy - energy[0])) <= 1e-6 * case["energy"]
         assert np.max(traj.gaps) < 1e-12
-        dependent = np.asarray(jax.vmap(lambda s: svkc.coordinates(chain, s).dependent)(traj.states))
+        dependent = np.asarray(
+            jax.vmap(lambda s: svkc.coordinates(chain, s).dependent)(traj.states)
+        )
         assert len(np.unique(dependent, axis=0)) > 1
 
 
@@ -105,7 +155,14 @@ def forty_windows():
     case = next(case for case in given("n_four_bar")["cases"] if case["N"] == 40)
     chain, state = maximal.load(n_four_bar(40))
     assert svkc.mobility(chain, state).freedoms == 1
-    traj = svkc.simulate(chain, state, 20.0, ts=jnp.array([0.0, 1.0, 20.0]), dynamics=svkc.Dynamics(hold=None), **tight(1e-8))
+    traj = svkc.simulate(
+        chain,
+        state,
+        20.0,
+        ts=jnp.array([0.0, 1.0, 20.0]),
+        dynamics=svkc.Dynamics(hold=None),
+        **tight(1e-8),
+    )
     np.testing.assert_allclose(2 * places(chain, traj, "vert0")[1, :2], case["B0"][1], atol=1e-6)
     assert abs(float(traj.report().energy_drift)) <= 1e-6 * case["energy"]
     assert int(traj.report().swaps) > 0
@@ -118,7 +175,14 @@ def test_n_four_bar_of_forty_windows():
     flags = os.environ["XLA_FLAGS"].replace("--xla_backend_optimization_level=0", "")
     env = os.environ | {"XLA_FLAGS": flags, "JAX_ENABLE_X64": "1"}
     code = "import test_reference; test_reference.forty_windows()"
-    done = subprocess.run([sys.executable, "-c", code], cwd=pathlib.Path(__file__).parent, env=env, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=pathlib.Path(__file__).parent,
+        env=env,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
 
 
@@ -132,13 +196,23 @@ def springs(chain, problem):
         w, u = quat[row, 0], quat[row, 1:]
         return place[row] + local + 2 * jnp.cross(u, jnp.cross(u, local) + w * local)
 
-    bodies = {body["name"]: maximal.Body(body) for body in problem["bodies"]} | {"ground": maximal.Body()}
+    bodies = {body["name"]: maximal.Body(body) for body in problem["bodies"]} | {
+        "ground": maximal.Body()
+    }
 
     def potential(q, structure):
         total = 0.0
         for spring in (force for force in problem["forces"] if force["type"] == "spring_damper"):
-            one, other = (end(q, structure, bodies[spring[e]], spring[f"point_{e}_world0"], spring[e]) for e in ("parent", "child"))
-            total = total + spring["stiffness"] / 2 * (jnp.linalg.norm(other - one) - spring["rest_length"]) ** 2
+            one, other = (
+                end(q, structure, bodies[spring[e]], spring[f"point_{e}_world0"], spring[e])
+                for e in ("parent", "child")
+            )
+            total = (
+                total
+                + spring["stiffness"]
+                / 2
+                * (jnp.linalg.norm(other - one) - spring["rest_length"]) ** 2
+            )
         return total
 
     def control(t, state, args):
@@ -155,30 +229,52 @@ def test_andrews_mechanism():
     """Every angle and rate over 0.05 s; at 0.03 s the digits that are published, to 1e-8."""
     reference = given("andrews")
     chain, state = maximal.load(reference["problem"])
-    traj = svkc.simulate(chain, state, 0.05, ts=jnp.array(reference["t"]), control=springs(chain, reference["problem"]), **tight(1e-12))
-    # K1 turns by beta, K2 on it by Theta, K3 by gamma, K5 and K7 by delta and epsilon, K4 and K6 on them by Phi and Omega
-    turned = {"beta": ("K1",), "gamma": ("K1", "K2", "K3"), "delta": ("K1", "K2", "K4", "K5"), "epsilon": ("K1", "K2", "K6", "K7"), "Theta": ("K2",)}
+    traj = svkc.simulate(
+        chain,
+        state,
+        0.05,
+        ts=jnp.array(reference["t"]),
+        control=springs(chain, reference["problem"]),
+        **tight(1e-12),
+    )
+    # K1 turns by beta, K2 on it by Theta, K3 by gamma, K5 and K7 by delta and epsilon, K4 and K6 on
+    # them by Phi and Omega
+    turned = {
+        "beta": ("K1",),
+        "gamma": ("K1", "K2", "K3"),
+        "delta": ("K1", "K2", "K4", "K5"),
+        "epsilon": ("K1", "K2", "K6", "K7"),
+        "Theta": ("K2",),
+    }
     turned |= {"Phi": ("K5",), "Omega": ("K7",)}
     signs = {"Phi": -1, "Omega": -1}
-    index = {name: [chain.dof_names.index(body) for body in bodies] for name, bodies in turned.items()}
+    index = {
+        name: [chain.dof_names.index(body) for body in bodies] for name, bodies in turned.items()
+    }
     for i, name in enumerate(reference["angles"]):
         sign = signs.get(name, 1)
         angle = reference["q0"][i] + sign * np.sum(np.asarray(traj.states.q)[:, index[name]], 1)
         rate = sign * np.sum(np.asarray(traj.states.v)[:, index[name]], 1)
         np.testing.assert_allclose(angle, np.array(reference["q"])[:, i], atol=1e-10)
-        np.testing.assert_allclose(rate, np.array(reference["v"])[:, i], atol=1e-8 * np.max(np.abs(reference["v"])))
+        np.testing.assert_allclose(
+            rate, np.array(reference["v"])[:, i], atol=1e-8 * np.max(np.abs(reference["v"]))
+        )
         there = int(np.argmin(np.abs(np.array(reference["t"]) - 0.03)))
         assert angle[there] == pytest.approx(float(reference["at_0p03"]["q"][i]), rel=1e-8)
         assert rate[there] == pytest.approx(float(reference["at_0p03"]["v"][i]), rel=1e-8)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("variant", given("slider_crank_3d")["variants"], ids=lambda variant: variant["name"])
+@pytest.mark.parametrize(
+    "variant", given("slider_crank_3d")["variants"], ids=lambda variant: variant["name"]
+)
 def test_slider_crank_3d(variant):
     chain, state = maximal.load(variant["problem"])
     traj = svkc.simulate(chain, state, 5.0, ts=jnp.array(variant["t"]), **tight(1e-12))
     np.testing.assert_allclose(places(chain, traj, "slider")[:, 0], variant["slider_x"], atol=1e-10)
-    np.testing.assert_allclose(traj.states.v[:, chain.dof_names.index("slider")], variant["slider_v"], atol=1e-9)
+    np.testing.assert_allclose(
+        traj.states.v[:, chain.dof_names.index("slider")], variant["slider_v"], atol=1e-9
+    )
 
 
 @pytest.mark.slow
@@ -188,39 +284,61 @@ def test_rssr_does_not_notice_its_idle_spin():
     for variant in given("rssr")["variants"]:
         chain, state = maximal.load(variant["problem"])
         traj = svkc.simulate(chain, state, 4.0, ts=jnp.array(variant["t"]), **tight(1e-12))
-        np.testing.assert_allclose(places(chain, traj, "coupler"), variant["coupler_com"], atol=1e-9)
-        np.testing.assert_allclose(traj.states.v[:, chain.dof_names.index("crank")], variant["crank_rate"], atol=1e-8)
+        np.testing.assert_allclose(
+            places(chain, traj, "coupler"), variant["coupler_com"], atol=1e-9
+        )
+        np.testing.assert_allclose(
+            traj.states.v[:, chain.dof_names.index("crank")], variant["crank_rate"], atol=1e-8
+        )
         found.append(np.asarray(traj.states.v[:, 0]))
     np.testing.assert_allclose(*found, atol=1e-8)
 
 
 CART = (
-    '<mujoco><compiler balanceinertia="false"/><option gravity="0 0 -9.81"/><worldbody><body name="cart"><joint name="x" type="slide" axis="1 0 0"/>'
-    '<inertial pos="0 0 0" mass="{}" diaginertia="1e-12 1e-12 1e-12"/><body name="pole"><joint name="theta" type="hinge" axis="0 -1 0"/>'
-    '<inertial pos="0 0 -1" mass="1" diaginertia="1e-15 1e-15 1e-15"/></body></body></worldbody></mujoco>'
+    '<mujoco><compiler balanceinertia="false"/><option gravity="0 0 -9.81"/><worldbody><body'
+    ' name="cart"><joint name="x" type="slide" axis="1 0 0"/><inertial pos="0 0 0" mass="{}"'
+    ' diaginertia="1e-12 1e-12 1e-12"/><body name="pole"><joint name="theta" type="hinge" axis="0'
+    ' -1 0"/><inertial pos="0 0 -1" mass="1" diaginertia="1e-15 1e-15'
+    ' 1e-15"/></body></body></worldbody></mujoco>'
 )
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("number", "tolerance", "error"), [(0, 1e-11, 1e-8), (1, 1e-13, 1e-10), (2, 1e-9, 1e-5)])
+@pytest.mark.parametrize(
+    ("number", "tolerance", "error"), [(0, 1e-11, 1e-8), (1, 1e-13, 1e-10), (2, 1e-9, 1e-5)]
+)
 def test_light_cartpole(number, tolerance, error):
     """A cart of 1e-6, 1e-3, 1e-9 of its pole: rates of 4e3, 1e2, 1e5 rad/s in each swing."""
     case = given("light_cartpole")["cases"][number]
     chain = svkc.load(CART.format(case["M"]))
-    traj = svkc.simulate(chain, chain.state({"theta": np.pi / 2}), 10.0, ts=jnp.array(case["t"]), **tight(tolerance))
+    traj = svkc.simulate(
+        chain, chain.state({"theta": np.pi / 2}), 10.0, ts=jnp.array(case["t"]), **tight(tolerance)
+    )
     np.testing.assert_allclose(traj.states.q[:, 0], case["x"], atol=error)
     np.testing.assert_allclose(traj.states.q[:, 1], case["theta"], atol=error)
 
 
 @pytest.mark.slow
 def test_slider_crank_with_gradients():
-    """SUNDIALS' own example: the path, the integral of the kinetic energy, and its derivatives by the spring and the damper."""
+    """SUNDIALS' own example: the path, the integral of the kinetic energy, and its derivatives by
+    the spring and the damper."""
     reference = given("sundials_slider_crank")
-    crank = '<body name="crank"><joint name="crank" axis="0 0 1"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body>'
-    rod = '<body name="rod"><joint name="x" type="slide" axis="1 0 0"/><joint name="rod" axis="0 0 1"/>'
+    crank = (
+        '<body name="crank"><joint name="crank" axis="0 0 1"/><inertial pos="0 0 0" mass="1"'
+        ' diaginertia="1 1 1"/></body>'
+    )
+    rod = (
+        '<body name="rod"><joint name="x" type="slide" axis="1 0 0"/><joint name="rod" axis="0 0'
+        ' 1"/>'
+    )
     rod += '<inertial pos="0 0 0" mass="1" diaginertia="2 2 2"/></body>'
-    pin = svkc.VirtualLink("pin", "crank", "rod", "hinge", pos=(0.5, 0, 0), real_pos=(-1, 0, 0), connected=True)
-    chain = svkc.load(f'<mujoco><option gravity="0 0 0"/><worldbody>{crank}{rod}</worldbody></mujoco>', virtual_links=[pin])
+    pin = svkc.VirtualLink(
+        "pin", "crank", "rod", "hinge", pos=(0.5, 0, 0), real_pos=(-1, 0, 0), connected=True
+    )
+    chain = svkc.load(
+        f'<mujoco><option gravity="0 0 0"/><worldbody>{crank}{rod}</worldbody></mujoco>',
+        virtual_links=[pin],
+    )
     state = chain.state({"crank": np.pi / 2, "x": np.sqrt(0.75), "rod": -np.pi / 6})
 
     def along(q):
@@ -247,9 +365,13 @@ def test_slider_crank_with_gradients():
     order = np.argsort(ts, kind="stable")
 
     def functional(args):
-        traj = svkc.simulate(chain, state, 10.0, ts=jnp.array(ts[order]), control=control, args=args, **tight(1e-12))
+        traj = svkc.simulate(
+            chain, state, 10.0, ts=jnp.array(ts[order]), control=control, args=args, **tight(1e-12)
+        )
         states = jax.tree.map(lambda x: x[np.argsort(order)], (traj.states.q, traj.states.v))
-        energy = jax.vmap(lambda q, v: svkc.kinetic_energy(chain, svkc.State(q, v, state.structure)))(*states)
+        energy = jax.vmap(
+            lambda q, v: svkc.kinetic_energy(chain, svkc.State(q, v, state.structure))
+        )(*states)
         return jnp.tile(weight, 40) @ energy[:320] / 8, states[0][320:]
 
     (value, path), slope = jax.jit(jax.value_and_grad(functional, has_aux=True))(args)
@@ -263,32 +385,61 @@ def test_slider_crank_with_gradients():
 def test_two_rods_latched():
     """Velocities after a hinge and after a weld, momenta and kinetic energy: the closed form."""
     case = given("events")["latch_two_rods"]
-    rod = '<body name="{0}" pos="{1} 0 0"><joint name="{0}.x" type="slide" axis="1 0 0"/><joint name="{0}.y" type="slide" axis="0 1 0"/>'
-    rod += '<joint name="{0}.turn" axis="0 0 1"/><inertial pos="0 0 0" mass="{2}" diaginertia="{3} {3} {3}"/></body>'
+    rod = (
+        '<body name="{0}" pos="{1} 0 0"><joint name="{0}.x" type="slide" axis="1 0 0"/><joint'
+        ' name="{0}.y" type="slide" axis="0 1 0"/>'
+    )
+    rod += (
+        '<joint name="{0}.turn" axis="0 0 1"/><inertial pos="0 0 0" mass="{2}" diaginertia="{3} {3}'
+        ' {3}"/></body>'
+    )
     text = rod.format("one", 0, 1, 1 / 12) + rod.format("two", 1, 2, 2 / 12)
-    links = [svkc.VirtualLink(kind, "one", "two", kind, pos=(0.5, 0, 0), real_pos=(-0.5, 0, 0)) for kind in ("hinge", "weld")]
-    chain = svkc.load(f'<mujoco><option gravity="0 0 0"/><worldbody>{text}</worldbody></mujoco>', virtual_links=links)
+    links = [
+        svkc.VirtualLink(kind, "one", "two", kind, pos=(0.5, 0, 0), real_pos=(-0.5, 0, 0))
+        for kind in ("hinge", "weld")
+    ]
+    chain = svkc.load(
+        f'<mujoco><option gravity="0 0 0"/><worldbody>{text}</worldbody></mujoco>',
+        virtual_links=links,
+    )
     before = chain.state(v=jnp.array(case["v_before"]), connected=())
     for kind, key, energy in (("hinge", "v_after_revolute", 1), ("weld", "v_after_weld", 2)):
         after = svkc.connect(chain, before, kind)
         np.testing.assert_allclose(after.v[:6], case[key], atol=1e-14)
-        assert float(svkc.kinetic_energy(chain, after)) == pytest.approx(case["kinetic"][energy], rel=1e-14)
+        assert float(svkc.kinetic_energy(chain, after)) == pytest.approx(
+            case["kinetic"][energy], rel=1e-14
+        )
         linear, angular = svkc.momentum(chain, after)
         np.testing.assert_allclose([*linear[:2], angular[2]], case["momenta_before"], atol=1e-14)
 
 
 @pytest.mark.slow
 def test_pendulum_released():
-    """A rod comes off its pin at an angle and flies: the time, the rate, and the path of both parts."""
+    """A rod comes off its pin at an angle and flies: the time, the rate, and the path of both
+    parts."""
     case = given("events")["pendulum_release"]
     rod = '<body name="rod"><joint name="pin" axis="0 0 1"/><inertial pos="0 -0.5 0" mass="1" '
     rod += f'diaginertia="{1 / 12!r} 0.01 {1 / 12!r}"/></body>'
-    chain = svkc.load(f'<mujoco><option gravity="0 -9.81 0"/><worldbody>{rod}</worldbody></mujoco>', cuttable="pin")
+    chain = svkc.load(
+        f'<mujoco><option gravity="0 -9.81 0"/><worldbody>{rod}</worldbody></mujoco>',
+        cuttable="pin",
+    )
     # half the angle's sine: its angle is -0.5
-    event = svkc.when(lambda t, s, args: svkc.poses(chain, s)[1][1, 3] + jnp.sin(0.25), cut="pin", direction=False)
-    traj = svkc.simulate(chain, chain.state({"pin": np.pi / 2}), 2.0, ts=jnp.array(case["t"]), events=[event], **tight(1e-13))
+    event = svkc.when(
+        lambda t, s, args: svkc.poses(chain, s)[1][1, 3] + jnp.sin(0.25), cut="pin", direction=False
+    )
+    traj = svkc.simulate(
+        chain,
+        chain.state({"pin": np.pi / 2}),
+        2.0,
+        ts=jnp.array(case["t"]),
+        events=[event],
+        **tight(1e-13),
+    )
     assert float(traj.events.time[0]) == pytest.approx(case["t_event"], abs=1e-12)
-    place, quat = (np.asarray(x)[:, 1] for x in jax.vmap(lambda s: svkc.poses(chain, s))(traj.states))
+    place, quat = (
+        np.asarray(x)[:, 1] for x in jax.vmap(lambda s: svkc.poses(chain, s))(traj.states)
+    )
     expected = np.array(case["theta_comx_comy"])
     com = place[:, :2] + 0.5 * np.stack([np.sin(expected[:, 0]), -np.cos(expected[:, 0])], 1)
     np.testing.assert_allclose(com, expected[:, 1:], atol=1e-11)
@@ -300,8 +451,14 @@ def test_pendulum_released():
 def test_simple_pendulum_for_a_long_time():
     """IFToMM A01: a point mass on a rod without mass, from the level, 42 periods and more."""
     case = given("events")["a01_simple_pendulum"]
-    rod = '<body name="rod"><joint name="pin" axis="0 0 1"/><inertial pos="1 0 0" mass="1" diaginertia="1e-15 1e-15 1e-15"/></body>'
-    chain = svkc.load(f'<mujoco><compiler balanceinertia="false"/><option gravity="0 -9.81 0"/><worldbody>{rod}</worldbody></mujoco>')
+    rod = (
+        '<body name="rod"><joint name="pin" axis="0 0 1"/><inertial pos="1 0 0" mass="1"'
+        ' diaginertia="1e-15 1e-15 1e-15"/></body>'
+    )
+    chain = svkc.load(
+        '<mujoco><compiler balanceinertia="false"/><option gravity="0 -9.81'
+        f' 0"/><worldbody>{rod}</worldbody></mujoco>'
+    )
     ts = [t for t in case["t"] if t <= 100]
     traj = svkc.simulate(chain, chain.state(), 100.0, ts=jnp.array(ts), **tight(1e-13))
     found = np.stack([np.cos(traj.states.q[:, 0]), np.sin(traj.states.q[:, 0])], 1)
@@ -310,26 +467,42 @@ def test_simple_pendulum_for_a_long_time():
 
 @pytest.mark.slow
 def test_an_elbow_that_locks():
-    """Rate, angular momentum and kinetic energy of a double pendulum whose elbow is locked in full swing: the closed form."""
+    """Rate, angular momentum and kinetic energy of a double pendulum whose elbow is locked in full
+    swing: the closed form."""
     case = given("events")["joint_lock"]
-    rod = '<body name="{0}" pos="{1}"><joint name="{0}" axis="0 0 1"/><inertial pos="0 -0.5 0" mass="1" diaginertia="{2} 0.01 {2}"/>{3}</body>'
-    text = rod.format("shoulder", "0 0 0", repr(1 / 12), rod.format("elbow", "0 -1 0", repr(1 / 12), ""))
-    chain = svkc.load(f'<mujoco><option gravity="0 -9.81 0"/><worldbody>{text}</worldbody></mujoco>')
+    rod = (
+        '<body name="{0}" pos="{1}"><joint name="{0}" axis="0 0 1"/><inertial pos="0 -0.5 0"'
+        ' mass="1" diaginertia="{2} 0.01 {2}"/>{3}</body>'
+    )
+    text = rod.format(
+        "shoulder", "0 0 0", repr(1 / 12), rod.format("elbow", "0 -1 0", repr(1 / 12), "")
+    )
+    chain = svkc.load(
+        f'<mujoco><option gravity="0 -9.81 0"/><worldbody>{text}</worldbody></mujoco>'
+    )
     before = chain.state({"elbow": 0.8}, {"shoulder": 2.0, "elbow": -5.0})
     after = svkc.lock(chain, before, "elbow")
     np.testing.assert_allclose(after.v, [case["rate_after"], 0], atol=1e-14)
     for state, energy in zip((before, after), case["kinetic"], strict=True):
         assert float(svkc.kinetic_energy(chain, state)) == pytest.approx(energy, rel=1e-14)
         # about the shoulder: of what the ground's pin cannot change
-        assert float((svkc.mass_matrix(chain, state) @ state.v)[0]) == pytest.approx(case["angular_momentum"], rel=1e-14)
+        assert float((svkc.mass_matrix(chain, state) @ state.v)[0]) == pytest.approx(
+            case["angular_momentum"], rel=1e-14
+        )
 
 
 @pytest.mark.slow
 def test_a_ball_that_bounces_ever_faster():
-    """Impacts are plastic here; one with restitution is a run that ends, a velocity put in by hand, and the next run: 25 of them, towards a last instant."""
+    """Impacts are plastic here; one with restitution is a run that ends, a velocity put in by hand,
+    and the next run: 25 of them, towards a last instant."""
     case = given("events")["bouncing_ball_zeno"]
-    ball = '<body name="ball"><joint name="z" type="slide" axis="0 0 1"/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body>'
-    chain = svkc.load(f'<mujoco><option gravity="0 0 -9.81"/><worldbody>{ball}</worldbody></mujoco>')
+    ball = (
+        '<body name="ball"><joint name="z" type="slide" axis="0 0 1"/><inertial pos="0 0 0"'
+        ' mass="1" diaginertia="1 1 1"/></body>'
+    )
+    chain = svkc.load(
+        f'<mujoco><option gravity="0 0 -9.81"/><worldbody>{ball}</worldbody></mujoco>'
+    )
     ground = svkc.when(lambda t, s, args: s.q[0], stop=True, direction=False)
 
     @jax.jit

@@ -1,4 +1,5 @@
-"""Many runs at once: lanes that differ in all they can, chunks, devices, processes, interruptions."""
+"""Many runs at once: lanes that differ in all they can, chunks, devices, processes,
+interruptions."""
 
 import os
 import pathlib
@@ -22,7 +23,12 @@ LANES = 11
 def lane(chain, x):
     """Every lane its own release, torque, gravity and end."""
     chain = eqx.tree_at(lambda c: c.gravity, chain, chain.gravity * x["gravity"])
-    return {"chain": chain, "events": [svkc.at(x["release"], cut="grip")], "args": x["torque"], "t1": x["end"]}
+    return {
+        "chain": chain,
+        "events": [svkc.at(x["release"], cut="grip")],
+        "args": x["torque"],
+        "t1": x["end"],
+    }
 
 
 def control(t, state, torque):
@@ -31,18 +37,43 @@ def control(t, state, torque):
 
 def hanging():
     """Two rods held by a grip at the far end, let go at some time."""
-    rods = models.bar("upper", models.Y, "0.5 0 -0.8", inside=models.bar("lower", models.Y, "0.5 0 0.8", "0.5 0 -0.8"))
-    grip = svkc.VirtualLink("grip", "world", "lower", "hinge", pos=(1.0, 0, 0), axis=(0, 1, 0), real_pos=(0.5, 0, 0.8), connected=True)
+    rods = models.bar(
+        "upper",
+        models.Y,
+        "0.5 0 -0.8",
+        inside=models.bar("lower", models.Y, "0.5 0 0.8", "0.5 0 -0.8"),
+    )
+    grip = svkc.VirtualLink(
+        "grip",
+        "world",
+        "lower",
+        "hinge",
+        pos=(1.0, 0, 0),
+        axis=(0, 1, 0),
+        real_pos=(0.5, 0, 0.8),
+        connected=True,
+    )
     chain = svkc.load(models.MJCF.format(rods), virtual_links=[grip])
     share = jnp.linspace(0, 1, LANES)
     # every other lane is not held from the first
     starts = [chain.state({"upper": 0.0}), chain.state({"upper": 0.3}, connected=())]
     states = jax.tree.map(lambda *x: jnp.stack([x[i % 2] for i in range(LANES)]), *starts)
-    return chain, states, {"release": 0.05 + 0.3 * share, "torque": share, "gravity": 1 + share, "end": 0.2 + 0.2 * share}
+    return (
+        chain,
+        states,
+        {
+            "release": 0.05 + 0.3 * share,
+            "torque": share,
+            "gravity": 1 + share,
+            "end": 0.2 + 0.2 * share,
+        },
+    )
 
 
 def call(chain, states, data, **options):
-    return svkc.rollout(chain, states, 0.4, data=data, lane=lane, control=control, rtol=1e-6, atol=1e-8, **options)
+    return svkc.rollout(
+        chain, states, 0.4, data=data, lane=lane, control=control, rtol=1e-6, atol=1e-8, **options
+    )
 
 
 def main(rank, count, port, out, dies=""):
@@ -50,9 +81,16 @@ def main(rank, count, port, out, dies=""):
     if rank == dies:
         save = svkc.Trajectory.save
         svkc.Trajectory.save = lambda *args: (save(*args), os.kill(os.getpid(), signal.SIGKILL))
-    jax.distributed.initialize(f"localhost:{port}", int(count), int(rank), heartbeat_timeout_seconds=10)
+    jax.distributed.initialize(
+        f"localhost:{port}", int(count), int(rank), heartbeat_timeout_seconds=10
+    )
     traj = call(*hanging(), chunk=2, out=out, progress=False)
-    np.savez(pathlib.Path(out) / f"whole_{rank}.npz", q=traj.final.q, times=traj.events.time, result=traj.result._value)
+    np.savez(
+        pathlib.Path(out) / f"whole_{rank}.npz",
+        q=traj.final.q,
+        times=traj.events.time,
+        result=traj.result._value,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +102,9 @@ def case():
 def alone(case):
     """Each lane by itself."""
     chain, states, data = case
-    single = lambda s, own: svkc.simulate(own.pop("chain"), s, control=control, rtol=1e-6, atol=1e-8, throw=False, **own)
+    single = lambda s, own: svkc.simulate(
+        own.pop("chain"), s, control=control, rtol=1e-6, atol=1e-8, throw=False, **own
+    )
     run = jax.jit(lambda s, x: single(s, dict(lane(chain, x))))
     return [run(*jax.tree.map(lambda x, i=i: x[i], (states, data))) for i in range(LANES)]
 
@@ -148,7 +188,12 @@ def start(count, out, dies=""):
     env = {**os.environ, "JAX_ENABLE_X64": "1", "PYTHONPATH": str(pathlib.Path(__file__).parent)}
     line = "import sys, test_rollout; test_rollout.main(*sys.argv[1:])"
     return [
-        subprocess.Popen([sys.executable, "-c", line, str(i), str(count), str(port), str(out), dies], env=env, stderr=subprocess.PIPE, text=True)
+        subprocess.Popen(
+            [sys.executable, "-c", line, str(i), str(count), str(port), str(out), dies],
+            env=env,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
         for i in range(count)
     ]
 

@@ -12,7 +12,9 @@ import pytest
 
 import svkc
 
-PENDULUM = models.MJCF.format(models.bar("arm", models.Y, "0 0 -1")).replace('gravity="0.3 -0.2 -9.81"', 'gravity="0 0 -10"')
+PENDULUM = models.MJCF.format(models.bar("arm", models.Y, "0 0 -1")).replace(
+    'gravity="0.3 -0.2 -9.81"', 'gravity="0 0 -10"'
+)
 
 
 @pytest.fixture(scope="module")
@@ -27,17 +29,21 @@ def high_bar_run(chain, state, right, left, again):
         svkc.at(left, cut="left_hand_grip"),
         svkc.at(again, connect="left_hand_grip", here=True),
     )
-    return svkc.simulate(chain, state, 1.0, ts=jnp.linspace(0, 1.0, 41), events=events, rtol=1e-10, atol=1e-12)
+    return svkc.simulate(
+        chain, state, 1.0, ts=jnp.linspace(0, 1.0, 41), events=events, rtol=1e-10, atol=1e-12
+    )
 
 
 @pytest.fixture(scope="module")
 def compiled():
-    """One compiled program for every run of the high bar in this file, and proof that it was traced once."""
+    """One compiled program for every run of the high bar in this file, and proof that it was traced
+    once."""
     return eqx.filter_jit(eqx.debug.assert_max_traces(high_bar_run, max_traces=1))
 
 
 def test_high_bar(high_bar, compiled):
-    """24, 23, 22 freedoms; energy within each phase to 1e-8, loops to 1e-9 m and rad at every saved time; then a re-catch: one trace."""
+    """24, 23, 22 freedoms; energy within each phase to 1e-8, loops to 1e-9 m and rad at every saved
+    time; then a re-catch: one trace."""
     chain, state = high_bar
     traj = compiled(chain, state, *jnp.array([0.5, 0.75, 10.0]))
     p = traj.phases
@@ -51,7 +57,10 @@ def test_high_bar(high_bar, compiled):
     # what is saved is on the loops as seen from outside, too
     positions, _ = jax.vmap(lambda s: svkc.poses(chain, s))(traj.states)
     hand = positions[:20, chain.body_names.index("right_hand")]
-    assert float(jnp.abs(jnp.linalg.norm(hand - jnp.array([[0, -0.3, 2.6]]), axis=1) - 0.0681).max()) < 1e-12
+    assert (
+        float(jnp.abs(jnp.linalg.norm(hand - jnp.array([[0, -0.3, 2.6]]), axis=1) - 0.0681).max())
+        < 1e-12
+    )
     caught = compiled(chain, state, *jnp.array([0.3, 0.6, 0.8]))
     assert caught.phases.joint_freedoms[:4].tolist() == [24, 23, 22, 23]
     assert float(caught.events.energy_lost[2]) > 0
@@ -61,13 +70,22 @@ def test_high_bar(high_bar, compiled):
 
 @pytest.mark.slow
 def test_a_batch_in_which_every_lane_differs(high_bar, compiled):
-    """Another release time and another starting structure in each lane, one trace, equal to the single runs."""
+    """Another release time and another starting structure in each lane, one trace, equal to the
+    single runs."""
     chain, state = high_bar
     masks = [[True, True], [True, False], [False, False]]
     starts = [svkc.transition(chain, state, np.array(m)) for m in masks]
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *starts)
-    right, left, again = jnp.array([0.2, 0.4, 10.0]), jnp.array([0.5, 0.1, 10.0]), jnp.array([0.7, 10.0, 0.5])
-    batched = eqx.filter_jit(eqx.debug.assert_max_traces(eqx.filter_vmap(high_bar_run, in_axes=(None, 0, 0, 0, 0)), max_traces=1))
+    right, left, again = (
+        jnp.array([0.2, 0.4, 10.0]),
+        jnp.array([0.5, 0.1, 10.0]),
+        jnp.array([0.7, 10.0, 0.5]),
+    )
+    batched = eqx.filter_jit(
+        eqx.debug.assert_max_traces(
+            eqx.filter_vmap(high_bar_run, in_axes=(None, 0, 0, 0, 0)), max_traces=1
+        )
+    )
     traj = batched(chain, stacked, right, left, again)
     for i, start in enumerate(starts):
         one = compiled(chain, start, right[i], left[i], again[i])
@@ -98,7 +116,8 @@ def quarter(pendulum, **kw):
 
 @pytest.mark.slow
 def test_guards_two_in_one_step_the_earliest_wins(pendulum):
-    """Fixed steps of 0.2 s: both guards are crossed within one; in either order the earlier one is found, to what a step of 0.2 s is good for."""
+    """Fixed steps of 0.2 s: both guards are crossed within one; in either order the earlier one is
+    found, to what a step of 0.2 s is good for."""
     fine = quarter(pendulum, events=[svkc.when(angle(g), stop=True) for g in (0.7, 0.3)], dt=1e-3)
     for guards in ([0.7, 0.3], [0.3, 0.7]):
         traj = quarter(pendulum, events=[svkc.when(angle(g), stop=True) for g in guards], dt=0.2)
@@ -112,7 +131,10 @@ def test_guards_two_in_one_step_the_earliest_wins(pendulum):
 @pytest.fixture(scope="module")
 def caught(pendulum):
     """Two guards of one crossing; the second takes hold."""
-    events = [svkc.when(angle(0.7)), svkc.when(lambda t, s, a: 0.7 - s.q[0], connect="hook", here=True)]
+    events = [
+        svkc.when(angle(0.7)),
+        svkc.when(lambda t, s, a: 0.7 - s.q[0], connect="hook", here=True),
+    ]
     return quarter(pendulum, events=events, ts=jnp.linspace(0, 1, 3), rtol=1e-9, atol=1e-11)
 
 
@@ -129,7 +151,8 @@ def test_guards_at_the_same_instant(caught):
 
 @pytest.mark.slow
 def test_event_time_has_the_solvers_accuracy(pendulum):
-    """The time at which the rod passes the vertical: a quarter period, by the arithmetic-geometric mean; and no more events than were asked for."""
+    """The time at which the rod passes the vertical: a quarter period, by the arithmetic-geometric
+    mean; and no more events than were asked for."""
     m, length, com = 1.0, 1.0, 0.5
     model = pendulum.model.model
     inertia = 1 / model.dof_invweight0[0]
@@ -141,7 +164,14 @@ def test_event_time_has_the_solvers_accuracy(pendulum):
     traj = quarter(pendulum, events=[svkc.when(angle(0.0))], rtol=1e-11, atol=1e-13, max_events=2)
     assert abs(float(traj.events.time[0]) - expected) < 1e-10
     # the program of that run, for longer than it has room
-    many = svkc.simulate(pendulum, pendulum.state({"arm": 1.0}), 9.0, events=[svkc.when(angle(0.0))], max_events=2, throw=False)
+    many = svkc.simulate(
+        pendulum,
+        pendulum.state({"arm": 1.0}),
+        9.0,
+        events=[svkc.when(angle(0.0))],
+        max_events=2,
+        throw=False,
+    )
     assert many.result == svkc.RESULTS.max_events
     assert int(many.events.count) == 2
     assert 0 < float(many.t_final) < 9
@@ -149,15 +179,24 @@ def test_event_time_has_the_solvers_accuracy(pendulum):
 
 @pytest.mark.slow
 def test_direction_and_rearming(pendulum):
-    """A guard without an action records every crossing; with a direction every second one; one that starts at zero has not crossed."""
+    """A guard without an action records every crossing; with a direction every second one; one that
+    starts at zero has not crossed."""
     state = pendulum.state({"arm": 0.5})
-    events = [svkc.when(angle(0.0)), svkc.when(angle(0.0), direction=True), svkc.when(angle(0.5), direction=True)]
+    events = [
+        svkc.when(angle(0.0)),
+        svkc.when(angle(0.0), direction=True),
+        svkc.when(angle(0.5), direction=True),
+    ]
     traj = svkc.simulate(pendulum, state, 3.0, events=events, rtol=1e-8, atol=1e-10)
     which = traj.events.which[: int(traj.events.count)].tolist()
     assert which.count(0) == 2 * which.count(1) or which.count(0) == 2 * which.count(1) + 1
     assert which.count(1) >= 1
     # (at the top of the swing it is touched again, by a hair or not)
-    assert all(time > 1 for time, i in zip(traj.events.time.tolist(), traj.events.which.tolist(), strict=True) if i == 2)
+    assert all(
+        time > 1
+        for time, i in zip(traj.events.time.tolist(), traj.events.which.tolist(), strict=True)
+        if i == 2
+    )
 
 
 @pytest.mark.slow
@@ -165,7 +204,12 @@ def test_events_at_the_ends_and_together(pendulum):
     """At t0, at t1, and there a guard's as well."""
     state = pendulum.state({"arm": 0.5}, {"arm": 1.0})
     last = svkc.when(lambda t, s, args: t - 1.0, stop=True)
-    events = [svkc.at(0.0, connect="hook", here=True), svkc.at(0.5, cut="hook"), svkc.at(1.0, connect="hook", here=True), last]
+    events = [
+        svkc.at(0.0, connect="hook", here=True),
+        svkc.at(0.5, cut="hook"),
+        svkc.at(1.0, connect="hook", here=True),
+        last,
+    ]
     traj = svkc.simulate(pendulum, state, 1.0, ts=jnp.array([0.0, 0.25, 0.5, 1.0]), events=events)
     assert traj.events.time[:4].tolist() == [0, 0.5, 1.0, 1.0]
     assert traj.events.which[:4].tolist() == [0, 1, 2, 3]
@@ -187,13 +231,20 @@ def test_fixed_and_adaptive_steps_agree(pendulum):
 
 
 def test_control_and_work(pendulum, capsys):
-    """Torque of a control, and the energy it puts in, are accounted for; one that is no number from some time on ends the run with a code."""
+    """Torque of a control, and the energy it puts in, are accounted for; one that is no number from
+    some time on ends the run with a code."""
 
     def control(t, state, args):
         return args[0] * jnp.ones(1) * jnp.sin(5 * t) + 0 * jnp.log(args[1] - t)
 
     run = lambda *args: quarter(
-        pendulum, control=control, args=jnp.array(args), rtol=1e-10, atol=1e-12, progress_meter=diffrax.TextProgressMeter(), throw=False
+        pendulum,
+        control=control,
+        args=jnp.array(args),
+        rtol=1e-10,
+        atol=1e-12,
+        progress_meter=diffrax.TextProgressMeter(),
+        throw=False,
     )
     traj = run(3.0, 2.0)
     jax.effects_barrier()
@@ -206,14 +257,23 @@ def test_control_and_work(pendulum, capsys):
 
 def gap_of_two_seconds(held) -> float:
     chain = models.four_bar()
-    traj = svkc.simulate(chain, chain.state(v={"crank": 4.0}), 2.0, ts=jnp.linspace(0, 2, 21), dt=0.01, stabilization=held, throw=False)
+    traj = svkc.simulate(
+        chain,
+        chain.state(v={"crank": 4.0}),
+        2.0,
+        ts=jnp.linspace(0, 2, 21),
+        dt=0.01,
+        stabilization=held,
+        throw=False,
+    )
     return float(traj.gaps.max())
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("held", [svkc.Projection(), svkc.Exact()])
 def test_drift_is_held(held):
-    """A four-bar for 2 s: projection keeps the loop to round-off, after steps or at every evaluation."""
+    """A four-bar for 2 s: projection keeps the loop to round-off, after steps or at every
+    evaluation."""
     assert gap_of_two_seconds(held) < 1e-13
 
 
@@ -247,7 +307,8 @@ def test_the_motion_does_not_depend_on_the_coordinates():
 
 @pytest.mark.slow
 def test_results_tell_what_went_wrong(pendulum):
-    """Too few steps; a link that is elsewhere. (Too many events: with the time of one; numbers that are none: with control.)"""
+    """Too few steps; a link that is elsewhere. (Too many events: with the time of one; numbers that
+    are none: with control.)"""
     state = pendulum.state({"arm": 1.0})
     short = svkc.simulate(pendulum, state, 1.0, dt=1e-3, max_steps=10, throw=False)
     assert short.result == svkc.RESULTS.max_steps
@@ -285,10 +346,17 @@ def test_wrong_calls(kw, message):
     kw = {"state": chain.state(), "t1": 1.0} | kw
     with pytest.raises(ValueError, match=message):
         svkc.simulate(chain, **kw)
-    single = eqx.tree_at(lambda s: (s.q, s.v), chain.state(), replace_fn=lambda x: x.astype(jnp.float32))
+    single = eqx.tree_at(
+        lambda s: (s.q, s.v), chain.state(), replace_fn=lambda x: x.astype(jnp.float32)
+    )
     with pytest.raises(ValueError, match="same precision"):
         svkc.simulate(chain, single, 1.0)
-    for wrong in (lambda: svkc.at(0.5, connect=3), lambda: svkc.when(3), lambda: svkc.when(angle(0), direction="up"), lambda: svkc.at(1.0, here="a")):
+    for wrong in (
+        lambda: svkc.at(0.5, connect=3),
+        lambda: svkc.when(3),
+        lambda: svkc.when(angle(0), direction="up"),
+        lambda: svkc.at(1.0, here="a"),
+    ):
         with pytest.raises((ValueError, TypeError)):
             wrong()
 
@@ -307,7 +375,8 @@ def test_save_and_load(tmp_path, pendulum, caught):
 
 
 def test_a_saved_run_goes_on(tmp_path, pendulum):
-    """Chain and state from the file, the chain's floats no longer those of its model: on bit for bit. What else is told of the run."""
+    """Chain and state from the file, the chain's floats no longer those of its model: on bit for
+    bit. What else is told of the run."""
     heavier = eqx.tree_at(lambda c: c.mass, pendulum, pendulum.mass * 1.1)
     traj = svkc.simulate(heavier, pendulum.state({"arm": 1.2}), 1.0, ts=FIVE)
     traj.save(tmp_path / "run.npz", heavier, rtol=1e-8, solver=diffrax.Tsit5())
@@ -325,18 +394,26 @@ def test_a_saved_run_goes_on(tmp_path, pendulum):
 
 @pytest.mark.slow
 def test_guards_that_jump(pendulum):
-    """A guard that jumps in time happens where it jumps; one that a change of structure makes jump has not crossed."""
+    """A guard that jumps in time happens where it jumps; one that a change of structure makes jump
+    has not crossed."""
     state = pendulum.state({"arm": 1.2})
     jumps = svkc.when(lambda t, s, a: jnp.where(t > 0.5, 1.0 + t, -1.0))
     later = svkc.when(lambda t, s, a: jnp.where(s.structure.connected[0], s.q[0] - 2.0, 1.0))
-    traj = svkc.simulate(pendulum, state, 1.0, events=[jumps, svkc.at(0.3, connect="hook", here=True), later], rtol=1e-8)
+    traj = svkc.simulate(
+        pendulum,
+        state,
+        1.0,
+        events=[jumps, svkc.at(0.3, connect="hook", here=True), later],
+        rtol=1e-8,
+    )
     assert traj.events.which[: int(traj.events.count)].tolist() == [1, 0]
     assert traj.events.time[1] == pytest.approx(0.5, abs=1e-7)
 
 
 @pytest.mark.slow
 def test_one_step_by_itself():
-    """What `simulate` does in a step of that kind; of first order, loops kept, in a batch of lanes that are joined differently."""
+    """What `simulate` does in a step of that kind; of first order, loops kept, in a batch of lanes
+    that are joined differently."""
     chain = models.four_bar()
     state, dt = chain.state(v={"crank": 3.0}), 1e-3
     alone = svkc.step(chain, state, jnp.zeros(chain.nv), dt)
@@ -346,10 +423,17 @@ def test_one_step_by_itself():
     np.testing.assert_allclose(alone.v, run.v, atol=1e-11)
     other = svkc.cut(chain, state, "pin")
     lanes = jax.tree.map(lambda *x: jnp.stack(x), state, state, other, other)
-    walk = lambda s, n: jax.lax.fori_loop(0, n, lambda _, s: svkc.step(chain, s, jnp.zeros(chain.nv), 0.5 / n.astype(float)), s)
+    walk = lambda s, n: jax.lax.fori_loop(
+        0, n, lambda _, s: svkc.step(chain, s, jnp.zeros(chain.nv), 0.5 / n.astype(float)), s
+    )
     ends = jax.jit(jax.vmap(walk))(lanes, jnp.array([500, 1000, 500, 1000]))
     # what loops are open by is of second order
-    gaps = [float(jnp.abs(svkc.loop_gaps(chain, jax.tree.map(lambda x, lane=lane: x[lane], ends))).max()) for lane in (0, 1)]
+    gaps = [
+        float(
+            jnp.abs(svkc.loop_gaps(chain, jax.tree.map(lambda x, lane=lane: x[lane], ends))).max()
+        )
+        for lane in (0, 1)
+    ]
     assert 1.8 < np.log2(gaps[0] / gaps[1]) < 2.2
     assert gaps[1] < 1e-4
     for i, start in ((0, state), (2, other)):
@@ -361,20 +445,32 @@ def test_one_step_by_itself():
 
 
 @pytest.mark.parametrize(
-    ("dtype", "rtol", "atol"), [("float64", 1e-11, 1e-13), ("float64", 1e-4, 1e-6), pytest.param("float32", 1e-5, 8 * 2.0**-23, marks=pytest.mark.slow)]
+    ("dtype", "rtol", "atol"),
+    [
+        ("float64", 1e-11, 1e-13),
+        ("float64", 1e-4, 1e-6),
+        pytest.param("float32", 1e-5, 8 * 2.0**-23, marks=pytest.mark.slow),
+    ],
 )
 def test_the_absolute_tolerance_follows_the_relative_one(pendulum, dtype, rtol, atol):
     """It is a hundredth, or what round-off leaves, so that rtol alone says how exact a run is."""
-    chain, start = jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, (pendulum, pendulum.state({"arm": 0.3})))
+    chain, start = jax.tree.map(
+        lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x,
+        (pendulum, pendulum.state({"arm": 0.3})),
+    )
     ts = FIVE.astype(dtype)
-    alone, both = svkc.simulate(chain, start, 1.0, ts=ts, rtol=rtol), svkc.simulate(chain, start, 1.0, ts=ts, rtol=rtol, atol=atol)
+    alone, both = (
+        svkc.simulate(chain, start, 1.0, ts=ts, rtol=rtol),
+        svkc.simulate(chain, start, 1.0, ts=ts, rtol=rtol, atol=atol),
+    )
     np.testing.assert_array_equal(alone.final.q, both.final.q)
     assert int(alone.report().accepted) == int(both.report().accepted)
 
 
 @pytest.mark.slow
 def test_a_step_that_would_be_too_small(pendulum):
-    """A controller that may not go below its bound gives up where it would have to: a code, the state it came to, and an error when asked to throw."""
+    """A controller that may not go below its bound gives up where it would have to: a code, the
+    state it came to, and an error when asked to throw."""
     controller = diffrax.PIDController(rtol=1e-12, atol=1e-14, dtmin=0.02, force_dtmin=False)
     traj = quarter(pendulum, stepsize_controller=controller, solver=diffrax.Tsit5(), throw=False)
     assert traj.result == svkc.RESULTS.step_too_small

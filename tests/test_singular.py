@@ -1,4 +1,5 @@
-"""Loops that are singular, nearly so, redundant, of no length, or not to be closed: what goes on goes on, what cannot says so, when, and in which loop."""
+"""Loops that are singular, nearly so, redundant, of no length, or not to be closed: what goes on
+goes on, what cannot says so, when, and in which loop."""
 
 import equinox as eqx
 import jax
@@ -16,13 +17,23 @@ FINE = {"rtol": 1e-9, "atol": 1e-11}
 
 def tilted(angle):
     """The four-bar with the axis of its last pin out of the others' direction by a small angle."""
-    pin = svkc.VirtualLink("pin", "world", "rocker", "hinge", pos=(1.2, 0, 0), axis=(np.sin(angle), np.cos(angle), 0), real_pos=(0.2, 0, -0.6), connected=True)
+    pin = svkc.VirtualLink(
+        "pin",
+        "world",
+        "rocker",
+        "hinge",
+        pos=(1.2, 0, 0),
+        axis=(np.sin(angle), np.cos(angle), 0),
+        real_pos=(0.2, 0, -0.6),
+        connected=True,
+    )
     return svkc.load(models.MJCF.format(models.FOUR_BAR), virtual_links=[pin])
 
 
 @pytest.mark.slow
 def test_nearly_redundant_loops():
-    """Tilted by 1e-8 rad a pin's rows still count as redundant, and the bars go round; by 1e-6 they do not, and nothing moves: the margin tells."""
+    """Tilted by 1e-8 rad a pin's rows still count as redundant, and the bars go round; by 1e-6 they
+    do not, and nothing moves: the margin tells."""
     run = eqx.filter_jit(lambda chain, state: svkc.simulate(chain, state, 1.0, **FINE))
     ends = {}
     for angle in (0.0, 1e-8, 1e-6):
@@ -31,7 +42,9 @@ def test_nearly_redundant_loops():
         found = svkc.mobility(chain, state)
         traj = run(chain, state)
         assert int(found.rank) == (3 if angle < 1e-7 else 4)
-        assert float(found.margin) == pytest.approx(0.3032 if angle < 1e-7 else 0.255 * angle, rel=1e-2)
+        assert float(found.margin) == pytest.approx(
+            0.3032 if angle < 1e-7 else 0.255 * angle, rel=1e-2
+        )
         assert float(traj.gaps.max()) <= max(0.5 * angle, 1e-12)
         ends[angle] = float(traj.final.q[0])
     assert ends[0.0] == pytest.approx(7.0109395, abs=1e-6)
@@ -44,7 +57,9 @@ def test_a_wrong_rank_is_seen():
     """Too low, a loop opens and the run stops there; too high, the margin is round-off."""
     chain = models.four_bar()
     state = chain.state(v={"crank": 4.0})
-    forced = lambda rank: eqx.tree_at(lambda s: s.structure.rank, state, jnp.asarray(rank, jnp.int32))
+    forced = lambda rank: eqx.tree_at(
+        lambda s: s.structure.rank, state, jnp.asarray(rank, jnp.int32)
+    )
     for kw in ({"dt": 1e-3}, FINE):
         low = svkc.simulate(chain, forced(2), 1.0, throw=False, **kw)
         assert low.result == svkc.RESULTS.loop_open
@@ -60,37 +75,72 @@ def test_a_wrong_rank_is_seen():
 
 @pytest.mark.slow
 def test_loops_that_allow_only_the_first_order():
-    """The pelvis turned on the swing's seat: two parallel slides allow the rate, not the turn. The run stops as they open, and names one of them."""
+    """The pelvis turned on the swing's seat: two parallel slides allow the rate, not the turn. The
+    run stops as they open, and names one of them."""
     from svkc.scenes.swing import swing
 
     chain, seated = swing(ignore="limit")
     state = chain.state(seated.q[: chain.nq], {"base": [2.2, 0.1, 0, 0, 0, 0.3]})
-    with pytest.raises(RuntimeError, match=r"t = 0\.01\d+ s, in phase 1, loop '(left|right)_thigh_plate': A loop is open"):
+    with pytest.raises(
+        RuntimeError,
+        match=r"t = 0\.01\d+ s, in phase 1, loop '(left|right)_thigh_plate': A loop is open",
+    ):
         svkc.simulate(chain, state, 0.03)
 
 
 @pytest.mark.slow
 def test_a_loop_of_no_length():
     """A second pin on a hinge that is there already takes nothing away."""
-    rods = models.bar("upper", models.Y, "0 0 -1", inside=models.bar("lower", models.Y, "0 0 -0.8", "0 0 -1"))
-    again = svkc.VirtualLink("again", "upper", "lower", "hinge", pos=(0, 0, -1), real_pos=(0, 0, 0), axis=(0, 1, 0), connected=True)
-    chain, plain = svkc.load(models.MJCF.format(rods), virtual_links=[again]), svkc.load(models.MJCF.format(rods))
+    rods = models.bar(
+        "upper", models.Y, "0 0 -1", inside=models.bar("lower", models.Y, "0 0 -0.8", "0 0 -1")
+    )
+    again = svkc.VirtualLink(
+        "again",
+        "upper",
+        "lower",
+        "hinge",
+        pos=(0, 0, -1),
+        real_pos=(0, 0, 0),
+        axis=(0, 1, 0),
+        connected=True,
+    )
+    chain, plain = (
+        svkc.load(models.MJCF.format(rods), virtual_links=[again]),
+        svkc.load(models.MJCF.format(rods)),
+    )
     pose = {"upper": 0.5}, {"lower": 1.0}
     state = chain.state(*pose)
     assert svkc.mobility(chain, state).freedoms == 2
-    one, other = svkc.simulate(chain, state, 1.0, **FINE), svkc.simulate(plain, plain.state(*pose), 1.0, **FINE)
+    one, other = (
+        svkc.simulate(chain, state, 1.0, **FINE),
+        svkc.simulate(plain, plain.state(*pose), 1.0, **FINE),
+    )
     np.testing.assert_allclose(one.final.q[:2], other.final.q, atol=1e-9)
 
 
 @pytest.mark.slow
 def test_a_loop_that_locks():
-    """A crank longer than its rod reaches no further than a dead centre, where the coordinate that drove it stands still: it turns back there, with all
+    """A crank longer than its rod reaches no further than a dead centre, where the coordinate that
+    drove it stands still: it turns back there, with all
     its energy, on other coordinates."""
-    slider = '<body name="slider"><joint name="slider" type="slide" axis="1 0 0"/><geom size="0.05" mass="1" contype="0"/></body>'
-    crank = models.bar("crank", models.Y, "0 0 -1", inside=models.bar("rod", models.Y, "0 0 -0.5", "0 0 -1"))
-    pin = svkc.VirtualLink("pin", "slider", "rod", "hinge", real_pos=(0, 0, -0.5), axis=(0, 1, 0), connected=True)
-    text = models.MJCF.format(f'<body name="at" pos="0 0 -0.9">{slider.split(">", 1)[1].rsplit("</body>", 1)[0]}</body>' + crank)
-    chain = svkc.load(text.replace("0.3 -0.2", "0 0"), virtual_links=[svkc.VirtualLink(**{**vars(pin), "parent": "at"})])
+    slider = (
+        '<body name="slider"><joint name="slider" type="slide" axis="1 0 0"/><geom size="0.05"'
+        ' mass="1" contype="0"/></body>'
+    )
+    crank = models.bar(
+        "crank", models.Y, "0 0 -1", inside=models.bar("rod", models.Y, "0 0 -0.5", "0 0 -1")
+    )
+    pin = svkc.VirtualLink(
+        "pin", "slider", "rod", "hinge", real_pos=(0, 0, -0.5), axis=(0, 1, 0), connected=True
+    )
+    text = models.MJCF.format(
+        f'<body name="at" pos="0 0 -0.9">{slider.split(">", 1)[1].rsplit("</body>", 1)[0]}</body>'
+        + crank
+    )
+    chain = svkc.load(
+        text.replace("0.3 -0.2", "0 0"),
+        virtual_links=[svkc.VirtualLink(**{**vars(pin), "parent": "at"})],
+    )
     state = chain.state({"crank": 0.2, "rod": -0.5}, {"crank": 2.0})
     ts = jnp.linspace(0, 3.0, 301)
     traj = svkc.simulate(chain, state, 3.0, ts=ts, **FINE)
@@ -104,10 +154,24 @@ def test_a_loop_that_locks():
 
 @pytest.mark.slow
 def test_without_pivots_a_singular_configuration_may_end_the_run():
-    """A slider-crank of equal bars whose slider weighs nothing: as the bars align, nothing but the choice of pivots tells where it goes."""
-    bar = '<body name="{0}" pos="{1} 0 0"><joint name="{0}" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 1 0 0" size="0.02"/>'
-    slot = svkc.VirtualLink("slot", "world", "rod", (False, True, False, True, False, False), real_pos=(1, 0, 0), connected=True)
-    chain = svkc.load(models.MJCF.format(bar.format("crank", 0) + bar.format("rod", 1) + "</body></body>"), virtual_links=[slot])
+    """A slider-crank of equal bars whose slider weighs nothing: as the bars align, nothing but the
+    choice of pivots tells where it goes."""
+    bar = (
+        '<body name="{0}" pos="{1} 0 0"><joint name="{0}" axis="0 1 0"/><geom type="capsule"'
+        ' fromto="0 0 0 1 0 0" size="0.02"/>'
+    )
+    slot = svkc.VirtualLink(
+        "slot",
+        "world",
+        "rod",
+        (False, True, False, True, False, False),
+        real_pos=(1, 0, 0),
+        connected=True,
+    )
+    chain = svkc.load(
+        models.MJCF.format(bar.format("crank", 0) + bar.format("rod", 1) + "</body></body>"),
+        virtual_links=[slot],
+    )
     state = chain.state({"crank": -np.pi / 4, "rod": np.pi / 2}, {"crank": 3.0})
     run = lambda **kw: svkc.simulate(chain, state, 3.0, throw=False, **kw)
     through, not_through = run(), run(dynamics=svkc.Dynamics(inertia=svkc.by_bodies))
@@ -121,7 +185,8 @@ def test_without_pivots_a_singular_configuration_may_end_the_run():
 @pytest.mark.slow
 @pytest.mark.parametrize("before", [1e-2, 1e-4, 1e-6, 0.0])
 def test_started_beside_a_singular_configuration(before):
-    """The N four-bar as its bars align, or nearly: it goes on as the parallelogram that it moves as, the direction of its velocity kept."""
+    """The N four-bar as its bars align, or nearly: it goes on as the parallelogram that it moves
+    as, the direction of its velocity kept."""
     case = next(case for case in given("n_four_bar")["cases"] if case["N"] == 2)
     chain, state = maximal.load(n_four_bar(2))
     signs = np.sign(np.asarray(state.v))

@@ -1,4 +1,5 @@
-"""A flyball governor after IFToMM's A05, springs of 8e5 N/m with dampers of 4e4 N s/m, against its own equations of motion."""
+"""A flyball governor after IFToMM's A05, springs of 8e5 N/m with dampers of 4e4 N s/m, against its
+own equations of motion."""
 
 import diffrax
 import jax
@@ -13,12 +14,16 @@ pytestmark = pytest.mark.slow
 
 STIFFNESS, DAMPING, START = 8e5, 4e4, np.pi / 6
 BALL, OWN, SLIDER, TURNING, GRAVITY = 5.0, 0.02, 1.0, 0.1, 9.81
-ARM = '<body name="{0}" pos="0 0 1"><joint name="{0}" axis="0 {1} 0"/><inertial pos="0 0 -1" mass="5" diaginertia="0.02 0.02 0.02"/></body>'
+ARM = (
+    '<body name="{0}" pos="0 0 1"><joint name="{0}" axis="0 {1} 0"/><inertial pos="0 0 -1" mass="5"'
+    ' diaginertia="0.02 0.02 0.02"/></body>'
+)
 GOVERNOR = (
-    '<mujoco><option gravity="0 0 -9.81"/><worldbody><body name="shaft"><joint name="shaft" axis="0 0 1"/>'
-    f'<inertial pos="0 0 0.5" mass="1" diaginertia="0.1 0.1 0.1"/>{ARM.format("left", -1)}{ARM.format("right", 1)}'
-    '<body name="slider"><joint name="slider" type="slide" axis="0 0 1"/><inertial pos="0 0 0" mass="1" diaginertia="0.1 0.1 0.1"/></body>'
-    "</body></worldbody></mujoco>"
+    '<mujoco><option gravity="0 0 -9.81"/><worldbody><body name="shaft"><joint name="shaft"'
+    ' axis="0 0 1"/><inertial pos="0 0 0.5" mass="1" diaginertia="0.1 0.1'
+    f' 0.1"/>{ARM.format("left", -1)}{ARM.format("right", 1)}<body name="slider"><joint'
+    ' name="slider" type="slide" axis="0 0 1"/><inertial pos="0 0 0" mass="1" diaginertia="0.1 0.1'
+    ' 0.1"/></body></body></worldbody></mujoco>'
 )
 
 
@@ -32,28 +37,47 @@ REST = stretch(START, LOW)
 
 
 def by_hand(t1):
-    """Angle of the shaft, of the arms, height of the slider at the end: Lagrange's equations of the symmetric motion, by LSODA."""
+    """Angle of the shaft, of the arms, height of the slider at the end: Lagrange's equations of the
+    symmetric motion, by LSODA."""
     turned = lambda angle: 2 * TURNING + 2 * OWN + 2 * BALL * np.sin(angle) ** 2
     spin = turned(START) * 2 * np.pi
 
     def rates(t, y):
         _, angle, height, opening, rising = y
         length = stretch(angle, height)
-        by_angle = (np.sin(angle) * np.cos(angle) / 2 - (height - 1 + np.cos(angle) / 2) * np.sin(angle)) / 2 / length
+        by_angle = (
+            (np.sin(angle) * np.cos(angle) / 2 - (height - 1 + np.cos(angle) / 2) * np.sin(angle))
+            / 2
+            / length
+        )
         by_height = (height - 1 + np.cos(angle) / 2) / length
         pull = STIFFNESS * (length - REST) + DAMPING * (by_angle * opening + by_height * rising)
         rate = spin / turned(angle)
-        swung = BALL * np.sin(angle) * np.cos(angle) * rate**2 - BALL * GRAVITY * np.sin(angle) - pull * by_angle
-        return [rate, opening, rising, swung / (BALL + OWN), -GRAVITY - 2 * pull * by_height / SLIDER]
+        swung = (
+            BALL * np.sin(angle) * np.cos(angle) * rate**2
+            - BALL * GRAVITY * np.sin(angle)
+            - pull * by_angle
+        )
+        return [
+            rate,
+            opening,
+            rising,
+            swung / (BALL + OWN),
+            -GRAVITY - 2 * pull * by_height / SLIDER,
+        ]
 
-    return solve_ivp(rates, (0, t1), [0, START, LOW, 0, 0], method="LSODA", rtol=1e-10, atol=1e-12).y[:3, -1]
+    return solve_ivp(
+        rates, (0, t1), [0, START, LOW, 0, 0], method="LSODA", rtol=1e-10, atol=1e-12
+    ).y[:3, -1]
 
 
 def control(t, state, args):
     """The springs and dampers, as joint torques."""
     lengths = lambda q: stretch(q[1:3], q[3], jnp)
     length, back = jax.vjp(lengths, state.q)
-    return back(-STIFFNESS * (length - REST) - DAMPING * jax.jvp(lengths, (state.q,), (state.v,))[1])[0]
+    return back(
+        -STIFFNESS * (length - REST) - DAMPING * jax.jvp(lengths, (state.q,), (state.v,))[1]
+    )[0]
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +87,11 @@ def governor():
     return lambda **kw: svkc.simulate(chain, state, 0.5, control=control, **kw)
 
 
-@pytest.mark.parametrize(("solver", "error", "most"), [(None, 1e-8, 3000), (diffrax.Kvaerno5(), 5e-6, 200)], ids=["explicit", "implicit"])
+@pytest.mark.parametrize(
+    ("solver", "error", "most"),
+    [(None, 1e-8, 3000), (diffrax.Kvaerno5(), 5e-6, 200)],
+    ids=["explicit", "implicit"],
+)
 def test_flyball_governor(governor, solver, error, most):
     traj = governor(solver=solver)
     np.testing.assert_allclose(traj.final.q[jnp.array([0, 1, 3])], by_hand(0.5), atol=error)
@@ -72,6 +100,7 @@ def test_flyball_governor(governor, solver, error, most):
 
 
 def test_solvers_keep_the_root_finder_they_are_given(governor):
-    """Stages that are solved with one Jacobian for all give steps up far sooner than by Newton's method, which svkc fills in where none is given."""
+    """Stages that are solved with one Jacobian for all give steps up far sooner than by Newton's
+    method, which svkc fills in where none is given."""
     frozen = diffrax.Kvaerno5(root_finder=diffrax.VeryChord(rtol=1e-7, atol=1e-9))
     assert int(governor(solver=frozen).report().accepted) > 500

@@ -18,16 +18,28 @@ INDICES = {
 }
 
 
-SLOW = [pytest.param(index, id=name, marks=pytest.mark.slow) for name, index in INDICES.items() if name != "some"]
+SLOW = [
+    pytest.param(index, id=name, marks=pytest.mark.slow)
+    for name, index in INDICES.items()
+    if name != "some"
+]
 
 
 @pytest.mark.parametrize("index", [pytest.param(INDICES["some"], id="some"), *SLOW])
 def test_it_is_indexing(index):
-    x, many = jax.random.normal(jax.random.key(0), (7, 3)), jax.random.normal(jax.random.key(1), (7, 5, 3))
+    x, many = (
+        jax.random.normal(jax.random.key(0), (7, 3)),
+        jax.random.normal(jax.random.key(1), (7, 5, 3)),
+    )
     ours = lambda x: jnp.sin(take(x, index))
     theirs = lambda x: jnp.sin(jnp.concatenate([x, jnp.zeros((1, *x.shape[1:]))])[index])
     once, twice = jax.vmap(ours, 1, -1), jax.vmap(theirs, 1, -1)
-    for f, g, at in ((ours, theirs, x), (jax.jit(ours), theirs, x), (ours, theirs, x[:, 0]), (once, twice, many)):
+    for f, g, at in (
+        (ours, theirs, x),
+        (jax.jit(ours), theirs, x),
+        (ours, theirs, x[:, 0]),
+        (once, twice, many),
+    ):
         np.testing.assert_array_equal(f(at), g(at))
         both = lambda f, at=at: jax.jit(lambda x: (jax.jacfwd(f)(x), jax.jacrev(f)(x)))(at)
         for got, expected in zip(both(f), both(g), strict=True):
@@ -37,7 +49,11 @@ def test_it_is_indexing(index):
 
 
 def test_derivatives_without_a_scatter():
-    made = lambda rows, index: jax.jit(jax.grad(lambda x: jnp.sum(jnp.sin(take(x, index))))).lower(jnp.ones((rows, 3))).as_text()
+    made = lambda rows, index: (
+        jax.jit(jax.grad(lambda x: jnp.sum(jnp.sin(take(x, index)))))
+        .lower(jnp.ones((rows, 3)))
+        .as_text()
+    )
     for name, index in INDICES.items():
         assert "scatter" not in made(7, index), name
     # what would be a table of 100 x 90 is left to jax

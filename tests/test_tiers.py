@@ -14,7 +14,13 @@ FOLDER = pathlib.Path(__file__).parent
 # calls that are there to be refused
 REFUSED = ("test_errors", "test_fuzz")
 # nouns that are made by a function, not by their name
-MADE_BY = {"Chain": "load", "Check": "check_grad", "Program": "compile", "Structure": "transition", "Trajectory": "simulate"}
+MADE_BY = {
+    "Chain": "load",
+    "Check": "check_grad",
+    "Program": "compile",
+    "Structure": "transition",
+    "Trajectory": "simulate",
+}
 
 
 @functools.cache
@@ -24,28 +30,39 @@ def parsed(name: str) -> ast.Module:
 
 @functools.cache
 def defined(name: str) -> dict[str, ast.AST]:
-    """What a file defines by name: functions, classes, constants, and the helper files that it imports."""
+    """What a file defines by name: functions, classes, constants, and the helper files that it
+    imports."""
     found: dict[str, ast.AST] = {}
     for node in parsed(name).body:
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
             found[node.name] = node
         elif isinstance(node, ast.Assign):
-            found |= {target.id: node.value for target in node.targets if isinstance(target, ast.Name)}
+            found |= {
+                target.id: node.value for target in node.targets if isinstance(target, ast.Name)
+            }
     return found
 
 
 def says(node: ast.AST, what: str) -> bool:
-    return any(isinstance(part, ast.Attribute) and ast.unparse(part) == what for part in ast.walk(node))
+    return any(
+        isinstance(part, ast.Attribute) and ast.unparse(part) == what for part in ast.walk(node)
+    )
 
 
 def slow(test: ast.FunctionDef, file: str) -> bool:
     """As a whole: a test of which only some parameters are marked has others in the fast tier."""
-    whole = any(isinstance(node, ast.Assign) and ast.unparse(node) == "pytestmark = pytest.mark.slow" for node in parsed(file).body)
-    return whole or any(ast.unparse(decorator) == "pytest.mark.slow" for decorator in test.decorator_list)
+    whole = any(
+        isinstance(node, ast.Assign) and ast.unparse(node) == "pytestmark = pytest.mark.slow"
+        for node in parsed(file).body
+    )
+    return whole or any(
+        ast.unparse(decorator) == "pytest.mark.slow" for decorator in test.decorator_list
+    )
 
 
 class Names(ast.NodeVisitor):
-    """Names of svkc that a definition comes upon, by way of what it names in its own file, its fixtures and its helpers; but for what it has refused."""
+    """Names of svkc that a definition comes upon, by way of what it names in its own file, its
+    fixtures and its helpers; but for what it has refused."""
 
     def __init__(self):
         self.public, self.seen = set(), set()
@@ -86,25 +103,45 @@ class Names(ast.NodeVisitor):
 
 
 def test_the_fast_tier_names_every_public_function():
-    """That a test of it reaches the name in code that is to succeed; what the test looks at there, this does not say."""
+    """That a test of it reaches the name in code that is to succeed; what the test looks at there,
+    this does not say."""
     names = Names()
     for path in sorted(FOLDER.glob("test_*.py")):
         if path.stem in (*REFUSED, "test_tiers"):
             continue
         for name, node in defined(path.stem).items():
-            if name.startswith("test_") and isinstance(node, ast.FunctionDef) and not slow(node, path.stem):
+            if (
+                name.startswith("test_")
+                and isinstance(node, ast.FunctionDef)
+                and not slow(node, path.stem)
+            ):
                 names.come_upon(path.stem, name)
-    public = {name for name in dir(svkc) if not name.startswith("_") and callable(getattr(svkc, name))}
+    public = {
+        name for name in dir(svkc) if not name.startswith("_") and callable(getattr(svkc, name))
+    }
     wanted = {MADE_BY.get(name, name) for name in public}
     missing = wanted - names.public
     assert not missing, ", ".join(sorted(missing))
 
 
-@pytest.mark.parametrize(("given", "collected"), [((), ["fast"]), (("-m", "slow"), ["slow"]), (("-m", "slow or not slow"), ["fast", "slow"])])
+@pytest.mark.parametrize(
+    ("given", "collected"),
+    [((), ["fast"]), (("-m", "slow"), ["slow"]), (("-m", "slow or not slow"), ["fast", "slow"])],
+)
 def test_which_tier_is_run(pytester, given, collected):
-    """Without -m the fast one, by the project's own settings; -m on the command line comes last and holds."""
+    """Without -m the fast one, by the project's own settings; -m on the command line comes last and
+    holds."""
     settings = (FOLDER.parent / "pyproject.toml").read_text()
-    pytester.makepyprojecttoml(settings[settings.index("[tool.pytest.ini_options]") : settings.index("[tool.ruff]")])
-    pytester.makepyfile("import pytest\ndef test_fast(): pass\n@pytest.mark.slow\ndef test_slow(): pass\n")
-    reports = pytester.inline_run("-n", "0", "test_which_tier_is_run.py", *given).getreports("pytest_runtest_logreport")
-    assert sorted(report.nodeid.split("::test_")[1] for report in reports if report.when == "call") == collected
+    pytester.makepyprojecttoml(
+        settings[settings.index("[tool.pytest.ini_options]") : settings.index("[tool.ruff]")]
+    )
+    pytester.makepyfile(
+        "import pytest\ndef test_fast(): pass\n@pytest.mark.slow\ndef test_slow(): pass\n"
+    )
+    reports = pytester.inline_run("-n", "0", "test_which_tier_is_run.py", *given).getreports(
+        "pytest_runtest_logreport"
+    )
+    assert (
+        sorted(report.nodeid.split("::test_")[1] for report in reports if report.when == "call")
+        == collected
+    )

@@ -1,4 +1,5 @@
-"""Derivatives of runs with a guard: under every transformation, twice, by every adjoint, and where there are none."""
+"""Derivatives of runs with a guard: under every transformation, twice, by every adjoint, and where
+there are none."""
 
 import derivatives
 import equinox as eqx
@@ -25,19 +26,27 @@ def angle(t, state, args):
 
 
 def held(chain, x, ts=None, **kw):
-    """Swings from x[0], held at the angle x[1] if it comes by, let go at the time x[2], until x[3]."""
+    """Swings from x[0], held at the angle x[1] if it comes by, let go at the time x[2], until
+    x[3]."""
     state = chain.state({"arm": 1.2})
     state = svkc.State(state.q.at[0].set(x[0]), state.v, state.structure)
     events = [svkc.when(angle, connect="hook", here=True), svkc.at(x[2], cut="hook")]
-    return svkc.simulate(chain, state, x[3], ts=ts, events=events, args=x[1], max_events=2, **(kw or TIGHT))
+    return svkc.simulate(
+        chain, state, x[3], ts=ts, events=events, args=x[1], max_events=2, **(kw or TIGHT)
+    )
 
 
 @pytest.mark.slow
 def test_the_end_and_an_event_at_a_save_time(pendulum):
-    """dL/dt1 is the rate at the end; what is saved at the time of an event moves with what came before."""
+    """dL/dt1 is the rate at the end; what is saved at the time of an event moves with what came
+    before."""
 
     def f(x):
-        traj = held(pendulum, jnp.stack([x["start"], x["angle"], jnp.asarray(0.8), x["t1"]]), ts=jnp.array([0.5, 0.8]))
+        traj = held(
+            pendulum,
+            jnp.stack([x["start"], x["angle"], jnp.asarray(0.8), x["t1"]]),
+            ts=jnp.array([0.5, 0.8]),
+        )
         return {"end": traj.final.q[0], "saved": traj.states.q[:, 0], "rate": traj.final.v[0]}
 
     x = {"start": jnp.asarray(1.2), "angle": jnp.asarray(0.3), "t1": jnp.asarray(1.3)}
@@ -51,9 +60,11 @@ def test_the_end_and_an_event_at_a_save_time(pendulum):
 
 @pytest.mark.slow
 def test_every_order_of_the_transformations(pendulum):
-    """Lanes with other structures, numbers of events and times: vmap(grad), vmap(jacfwd), grad(vmap), grad of a scan, under jit: all the same.
+    """Lanes with other structures, numbers of events and times: vmap(grad), vmap(jacfwd),
+    grad(vmap), grad of a scan, under jit: all the same.
 
-    (The gradient of one run alone, in both modes and against differences: `test_the_end_and_an_event_at_a_save_time`.)
+    (The gradient of one run alone, in both modes and against differences:
+    `test_the_end_and_an_event_at_a_save_time`.)
     """
     lanes = jnp.array([[1.2, 0.3, 0.8, 1.3], [1.2, -2.0, 0.5, 0.6]])
     com, both = pendulum.com, (0, 1)
@@ -64,7 +75,9 @@ def test_every_order_of_the_transformations(pendulum):
         return traj.final.q[0], traj.events.count
 
     one = lambda x, com: loss(x, com)[0]
-    looped = lambda x, com: jax.lax.scan(lambda total, lane: (total + one(lane, com), None), jnp.zeros(()), x)[0]
+    looped = lambda x, com: jax.lax.scan(
+        lambda total, lane: (total + one(lane, com), None), jnp.zeros(()), x
+    )[0]
     lanewise = lambda derivative, f, **kw: jax.jit(jax.vmap(derivative(f, both, **kw), (0, None)))
     (single, shares), counts = lanewise(jax.grad, loss, has_aux=True)(lanes, com)
     assert len(set(counts.tolist())) == len(lanes)
@@ -72,16 +85,21 @@ def test_every_order_of_the_transformations(pendulum):
     assert np.abs(shares).max() > 0
     for name, (got, share) in {
         "vmap(jacfwd)": lanewise(jax.jacfwd, one)(lanes, com),
-        "grad(vmap)": jax.jit(jax.grad(lambda x, com: jnp.sum(jax.vmap(one, (0, None))(x, com)), both))(lanes, com),
+        "grad(vmap)": jax.jit(
+            jax.grad(lambda x, com: jnp.sum(jax.vmap(one, (0, None))(x, com)), both)
+        )(lanes, com),
         "grad(scan)": jax.jit(jax.grad(looped, both))(lanes, com),
     }.items():
         np.testing.assert_allclose(got, single, atol=1e-9, err_msg=name)
         # gradients by what is shared add up
-        np.testing.assert_allclose(share, shares if share.ndim > com.ndim else shares.sum(0), atol=1e-9, err_msg=name)
+        np.testing.assert_allclose(
+            share, shares if share.ndim > com.ndim else shares.sum(0), atol=1e-9, err_msg=name
+        )
 
 
 def twice(f, x):
-    """The largest relative error of the gradient's derivative, as `svkc.check_grad(jax.grad(f), x, "forward", directions=1)` has it, by one program."""
+    """The largest relative error of the gradient's derivative, as `svkc.check_grad(jax.grad(f), x,
+    "forward", directions=1)` has it, by one program."""
     return derivatives.worst(jax.jit(lambda x, along: jax.jvp(jax.grad(f), (x,), (along,))), x)
 
 
@@ -92,11 +110,19 @@ def test_second_derivatives_of_forward_dynamics():
 
     def power(x):
         c = derivatives.changed(chain, x)
-        c = eqx.tree_at(lambda c: c.structure.real_pos, c, chain.structure.real_pos.at[:, ::2].add(x["pin"]))
+        c = eqx.tree_at(
+            lambda c: c.structure.real_pos, c, chain.structure.real_pos.at[:, ::2].add(x["pin"])
+        )
         s = c.state({"crank": x["angle"]}, {"crank": x["speed"]})
         return jnp.sum(svkc.forward_dynamics(c, s, x["tau"]) ** 2) / 1e4
 
-    x = {"angle": jnp.asarray(0.2), "speed": jnp.asarray(4.0), "tau": jnp.ones(chain.dofs), "mass": chain.mass, "pin": jnp.zeros((1, 2))}
+    x = {
+        "angle": jnp.asarray(0.2),
+        "speed": jnp.asarray(4.0),
+        "tau": jnp.ones(chain.dofs),
+        "mass": chain.mass,
+        "pin": jnp.zeros((1, 2)),
+    }
     assert twice(power, x) <= 1e-8
 
 
@@ -113,7 +139,8 @@ def test_second_derivatives_of_a_run(pendulum):
 
 @pytest.mark.slow
 def test_adjoints_pass_through(pendulum):
-    """diffrax's own give the same gradient; one that keeps fewer states, too; what does not fit is refused with words."""
+    """diffrax's own give the same gradient; one that keeps fewer states, too; what does not fit is
+    refused with words."""
     import diffrax
 
     x = jnp.array([1.2, 0.3, 0.8, 1.3])
@@ -123,34 +150,57 @@ def test_adjoints_pass_through(pendulum):
         return traj.final.q[0] + jnp.sum(traj.states.q)
 
     expected = jax.grad(loss)(x, svkc.Replay(every=5))
-    np.testing.assert_allclose(jax.grad(loss)(x, diffrax.RecursiveCheckpointAdjoint()), expected, atol=1e-7)
+    np.testing.assert_allclose(
+        jax.grad(loss)(x, diffrax.RecursiveCheckpointAdjoint()), expected, atol=1e-7
+    )
     forward = jax.jvp(lambda x: loss(x, diffrax.ForwardMode()), (x,), (jnp.ones(4),))[1]
     np.testing.assert_allclose(forward, jnp.sum(expected), atol=1e-7)
     with pytest.raises(ValueError, match="adjoint"):
         loss(x, "replay")
     with pytest.raises(ValueError, match="needs dt or an adaptive"):
-        svkc.simulate(pendulum, pendulum.state(), 1.0, stepsize_controller=diffrax.StepTo(jnp.linspace(0, 1, 5)), adjoint=svkc.Replay())
+        svkc.simulate(
+            pendulum,
+            pendulum.state(),
+            1.0,
+            stepsize_controller=diffrax.StepTo(jnp.linspace(0, 1, 5)),
+            adjoint=svkc.Replay(),
+        )
 
 
 class Choice(eqx.Module):
-    """A guard of which the case chooses by numbers: what it is at rest, a step of time, a joint's angle, the time itself."""
+    """A guard of which the case chooses by numbers: what it is at rest, a step of time, a joint's
+    angle, the time itself."""
 
     which: int = eqx.field(static=True)
 
     def __call__(self, t, state, args):
         rest, jump, turned, clock = args[self.which]
-        return rest + jump * jnp.where(t > 0.5, 1.0, -1.0) + turned * (state.q[0] - 0.3) + clock * (t - 0.5)
+        return (
+            rest
+            + jump * jnp.where(t > 0.5, 1.0, -1.0)
+            + turned * (state.q[0] - 0.3)
+            + clock * (t - 0.5)
+        )
 
 
 @pytest.mark.slow
 def test_where_there_is_no_derivative(pendulum):
-    """A guard that grazes, one that jumps, two at one instant, a rank that is lost: a code says so; a grazing guard gives no number."""
+    """A guard that grazes, one that jumps, two at one instant, a rank that is lost: a code says so;
+    a grazing guard gives no number."""
 
     def grazed(size):
         """A guard that is above zero for a moment only, at a time where the run stops to save."""
         above = lambda t, s, args: args - (t - 0.5) ** 2
         state = pendulum.state({"arm": 1.2})
-        traj = svkc.simulate(pendulum, state, 1.0, ts=jnp.array([0.5]), events=[svkc.when(above, stop=True)], args=size, **TIGHT)
+        traj = svkc.simulate(
+            pendulum,
+            state,
+            1.0,
+            ts=jnp.array([0.5]),
+            events=[svkc.when(above, stop=True)],
+            args=size,
+            **TIGHT,
+        )
         return traj.events.time[0], traj.derivative
 
     # at 0.4 it goes through zero at a rate; 3e-8 s before 0.5 s at almost none
@@ -162,12 +212,30 @@ def test_where_there_is_no_derivative(pendulum):
 
     @jax.jit
     def code(first, second, at, also):
-        """Two guards, each by its four numbers, and two times; the first of them takes hold. Past the end of the run there are none."""
-        events = [svkc.when(Choice(0)), svkc.when(Choice(1)), svkc.at(at, connect="hook", here=True), svkc.at(also)]
-        return svkc.simulate(pendulum, pendulum.state({"arm": 1.2}), 2.0, events=events, args=(first, second), max_events=6, **TIGHT).derivative
+        """Two guards, each by its four numbers, and two times; the first of them takes hold. Past
+        the end of the run there are none."""
+        events = [
+            svkc.when(Choice(0)),
+            svkc.when(Choice(1)),
+            svkc.at(at, connect="hook", here=True),
+            svkc.at(also),
+        ]
+        return svkc.simulate(
+            pendulum,
+            pendulum.state({"arm": 1.2}),
+            2.0,
+            events=events,
+            args=(first, second),
+            max_events=6,
+            **TIGHT,
+        ).derivative
 
     rest, never = jnp.array([1.0, 0, 0, 0]), 9.0
-    jump, turned, clock = jnp.array([0, 1.0, 0, 0]), jnp.array([0, 0, 1.0, 0]), jnp.array([0, 0, 0, 1.0])
+    jump, turned, clock = (
+        jnp.array([0, 1.0, 0, 0]),
+        jnp.array([0, 0, 1.0, 0]),
+        jnp.array([0, 0, 0, 1.0]),
+    )
     assert code(jump, rest, never, never) == svkc.RESULTS.jump
     assert code(turned, 2 * turned, never, never) == svkc.RESULTS.together
     assert code(rest, rest, 0.5, 0.5) == svkc.RESULTS.together

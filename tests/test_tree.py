@@ -1,4 +1,5 @@
-"""Open chains against MuJoCo, every intermediate along a trajectory: random trees, figures nobody here wrote, one URDF."""
+"""Open chains against MuJoCo, every intermediate along a trajectory: random trees, figures nobody
+here wrote, one URDF."""
 
 import pathlib
 
@@ -17,28 +18,46 @@ from svkc.tree.kinematics import kinematics
 
 ASSETS = pathlib.Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 URDF = """<robot name="arm">
-<link name="base"/><link name="upper"><inertial><origin xyz="0 0.02 0.15" rpy="0.1 0.2 0.3"/><mass value="2"/>
+<link name="base"/><link name="upper"><inertial><origin xyz="0 0.02 0.15" rpy="0.1 0.2 0.3"/><mass
+  value="2"/>
 <inertia ixx="0.02" iyy="0.03" izz="0.015" ixy="0.002" ixz="0.001" iyz="0.003"/></inertial></link>
-<link name="lower"><inertial><origin xyz="0 0 0.1"/><mass value="1"/><inertia ixx="0.01" iyy="0.01" izz="0.004" ixy="0" ixz="0" iyz="0"/></inertial></link>
-<link name="tool"><inertial><mass value="0.5"/><inertia ixx="0.001" iyy="0.001" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial></link>
-<joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/><origin xyz="0 0 0.4" rpy="0 0.3 0"/><axis xyz="0 1 0"/>
+<link name="lower"><inertial><origin xyz="0 0 0.1"/><mass value="1"/><inertia ixx="0.01" iyy="0.01"
+  izz="0.004" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<link name="tool"><inertial><mass value="0.5"/><inertia ixx="0.001" iyy="0.001" izz="0.001" ixy="0"
+  ixz="0" iyz="0"/></inertial></link>
+<joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/><origin
+  xyz="0 0 0.4" rpy="0 0.3 0"/><axis xyz="0 1 0"/>
 <limit lower="-2" upper="2" effort="50" velocity="5"/><dynamics damping="0.2"/></joint>
-<joint name="elbow" type="continuous"><parent link="upper"/><child link="lower"/><origin xyz="0 0 0.3"/><axis xyz="1 1 0"/></joint>
-<joint name="wrist" type="prismatic"><parent link="lower"/><child link="tool"/><origin xyz="0 0 0.2"/><axis xyz="0 0 1"/>
+<joint name="elbow" type="continuous"><parent link="upper"/><child link="lower"/><origin
+  xyz="0 0 0.3"/><axis xyz="1 1 0"/></joint>
+<joint name="wrist" type="prismatic"><parent link="lower"/><child link="tool"/><origin
+  xyz="0 0 0.2"/><axis xyz="0 0 1"/>
 <limit lower="-0.1" upper="0.1" effort="50" velocity="5"/></joint></robot>"""
 # MuJoCo says it of gymnasium's half_cheetah.xml
 pytestmark = pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass' is deprecated")
-SOURCES = {name: str(ASSETS / f"{name}.xml") for name in ("humanoid", "ant", "half_cheetah", "hopper", "walker2d")}
-SOURCES |= {f"random_{n}": models.random_tree(n, seed=n) for n in (2, 7, 25, 60)} | {"urdf": URDF, "figure40": str(svkc.scenes.FOLDER / "figure40.xml")}
+SOURCES = {
+    name: str(ASSETS / f"{name}.xml")
+    for name in ("humanoid", "ant", "half_cheetah", "hopper", "walker2d")
+}
+SOURCES |= {f"random_{n}": models.random_tree(n, seed=n) for n in (2, 7, 25, 60)} | {
+    "urdf": URDF,
+    "figure40": str(svkc.scenes.FOLDER / "figure40.xml"),
+}
 
 
 # of each kind one, in the fast tier: a tree of everything, a figure of others, a URDF
 FAST = ("random_7", "hopper", "urdf")
 
 
-@pytest.fixture(params=[name if name in FAST else pytest.param(name, marks=pytest.mark.slow) for name in SOURCES], scope="module")
+@pytest.fixture(
+    params=[
+        name if name in FAST else pytest.param(name, marks=pytest.mark.slow) for name in SOURCES
+    ],
+    scope="module",
+)
 def run(request):
-    """A chain, MuJoCo's data without constraints, and eight states along MuJoCo's own motion with random torques."""
+    """A chain, MuJoCo's data without constraints, and eight states along MuJoCo's own motion with
+    random torques."""
     chain = svkc.load(SOURCES[request.param])
     model = chain.model.model
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
@@ -62,16 +81,26 @@ def everything(chain, state, tau):
     linear, angular = svkc.velocities(chain, state)
     vdot = svkc.forward_dynamics(chain, state, tau)
     return {
-        "position": position, "quat": quat, "linear": linear, "angular": angular,
-        "mass": svkc.mass_matrix(chain, state), "mass by unit vectors": svkc.inertia_by_unit_vectors(chain, kin),
-        "bias": svkc.bias_force(chain, state), "acceleration": vdot,
+        "position": position,
+        "quat": quat,
+        "linear": linear,
+        "angular": angular,
+        "mass": svkc.mass_matrix(chain, state),
+        "mass by unit vectors": svkc.inertia_by_unit_vectors(chain, kin),
+        "bias": svkc.bias_force(chain, state),
+        "acceleration": vdot,
         "acceleration by unit vectors": forward_dynamics_by_unit_vectors(chain, state, tau),
-        "acceleration by composites": acceleration(chain, state.structure, state.q, state.v, tau, svkc.inertia_by_composites),
-        "inverse": svkc.inverse_dynamics(chain, state, vdot), "kinetic": svkc.kinetic_energy(chain, state),
+        "acceleration by composites": acceleration(
+            chain, state.structure, state.q, state.v, tau, svkc.inertia_by_composites
+        ),
+        "inverse": svkc.inverse_dynamics(chain, state, vdot),
+        "kinetic": svkc.kinetic_energy(chain, state),
         "power": jax.jvp(
-            lambda q, v: svkc.energy(chain, svkc.State(q, v, state.structure)), (state.q, state.v), (rates(chain, state.q, state.v), vdot)
+            lambda q, v: svkc.energy(chain, svkc.State(q, v, state.structure)),
+            (state.q, state.v),
+            (rates(chain, state.q, state.v), vdot),
         )[1],
-    }  # fmt: skip
+    }
 
 
 def test_every_intermediate(run):
@@ -87,12 +116,25 @@ def test_every_intermediate(run):
         R = np.zeros((model.nbody, 9))
         for body in range(model.nbody):
             mujoco.mju_quat2Mat(R[body], np.asarray(got["quat"])[body])
-        damping = data.qfrc_damper @ v if hasattr(data, "qfrc_damper") else -(model.dof_damping.ravel() * v) @ v
+        damping = (
+            data.qfrc_damper @ v
+            if hasattr(data, "qfrc_damper")
+            else -(model.dof_damping.ravel() * v) @ v
+        )
         expected = {
-            "position": data.xpos, "linear": twist[:, 3:], "angular": twist[:, :3], "mass": M, "mass by unit vectors": M,
-            "bias": data.qfrc_bias, "acceleration": data.qacc, "acceleration by unit vectors": data.qacc, "acceleration by composites": data.qacc,
-            "inverse": tau, "kinetic": v @ M @ v / 2, "power": tau @ v + damping,
-        }  # fmt: skip
+            "position": data.xpos,
+            "linear": twist[:, 3:],
+            "angular": twist[:, :3],
+            "mass": M,
+            "mass by unit vectors": M,
+            "bias": data.qfrc_bias,
+            "acceleration": data.qacc,
+            "acceleration by unit vectors": data.qacc,
+            "acceleration by composites": data.qacc,
+            "inverse": tau,
+            "kinetic": v @ M @ v / 2,
+            "power": tau @ v + damping,
+        }
         np.testing.assert_allclose(R, data.xmat, atol=1e-12)
         for name, value in expected.items():
             scale = max(np.abs(value).max(), 1e-3)
@@ -104,16 +146,22 @@ def test_every_intermediate(run):
 
 def test_momentum_of_a_free_system():
     """No gravity, no ground: forces inside change neither linear nor angular momentum."""
-    text = models.random_tree(8, seed=4, kinds=("free", "ball", "hinge")).replace('gravity="0.3 -0.2 -9.81"', 'gravity="0 0 0"')
+    text = models.random_tree(8, seed=4, kinds=("free", "ball", "hinge")).replace(
+        'gravity="0.3 -0.2 -9.81"', 'gravity="0 0 0"'
+    )
     import re
 
-    text = re.sub(r'<body name="b1"([^>]*)>(<joint[^>]*/>)*', r'<body name="b1"\1><freejoint/>', text, count=1)
+    text = re.sub(
+        r'<body name="b1"([^>]*)>(<joint[^>]*/>)*', r'<body name="b1"\1><freejoint/>', text, count=1
+    )
     chain = svkc.load(text)
     if np.sum(np.array(chain.parent) == 0) > 1 or chain.topology.kind[1] != 4:
         pytest.fail("the model should be one free tree")
     rng = np.random.default_rng(0)
     state = chain.state(v=rng.normal(size=chain.nv))
-    vdot = svkc.forward_dynamics(chain, state, jnp.concatenate([jnp.zeros(6), jnp.asarray(rng.normal(size=chain.nv - 6))]))
+    vdot = svkc.forward_dynamics(
+        chain, state, jnp.concatenate([jnp.zeros(6), jnp.asarray(rng.normal(size=chain.nv - 6))])
+    )
 
     def both(q, v):
         return jnp.concatenate(svkc.momentum(chain, svkc.State(q, v, state.structure)))
@@ -126,7 +174,9 @@ def test_integrate_and_difference_are_inverse():
     chain = svkc.load(SOURCES["random_7"])
     rng = np.random.default_rng(0)
     q, dv = chain.state().q, jnp.asarray(0.5 * rng.normal(size=chain.nv))
-    np.testing.assert_allclose(svkc.difference(chain, q, svkc.integrate(chain, q, dv)), dv, atol=1e-13)
+    np.testing.assert_allclose(
+        svkc.difference(chain, q, svkc.integrate(chain, q, dv)), dv, atol=1e-13
+    )
     _, rate = jax.jvp(lambda s: svkc.integrate(chain, q, s * dv), (0.0,), (1.0,))
     np.testing.assert_allclose(rate, rates(chain, q, dv), atol=1e-13)
 
@@ -143,23 +193,35 @@ def test_open_chain_has_nothing_of_the_closure():
 @pytest.mark.slow
 @pytest.mark.parametrize("twigs", [0, 1, 6])
 def test_deep_chain_agrees_with_mujoco(twigs):
-    """40 levels, past the depth that is unrolled: a chain, one with a twig on every third link, one with a ball and as many twigs there as make it wide."""
+    """40 levels, past the depth that is unrolled: a chain, one with a twig on every third link, one
+    with a ball and as many twigs there as make it wide."""
     xml, rod = "", '<geom type="capsule" fromto="0 0 0 0 0 -0.1" size="0.02" contype="0"/>'
     for i in range(40):
         for k in range(twigs if i % 3 == 1 else 0):
-            joint, tip = "ball" if k == 1 else "hinge", f'<body pos="0 0 -0.1"><joint axis="1 0 0"/>{rod}</body>'
+            joint, tip = (
+                "ball" if k == 1 else "hinge",
+                f'<body pos="0 0 -0.1"><joint axis="1 0 0"/>{rod}</body>',
+            )
             xml += f'<body name="t{i}_{k}" pos="0 {k} 0"><joint type="{joint}"/>{rod}{tip}</body>'
-        xml = f'<body name="l{i}" pos="0 0 -0.1"><joint axis="{i % 2} {1 - i % 2} 0"/>{rod}{xml}</body>'
+        xml = (
+            f'<body name="l{i}" pos="0 0 -0.1"><joint axis="{i % 2} {1 - i % 2}'
+            f' 0"/>{rod}{xml}</body>'
+        )
     chain = svkc.load(models.MJCF.format(xml))
     model = chain.model.model
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
-    data.qpos[:], data.qvel[:] = data.qpos + 0.3 * rng.normal(size=model.nq), rng.normal(size=model.nv)
+    data.qpos[:], data.qvel[:] = (
+        data.qpos + 0.3 * rng.normal(size=model.nq),
+        rng.normal(size=model.nv),
+    )
     mujoco.mj_normalizeQuat(model, data.qpos)
     mujoco.mj_forward(model, data)
     state = chain.state(data.qpos, data.qvel)
     vdot = svkc.forward_dynamics(chain, state, jnp.zeros(model.nv))
     np.testing.assert_allclose(vdot, data.qacc, rtol=1e-8, atol=1e-8 * np.abs(data.qacc).max())
-    by_composites = acceleration(chain, state.structure, state.q, state.v, jnp.zeros(model.nv), svkc.inertia_by_composites)
+    by_composites = acceleration(
+        chain, state.structure, state.q, state.v, jnp.zeros(model.nv), svkc.inertia_by_composites
+    )
     np.testing.assert_allclose(vdot, by_composites, rtol=1e-9, atol=1e-10 * np.abs(data.qacc).max())
 
 
@@ -168,8 +230,13 @@ def test_derivatives_of_a_deep_chain():
     """Forward and reverse against differences, through loops over levels."""
     xml = ""
     for i in range(30):
-        xml = f'<body name="l{i}" pos="0 0 -0.1"><joint axis="{i % 2} {1 - i % 2} 0"/><geom size="0.02" contype="0"/>{xml}</body>'
+        xml = (
+            f'<body name="l{i}" pos="0 0 -0.1"><joint axis="{i % 2} {1 - i % 2} 0"/><geom'
+            f' size="0.02" contype="0"/>{xml}</body>'
+        )
     chain = svkc.load(models.MJCF.format(xml))
     q = jnp.asarray(np.random.default_rng(0).normal(size=30) * 0.3)
-    out = svkc.check_grad(lambda q: jnp.sum(svkc.forward_dynamics(chain, chain.state(q), jnp.zeros(30))[:3]), q)
+    out = svkc.check_grad(
+        lambda q: jnp.sum(svkc.forward_dynamics(chain, chain.state(q), jnp.zeros(30))[:3]), q
+    )
     assert out.error < 1e-7, out

@@ -1,4 +1,5 @@
-"""Compiled programs kept on disk from one process to the next, for the command line and the tests. A library user's settings stay as they are."""
+"""Compiled programs kept on disk from one process to the next, for the command line and the tests.
+A library user's settings stay as they are."""
 
 import contextlib
 import hashlib
@@ -12,20 +13,37 @@ import tempfile
 import threading
 
 SIZE = 512 * 2**20  # bytes, of all processors and versions together
-DESCRIBES = ("vendor_id", "cpu family", "model", "model name", "flags", "CPU implementer", "CPU part", "Features")
-# XLA reports these preferences of LLVM as missing features of the processor (openxla/xla issue 44565)
-PREFERENCE = re.compile(rb"cpu_aot_loader\.cc.*Target machine feature \+prefer-no-(gather|scatter) is not")
+DESCRIBES = (
+    "vendor_id",
+    "cpu family",
+    "model",
+    "model name",
+    "flags",
+    "CPU implementer",
+    "CPU part",
+    "Features",
+)
+# XLA reports these preferences of LLVM as missing features of the processor (openxla/xla issue
+# 44565)
+PREFERENCE = re.compile(
+    rb"cpu_aot_loader\.cc.*Target machine feature \+prefer-no-(gather|scatter) is not"
+)
 _loading = threading.Lock()
 
 
 def use_cache() -> pathlib.Path | None:
-    """Set jax's persistent cache in this process, and return its folder: None without one. Call it before the first program is compiled.
+    """Set jax's persistent cache in this process, and return its folder: None without one. Call it
+    before the first program is compiled.
 
-    $SVKC_CACHE_DIR names another folder, or is `off`. If it is not set and JAX_COMPILATION_CACHE_DIR is, jax's own setting is kept.
+    $SVKC_CACHE_DIR names another folder, or is `off`. If it is not set and
+    JAX_COMPILATION_CACHE_DIR is, jax's own setting is kept.
     """
     import jax
 
-    if os.environ.get("SVKC_CACHE_DIR") in (None, "", "off") and jax.config.jax_compilation_cache_dir:
+    if (
+        os.environ.get("SVKC_CACHE_DIR") in (None, "", "off")
+        and jax.config.jax_compilation_cache_dir
+    ):
         return pathlib.Path(jax.config.jax_compilation_cache_dir)
     if not jax.config.jax_enable_compilation_cache:
         return None
@@ -57,19 +75,27 @@ def processor(cpuinfo: str = "/proc/cpuinfo") -> str:
     """Name the model of the processor, with a hash of its features."""
     try:
         lines = pathlib.Path(cpuinfo).read_text().partition("\n\n")[0].splitlines()
-        told = {name.strip(): value.strip() for name, _, value in (line.partition(":") for line in lines)}
+        told = {
+            name.strip(): value.strip()
+            for name, _, value in (line.partition(":") for line in lines)
+        }
     except OSError:
         told = {"model name": platform.processor() or platform.machine()}
     model = re.sub(r"[^A-Za-z0-9]+", "-", told.get("model name", platform.machine())).strip("-")
-    return f"{model}-{hashlib.sha256(repr([told.get(name) for name in DESCRIBES]).encode()).hexdigest()[:12]}"
+    described = repr([told.get(name) for name in DESCRIBES])
+    return f"{model}-{hashlib.sha256(described.encode()).hexdigest()[:12]}"
 
 
 def _own(folder: pathlib.Path) -> bool:
-    """Make a folder of mode 0700 and return True. Return False for one that others own or can write to, as its programs are executed."""
+    """Make a folder of mode 0700 and return True. Return False for one that others own or can write
+    to, as its programs are executed."""
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     found = folder.stat()
     if hasattr(os, "getuid") and (found.st_uid != os.getuid() or found.st_mode & 0o022):
-        print(f"svkc: no cache of compiled programs: others own {folder} or can write to it", file=sys.stderr)
+        print(
+            f"svkc: no cache of compiled programs: others own {folder} or can write to it",
+            file=sys.stderr,
+        )
         return False
     return True
 
@@ -91,7 +117,8 @@ def _prune(top: pathlib.Path):
 
 
 def _amend():
-    """Make jax write entries atomically, and load them without false warnings. If a later jax lacks the names patched here, nothing is patched."""
+    """Make jax write entries atomically, and load them without false warnings. If a later jax lacks
+    the names patched here, nothing is patched."""
     with contextlib.suppress(ImportError, AttributeError):
         from jax._src import compilation_cache, lru_cache
 
@@ -101,7 +128,8 @@ def _amend():
 
 
 def _put(entries, key: str, value: bytes):
-    """Write an entry atomically. jax writes in place, and never replaces an entry that was cut short."""
+    """Write an entry atomically. jax writes in place, and never replaces an entry that was cut
+    short."""
     path = pathlib.Path(entries.path)
     # a full disk, or one that is read only: the program is compiled again
     with contextlib.suppress(OSError), tempfile.TemporaryDirectory(dir=path) as aside:
@@ -111,7 +139,8 @@ def _put(entries, key: str, value: bytes):
 
 
 def _without_preferences(load):
-    """Wrap jax's loading of a program so that the warnings of `PREFERENCE` are dropped from stderr."""
+    """Wrap jax's loading of a program so that the warnings of `PREFERENCE` are dropped from
+    stderr."""
 
     def quiet(*args, **kw):
         # one at a time, as the process has one stderr

@@ -1,4 +1,5 @@
-"""Compilation of functions that are called eagerly, once or a few times: for compile time, not for speed."""
+"""Compilation of functions that are called eagerly, once or a few times: for compile time, not for
+speed."""
 
 import functools
 import re
@@ -13,14 +14,20 @@ except ImportError:
     from jax._src.core import trace_state_clean
 
 # LLVM's optimization and the fusion emitters take most of XLA's compile time on a CPU
-_OPTIONS = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
+_OPTIONS = {
+    "xla_backend_optimization_level": 0,
+    "xla_cpu_use_fusion_emitters": False,
+    "xla_cpu_parallel_codegen_split_count": 1,
+}
 
 
 def eager_jit(function: Callable, jit: Callable = jax.jit) -> Callable:
-    """Wrap a function in `jit` (`jax.jit` or `equinox.filter_jit`) so that an eager call compiles fast, and its code runs slower.
+    """Wrap a function in `jit` (`jax.jit` or `equinox.filter_jit`) so that an eager call compiles
+    fast, and its code runs slower.
 
-    jax accepts compiler options at the outermost jit only. Under jit, grad, vmap and scan the function is therefore compiled without them. Options that the
-    installed jaxlib does not know are left out.
+    jax accepts compiler options at the outermost jit only. Under jit, grad, vmap and scan the
+    function is therefore compiled without them. Options that the installed jaxlib does not know are
+    left out.
     """
     plain, quick = jit(function), {}
 

@@ -1,8 +1,10 @@
-"""Comparison of functions given to a run by what they read, so that a new function object is not a new program.
+"""Comparison of functions given to a run by what they read, so that a new function object is not a
+new program.
 
-A function reads closure cells, defaults, and the globals that its code names. If all of these are of simple kinds (numbers, strings, arrays, containers and
-pytrees, other functions, objects defined by libraries), floating-point arrays are data and the rest is static, compared by content. Any other function is
-compared by identity.
+A function reads closure cells, defaults, and the globals that its code names. If all of these are
+of simple kinds (numbers, strings, arrays, containers and pytrees, other functions, objects defined
+by libraries), floating-point arrays are data and the rest is static, compared by content. Any other
+function is compared by identity.
 """
 
 import dataclasses
@@ -27,14 +29,25 @@ import numpy as np
 from svkc._jax.pytrees import concrete
 
 PLAIN = (type(None), bool, int, float, complex, str, bytes, range, type(...))
-# objects that libraries define do not change between two calls; svkc counts as a library, wherever its sources are
-_PATHS = {sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")} | {*site.getsitepackages(), site.getusersitepackages()}
-LIBRARIES = tuple(path + os.sep for path in (*_PATHS, os.path.dirname(os.path.dirname(os.path.abspath(__file__)))))
+# objects that libraries define do not change between two calls; svkc counts as a library, wherever
+# its sources are
+_PATHS = {sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")} | {
+    *site.getsitepackages(),
+    site.getusersitepackages(),
+}
+LIBRARIES = tuple(
+    path + os.sep for path in (*_PATHS, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
+)
 # errors of jax where Python code reads the value of a tracer
-LOOKED_AT = (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError, jax.errors.TracerIntegerConversionError)
+LOOKED_AT = (
+    jax.errors.ConcretizationTypeError,
+    jax.errors.TracerArrayConversionError,
+    jax.errors.TracerIntegerConversionError,
+)
 LOOKED_AT += (jax.errors.TracerBoolConversionError, jax.errors.NonConcreteBooleanIndexError)
 JIT = type(jax.jit(len))
-# code of functions whose arrays Python has to read; the first static part of each function; the first function of each argument and code compared by identity
+# code of functions whose arrays Python has to read; the first static part of each function; the
+# first function of each argument and code compared by identity
 _looking: set = set()
 _first: weakref.WeakKeyDictionary = weakref.WeakKeyDictionary()
 _identified: dict[tuple, Any] = {}
@@ -42,7 +55,8 @@ _identified: dict[tuple, Any] = {}
 
 @dataclasses.dataclass(frozen=True)
 class Still:
-    """A static value, compared by a key: its content, or its id. It holds the original object, so that writes to a list are kept."""
+    """A static value, compared by a key: its content, or its id. It holds the original object, so
+    that writes to a list are kept."""
 
     key: Any
     thing: Any = dataclasses.field(compare=False)
@@ -55,15 +69,20 @@ def _refuse(what: str) -> NoReturn:
 
 
 class Function(eqx.Module):
-    """A function, or a container that it reads, as build(*parts). Parts are arrays (the leaves), `Still`s, or again `Function`s. Writes to a rebuilt
-    container are lost."""
+    """A function, or a container that it reads, as build(*parts). Parts are arrays (the leaves),
+    `Still`s, or again `Function`s. Writes to a rebuilt container are lost."""
 
     parts: list
     build: Callable = eqx.field(static=True)
 
     def made(self):
         """Return the function or the container itself."""
-        return self.build(*(x.made() if isinstance(x, Function) else x.thing if isinstance(x, Still) else x for x in self.parts))
+        return self.build(
+            *(
+                x.made() if isinstance(x, Function) else x.thing if isinstance(x, Still) else x
+                for x in self.parts
+            )
+        )
 
     def __call__(self, *args):
         function = self.made()
@@ -78,7 +97,9 @@ class Function(eqx.Module):
 def _function(code, space, names, defaults, kwdefaults, *values) -> types.FunctionType:
     # imported modules come last; Python finds them by itself
     cells = tuple(map(types.CellType, values[len(names) :][: len(code.co_freevars)]))
-    f = types.FunctionType(code, {**space, **dict(zip(names, values))}, code.co_name, defaults, cells)
+    f = types.FunctionType(
+        code, {**space, **dict(zip(names, values))}, code.co_name, defaults, cells
+    )
     f.__kwdefaults__ = kwdefaults
     return f
 
@@ -89,12 +110,16 @@ _tree = lambda shape, *parts: jax.tree.unflatten(shape, parts)
 
 
 def _of_library(space) -> bool:
-    """Return whether these are the globals of a module of Python, of an installed package, or of svkc."""
-    return str(space.get("__file__")).startswith(LIBRARIES) or getattr(space.get("__spec__"), "origin", None) in ("built-in", "frozen")
+    """Return whether these are the globals of a module of Python, of an installed package, or of
+    svkc."""
+    return str(space.get("__file__")).startswith(LIBRARIES) or getattr(
+        space.get("__spec__"), "origin", None
+    ) in ("built-in", "frozen")
 
 
 def _named(x) -> bool:
-    """Return whether a library defines x: a module, a class, or a name of a module. jax compares jit-wrapped functions of any module by identity."""
+    """Return whether a library defines x: a module, a class, or a name of a module. jax compares
+    jit-wrapped functions of any module by identity."""
     if isinstance(x, types.ModuleType):
         return _of_library(vars(x))
     found = sys.modules.get(str(getattr(x, "__module__", None)))
@@ -107,29 +132,56 @@ def _named(x) -> bool:
 
 @functools.cache
 def _facts(code: types.CodeType) -> tuple[set[str], set[str], set[str]]:
-    """Return the names in a code object and those nested in it, the modules that they import, and the outer variables that they assign or delete."""
+    """Return the names in a code object and those nested in it, the modules that they import, and
+    the outer variables that they assign or delete."""
     lines = [(line.opname, line.argval) for line in dis.get_instructions(code)]
-    names, imports = set(code.co_names), {name for operation, name in lines if operation == "IMPORT_NAME"}
-    written = {name for operation, name in lines if operation in ("STORE_GLOBAL", "DELETE_GLOBAL", "STORE_DEREF", "DELETE_DEREF")} - set(code.co_cellvars)
+    names, imports = (
+        set(code.co_names),
+        {name for operation, name in lines if operation == "IMPORT_NAME"},
+    )
+    written = {
+        name
+        for operation, name in lines
+        if operation in ("STORE_GLOBAL", "DELETE_GLOBAL", "STORE_DEREF", "DELETE_DEREF")
+    } - set(code.co_cellvars)
     for inner in (_facts(x) for x in code.co_consts if isinstance(x, types.CodeType)):
-        names, imports, written = names | inner[0], imports | inner[1], written | inner[2] - set(code.co_cellvars)
+        names, imports, written = (
+            names | inner[0],
+            imports | inner[1],
+            written | inner[2] - set(code.co_cellvars),
+        )
     return names, imports, written
 
 
 def _split(f: types.FunctionType):
-    """Return how to build a function, and from what: code, globals, the names among them, and the values it reads."""
+    """Return how to build a function, and from what: code, globals, the names among them, and the
+    values it reads."""
     names, imports, written = _facts(f.__code__)
     if written or set(vars(f)) - {"__wrapped__"}:
         _refuse("a variable outside that it assigns" if written else "a function with attributes")
     # globals of libraries stay as they are
     space, own = f.__globals__, not _of_library(f.__globals__)
-    names, imports = (tuple(sorted(found)) if own else () for found in (names & space.keys(), imports))
-    read = [*(space[name] for name in names), *(cell.cell_contents for cell in f.__closure__ or ()), *(sys.modules[name] for name in imports)]
-    return _function, [Still(f.__code__, f.__code__), Still(id(space), space), names, f.__defaults__, f.__kwdefaults__, *read]
+    names, imports = (
+        tuple(sorted(found)) if own else () for found in (names & space.keys(), imports)
+    )
+    read = [
+        *(space[name] for name in names),
+        *(cell.cell_contents for cell in f.__closure__ or ()),
+        *(sys.modules[name] for name in imports),
+    ]
+    return _function, [
+        Still(f.__code__, f.__code__),
+        Still(id(space), space),
+        names,
+        f.__defaults__,
+        f.__kwdefaults__,
+        *read,
+    ]
 
 
 class _Reader:
-    """Reads the values that one function depends on. as_data: whether floating-point arrays are data."""
+    """Reads the values that one function depends on. as_data: whether floating-point arrays are
+    data."""
 
     def __init__(self, as_data: bool):
         # by id: values read before; None while one is being read
@@ -161,13 +213,33 @@ class _Reader:
     def array(self, x):
         if isinstance(x, jax.Array):
             # tracers are always data, and so are arrays whose values this process cannot read
-            data = self.as_data or not concrete(x) or jnp.issubdtype(x.dtype, jax.dtypes.extended) or not x.is_fully_addressable
+            data = (
+                self.as_data
+                or not concrete(x)
+                or jnp.issubdtype(x.dtype, jax.dtypes.extended)
+                or not x.is_fully_addressable
+            )
         elif x.dtype.hasobject or type(x) not in (np.ndarray, x.dtype.type):
             _refuse("an array of objects or of a class of its own")
         else:
             # integers are sizes and indices, which Python needs; jax has no long double
-            data = self.as_data and jnp.issubdtype(x.dtype, jnp.inexact) and x.dtype.char not in "gG"
-        return x if data else Still((type(x), repr(x.dtype), getattr(x, "weak_type", False), x.shape, np.asarray(x).tobytes()), x)
+            data = (
+                self.as_data and jnp.issubdtype(x.dtype, jnp.inexact) and x.dtype.char not in "gG"
+            )
+        return (
+            x
+            if data
+            else Still(
+                (
+                    type(x),
+                    repr(x.dtype),
+                    getattr(x, "weak_type", False),
+                    x.shape,
+                    np.asarray(x).tobytes(),
+                ),
+                x,
+            )
+        )
 
     def parts(self, x) -> Function:
         """Return the parts of a function or a container."""
@@ -187,7 +259,11 @@ class _Reader:
         else:
             parts, shape = eqx.tree_flatten_one_level(x)
             # raise now if the static part is not hashable
-            hash(tuple(getattr(x, f.name) for f in dataclasses.fields(x) if f.metadata.get("static")) if isinstance(x, eqx.Module) else shape.node_data())
+            hash(
+                tuple(getattr(x, f.name) for f in dataclasses.fields(x) if f.metadata.get("static"))
+                if isinstance(x, eqx.Module)
+                else shape.node_data()
+            )
             build, parts = _tree, [Still(shape, shape), *parts]
         return Function([self.read(part) for part in parts], build)
 
@@ -198,11 +274,15 @@ def _code(function):
 
 
 def comparable(function) -> Any:
-    """Return the function as a `Function`. Any error means that it has to be compared by identity. Callables that jax or equinox compare are returned as is.
+    """Return the function as a `Function`. Any error means that it has to be compared by identity.
+    Callables that jax or equinox compare are returned as is.
 
-    As in jax, one function object keeps its program when a number or a list that it reads changes. Its arrays are read at each call.
+    As in jax, one function object keeps its program when a number or a list that it reads changes.
+    Its arrays are read at each call.
     """
-    if not isinstance(function, types.FunctionType | types.MethodType | functools.partial) or _named(function):
+    if not isinstance(
+        function, types.FunctionType | types.MethodType | functools.partial
+    ) or _named(function):
         return function
     made = _Reader(_code(function) not in _looking).parts(function)
     arrays, static = eqx.partition(made, eqx.is_array)
@@ -212,10 +292,12 @@ def comparable(function) -> Any:
 
 
 def shared(program: Callable, **functions) -> Any:
-    """Call program(**functions) with comparable functions, so that equal function objects share a compiled program.
+    """Call program(**functions) with comparable functions, so that equal function objects share a
+    compiled program.
 
-    functions: one function, or a pytree of them, for each argument name. If Python code in a function reads the values of its arrays, tracing fails; the call
-    is then repeated with these arrays static.
+    functions: one function, or a pytree of them, for each argument name. If Python code in a
+    function reads the values of its arrays, tracing fails; the call is then repeated with these
+    arrays static.
     """
     while True:
         known, identified = len(_looking), []
@@ -229,7 +311,12 @@ def shared(program: Callable, **functions) -> Any:
                 return function
 
         try:
-            out = program(**{name: jax.tree.map(functools.partial(given, name), tree) for name, tree in functions.items()})
+            out = program(
+                **{
+                    name: jax.tree.map(functools.partial(given, name), tree)
+                    for name, tree in functions.items()
+                }
+            )
             break
         except LOOKED_AT:
             if len(_looking) == known:
@@ -239,6 +326,8 @@ def shared(program: Callable, **functions) -> Any:
         if _identified.setdefault(key, function) not in (None, function):
             _identified[key] = None
             warnings.warn(
-                f"{name}: a new function object with the same code is compiled again; {error} cannot be compared. Define it outside the loop.", stacklevel=3
+                f"{name}: a new function object with the same code is compiled again; {error}"
+                " cannot be compared. Define it outside the loop.",
+                stacklevel=3,
             )
     return out

@@ -1,6 +1,7 @@
 """A `vmap` that keeps the lanes on the last axis, where processors take several in one instruction.
 
-jax puts them first; the axes of 3, 6 or 46 that end up last are too short for that. A function's jaxpr is gone through once more with every array
+jax puts them first; the axes of 3, 6 or 46 that end up last are too short for that. A function's
+jaxpr is gone through once more with every array
 [..., lanes]; what has no rule here goes through jax's own `vmap`.
 """
 
@@ -17,15 +18,30 @@ from jaxtyping import Array
 
 from svkc._jax.primitive import operation
 
-# lanes that one processor takes at a time: what they need between two operations stays in its cache (benchmarks/README.md)
+# lanes that one processor takes at a time: what they need between two operations stays in its cache
+# (benchmarks/README.md)
 TILE = 32
-# terms of a sum at a time: 46 in one loop cost a step with two grips a quarter of its time, 22 one of the high bar's 16-joint figure a third
+# terms of a sum at a time: 46 in one loop cost a step with two grips a quarter of its time, 22 one
+# of the high bar's 16-joint figure a third
 FEW = 8
 ELEMENTWISE = set(
-    "abs add add_any and atan2 ceil clamp convert_element_type copy copy_p cos div eq exp exp2 expm1 floor ge gt integer_pow is_finite le log log1p lt max min "
-    "mul ne neg not or pow rem round rsqrt select_n sign sin sqrt square stop_gradient sub tan tanh xor".split()
+    "abs add add_any and atan2 ceil clamp convert_element_type copy copy_p cos div eq exp exp2"
+    " expm1 floor ge gt integer_pow is_finite le log log1p lt max min mul ne neg not or pow rem"
+    " round rsqrt select_n sign sin sqrt square stop_gradient sub tan tanh xor".split()
 )
-ALONG = {"argmax", "argmin", "cumsum", "reduce_and", "reduce_max", "reduce_min", "reduce_or", "reduce_prod", "rev", "split", "squeeze"}
+ALONG = {
+    "argmax",
+    "argmin",
+    "cumsum",
+    "reduce_and",
+    "reduce_max",
+    "reduce_min",
+    "reduce_or",
+    "reduce_prod",
+    "rev",
+    "split",
+    "squeeze",
+}
 JOINING = {"concatenate", "stack"}
 CALLS = {
     "closed_call": "call_jaxpr",
@@ -45,7 +61,11 @@ class Lanes(NamedTuple):
 
 def spread(x, lanes: int) -> Array:
     """[..., lanes] of any value."""
-    return x.x if isinstance(x, Lanes) else jnp.broadcast_to(jnp.asarray(x)[..., None], (*jnp.shape(x), lanes))
+    return (
+        x.x
+        if isinstance(x, Lanes)
+        else jnp.broadcast_to(jnp.asarray(x)[..., None], (*jnp.shape(x), lanes))
+    )
 
 
 def _broadcast(x: Array, lanes: int, *, shape, broadcast_dimensions, **_):
@@ -53,7 +73,9 @@ def _broadcast(x: Array, lanes: int, *, shape, broadcast_dimensions, **_):
 
 
 def _slice(x: Array, lanes: int, *, start_indices, limit_indices, strides):
-    return lax.slice(x, (*start_indices, 0), (*limit_indices, lanes), None if strides is None else (*strides, 1))
+    return lax.slice(
+        x, (*start_indices, 0), (*limit_indices, lanes), None if strides is None else (*strides, 1)
+    )
 
 
 MOVING = {
@@ -68,20 +90,39 @@ def _gather(x, index, lanes: int, *, dimension_numbers, slice_sizes, **rest):
     d = dimension_numbers
     if not isinstance(index, Lanes):
         last = jnp.ndim(index) - 1 + len(d.offset_dims)
-        return lax.gather(x.x, index, d._replace(offset_dims=(*d.offset_dims, last)), (*slice_sizes, lanes), **rest)
+        return lax.gather(
+            x.x,
+            index,
+            d._replace(offset_dims=(*d.offset_dims, last)),
+            (*slice_sizes, lanes),
+            **rest,
+        )
     # the index's own axis stays its last
     index = jnp.swapaxes(index.x, -1, -2)
     if not isinstance(x, Lanes):
         return lax.gather(x, index, d, slice_sizes, **rest)
-    of_x, of_index = (*d.operand_batching_dims, x.x.ndim - 1), (*d.start_indices_batching_dims, index.ndim - 2)
-    return lax.gather(x.x, index, d._replace(operand_batching_dims=of_x, start_indices_batching_dims=of_index), (*slice_sizes, 1), **rest)
+    of_x, of_index = (
+        (*d.operand_batching_dims, x.x.ndim - 1),
+        (*d.start_indices_batching_dims, index.ndim - 2),
+    )
+    return lax.gather(
+        x.x,
+        index,
+        d._replace(operand_batching_dims=of_x, start_indices_batching_dims=of_index),
+        (*slice_sizes, 1),
+        **rest,
+    )
 
 
 def sum_by_few(x: Array, axes: tuple[int, ...]) -> Array:
-    """Sums of few at a time: such a loop is unrolled, and the one around it, over lanes or what else is last, can take several in one instruction."""
+    """Sums of few at a time: such a loop is unrolled, and the one around it, over lanes or what
+    else is last, can take several in one instruction."""
     for axis in sorted(axes, reverse=True):
         size = x.shape[axis]
-        parts = [jnp.sum(lax.slice_in_dim(x, i, min(i + FEW, size), axis=axis), axis, x.dtype) for i in range(0, max(size, 1), FEW)]
+        parts = [
+            jnp.sum(lax.slice_in_dim(x, i, min(i + FEW, size), axis=axis), axis, x.dtype)
+            for i in range(0, max(size, 1), FEW)
+        ]
         x = functools.reduce(jnp.add, parts)
     return x
 
@@ -90,21 +131,35 @@ def _dot(*sides, dimension_numbers, preferred_element_type, **_):
     """Products and sums: XLA has no `dot` whose lanes come last."""
     sides = [v.x if isinstance(v, Lanes) else jnp.asarray(v)[..., None] for v in sides]
     contracted, batch = dimension_numbers
-    free = [[i for i in range(x.ndim - 1) if i not in (*c, *b)] for x, c, b in zip(sides, contracted, batch, strict=True)]
+    free = [
+        [i for i in range(x.ndim - 1) if i not in (*c, *b)]
+        for x, c, b in zip(sides, contracted, batch, strict=True)
+    ]
 
     axes = len(batch[0])
     middle, end = axes + len(free[0]), axes + len(free[0]) + len(free[1])
     # the other side's own axes are of one
-    left, right = (jnp.transpose(x, (*b, *f, *c, x.ndim - 1)) for x, b, f, c in zip(sides, batch, free, contracted, strict=True))
-    products = jnp.expand_dims(left, range(middle, end)) * jnp.expand_dims(right, range(axes, middle))
-    products = products if preferred_element_type is None else products.astype(preferred_element_type)
+    left, right = (
+        jnp.transpose(x, (*b, *f, *c, x.ndim - 1))
+        for x, b, f, c in zip(sides, batch, free, contracted, strict=True)
+    )
+    products = jnp.expand_dims(left, range(middle, end)) * jnp.expand_dims(
+        right, range(axes, middle)
+    )
+    products = (
+        products if preferred_element_type is None else products.astype(preferred_element_type)
+    )
     return sum_by_few(products, tuple(range(end, end + len(contracted[0]))))
 
 
 def _solve(inputs: list, lanes: int, *, const_lengths, jaxprs, **_):
     """The solve itself; what it is the inverse of matters to derivatives alone."""
     before = const_lengths.matvec + const_lengths.vecmat
-    return evaluate(jaxprs.solve, [*inputs[before : before + const_lengths.solve], *inputs[sum(const_lengths) :]], lanes)
+    return evaluate(
+        jaxprs.solve,
+        [*inputs[before : before + const_lengths.solve], *inputs[sum(const_lengths) :]],
+        lanes,
+    )
 
 
 def _as_jax_does(primitive, inputs: list, params: dict, lanes: int):
@@ -126,7 +181,9 @@ def _one(primitive, inputs: list, params: dict, shape: tuple[int, ...], lanes: i
         return primitive.bind(*(spread(v, lanes) for v in inputs), **params)
     if name in ELEMENTWISE:
         # (numbers and axes of one go with any size)
-        return primitive.bind(*(jnp.broadcast_to(spread(v, lanes), (*shape, lanes)) for v in inputs), **params)
+        return primitive.bind(
+            *(jnp.broadcast_to(spread(v, lanes), (*shape, lanes)) for v in inputs), **params
+        )
     if name in MOVING and alone:
         return MOVING[name](inputs[0].x, lanes, **params)
     if name == "taking":
@@ -152,7 +209,11 @@ def evaluate(closed: core.ClosedJaxpr, inputs: list, lanes: int) -> list:
         elif name in ("custom_linear_solve", "linear_solve") and mixed:
             out = _solve(values, lanes, **params)
         else:
-            out = eqn.primitive.bind(*values, **params) if not mixed else _one(eqn.primitive, values, params, eqn.outvars[0].aval.shape, lanes)
+            out = (
+                eqn.primitive.bind(*values, **params)
+                if not mixed
+                else _one(eqn.primitive, values, params, eqn.outvars[0].aval.shape, lanes)
+            )
             out = out if eqn.primitive.multiple_results else [out]
             out = [Lanes(x) for x in out] if mixed else out
         known |= dict(zip(eqn.outvars, out, strict=True))
@@ -162,7 +223,10 @@ def evaluate(closed: core.ClosedJaxpr, inputs: list, lanes: int) -> list:
 def _for_lanes(function: Callable, lanes: int, flags: list[bool], args):
     """All lanes first and last to the eye, last in between."""
     leaves, tree = jax.tree.flatten(args)
-    shapes = [jax.ShapeDtypeStruct(jnp.shape(x)[flag:], jnp.result_type(x)) for x, flag in zip(leaves, flags, strict=True)]
+    shapes = [
+        jax.ShapeDtypeStruct(jnp.shape(x)[flag:], jnp.result_type(x))
+        for x, flag in zip(leaves, flags, strict=True)
+    ]
     closed, made = jax.make_jaxpr(function, return_shape=True)(*tree.unflatten(shapes))
     gathered = jax.tree.structure(made).unflatten
     tile = max(1, min(lanes, TILE) if jax.default_backend() == "cpu" else lanes)
@@ -170,7 +234,14 @@ def _for_lanes(function: Callable, lanes: int, flags: list[bool], args):
 
     def some(own):
         own = iter(own)
-        out = evaluate(closed, [Lanes(jnp.moveaxis(next(own), 0, -1)) if flag else x for x, flag in zip(leaves, flags, strict=True)], tile)
+        out = evaluate(
+            closed,
+            [
+                Lanes(jnp.moveaxis(next(own), 0, -1)) if flag else x
+                for x, flag in zip(leaves, flags, strict=True)
+            ],
+            tile,
+        )
         return [jnp.moveaxis(spread(x, tile), -1, 0) for x in out]
 
     own = [x for x, flag in zip(leaves, flags, strict=True) if flag]
@@ -178,13 +249,17 @@ def _for_lanes(function: Callable, lanes: int, flags: list[bool], args):
         return gathered(some(own))
     if count * tile != lanes:
         # the last lane stands in for those that a whole number of tiles would have more
-        own = [jnp.concatenate([x, jnp.broadcast_to(x[-1:], (count * tile - lanes, *x.shape[1:]))]) for x in own]
+        own = [
+            jnp.concatenate([x, jnp.broadcast_to(x[-1:], (count * tile - lanes, *x.shape[1:]))])
+            for x in own
+        ]
     out = lax.map(some, [x.reshape(count, tile, *x.shape[1:]) for x in own])
     return gathered([x.reshape(count * tile, *x.shape[2:])[:lanes] for x in out])
 
 
 def with_lanes_last(function: Callable) -> Callable:
-    """The function, whose `jax.vmap` keeps lanes last, on processors a few at a time. Its derivatives are those of the function as it is."""
+    """The function, whose `jax.vmap` keeps lanes last, on processors a few at a time. Its
+    derivatives are those of the function as it is."""
     batched = jax.custom_batching.custom_vmap(function)
 
     @batched.def_vmap

@@ -12,7 +12,12 @@ def frozen(tree):
 
 def filled(x, dx):
     """The tangent of x: zeros where dx is None."""
-    return jax.tree.map(lambda x, d: jnp.zeros_like(x) if d is None and x is not None else d, x, dx, is_leaf=lambda x: x is None)
+    return jax.tree.map(
+        lambda x, d: jnp.zeros_like(x) if d is None and x is not None else d,
+        x,
+        dx,
+        is_leaf=lambda x: x is None,
+    )
 
 
 def chosen(which, new, old):

@@ -1,6 +1,7 @@
 """Rows of an array by an index that is known beforehand, whose derivatives are rows and sums again.
 
-The transpose of jax's own indexing is a scatter, which XLA's CPU backend runs entry by entry, and never in one kernel with what is around it.
+The transpose of jax's own indexing is a scatter, which XLA's CPU backend runs entry by entry, and
+never in one kernel with what is around it.
 """
 
 import jax.numpy as jnp
@@ -10,11 +11,14 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Float, Int
 
-# a table of what goes to each row may have so many times the entries that are there and taken; else it is a scatter
+# a table of what goes to each row may have so many times the entries that are there and taken; else
+# it is a scatter
 WASTE = 8
 
 
-def take(x: Float[Array, "rows *n"], index: Int[np.ndarray, "*m"] | Int[Array, "*m"]) -> Float[Array, "..."]:
+def take(
+    x: Float[Array, "rows *n"], index: Int[np.ndarray, "*m"] | Int[Array, "*m"]
+) -> Float[Array, "..."]:
     """x[index] along the first axis; zeros where the index is one past the last row."""
     if not isinstance(index, np.ndarray):
         return jnp.concatenate([x, jnp.zeros_like(x[:1])])[index]
@@ -27,11 +31,17 @@ def take(x: Float[Array, "rows *n"], index: Int[np.ndarray, "*m"] | Int[Array, "
 def _take(x, *, index: bytes, axis: int):
     table, n = np.frombuffer(index, np.int32), x.shape[axis]
     if table.max(initial=0) == n:
-        x = lax.concatenate([x, jnp.zeros((*x.shape[:axis], 1, *x.shape[axis + 1 :]), x.dtype)], axis)
+        x = lax.concatenate(
+            [x, jnp.zeros((*x.shape[:axis], 1, *x.shape[axis + 1 :]), x.dtype)], axis
+        )
     others = tuple(i for i in range(x.ndim) if i != axis)
-    numbers = lax.GatherDimensionNumbers(offset_dims=others, collapsed_slice_dims=(axis,), start_index_map=(axis,))
+    numbers = lax.GatherDimensionNumbers(
+        offset_dims=others, collapsed_slice_dims=(axis,), start_index_map=(axis,)
+    )
     sizes = tuple(1 if i == axis else size for i, size in enumerate(x.shape))
-    return lax.gather(x, table[:, None], numbers, sizes, mode=lax.GatherScatterMode.PROMISE_IN_BOUNDS)
+    return lax.gather(
+        x, table[:, None], numbers, sizes, mode=lax.GatherScatterMode.PROMISE_IN_BOUNDS
+    )
 
 
 def _shape(x, *, index: bytes, axis: int):
@@ -53,7 +63,11 @@ def _back(ct, x, *, index: bytes, axis: int):
     for row in range(n):
         back[row, : count[row]] = order[first[row] : first[row] + count[row]]
     parts = taking.bind(ct, index=back.tobytes(), axis=axis)
-    return [parts if most == 1 else jnp.sum(parts.reshape(*ct.shape[:axis], n, most, *ct.shape[axis + 1 :]), axis + 1)]
+    return [
+        parts
+        if most == 1
+        else jnp.sum(parts.reshape(*ct.shape[:axis], n, most, *ct.shape[axis + 1 :]), axis + 1)
+    ]
 
 
 def _lanes(args, axes, *, index: bytes, axis: int):

@@ -23,7 +23,10 @@ def info(path: str) -> int:
     print(f"{len(chain.body_names) - 1} bodies: {', '.join(chain.body_names[1:])}")
     print(f"{len(chain.joint_names)} joints: {', '.join(chain.joint_names)}")
     print(f"{len(chain.link_names)} virtual links: {', '.join(chain.link_names) or 'none'}")
-    print(f"{chain.nv} joint freedoms in the tree, {chain.dofs} with every virtual link; {chain.gear.shape[0]} actuators")
+    print(
+        f"{chain.nv} joint freedoms in the tree, {chain.dofs} with every virtual link;"
+        f" {chain.gear.shape[0]} actuators"
+    )
     if state is not None:
         print(f"as loaded:\n{svkc.mobility(chain, state)}")
     for line in chain.left_out:
@@ -42,7 +45,8 @@ def _state_or_none(chain):
 
 
 def _suggest(chain):
-    """Joints that can be cut, and bodies at the ends of the tree, which could hold on to something."""
+    """Joints that can be cut, and bodies at the ends of the tree, which could hold on to
+    something."""
     from svkc.mjcf.cuttable_joints import cuts_of
 
     def cut(name):
@@ -53,10 +57,20 @@ def _suggest(chain):
 
     parents = {int(p) for p in chain.model.model.body_parentid[1:]}
     ends = [name for i, name in enumerate(chain.body_names) if i and i not in parents]
-    print(f"joints that can be cut, load(..., cuttable=[...]): {', '.join(filter(cut, chain.joint_names)) or 'none'}")
-    print("ends of the tree, which could be held: " + ", ".join(ends[:12]) + ", ..." * (len(ends) > 12))
+    print(
+        "joints that can be cut, load(..., cuttable=[...]):"
+        f" {', '.join(filter(cut, chain.joint_names)) or 'none'}"
+    )
+    print(
+        "ends of the tree, which could be held: "
+        + ", ".join(ends[:12])
+        + ", ..." * (len(ends) > 12)
+    )
     if ends:
-        print(f'  svkc.VirtualLink("grip", "world", "{ends[0]}", joint="ball"), or load(..., spare=1) and svkc.bind while it moves')
+        print(
+            f'  svkc.VirtualLink("grip", "world", "{ends[0]}", joint="ball"), or load(..., spare=1)'
+            " and svkc.bind while it moves"
+        )
 
 
 def view(path: pathlib.Path, show: bool) -> int:

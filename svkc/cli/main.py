@@ -1,4 +1,5 @@
-"""The command line. `svkc` alone, or `python -m svkc`, runs the high bar: two hands, one hand, flight."""
+"""The command line. `svkc` alone, or `python -m svkc`, runs the high bar: two hands, one hand,
+flight."""
 
 import argparse
 import math
@@ -18,21 +19,37 @@ def _event(kind: str):
         except ValueError:
             seconds = math.nan
         if not link or not math.isfinite(seconds):
-            raise argparse.ArgumentTypeError(f"expected NAME@TIME, a virtual link and seconds, got {text!r}")
+            raise argparse.ArgumentTypeError(
+                f"expected NAME@TIME, a virtual link and seconds, got {text!r}"
+            )
         return kind, link, seconds
 
     return read
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser("svkc", description="Structure-varying kinematic chains. Without a command: the high bar, release and all.")
+    parser = argparse.ArgumentParser(
+        "svkc",
+        description=(
+            "Structure-varying kinematic chains. Without a command: the high bar, release and all."
+        ),
+    )
     add = parser.add_subparsers(dest="command", metavar="COMMAND", required=True).add_parser
-    job = add("run", help="a scene, or a model from where it was loaded: table, npz, pictures, page")
+    job = add(
+        "run", help="a scene, or a model from where it was loaded: table, npz, pictures, page"
+    )
     job.add_argument(
-        "what", nargs="?", default="high_bar", metavar="SCENE|MODEL", help="a name that `svkc scenes` lists (default: high_bar), or an MJCF or URDF file"
+        "what",
+        nargs="?",
+        default="high_bar",
+        metavar="SCENE|MODEL",
+        help="a name that `svkc scenes` lists (default: high_bar), or an MJCF or URDF file",
     )
     job.add_argument("--t1", type=float, help="until when, s")
-    for kind, what in (("release", "let a virtual link go"), ("catch", "connect one where its bodies are then")):
+    for kind, what in (
+        ("release", "let a virtual link go"),
+        ("catch", "connect one where its bodies are then"),
+    ):
         job.add_argument(
             f"--{kind}",
             dest="events",
@@ -42,8 +59,19 @@ def _parser() -> argparse.ArgumentParser:
             metavar="NAME@TIME",
             help=f"{what} at a time, s; again for more, instead of the scene's own events",
         )
-    job.add_argument("--ignore", nargs="*", default=[], metavar="KIND", help="kinds of elements of a model to leave out, or all")
-    job.add_argument("--out", type=pathlib.Path, default=pathlib.Path("out"), help="folder for results (default: out)")
+    job.add_argument(
+        "--ignore",
+        nargs="*",
+        default=[],
+        metavar="KIND",
+        help="kinds of elements of a model to leave out, or all",
+    )
+    job.add_argument(
+        "--out",
+        type=pathlib.Path,
+        default=pathlib.Path("out"),
+        help="folder for results (default: out)",
+    )
     job.add_argument("--mp4", action="store_true", help="an mp4 too (needs the extra svkc[video])")
     job.add_argument("--quiet", action="store_true", help="no progress")
     add("info", help="what a model is to svkc").add_argument("model", help="MJCF or URDF file")
@@ -60,11 +88,23 @@ def main(argv=None) -> int:
     """Entry point."""
     argv = list(sys.argv[1:] if argv is None else argv)
     # alone it is the main job, and a scene's name is enough
-    if not argv or argv[0] in run.SCENES or (argv[0].startswith("-") and argv[0] not in ("-h", "--help")):
+    if (
+        not argv
+        or argv[0] in run.SCENES
+        or (argv[0].startswith("-") and argv[0] not in ("-h", "--help"))
+    ):
         argv = ["run", *argv]
     options = _parser().parse_args(argv)
     if options.command == "run":
-        return run.run(options.what, options.t1, options.events, tuple(options.ignore), options.out, options.mp4, options.quiet)
+        return run.run(
+            options.what,
+            options.t1,
+            options.events,
+            tuple(options.ignore),
+            options.out,
+            options.mp4,
+            options.quiet,
+        )
     if options.command == "info":
         return inspect.info(options.model)
     if options.command == "view":

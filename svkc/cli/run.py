@@ -1,4 +1,5 @@
-"""Commands that run a scene or a model. jax and the rest are imported where they are used, so that help is quick."""
+"""Commands that run a scene or a model. jax and the rest are imported where they are used, so that
+help is quick."""
 
 import gc
 import pathlib
@@ -12,7 +13,10 @@ def _high_bar():
     import svkc
     from svkc.scenes import high_bar
 
-    return *high_bar(), (svkc.at(RELEASE_RIGHT, cut="right_hand_grip"), svkc.at(RELEASE_LEFT, cut="left_hand_grip"))
+    return *high_bar(), (
+        svkc.at(RELEASE_RIGHT, cut="right_hand_grip"),
+        svkc.at(RELEASE_LEFT, cut="left_hand_grip"),
+    )
 
 
 def _swing():
@@ -38,8 +42,19 @@ def _walking():
 SCENES = {
     "high_bar": (_high_bar, 1.8, "two hands on a bar, one, flight (the paper's Fig. 20)"),
     "swing": (_swing, 2.0, "the seat of a swing gives way as the thighs slide off (Fig. 21)"),
-    "brachiation": (_brachiation, 1.0, "hangs from the first of three bars; nobody drives it (examples/03_brachiation.py does)"),
-    "walking": (_walking, 0.6, "stands on two feet and falls, only its feet held by the ground; nobody drives it (examples/04_walk.py does)"),
+    "brachiation": (
+        _brachiation,
+        1.0,
+        "hangs from the first of three bars; nobody drives it (examples/03_brachiation.py does)",
+    ),
+    "walking": (
+        _walking,
+        0.6,
+        (
+            "stands on two feet and falls, only its feet held by the ground; nobody drives it"
+            " (examples/04_walk.py does)"
+        ),
+    ),
 }
 
 
@@ -52,8 +67,11 @@ def scenes() -> int:
     return 0
 
 
-def run(name: str, t1: float | None, events, ignore, out: pathlib.Path, video: bool, quiet: bool) -> int:
-    """One scene or model: the table of its phases, the run, the pictures. events: (kind, link, time) besides the scene's own."""
+def run(
+    name: str, t1: float | None, events, ignore, out: pathlib.Path, video: bool, quiet: bool
+) -> int:
+    """One scene or model: the table of its phases, the run, the pictures. events: (kind, link,
+    time) besides the scene's own."""
     import jax
     from tqdm import tqdm
 
@@ -63,11 +81,18 @@ def run(name: str, t1: float | None, events, ignore, out: pathlib.Path, video: b
     from svkc._jax.compilation_cache import use_cache
 
     kept = use_cache()
-    # tracing makes very many small objects that stay: the collector would look through all of them again and again
+    # tracing makes very many small objects that stay: the collector would look through all of them
+    # again and again
     gc.freeze()
     gc.set_threshold(100_000, 20, 50)
     begin = time.perf_counter()
-    stages = tqdm(total=4, desc="loading", bar_format="{l_bar}{bar:20}| {elapsed}", disable=True if quiet else None, leave=False)
+    stages = tqdm(
+        total=4,
+        desc="loading",
+        bar_format="{l_bar}{bar:20}| {elapsed}",
+        disable=True if quiet else None,
+        leave=False,
+    )
     try:
         chain, state, events, end = _wanted(name, t1, events, ignore)
         out.mkdir(parents=True, exist_ok=True)
@@ -83,14 +108,22 @@ def run(name: str, t1: float | None, events, ignore, out: pathlib.Path, video: b
     traj = _simulated(chain, state, events, end, stages.disable)
     done = time.perf_counter()
     _next(stages, "pictures")
-    written, missing = _write(chain, traj, out, pathlib.Path(name).stem, video, {**TOLERANCES, "t1": end, "what": name})
+    written, missing = _write(
+        chain, traj, out, pathlib.Path(name).stem, video, {**TOLERANCES, "t1": end, "what": name}
+    )
     _next(stages, "done")
     stages.close()
     print_phases(chain, traj)
-    print(f"load and close the loops {loaded - begin:.1f} s, first run with compilation {compiled - loaded:.1f} s, a run {done - compiled:.3f} s")
+    print(
+        f"load and close the loops {loaded - begin:.1f} s, first run with compilation"
+        f" {compiled - loaded:.1f} s, a run {done - compiled:.3f} s"
+    )
     print(f"compiled programs are kept in {kept}\n" * (kept is not None), end="")
     print("\n".join(missing) + "\n" * bool(missing) + "wrote " + ", ".join(map(str, written)))
-    print(f"look: open {written[-1]}" + f", or  svkc view {written[0]}" * (written[-1].suffix == ".html"))
+    print(
+        f"look: open {written[-1]}"
+        + f", or  svkc view {written[0]}" * (written[-1].suffix == ".html")
+    )
     # what ended early is kept and said, and the shell is told
     return 0 if traj.result in (svkc.RESULTS.successful, svkc.RESULTS.stopped) else 1
 
@@ -105,7 +138,11 @@ def _simulated(chain, state, events, end: float, quiet: bool):
 
     ts = jnp.linspace(0, end, max(round(end / 0.025), 1) + 1)
     meter = None if quiet or end <= 10 else diffrax.TqdmProgressMeter()
-    return jax.block_until_ready(svkc.simulate(chain, state, end, ts=ts, events=events, throw=False, progress_meter=meter, **TOLERANCES))
+    return jax.block_until_ready(
+        svkc.simulate(
+            chain, state, end, ts=ts, events=events, throw=False, progress_meter=meter, **TOLERANCES
+        )
+    )
 
 
 def _next(stages, what: str):
@@ -124,7 +161,8 @@ def _wanted(name: str, t1: float | None, events, ignore):
 
 
 def _scene(name: str, ignore):
-    """Chain, state, events and end of a scene that ships, or of a model file at its load pose for two seconds."""
+    """Chain, state, events and end of a scene that ships, or of a model file at its load pose for
+    two seconds."""
     import svkc
 
     if name in SCENES:
@@ -142,11 +180,19 @@ def _asked(chain, events):
 
     for _, link, _ in events:
         if link not in chain.link_names:
-            raise ValueError(f"run: no virtual link {link!r}; virtual links: {', '.join(chain.link_names) or 'none'}")
-    return tuple(svkc.at(t, cut=link) if kind == "release" else svkc.at(t, connect=link, here=True) for kind, link, t in events)
+            raise ValueError(
+                f"run: no virtual link {link!r}; virtual links:"
+                f" {', '.join(chain.link_names) or 'none'}"
+            )
+    return tuple(
+        svkc.at(t, cut=link) if kind == "release" else svkc.at(t, connect=link, here=True)
+        for kind, link, t in events
+    )
 
 
-def _write(chain, traj, out: pathlib.Path, stem: str, video: bool, options: dict) -> tuple[list, list[str]]:
+def _write(
+    chain, traj, out: pathlib.Path, stem: str, video: bool, options: dict
+) -> tuple[list, list[str]]:
     """The run and its pictures: what was written, and a line for each that could not be."""
     import svkc
 
@@ -154,7 +200,13 @@ def _write(chain, traj, out: pathlib.Path, stem: str, video: bool, options: dict
     traj.save(written[0], chain, **options)
     curves = lambda path: traj.plot(chain).savefig(path, dpi=110)
     draw = lambda path: svkc.render(chain, traj, path, azimuth=90)
-    pictures = [(f"{stem}.png", draw), (f"{stem}_curves.png", curves), (f"{stem}.gif", draw), (f"{stem}.mp4", draw), (f"{stem}.html", draw)]
+    pictures = [
+        (f"{stem}.png", draw),
+        (f"{stem}_curves.png", curves),
+        (f"{stem}.gif", draw),
+        (f"{stem}.mp4", draw),
+        (f"{stem}.html", draw),
+    ]
     for file, how in pictures:
         if file.endswith(".mp4") and not video:
             continue
@@ -167,9 +219,16 @@ def _write(chain, traj, out: pathlib.Path, stem: str, video: bool, options: dict
 
 
 def print_phases(chain, traj):
-    """Freedoms, rank, mobility, steps and energy before and after each event, then the certificate."""
+    """Freedoms, rank, mobility, steps and energy before and after each event, then the
+    certificate."""
     p, report = traj.phases, traj.report()
-    names = {i: ", ".join(n for n, on in zip(chain.link_names, p.connected[i], strict=True) if on) or "nothing" for i in range(int(p.count))}
+    names = {
+        i: (
+            ", ".join(n for n, on in zip(chain.link_names, p.connected[i], strict=True) if on)
+            or "nothing"
+        )
+        for i in range(int(p.count))
+    }
     wide = max(34, *map(len, names.values()))
     print(f"      from        to  {'held by':<{wide}} joint   rank  mobility   steps  energy drift")
     print(f"         s         s  {'':<{wide}} freedoms                           J")
@@ -177,7 +236,8 @@ def print_phases(chain, traj):
         if float(p.start[i]) == float(p.stop[i]) and i:
             continue
         print(
-            f"{float(p.start[i]):10.6f}{float(p.stop[i]):10.6f}  {names[i]:<{wide}}{int(p.joint_freedoms[i]):6d}{int(p.rank[i]):7d}"
+            f"{float(p.start[i]):10.6f}{float(p.stop[i]):10.6f} "
+            f" {names[i]:<{wide}}{int(p.joint_freedoms[i]):6d}{int(p.rank[i]):7d}"
             f"{int(p.freedoms[i]):10d}{int(p.accepted[i]):8d}{float(p.energy_drift[i]):14.2e}"
         )
     times = ", ".join(f"{float(t):.6f} s" for t in traj.events.time[: int(traj.events.count)])

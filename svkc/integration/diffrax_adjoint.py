@@ -22,7 +22,9 @@ class _Interpolation(diffrax.AbstractLocalInterpolation):
     def evaluate(self, t0, t1=None, left=True):
         def at(t):
             part = (t - self.t0) / (self.t1 - self.t0)
-            return jax.tree.map(lambda y, s: y + part * s, self.inner.evaluate(t, left=left), self.shift)
+            return jax.tree.map(
+                lambda y, s: y + part * s, self.inner.evaluate(t, left=left), self.shift
+            )
 
         if t1 is None:
             return at(t0)
@@ -67,7 +69,9 @@ class Settled(diffrax.AbstractWrappedSolver):
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         fresh = True if projects(self.field.stabilization, args) else made_jump
-        raw, error, dense, solver_state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, fresh)
+        raw, error, dense, solver_state, result = self.solver.step(
+            terms, t0, t1, y0, args, solver_state, fresh
+        )
         y1, _ = settle(self.field, args, raw)
         shift = jax.tree.map(lambda a, b: a - b, y1, raw)
         return y1, error, {"inner": dense, "shift": shift}, solver_state, result

@@ -19,35 +19,44 @@ def _arrived_jvp(primals, tangents):
 
 
 def arrival_tangent(primals, tangents, end, at: Motion, rate: Motion):
-    """What y changes by at its time, and its rate times the change of the end's time: that of `late`, or dt = -dg / (dg/dt), the implicit function's.
+    """What y changes by at its time, and its rate times the change of the end's time: that of
+    `late`, or dt = -dg / (dg/dt), the implicit function's.
 
     primals, tangents: of `arrived`; end, at: what it gives; rate: of the motion there.
     """
     t, y, late, scene, guards, found = primals
     d_t, dy, d_late, d_scene, d_guards, _ = tangents
-    field, d_field = (guards, d_guards) if isinstance(guards, Field) else (guards.field, d_guards.field)
+    field, d_field = (
+        (guards, d_guards) if isinstance(guards, Field) else (guards.field, d_guards.field)
+    )
     d_t = filled(t, d_t)
     dy = carried((filled(y, dy), d_scene, d_field), rate, end - t, end, at, scene, field)
     dt = filled(late, d_late)
     if found is not None:
         guard = lambda t, y, scene, guards: guards(t, y, scene)[found.first]
-        slope = jax.jvp(lambda t, y: guard(t, y, scene, guards), (end, at), (jnp.ones_like(end), rate))[1]
+        slope = jax.jvp(
+            lambda t, y: guard(t, y, scene, guards), (end, at), (jnp.ones_like(end), rate)
+        )[1]
         change = eqx.filter_jvp(guard, (end, at, scene, guards), (d_t, dy, d_scene, d_guards))[1]
         none = found.jumps | ~found.hit
         # where a guard touches zero there is no derivative, and no number that looks like one
-        implicit = jnp.where(none, 0, -change) / jnp.where(none, 1, jnp.where(found.flat, jnp.nan, slope))
+        implicit = jnp.where(none, 0, -change) / jnp.where(
+            none, 1, jnp.where(found.flat, jnp.nan, slope)
+        )
         dt = jnp.where(found.hit, implicit, dt)
     return d_t + dt, jax.tree.map(lambda d, r: d + r * dt, dy, rate)
 
 
-# arrived(t, y, late, scene, guards or field, found or None) -> t, y: the end of a phase, where the motion y was found at the time t, a guard's zero, or,
-# `late` by nothing, the time scheduled
+# arrived(t, y, late, scene, guards or field, found or None) -> t, y: the end of a phase, where the
+# motion y was found at the time t, a guard's zero, or, `late` by nothing, the time scheduled
 arrived = operation("arrived", lambda t, y, *_: (t, y), _arrived_jvp)
 
 
 def _rate_of(changes, t, at: Motion, scene: Scene, field: Field) -> Motion:
     """How fast changes of the motion, the scene and the field make the motion's change grow."""
-    return eqx.filter_jvp(lambda y, scene, field: field(t, y, scene), (at, scene, field), changes)[1]
+    return eqx.filter_jvp(lambda y, scene, field: field(t, y, scene), (at, scene, field), changes)[
+        1
+    ]
 
 
 def _carried_jvp(primals, tangents):
@@ -61,24 +70,34 @@ def _carried_jvp(primals, tangents):
 
 def _carried_transpose(inputs, cotangent: Motion):
     changes, *where = inputs
-    asked = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) if is_cotangent_of(x) else None, changes, is_leaf=is_cotangent_of)
-    return _brought_back(filled(where[2], cotangent), asked, *where), *jax.tree.map(lambda _: None, tuple(where))
+    asked = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) if is_cotangent_of(x) else None,
+        changes,
+        is_leaf=is_cotangent_of,
+    )
+    return _brought_back(filled(where[2], cotangent), asked, *where), *jax.tree.map(
+        lambda _: None, tuple(where)
+    )
 
 
 _carried = operation("carried", lambda changes, *_: changes[0], _carried_jvp, _carried_transpose)
 
 
 def carried(changes, rate: Motion, none, t, at: Motion, scene: Scene, field: Field) -> Motion:
-    """Of changes = (dy, d_scene, d_field), dy carried along for a time that is zero but may itself change, which second derivatives see."""
+    """Of changes = (dy, d_scene, d_field), dy carried along for a time that is zero but may itself
+    change, which second derivatives see."""
     # a number for each lane of its own, as the operation's transpose would not sum over lanes
     one = 1 + 0 * jnp.sum(rate.v)
     return _carried(jax.tree.map(lambda d: d * one, changes), none, t, at, scene, field)
 
 
 def _back(cotangent: Motion, asked, *_):
-    """The cotangent of dy, and zeros for those of the scene and the field, as far as they are asked for."""
+    """The cotangent of dy, and zeros for those of the scene and the field, as far as they are asked
+    for."""
     moving, *rest = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), asked)
-    return jax.tree.map(lambda z, c: None if z is None else c, moving, cotangent, is_leaf=lambda z: z is None), *rest
+    return jax.tree.map(
+        lambda z, c: None if z is None else c, moving, cotangent, is_leaf=lambda z: z is None
+    ), *rest
 
 
 def _back_jvp(primals, tangents):
@@ -86,11 +105,14 @@ def _back_jvp(primals, tangents):
     further, _, delay, *_ = tangents
     change = _back(filled(cotangent, further), asked)
     if delay is not None:
-        pulled = eqx.filter_vjp(lambda y, scene, field: field(t, y, scene), at, scene, field)[1](cotangent)
+        pulled = eqx.filter_vjp(lambda y, scene, field: field(t, y, scene), at, scene, field)[1](
+            cotangent
+        )
         grown = lambda c, p: None if c is None else c + delay * p
         change = jax.tree.map(grown, change, pulled, is_leaf=lambda c: c is None)
     return _brought_back(*primals), change
 
 
-# _brought_back(cotangent of dy, shapes, delay, t, at, scene, field) -> cotangents of (dy, d_scene, d_field): the transpose of `_carried`
+# _brought_back(cotangent of dy, shapes, delay, t, at, scene, field) -> cotangents of (dy, d_scene,
+# d_field): the transpose of `_carried`
 _brought_back = operation("brought_back", _back, _back_jvp)

@@ -1,6 +1,7 @@
 """Event location: guards, the bracket about a root, and the search for the root.
 
-The search is a state machine that is advanced by one evaluation of the guards; the stepping loop makes the evaluations.
+The search is a state machine that is advanced by one evaluation of the guards; the stepping loop
+makes the evaluations.
 """
 
 import equinox as eqx
@@ -20,8 +21,9 @@ NARROWINGS = 200
 
 
 class Bracket(eqx.Module):
-    """Two times, at the first a function is below zero, at the second not: narrowed to round-off by false position with the Illinois weight, every third
-    time by bisection. `fine`: how narrow; `last`: which end has moved (1: b, -1: a)."""
+    """Two times, at the first a function is below zero, at the second not: narrowed to round-off by
+    false position with the Illinois weight, every third time by bisection. `fine`: how narrow;
+    `last`: which end has moved (1: b, -1: a)."""
 
     a: Float[Array, ""]
     b: Float[Array, ""]
@@ -52,12 +54,23 @@ class Bracket(eqx.Module):
     def narrowed(self, c, fc) -> "Bracket":
         """With what the function is at c."""
         right = fc >= 0
-        fa, fb = jnp.where(right & (self.last == 1), self.fa / 2, self.fa), jnp.where(~right & (self.last == -1), self.fb / 2, self.fb)
-        a, fa, b, fb = jnp.where(right, self.a, c), jnp.where(right, fa, fc), jnp.where(right, c, self.b), jnp.where(right, fc, fb)
-        return Bracket(a, b, fa, fb, self.fine, jnp.where(right, 1, -1).astype(jnp.int32), self.count + 1)
+        fa, fb = (
+            jnp.where(right & (self.last == 1), self.fa / 2, self.fa),
+            jnp.where(~right & (self.last == -1), self.fb / 2, self.fb),
+        )
+        a, fa, b, fb = (
+            jnp.where(right, self.a, c),
+            jnp.where(right, fa, fc),
+            jnp.where(right, c, self.b),
+            jnp.where(right, fc, fb),
+        )
+        return Bracket(
+            a, b, fa, fb, self.fine, jnp.where(right, 1, -1).astype(jnp.int32), self.count + 1
+        )
 
 
-# a guard that at the rate it crosses zero with would change this little over a step, measured by its size, touches zero rather than crosses it
+# a guard that at the rate it crosses zero with would change this little over a step, measured by
+# its size, touches zero rather than crosses it
 FLAT = 1e-5
 
 
@@ -70,13 +83,21 @@ class Reading(eqx.Module):
     def __call__(self, t, y: Motion, scene: Scene) -> Float[Array, " guards"]:
         state = State(y.q, y.v, scene.structure)
         guards = self.made.guards
-        tau = self.field.torques(t, y, scene)[0] if any(isinstance(g, Sensor) and g.loaded for g in guards) else jnp.zeros_like(y.v)
-        values = [g.measure(scene.chain, state, tau) if isinstance(g, Sensor) else g(t, state, scene.args) for g in guards]
+        tau = (
+            self.field.torques(t, y, scene)[0]
+            if any(isinstance(g, Sensor) and g.loaded for g in guards)
+            else jnp.zeros_like(y.v)
+        )
+        values = [
+            g.measure(scene.chain, state, tau) if isinstance(g, Sensor) else g(t, state, scene.args)
+            for g in guards
+        ]
         return jnp.stack([jnp.asarray(one("guard", x), y.q.dtype) for x in values])
 
 
 class Found(eqx.Module):
-    """The guards that fired, which guard values go on, the first guard, whether there was one, it jumped over zero, or it only touched it."""
+    """The guards that fired, which guard values go on, the first guard, whether there was one, it
+    jumped over zero, or it only touched it."""
 
     fired: Bool[Array, " guards"]
     values: Float[Array, " guards"]
@@ -87,7 +108,8 @@ class Found(eqx.Module):
 
 
 def event_tolerance(t: Float[Array, ""]) -> Float[Array, ""]:
-    """Events this close (s) to the earliest happen together with it: sqrt(eps), 1.5e-8 in float64, relative from t = 1 s on."""
+    """Events this close (s) to the earliest happen together with it: sqrt(eps), 1.5e-8 in float64,
+    relative from t = 1 s on."""
     return jnp.finfo(t.dtype).eps ** 0.5 * jnp.maximum(1, jnp.abs(t))
 
 
@@ -105,8 +127,10 @@ class Watched(eqx.Module):
 
 
 class Search(eqx.Module):
-    """For the first zero in the step from the loop's t, over a span of time: guards that crossed it, by the side they are on then, and their sizes; the
-    bracket and, at its right end, the motion and the guards; the guards just after that. on: begun; narrow: the bracket is to be made smaller yet."""
+    """For the first zero in the step from the loop's t, over a span of time: guards that crossed
+    it, by the side they are on then, and their sizes; the bracket and, at its right end, the motion
+    and the guards; the guards just after that. on: begun; narrow: the bracket is to be made smaller
+    yet."""
 
     span: Float[Array, ""]
     side: Float[Array, " guards"]
@@ -125,17 +149,33 @@ class Search(eqx.Module):
         return jnp.where(self.narrow, self.bracket.inside(), b + event_tolerance(b))
 
 
-def watch(old: Search, before: Float[Array, " guards"], t0, t1, y: Motion, keep, scene: Scene, watched: Watched) -> tuple[Float[Array, " guards"], Search]:
-    """The guards after a try of a step from t0 to t1, and the search for their first zero: begun, narrowed, or done once they are known just after it.
+def watch(
+    old: Search,
+    before: Float[Array, " guards"],
+    t0,
+    t1,
+    y: Motion,
+    keep,
+    scene: Scene,
+    watched: Watched,
+) -> tuple[Float[Array, " guards"], Search]:
+    """The guards after a try of a step from t0 to t1, and the search for their first zero: begun,
+    narrowed, or done once they are known just after it.
 
     before: the guards at t0; y: where the try has led to; keep: whether the step holds.
     """
     values = watched.guards(t1, y, scene)
     # a guard at zero is not armed before it has left it by more than round-off
-    values = jnp.where((before == 0) & (jnp.abs(values) < jnp.finfo(values.dtype).eps ** 0.75), 0, values)
+    values = jnp.where(
+        (before == 0) & (jnp.abs(values) < jnp.finfo(values.dtype).eps ** 0.75), 0, values
+    )
     crossed = watched.guards.made.crossed(before, values) & watched.which & keep & ~old.on
     begun = jnp.any(crossed)
-    side = jnp.where(begun, jnp.where(crossed, jnp.where(values >= before, 1, -1), 0).astype(values.dtype), old.side)
+    side = jnp.where(
+        begun,
+        jnp.where(crossed, jnp.where(values >= before, 1, -1), 0).astype(values.dtype),
+        old.side,
+    )
     # the largest of the guards that crossed: positive where one has
     passed = lambda values: jnp.max(jnp.where(side != 0, side * values, -jnp.inf))
     bracket = chosen(old.narrow, old.bracket.narrowed(t1, passed(values)), old.bracket)
@@ -159,11 +199,18 @@ def watch(old: Search, before: Float[Array, " guards"], t0, t1, y: Motion, keep,
 
 
 def found(search: Search, guards: Float[Array, " guards"], t) -> Found:
-    """Which guards fired, where a search that ended at t has looked for that. guards: their values there."""
+    """Which guards fired, where a search that ended at t has looked for that. guards: their values
+    there."""
     crossed, passed = search.side != 0, search.side * search.values
     first = jnp.argmax(jnp.where(crossed, passed, -jnp.inf)).astype(jnp.int32)
-    fired = (crossed & (search.side * search.ahead >= 0)) | (jnp.arange(crossed.shape[0], dtype=jnp.int32) == first)
-    value, grown, large = jnp.abs(passed[first]), jnp.abs(search.ahead - search.values)[first], FLAT * search.size[first]
+    fired = (crossed & (search.side * search.ahead >= 0)) | (
+        jnp.arange(crossed.shape[0], dtype=jnp.int32) == first
+    )
+    value, grown, large = (
+        jnp.abs(passed[first]),
+        jnp.abs(search.ahead - search.values)[first],
+        FLAT * search.size[first],
+    )
     jumps = search.done & (value > grown) & (value > large)
     flat = search.done & ~jumps & (grown / event_tolerance(t) * search.span < large)
     fired = fired & search.done

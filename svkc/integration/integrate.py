@@ -1,6 +1,8 @@
-"""The steps of one phase: forward until its end, or until a guard has gone through zero; then, from the same step's begin, to where it was zero.
+"""The steps of one phase: forward until its end, or until a guard has gone through zero; then, from
+the same step's begin, to where it was zero.
 
-One loop does both, so that a program holds the field, the solver's stages and the way back onto the loops once. Nothing here is differentiated.
+One loop does both, so that a program holds the field, the solver's stages and the way back onto the
+loops once. Nothing here is differentiated.
 """
 
 import dataclasses
@@ -15,7 +17,21 @@ from svkc._jax.control_flow import buffer_at_set, while_loop
 from svkc._jax.pytrees import chosen
 from svkc.integration.event_location import Bracket, Search, found, watch
 from svkc.integration.integrators import REST, Motion, finite, motion_norm
-from svkc.integration.solution import EVENT, MAX_STEPS, MOVED, NON_FINITE, OPEN, SUCCESSFUL, How, Path, Step, Tally, Tried, World, _counted
+from svkc.integration.solution import (
+    EVENT,
+    MAX_STEPS,
+    MOVED,
+    NON_FINITE,
+    OPEN,
+    SUCCESSFUL,
+    How,
+    Path,
+    Step,
+    Tally,
+    Tried,
+    World,
+    _counted,
+)
 from svkc.integration.stabilization import projects
 from svkc.integration.vector_field import Seen, settle
 
@@ -32,27 +48,62 @@ def march(start: Motion, times, world: World, how: How) -> Path:
         return more & (s.result == SUCCESSFUL)
 
     begin, buffers = _begin(start, times, world, how), lambda s: (s.times, s.kept, s.saved)
-    end = while_loop(going, lambda s: _step(s, times, world, how), begin, buffers=buffers, kind="lax")
+    end = while_loop(
+        going, lambda s: _step(s, times, world, how), begin, buffers=buffers, kind="lax"
+    )
     how.progress_meter.close(end.meter)
     # of times that are equal the first one's row is written
-    saved = jax.tree.map(lambda x: x[jnp.searchsorted(at, at)], end.saved) if at.shape[0] else end.saved
+    saved = (
+        jax.tree.map(lambda x: x[jnp.searchsorted(at, at)], end.saved) if at.shape[0] else end.saved
+    )
     short = jnp.where(end.t < stop, MAX_STEPS, SUCCESSFUL)
     fired = None if how.watched is None else found(end.search, end.guards, end.t)
     if fired is not None:
         short = jnp.where(fired.hit, EVENT, short)
     result = jnp.where(end.result == SUCCESSFUL, short, end.result)
-    return Path(end.t, end.y, saved, end.times, end.kept, end.accepted, end.rejected, result.astype(jnp.int32), end.tally, fired)
+    return Path(
+        end.t,
+        end.y,
+        saved,
+        end.times,
+        end.kept,
+        end.accepted,
+        end.rejected,
+        result.astype(jnp.int32),
+        end.tally,
+        fired,
+    )
 
 
 def _begin(start: Motion, times, world: World, how: How) -> Step:
     t0, stop, at = times
     term, no, zero = diffrax.ODETerm(world.field), jnp.zeros((), bool), jnp.zeros((), jnp.int32)
-    first, controller = how.controller.init(term, t0, stop, start, how.first_step, world.scene, how.solver.func, how.solver.error_order(term))
+    first, controller = how.controller.init(
+        term,
+        t0,
+        stop,
+        start,
+        how.first_step,
+        world.scene,
+        how.solver.func,
+        how.solver.error_order(term),
+    )
     rows = lambda n: jax.tree.map(lambda x: jnp.broadcast_to(x[None], (n, *x.shape)), start)
     values, search, seen = None, None, Seen.first(world.field, world.scene, start.q)
     if how.watched is not None:
         values = how.watched.values
-        search = Search(t0, jnp.zeros_like(values), values, Bracket.around(t0, t0, t0, t0), start, values, values, no, no, no)
+        search = Search(
+            t0,
+            jnp.zeros_like(values),
+            values,
+            Bracket.around(t0, t0, t0, t0),
+            start,
+            values,
+            values,
+            no,
+            no,
+            no,
+        )
     return Step(
         t=t0,
         y=start,
@@ -85,49 +136,69 @@ def _met(t, proposed, times) -> Float[Array, ""]:
 def _try(s: Step, t1, world: World, how: How) -> Tried:
     """A step of the solver to t1, settled, and what the controller says of it."""
     term, stabilization = diffrax.ODETerm(world.field), world.field.stabilization
-    # a step begins with the rate where the one before was settled to, not with one remembered from where it was before that
+    # a step begins with the rate where the one before was settled to, not with one remembered from
+    # where it was before that
     fresh = True if projects(stabilization, world.scene) else s.jumped
     y, error, _, solver, solved = how.solver.step(term, s.t, t1, s.y, world.scene, s.solver, fresh)
     raw, (y, seen) = y, settle(world.field, world.scene, y)
     if error is not None and world.field.pivotless:
         # without pivots nothing else shows that loops lose rank
-        error = jax.tree.map(lambda e, new, old: jnp.maximum(jnp.abs(e), MOVED * jnp.abs(new - old)), error, y, raw)
+        error = jax.tree.map(
+            lambda e, new, old: jnp.maximum(jnp.abs(e), MOVED * jnp.abs(new - old)), error, y, raw
+        )
     whole, order = finite(y), how.solver.error_order(term)
     why = jnp.where(whole, OPEN, NON_FINITE)
     if seen is not None:
         whole = whole & (jnp.max(seen.gap) <= how.gap)
     error = jax.tree.map(lambda x: jnp.where(whole & jnp.isfinite(x), x, jnp.inf), error)
-    keep, t, ahead, jumped, controller, said = how.controller.adapt_step_size(s.t, t1, s.y, y, world.scene, error, order, s.controller)
+    keep, t, ahead, jumped, controller, said = how.controller.adapt_step_size(
+        s.t, t1, s.y, y, world.scene, error, order, s.controller
+    )
     keep, length = jnp.asarray(keep), ahead - t
     if isinstance(how.controller, diffrax.PIDController):
-        # the length asked for before a step was much shortened, where that step says no more than that it may grow as far as it ever may
+        # the length asked for before a step was much shortened, where that step says no more than
+        # that it may grow as far as it ever may
         grown = keep & (length >= 0.99 * how.controller.factormax * (t1 - s.t))
         length = jnp.where(grown, jnp.maximum(length, s.length), length)
     failed = keep & (solved._value != SUCCESSFUL)
     result = jnp.where(failed, solved._value, said._value)
-    # what is not finite, or open, is never kept: it ends the run where the step has to be of that length, or when there is no shorter one
+    # what is not finite, or open, is never kept: it ends the run where the step has to be of that
+    # length, or when there is no shorter one
     result = jnp.where(~whole & (keep | (result != SUCCESSFUL)), why, result).astype(jnp.int32)
     estimate = jnp.asarray(jnp.inf, t.dtype) if error is None else motion_norm(error)
-    return Tried(t, y, keep & whole, length, jnp.asarray(jumped), solver, controller, result, estimate, seen)
+    return Tried(
+        t, y, keep & whole, length, jnp.asarray(jumped), solver, controller, result, estimate, seen
+    )
 
 
 def _step(s: Step, times, world: World, how: How) -> Step:
-    """One try: kept, or to be made shorter; or one more look at the step in which a guard went through zero."""
+    """One try: kept, or to be made shorter; or one more look at the step in which a guard went
+    through zero."""
     t0, stop, at = times
     if s.seen is not None and s.seen.pivots is not None and world.field.dynamics.hold is not None:
-        world = eqx.tree_at(lambda w: w.scene.pivots, world, s.seen.pivots, is_leaf=lambda x: x is None)
+        world = eqx.tree_at(
+            lambda w: w.scene.pivots, world, s.seen.pivots, is_leaf=lambda x: x is None
+        )
     if s.search is None:
         tried = _try(s, s.next, world, how)
         guards, search, still = None, None, jnp.zeros((), bool)
     else:
         t1 = jnp.where(s.search.on, s.search.asked(), s.next)
         tried = _try(s, t1, world, how)
-        guards, search = watch(s.search, s.guards, s.t, t1, tried.y, tried.keep, world.scene, how.watched)
+        guards, search = watch(
+            s.search, s.guards, s.t, t1, tried.y, tried.keep, world.scene, how.watched
+        )
         still = s.search.on | search.on
         blind = tried.keep & jnp.any(jnp.isnan(guards))
-        tried = eqx.tree_at(lambda x: (x.keep, x.result), tried, (tried.keep & ~blind, jnp.where(blind, NON_FINITE, tried.result)))
+        tried = eqx.tree_at(
+            lambda x: (x.keep, x.result),
+            tried,
+            (tried.keep & ~blind, jnp.where(blind, NON_FINITE, tried.result)),
+        )
         landed = chosen(search.done, (search.bracket.b, search.motion), (tried.t, tried.y))
-        tried = eqx.tree_at(lambda x: (x.t, x.y, x.keep), tried, (*landed, (tried.keep & ~still) | search.done))
+        tried = eqx.tree_at(
+            lambda x: (x.t, x.y, x.keep), tried, (*landed, (tried.keep & ~still) | search.done)
+        )
     moved = lambda new, old: chosen(tried.keep, new, old)
     # while a zero is looked for, nothing else goes on
     next_ = lambda new, old: chosen(still, old, new)
@@ -137,7 +208,9 @@ def _step(s: Step, times, world: World, how: How) -> Step:
         place = jnp.minimum(jnp.sum(at < t, dtype=jnp.int32), at.shape[0] - 1)
         saved = _written(saved, place, tried.y, tried.keep & (at[place] == t))
     if kept.q.shape[0]:
-        kept = _written(kept, accepted // how.every - 1, tried.y, tried.keep & (accepted % how.every == 0))
+        kept = _written(
+            kept, accepted // how.every - 1, tried.y, tried.keep & (accepted % how.every == 0)
+        )
     return Step(
         t=t,
         y=moved(tried.y, s.y),

@@ -1,4 +1,5 @@
-"""The state and the arguments of the vector field, integrators of our own as diffrax solvers, and one step by itself."""
+"""The state and the arguments of the vector field, integrators of our own as diffrax solvers, and
+one step by itself."""
 
 from typing import Any, ClassVar
 
@@ -23,7 +24,8 @@ REST = 1e-6
 
 
 class Motion(eqx.Module):
-    """What is integrated: q, v, and the work (J) done by control, limits and dampers; None where the scene has none of them."""
+    """What is integrated: q, v, and the work (J) done by control, limits and dampers; None where
+    the scene has none of them."""
 
     q: Float[Array, " q"]
     v: Float[Array, " dofs"]
@@ -31,7 +33,8 @@ class Motion(eqx.Module):
 
 
 class Scene(eqx.Module):
-    """The `args` of the vector field: all it depends on besides time and motion. pivots: of the loops' rows, where they are held (`Dynamics.hold`)."""
+    """The `args` of the vector field: all it depends on besides time and motion. pivots: of the
+    loops' rows, where they are held (`Dynamics.hold`)."""
 
     chain: Chain
     structure: Structure
@@ -45,7 +48,8 @@ def finite(y: Motion) -> Bool[Array, ""]:
 
 
 class FixedSteps(diffrax.AbstractStepSizeController):
-    """Steps of dt; diffrax is told the times `ts` to shorten them for. A step that is not finite is not taken: it ends the solve."""
+    """Steps of dt; diffrax is told the times `ts` to shorten them for. A step that is not finite is
+    not taken: it ends the solve."""
 
     dt: Float[Array, ""]
     ts: Float[Array, " times"]
@@ -61,9 +65,13 @@ class FixedSteps(diffrax.AbstractStepSizeController):
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         return self._next(t0), None
 
-    def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
+    def adapt_step_size(
+        self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
+    ):
         whole = finite(y1_candidate)
-        said = diffrax.RESULTS.where(whole, diffrax.RESULTS.successful, diffrax.RESULTS.internal_error)
+        said = diffrax.RESULTS.where(
+            whole, diffrax.RESULTS.successful, diffrax.RESULTS.internal_error
+        )
         return whole, jnp.where(whole, t1, t0), self._next(t1), False, controller_state, said
 
 
@@ -74,9 +82,11 @@ def motion_norm(error: Motion) -> Float[Array, ""]:
 
 
 class RodriguesEuler(diffrax.AbstractSolver):
-    """The paper's integration (39)-(44): first order, orientations turned by Rodrigues' formula, which keeps quaternions at unit length.
+    """The paper's integration (39)-(44): first order, orientations turned by Rodrigues' formula,
+    which keeps quaternions at unit length.
 
-    q(t + dt) = q(t) moved by v dt along the exponential map, v(t + dt) = v(t) + vdot dt. For `svkc.simulate` alone, with dt.
+    q(t + dt) = q(t) moved by v dt along the exponential map, v(t + dt) = v(t) + vdot dt. For
+    `svkc.simulate` alone, with dt.
     """
 
     term_structure: ClassVar = diffrax.AbstractTerm
@@ -107,7 +117,8 @@ class RodriguesEuler(diffrax.AbstractSolver):
 
 
 class SemiImplicitEuler(RodriguesEuler):
-    """Symplectic Euler: the velocity first, v(t + dt) = v(t) + vdot dt, then q moved by the new one along the exponential map. First order; on
+    """Symplectic Euler: the velocity first, v(t + dt) = v(t) + vdot dt, then q moved by the new one
+    along the exponential map. First order; on
     conservative open chains the energy's error stays bounded. For `svkc.simulate` alone, with dt.
     """
 
@@ -116,29 +127,42 @@ class SemiImplicitEuler(RodriguesEuler):
 
 
 class SimplifiedNewton(diffrax.VeryChord):
-    """Newton's iteration with one Jacobian for all stages of a step, for solvers with implicit stages (Hairer and Wanner, Solving Ordinary Differential
-    Equations II, IV.8), ended where what is left, by the last update or by its rate, is below kappa of the tolerance, or below round-off.
+    """Newton's iteration with one Jacobian for all stages of a step, for solvers with implicit
+    stages (Hairer and Wanner, Solving Ordinary Differential Equations II, IV.8), ended where what
+    is left, by the last update or by its rate, is below kappa of the tolerance, or below round-off.
 
-    diffrax's own always takes a second update, and finds it diverging where both are round-off: on the high bar it takes five times as many steps.
+    diffrax's own always takes a second update, and finds it diverging where both are round-off: on
+    the high bar it takes five times as many steps.
     """
 
     def terminate(self, fn, y, args, options, state, tags):
         size, again = state.diffsize, state.step >= 2
         rate = size / state.diffsize_prev
-        near = (size <= self.kappa) | (self.norm(state.diff) <= 100 * jnp.finfo(size.dtype).eps * self.norm(y))
-        close = ((state.step >= 1) & near) | (again & (rate < 1) & (size * rate / (1 - rate) <= self.kappa))
+        near = (size <= self.kappa) | (
+            self.norm(state.diff) <= 100 * jnp.finfo(size.dtype).eps * self.norm(y)
+        )
+        close = ((state.step >= 1) & near) | (
+            again & (rate < 1) & (size * rate / (1 - rate) <= self.kappa)
+        )
         diverging = again & ~close & ~(rate < 2)
         failed = state.result != optimistix.RESULTS.successful
-        result = optimistix.RESULTS.where(diverging, optimistix.RESULTS.nonlinear_divergence, optimistix.RESULTS.successful)
+        result = optimistix.RESULTS.where(
+            diverging, optimistix.RESULTS.nonlinear_divergence, optimistix.RESULTS.successful
+        )
         return failed | close | diverging, optimistix.RESULTS.where(failed, state.result, result)
 
 
 @verb
-def step(chain: Chain, state: State, tau: Float[Array, " torques"], dt: Float[Array, ""] | float) -> State:
-    """One step of symplectic Euler of dt (s), for loops of one's own: v + vdot dt, then q moved by that along the exponential map.
+def step(
+    chain: Chain, state: State, tau: Float[Array, " torques"], dt: Float[Array, ""] | float
+) -> State:
+    """One step of symplectic Euler of dt (s), for loops of one's own: v + vdot dt, then q moved by
+    that along the exponential map.
 
-    The joint torques tau (N m, N; over every coordinate, or the tree's alone) are held over the step; springs, dampers and ranges of the joints act.
-    Each step takes away a quarter of what loops are open by (Baumgarte's rate 1 / (2 dt)). First order; structure, events, other orders and error
+    The joint torques tau (N m, N; over every coordinate, or the tree's alone) are held over the
+    step; springs, dampers and ranges of the joints act.
+    Each step takes away a quarter of what loops are open by (Baumgarte's rate 1 / (2 dt)). First
+    order; structure, events, other orders and error
     control: `svkc.simulate`. ValueError: tau has another size.
     """
     return _step(chain, state, joint_torques(chain, tau), jnp.asarray(one("dt", dt), state.q.dtype))
@@ -147,6 +171,18 @@ def step(chain: Chain, state: State, tau: Float[Array, " torques"], dt: Float[Ar
 @with_lanes_last
 def _step(chain: Chain, state: State, tau: Float[Array, " dofs"], dt: Float[Array, ""]) -> State:
     tau = tau + limit_forces(chain, state.q, state.v)
-    v, vdot = moving(chain, state.structure, state.q, state.v, tau, by_bodies, 0.5 / dt if chain.link_names else None)
+    v, vdot = moving(
+        chain,
+        state.structure,
+        state.q,
+        state.v,
+        tau,
+        by_bodies,
+        0.5 / dt if chain.link_names else None,
+    )
     v = v + dt * vdot
-    return State(integrate(chain, state.q, dt * jnp.where(active_dofs(chain, state.structure), v, 0)), v, state.structure)
+    return State(
+        integrate(chain, state.q, dt * jnp.where(active_dofs(chain, state.structure), v, 0)),
+        v,
+        state.structure,
+    )

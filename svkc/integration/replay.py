@@ -1,8 +1,11 @@
-"""The motion of one phase as a function that is differentiated both ways, whatever solver and step control found it.
+"""The motion of one phase as a function that is differentiated both ways, whatever solver and step
+control found it.
 
-The run itself is never differentiated. Its steps are gone through again, their times held fixed, for what a change of start and parameters does to
-each: forwards for a tangent, backwards for a cotangent. Kept of a run are the times of its steps and one state in `every`. What a change of the start's
-time or of a save time does is the rate of the motion there.
+The run itself is never differentiated. Its steps are gone through again, their times held fixed,
+for what a change of start and parameters does to
+each: forwards for a tangent, backwards for a cotangent. Kept of a run are the times of its steps
+and one state in `every`. What a change of the start's time or of a save time does is the rate of
+the motion there.
 """
 
 import diffrax
@@ -29,8 +32,10 @@ GROUP = 64
 class Replay(eqx.Module):
     """The default `adjoint` of `svkc.simulate`: both modes, in any mixture with vmap and jit.
 
-    every: one state in so many steps is kept, and the steps between are taken once more on the way back. Memory for a phase, in numbers:
-    max_steps (1 + size / every), with size that of q and v together, and what one block of `every` steps needs.
+    every: one state in so many steps is kept, and the steps between are taken once more on the way
+    back. Memory for a phase, in numbers:
+    max_steps (1 + size / every), with size that of q and v together, and what one block of `every`
+    steps needs.
     """
 
     every: int = eqx.field(static=True, default=16)
@@ -40,15 +45,22 @@ class Replay(eqx.Module):
 
 
 def _grid(t0, at, path: Path):
-    """[steps + 1] times of the start and of every step, after the last its end again; and for each save time the place of its state among them."""
+    """[steps + 1] times of the start and of every step, after the last its end again; and for each
+    save time the place of its state among them."""
     times = jnp.concatenate([t0[None], path.times])
     place = jnp.searchsorted(times, at).astype(jnp.int32)
     # past the last step time stands still
-    return jnp.where(jnp.arange(times.shape[0], dtype=jnp.int32) > path.accepted, times[path.accepted], times), place
+    return (
+        jnp.where(
+            jnp.arange(times.shape[0], dtype=jnp.int32) > path.accepted, times[path.accepted], times
+        ),
+        place,
+    )
 
 
 def _block(y: Motion, times, world: World, solver) -> tuple[Motion, Motion]:
-    """The steps of one block, from times[0] to times[1]: the state after it, and after each step."""
+    """The steps of one block, from times[0] to times[1]: the state after it, and after each
+    step."""
 
     def step(y, ends):
         y = step_alone(solver, world.field, ends[0], ends[1], y, world.scene)
@@ -68,30 +80,46 @@ def _integrated(start: Motion, times, world: World, how: How, guards):
 
 
 def _integrated_jvp(primals, tangents):
-    """Tangents at the times that the run has found, which stay, and what the changes of the times of its start, its end and of the save times add."""
+    """Tangents at the times that the run has found, which stay, and what the changes of the times
+    of its start, its end and of the save times add."""
     start, times, world, how, guards = primals
     d_start, d_times, d_world, _, d_guards = tangents
     path, t, end = integrated(*primals)
     (t0, stop, at), (d_t0, d_stop, d_at) = times, d_times
     # of both ends by one program
-    rates = jax.lax.map(lambda x: world.field(*x, world.scene), (jnp.stack([t0, t]), jax.tree.map(lambda *x: jnp.stack(x), start, end)))
+    rates = jax.lax.map(
+        lambda x: world.field(*x, world.scene),
+        (jnp.stack([t0, t]), jax.tree.map(lambda *x: jnp.stack(x), start, end)),
+    )
     at_start, at_end = (jax.tree.map(lambda x, i=i: x[i], rates) for i in range(2))
     grid, place = _grid(*frozen((t0, at, path)))
     start, d_start = _from_fixed(start, filled(start, d_start), at_start, t0, d_t0, world, d_world)
     d_end, d_saved, d_kept = _through(start, d_start, grid, place, world, d_world, path, how)
     if d_at is not None:
-        d_saved = jax.vmap(lambda y, dy, t, dt: _moved_on(y, dy, t, dt, world, d_world))(path.saved, d_saved, at, d_at)
+        d_saved = jax.vmap(lambda y, dy, t, dt: _moved_on(y, dy, t, dt, world, d_world))(
+            path.saved, d_saved, at, d_at
+        )
     none = jax.tree.map(lambda x: None, path)
     moving = lambda p: (p.end, p.saved, p.kept)
-    d_path = eqx.tree_at(moving, none, (d_end, d_saved, d_kept), is_leaf=lambda x: x is None or isinstance(x, Motion))
+    d_path = eqx.tree_at(
+        moving, none, (d_end, d_saved, d_kept), is_leaf=lambda x: x is None or isinstance(x, Motion)
+    )
     late = _late(path, stop)
     d_late = None if d_stop is None else jnp.where(path.result == SUCCESSFUL, d_stop, 0)
     arriving = (path.t, path.end, late, world.scene, guards, frozen(path.found))
-    return (path, t, end), (d_path, *arrival_tangent(arriving, (None, d_end, d_late, d_world.scene, d_guards, None), t, end, at_end))
+    return (path, t, end), (
+        d_path,
+        *arrival_tangent(
+            arriving, (None, d_end, d_late, d_world.scene, d_guards, None), t, end, at_end
+        ),
+    )
 
 
-def _from_fixed(y: Motion, dy: Motion, rate: Motion, t0, d_t0, world: World, d_world) -> tuple[Motion, Motion]:
-    """The start of a run and its tangent, as of a start at a time that stays: one that comes later has less time to move. rate: of the motion there."""
+def _from_fixed(
+    y: Motion, dy: Motion, rate: Motion, t0, d_t0, world: World, d_world
+) -> tuple[Motion, Motion]:
+    """The start of a run and its tangent, as of a start at a time that stays: one that comes later
+    has less time to move. rate: of the motion there."""
     if d_t0 is None:
         return y, dy
     none = jax.lax.stop_gradient(t0) - t0
@@ -108,27 +136,41 @@ def _moved_on(y: Motion, dy: Motion, t, dt, world: World, d_world) -> Motion:
 
 
 def _blocks(start: Motion, grid, path: Path, every: int):
-    """For every block of steps, in whole groups: its place, whether it was begun, the state it begins from, the times of its steps' begins and ends."""
+    """For every block of steps, in whole groups: its place, whether it was begun, the state it
+    begins from, the times of its steps' begins and ends."""
     groups = -(-(path.kept.q.shape[0] + 1) // GROUP)
     pad = groups * GROUP - path.kept.q.shape[0] - 1
     index = jnp.arange(groups * GROUP, dtype=jnp.int32)
     going = index * every < path.accepted
-    kept = jax.tree.map(lambda s, k: jnp.concatenate([s[None], k, jnp.broadcast_to(s[None], (pad, *s.shape))]), start, path.kept)
+    kept = jax.tree.map(
+        lambda s, k: jnp.concatenate([s[None], k, jnp.broadcast_to(s[None], (pad, *s.shape))]),
+        start,
+        path.kept,
+    )
     # blocks that were not begun get numbers that are finite
-    kept = jax.tree.map(lambda s, k: jnp.where(going.reshape(-1, *(1,) * s.ndim), k, s[None]), start, kept)
-    times = jnp.concatenate([grid, jnp.broadcast_to(grid[-1:], (groups * GROUP * every + 1 - grid.shape[0],))])
+    kept = jax.tree.map(
+        lambda s, k: jnp.where(going.reshape(-1, *(1,) * s.ndim), k, s[None]), start, kept
+    )
+    times = jnp.concatenate(
+        [grid, jnp.broadcast_to(grid[-1:], (groups * GROUP * every + 1 - grid.shape[0],))]
+    )
     return index, going, kept, (times[:-1].reshape(-1, every), times[1:].reshape(-1, every))
 
 
 @eqx.filter_jit
-def _through(start: Motion, d_start: Motion, grid, place, world: World, d_world, path: Path, how: How):
-    """The tangents at the end, at the save times and at the kept states: block after block of steps, each from its kept state."""
+def _through(
+    start: Motion, d_start: Motion, grid, place, world: World, d_world, path: Path, how: How
+):
+    """The tangents at the end, at the save times and at the kept states: block after block of
+    steps, each from its kept state."""
     every, blocks = how.every, path.kept.q.shape[0]
     index, *rest = _blocks(start, grid, path, every)
 
     @eqx.filter_checkpoint
     def block(d_y, y, times):
-        _, (d_y, d_every) = eqx.filter_jvp(lambda y, world: _block(y, times, world, how.solver), (y, world), (d_y, d_world))
+        _, (d_y, d_every) = eqx.filter_jvp(
+            lambda y, world: _block(y, times, world, how.solver), (y, world), (d_y, d_world)
+        )
         return d_y, d_every
 
     def one(carry, x):
@@ -139,8 +181,12 @@ def _through(start: Motion, d_start: Motion, grid, place, world: World, d_world,
             after, d_every = block(d_y, y, times)
             here = (place > i * every) & (place <= jnp.minimum((i + 1) * every, path.accepted))
             local = jnp.clip(place - i * every - 1, 0, every - 1)
-            spread = lambda old, new: jnp.where(here.reshape(-1, *(1,) * (old.ndim - 1)) & going, new[local], old)
-            return jax.tree.map(lambda new, old: jnp.where(going, new, old), after, d_y), jax.tree.map(spread, d_saved, d_every)
+            spread = lambda old, new: jnp.where(
+                here.reshape(-1, *(1,) * (old.ndim - 1)) & going, new[local], old
+            )
+            return jax.tree.map(
+                lambda new, old: jnp.where(going, new, old), after, d_y
+            ), jax.tree.map(spread, d_saved, d_every)
 
         carry = jax.lax.cond(unvmap_any(going), taken, lambda: (d_y, d_saved))
         return carry, carry[0]
@@ -155,32 +201,43 @@ def _through(start: Motion, d_start: Motion, grid, place, world: World, d_world,
 
         return jax.lax.cond(unvmap_any(jnp.any(x[1])), some, none, carry)
 
-    d_saved = jax.tree.map(lambda d: jnp.where((place == 0).reshape(-1, *(1,) * d.ndim), d[None], 0), d_start)
+    d_saved = jax.tree.map(
+        lambda d: jnp.where((place == 0).reshape(-1, *(1,) * d.ndim), d[None], 0), d_start
+    )
     xs = jax.tree.map(lambda x: x.reshape(-1, GROUP, *x.shape[1:]), (index, *rest))
     (d_end, d_saved), after = jax.lax.scan(group, (d_start, d_saved), xs)
     written = (index[:blocks] + 1) * every <= path.accepted
     flat = jax.tree.map(lambda d: d.reshape(-1, *d.shape[2:])[:blocks], after)
-    d_kept = jax.tree.map(lambda d: jnp.where(written.reshape(-1, *(1,) * (d.ndim - 1)), d, 0), flat)
+    d_kept = jax.tree.map(
+        lambda d: jnp.where(written.reshape(-1, *(1,) * (d.ndim - 1)), d, 0), flat
+    )
     return d_end, d_saved, d_kept
 
 
-# integrated(start, times, world, how, guards or field) -> Path, t, Motion: where the run went, with the time of its end fixed in derivatives; and its end,
-# whose time is a guard's zero or the scheduled one
+# integrated(start, times, world, how, guards or field) -> Path, t, Motion: where the run went, with
+# the time of its end fixed in derivatives; and its end, whose time is a guard's zero or the
+# scheduled one
 integrated = operation("integrated", _integrated, _integrated_jvp)
 
 
 def staged(solver: diffrax.AbstractSolver, kind: str | None) -> diffrax.AbstractSolver:
-    """The solver with its loop over stages made for what is to be differentiated: "lax" forwards, "bounded" both ways, None diffrax's own choice."""
+    """The solver with its loop over stages made for what is to be differentiated: "lax" forwards,
+    "bounded" both ways, None diffrax's own choice."""
     if not isinstance(solver, diffrax.AbstractRungeKutta):
         return solver
     return eqx.tree_at(lambda s: s.scan_kind, solver, kind, is_leaf=lambda x: x is None)
 
 
-def step_alone(solver: diffrax.AbstractSolver, field: Field, t0, t1, y: Motion, scene: Scene) -> Motion:
-    """One settled step of a solver that remembers nothing of the step before, to be differentiated: of each evaluation of the field, and
+def step_alone(
+    solver: diffrax.AbstractSolver, field: Field, t0, t1, y: Motion, scene: Scene
+) -> Motion:
+    """One settled step of a solver that remembers nothing of the step before, to be differentiated:
+    of each evaluation of the field, and
     of each turn of the loop that settles the step, only the arguments are kept on the way back."""
     rate = eqx.filter_checkpoint(field)
-    if isinstance(solver, diffrax.AbstractERK) and isinstance(solver.tableau, diffrax.ButcherTableau):
+    if isinstance(solver, diffrax.AbstractERK) and isinstance(
+        solver.tableau, diffrax.ButcherTableau
+    ):
         raw = _explicit_step(solver.tableau, rate, t0, t1, y, scene)
     else:
         solver = staged(solver, "bounded")
@@ -189,14 +246,19 @@ def step_alone(solver: diffrax.AbstractSolver, field: Field, t0, t1, y: Motion, 
     return settle(field, scene, raw)[0]
 
 
-def _explicit_step(tableau: diffrax.ButcherTableau, rate, t0, t1, y: Motion, scene: Scene) -> Motion:
-    """An explicit Runge-Kutta step as a loop over its stages, without those that only estimate the error."""
+def _explicit_step(
+    tableau: diffrax.ButcherTableau, rate, t0, t1, y: Motion, scene: Scene
+) -> Motion:
+    """An explicit Runge-Kutta step as a loop over its stages, without those that only estimate the
+    error."""
     used = int(np.max(np.flatnonzero(tableau.b_sol))) + 1
     A = np.zeros((used, used))
     for i, row in enumerate(tableau.a_lower[: used - 1]):
         A[i + 1, : i + 1] = row
     c, dtype = np.append(0.0, tableau.c)[:used], t1.dtype
-    add = lambda weights, rates: jax.tree.map(lambda y, k: y + (t1 - t0) * jnp.tensordot(weights, k, 1), y, rates)
+    add = lambda weights, rates: jax.tree.map(
+        lambda y, k: y + (t1 - t0) * jnp.tensordot(weights, k, 1), y, rates
+    )
 
     def stage(rates, x):
         weights, part, here = x

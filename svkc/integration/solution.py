@@ -14,13 +14,19 @@ from svkc.loops.constraint import largest_gaps
 from svkc.model.chain import State
 
 NON_FINITE, OPEN = -1, -2
-# by articulated bodies a step may be moved, as it is put back onto the loops, by 1 / MOVED of what it may err by
+# by articulated bodies a step may be moved, as it is put back onto the loops, by 1 / MOVED of what
+# it may err by
 MOVED = 1e-3
-SUCCESSFUL, EVENT, MAX_STEPS = diffrax.RESULTS.successful._value, diffrax.RESULTS.event_occurred._value, diffrax.RESULTS.max_steps_reached._value
+SUCCESSFUL, EVENT, MAX_STEPS = (
+    diffrax.RESULTS.successful._value,
+    diffrax.RESULTS.event_occurred._value,
+    diffrax.RESULTS.max_steps_reached._value,
+)
 
 
 class World(eqx.Module):
-    """What the motion depends on besides its start: the scene, and the vector field with all that it closes over."""
+    """What the motion depends on besides its start: the scene, and the vector field with all that
+    it closes over."""
 
     scene: Scene
     field: Field
@@ -40,8 +46,10 @@ class How(eqx.Module):
 
 
 class Tally(eqx.Module):
-    """What a run has cost and shown: tries, and of the steps that were kept the sum of their estimated errors (root mean square over q and v; inf: the
-    solver gives none), the least |R_mm| / |R_11| of the loops, how often the dependent coordinates changed (-1: not looked at), the loop that could
+    """What a run has cost and shown: tries, and of the steps that were kept the sum of their
+    estimated errors (root mean square over q and v; inf: the solver gives none), the least |R_mm| /
+    |R_11| of the loops, how often the dependent coordinates changed (-1: not looked at), the loop
+    that could
     not be closed (-1: none), and the largest of the loops' gaps (rad, m)."""
 
     tries: Int[Array, ""]
@@ -55,11 +63,19 @@ class Tally(eqx.Module):
     def none(cls, dtype, looked: bool) -> "Tally":
         """Before the first step."""
         zero = jnp.zeros((), jnp.int32)
-        return cls(zero, jnp.zeros((), dtype), jnp.ones((), dtype), zero if looked else zero - 1, zero - 1, jnp.zeros(2, dtype))
+        return cls(
+            zero,
+            jnp.zeros((), dtype),
+            jnp.ones((), dtype),
+            zero if looked else zero - 1,
+            zero - 1,
+            jnp.zeros(2, dtype),
+        )
 
 
 class Path(eqx.Module):
-    """Where a solve ended, the states at the times asked for, the times of its steps (inf: not taken), one state in `every`, diffrax's result code."""
+    """Where a solve ended, the states at the times asked for, the times of its steps (inf: not
+    taken), one state in `every`, diffrax's result code."""
 
     t: Float[Array, ""]
     end: Motion
@@ -74,7 +90,8 @@ class Path(eqx.Module):
 
 
 class Step(eqx.Module):
-    """What goes from step to step. length: what the controller asks for, before a time to be met shortens it; times, kept, saved: as in `Path`, but
+    """What goes from step to step. length: what the controller asks for, before a time to be met
+    shortens it; times, kept, saved: as in `Path`, but
     buffers within the loop."""
 
     t: Float[Array, ""]
@@ -121,14 +138,24 @@ def _counted(s: Step, tried: Tried, result: Int[Array, ""], scene: Scene) -> Tal
         # the first choice of a phase is no change
         swapped = jnp.any(s.seen.dependent) & jnp.any(s.seen.dependent != tried.seen.dependent)
         swaps = swaps + (kept & swapped).astype(jnp.int32)
-    loop = old.loop if tried.seen is None else jnp.where(result == OPEN, jnp.argmax(jnp.max(tried.seen.gap, 1)).astype(jnp.int32), old.loop)
+    loop = (
+        old.loop
+        if tried.seen is None
+        else jnp.where(
+            result == OPEN, jnp.argmax(jnp.max(tried.seen.gap, 1)).astype(jnp.int32), old.loop
+        )
+    )
     if len(scene.chain.link_names):
         gap = jnp.where(kept, jnp.maximum(gap, _open(tried, scene)), gap)
-    return Tally(old.tries + 1, old.error + jnp.where(kept, tried.error, 0), margin, swaps, loop, gap)
+    return Tally(
+        old.tries + 1, old.error + jnp.where(kept, tried.error, 0), margin, swaps, loop, gap
+    )
 
 
 def _open(tried: Tried, scene: Scene) -> Float[Array, "2"]:
     """The largest of the loops' gaps (rad, m) at the end of a try."""
     if tried.seen is None:
         return largest_gaps(scene.chain, State(tried.y.q, tried.y.v, scene.structure))[0]
-    return jnp.max(tried.seen.gap, 0) * jnp.stack([jnp.ones_like(scene.chain.length), scene.chain.length])
+    return jnp.max(tried.seen.gap, 0) * jnp.stack(
+        [jnp.ones_like(scene.chain.length), scene.chain.length]
+    )

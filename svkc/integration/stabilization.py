@@ -11,10 +11,13 @@ from svkc.model.validation import function, one, whole
 
 
 class Projection(eqx.Module):
-    """Loop drift is taken away after every step by the smallest change of q and v that closes the loops.
+    """Loop drift is taken away after every step by the smallest change of q and v that closes the
+    loops.
 
-    iterations: Newton steps on the position; one leaves a gap of the second order in the drift of a step. change: what is smallest:
-    `svkc.inertia_change` (kinetic energy: a velocity that is projected loses energy of second order only), `svkc.least_change` (scaled coordinates)
+    iterations: Newton steps on the position; one leaves a gap of the second order in the drift of a
+    step. change: what is smallest:
+    `svkc.inertia_change` (kinetic energy: a velocity that is projected loses energy of second order
+    only), `svkc.least_change` (scaled coordinates)
     or `svkc.dependent_change` (no independent coordinate moves).
     """
 
@@ -27,14 +30,16 @@ class Projection(eqx.Module):
 
 
 class Exact(Projection):
-    """Dependent coordinates are functions of the independent ones, solved for at every evaluation of the field as well as after every step: what is
-    integrated is the paper's theta_G, and the rest follows from it. `iterations` and `change` as in `Projection`."""
+    """Dependent coordinates are functions of the independent ones, solved for at every evaluation
+    of the field as well as after every step: what is integrated is the paper's theta_G, and the
+    rest follows from it. `iterations` and `change` as in `Projection`."""
 
     change: Callable = eqx.field(static=True, default=dependent_change)
 
 
 class Baumgarte(eqx.Module):
-    """Loop drift is pulled back while integrating, as by a critically damped spring of this rate (1/s); nothing is projected."""
+    """Loop drift is pulled back while integrating, as by a critically damped spring of this rate
+    (1/s); nothing is projected."""
 
     rate: Float[Array, ""] | float = 20.0
 

@@ -20,7 +20,8 @@ from svkc.tree.traversal import LEVELS_UNROLLED
 
 
 class Field(eqx.Module):
-    """The vector field of one phase: qdot, vdot, power. differentiated: or in a loop that nothing differentiates, where a `vmap` keeps lanes last."""
+    """The vector field of one phase: qdot, vdot, power. differentiated: or in a loop that nothing
+    differentiates, where a `vmap` keeps lanes last."""
 
     control: Callable | None
     stabilization: Projection | Baumgarte | Drift
@@ -30,27 +31,44 @@ class Field(eqx.Module):
     @property
     def pivotless(self) -> bool:
         """Whether steps are put back onto the loops by the loops' forces, without pivots."""
-        return self.dynamics.inertia is by_bodies and isinstance(self.stabilization, Projection) and self.stabilization.change is inertia_change
+        return (
+            self.dynamics.inertia is by_bodies
+            and isinstance(self.stabilization, Projection)
+            and self.stabilization.change is inertia_change
+        )
 
     def __call__(self, t, y: Motion, scene: Scene) -> Motion:
         chain, structure, held = scene.chain, scene.structure, self.stabilization
         if isinstance(held, Exact):
             y, _ = settle(self, scene, y)
         tau, power = self.torques(t, y, scene)
-        rate, agree = held.rate if isinstance(held, Baumgarte) else None, isinstance(held, Projection) and not self.pivotless
+        rate, agree = (
+            held.rate if isinstance(held, Baumgarte) else None,
+            isinstance(held, Projection) and not self.pivotless,
+        )
         if self._in_lanes(chain) and not agree:
             v, vdot = moving_in_lanes(chain, structure, y.q, y.v, tau, rate)
         else:
-            v, vdot = moving(chain, structure, y.q, y.v, tau, self.dynamics.inertia, rate, agree, scene.pivots)
-        return Motion(rates(chain, y.q, jnp.where(active_dofs(chain, structure), v, 0)), vdot, power)
+            v, vdot = moving(
+                chain, structure, y.q, y.v, tau, self.dynamics.inertia, rate, agree, scene.pivots
+            )
+        return Motion(
+            rates(chain, y.q, jnp.where(active_dofs(chain, structure), v, 0)), vdot, power
+        )
 
     def _in_lanes(self, chain: Chain) -> bool:
-        """Whether it is for speed alone, and accelerations are had by articulated bodies, level by level."""
+        """Whether it is for speed alone, and accelerations are had by articulated bodies, level by
+        level."""
         ways = (by_bodies,) if chain.topology.link_names else (by_bodies, None)
-        return not self.differentiated and self.dynamics.inertia in ways and len(chain.topology.levels) <= LEVELS_UNROLLED
+        return (
+            not self.differentiated
+            and self.dynamics.inertia in ways
+            and len(chain.topology.levels) <= LEVELS_UNROLLED
+        )
 
     def torques(self, t, y: Motion, scene: Scene):
-        """Joint torques of the control and the limits, and the power of all that is not conservative (None: there is none)."""
+        """Joint torques of the control and the limits, and the power of all that is not
+        conservative (None: there is none)."""
         chain = scene.chain
         tau = jnp.zeros_like(y.v)
         if self.control is not None:
@@ -66,7 +84,8 @@ class Field(eqx.Module):
 
 
 class Seen(eqx.Module):
-    """What the loops show as a step is put back onto them: how far each loop is open yet (rad, `chain.length`s) and, where pivots are chosen,
+    """What the loops show as a step is put back onto them: how far each loop is open yet (rad,
+    `chain.length`s) and, where pivots are chosen,
     |R_mm| / |R_11| and those to go on with."""
 
     gap: Float[Array, "links 2"]
@@ -81,7 +100,11 @@ class Seen(eqx.Module):
         links, dofs = len(scene.chain.link_names), scene.chain.dofs
         gap = jnp.zeros((links, 2), q.dtype)
         # the first evaluation of the field finds no pivots held, and chooses
-        return cls(gap) if field.pivotless else cls(gap, jnp.ones((), q.dtype), jnp.zeros((min(6 * links, dofs), dofs), q.dtype))
+        return (
+            cls(gap)
+            if field.pivotless
+            else cls(gap, jnp.ones((), q.dtype), jnp.zeros((min(6 * links, dofs), dofs), q.dtype))
+        )
 
     @property
     def dependent(self) -> Bool[Array, " dofs"]:
@@ -90,12 +113,24 @@ class Seen(eqx.Module):
 
 
 def settle(field: Field, scene: Scene, y: Motion) -> tuple[Motion, Seen | None]:
-    """The motion put back: quaternions to unit length, loops closed, velocities in agreement; and what that showed (None: loops are left alone)."""
+    """The motion put back: quaternions to unit length, loops closed, velocities in agreement; and
+    what that showed (None: loops are left alone)."""
     chain, structure, held = scene.chain, scene.structure, field.stabilization
     if not projects(held, scene):
         return eqx.tree_at(lambda y: y.q, y, normalize(chain, y.q)), None
     if field.pivotless:
-        q, v, *seen = settle_by_bodies(chain, structure, y.q, y.v, held.iterations, field.differentiated)
+        q, v, *seen = settle_by_bodies(
+            chain, structure, y.q, y.v, held.iterations, field.differentiated
+        )
     else:
-        q, v, *seen = settle_loops(chain, structure, y.q, y.v, held.iterations, held.change, scene.pivots, field.dynamics.hold or 0.0)
+        q, v, *seen = settle_loops(
+            chain,
+            structure,
+            y.q,
+            y.v,
+            held.iterations,
+            held.change,
+            scene.pivots,
+            field.dynamics.hold or 0.0,
+        )
     return eqx.tree_at(lambda y: (y.q, y.v), y, (q, v)), Seen(*seen)

@@ -1,1 +1,2 @@
-"""Closed chains: loop Jacobian, pivots, H, W and S, forward dynamics, projection, mobility, actuation."""
+"""Closed chains: loop Jacobian, pivots, H, W and S, forward dynamics, projection, mobility,
+actuation."""

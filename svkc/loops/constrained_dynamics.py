@@ -1,4 +1,5 @@
-"""Accelerations and multipliers of a chain with loops, and the choice among the ways to compute them."""
+"""Accelerations and multipliers of a chain with loops, and the choice among the ways to compute
+them."""
 
 from collections.abc import Callable
 
@@ -26,15 +27,21 @@ def by_bodies(chain: Chain, kin: Kinematics) -> list[Body] | Body:
 
 
 class Dynamics(eqx.Module):
-    """How `svkc.simulate` computes accelerations. All of these agree; they differ in what they cost.
+    """How `svkc.simulate` computes accelerations. All of these agree; they differ in what they
+    cost.
 
-    inertia: None (default), articulated bodies where the scene has no loops, else composite ones; `svkc.inertia_by_composites` always;
-    `svkc.inertia_by_unit_vectors`, the paper's columns by inverse dynamics; or `svkc.by_bodies`, articulated bodies and the forces of the loops, which
-    square the loops' conditioning near singular configurations. With it `Projection()` too does without pivots: the fastest, and the one for batches;
+    inertia: None (default), articulated bodies where the scene has no loops, else composite ones;
+    `svkc.inertia_by_composites` always; `svkc.inertia_by_unit_vectors`, the paper's columns by
+    inverse dynamics; or `svkc.by_bodies`, articulated bodies and the forces of the loops, which
+    square the loops' conditioning near singular configurations. With it `Projection()` too does
+    without pivots: the fastest, and the one for batches;
     the certificate then has the margin of the phases' ends alone, and counts no swaps.
-    hold: dependent coordinates are chosen at every evaluation (None), or held until, at the end of a step, the least |R_kk| / |R_11| of their columns is
-    below this part of what a new choice has (default 0.3); 0 holds them until the structure changes. Held only where steps are projected; near a
-    singular configuration, and in what is differentiated, they are chosen at every evaluation, as the motion does not depend on the choice.
+    hold: dependent coordinates are chosen at every evaluation (None), or held until, at the end of
+    a step, the least |R_kk| / |R_11| of their columns is below this part of what a new choice has
+    (default 0.3); 0 holds them until the structure changes. Held only where steps are projected;
+    near a
+    singular configuration, and in what is differentiated, they are chosen at every evaluation, as
+    the motion does not depend on the choice.
     """
 
     inertia: Callable | None = eqx.field(static=True, default=None)
@@ -43,10 +50,14 @@ class Dynamics(eqx.Module):
     def __check_init__(self):
         function("dynamics.inertia", self.inertia)
         if self.hold is not None and not 0 <= one("dynamics.hold", self.hold) <= 1:
-            raise ValueError(f"dynamics.hold: got {self.hold}, expected None or a part between 0 and 1")
+            raise ValueError(
+                f"dynamics.hold: got {self.hold}, expected None or a part between 0 and 1"
+            )
 
 
-def reduced_inertia(chain: Chain, co: Coordinates, M: Float[Array, "nv nv"]) -> Float[Array, "dofs dofs"]:
+def reduced_inertia(
+    chain: Chain, co: Coordinates, M: Float[Array, "nv nv"]
+) -> Float[Array, "dofs dofs"]:
     """A = W^T M W (23), ones on the diagonal of coordinates that are not independent."""
     W = co.W[: chain.nv]
     A = W.T @ (M @ W) + jnp.diag(jnp.where(co.independent, 0, 1).astype(M.dtype))
@@ -56,20 +67,25 @@ def reduced_inertia(chain: Chain, co: Coordinates, M: Float[Array, "nv nv"]) -> 
     return A + own.T @ (chain.link_armature[:, None] * own)
 
 
-def with_links(chain: Chain, tree: Float[Array, " nv"], own: Float[Array, " dofs"]) -> Float[Array, " dofs"]:
-    """Generalized forces of the tree, and those that the armatures of virtual joints need for `own` (accelerations, or jumps of velocity)."""
+def with_links(
+    chain: Chain, tree: Float[Array, " nv"], own: Float[Array, " dofs"]
+) -> Float[Array, " dofs"]:
+    """Generalized forces of the tree, and those that the armatures of virtual joints need for `own`
+    (accelerations, or jumps of velocity)."""
     if chain.link_armature is None:
         return jnp.concatenate([tree, jnp.zeros(chain.dofs - chain.nv, tree.dtype)])
     return jnp.concatenate([tree, chain.link_armature * own[chain.nv :]])
 
 
 def solve_motion(
-    chain: Chain, structure: Structure, kin: Kinematics, selection: Selection | None, J: Float[Array, "rows dofs"], force: Float[Array, " dofs"],
-    bias: Float[Array, " rows"], inertia=None,
+    chain: Chain, structure: Structure, kin: Kinematics, selection: Selection | None,
+    J: Float[Array, "rows dofs"], force: Float[Array, " dofs"], bias: Float[Array, " rows"],
+    inertia=None,
 ) -> Float[Array, " dofs"]:  # fmt: skip
     """The x with M x = force + J_C^T lambda and J_C x + bias = 0 (paper, section III-B).
 
-    Its derivatives are those of these equations, M x by Newton-Euler: one more solve with the same factors, nothing through recursions for M or pivots.
+    Its derivatives are those of these equations, M x by Newton-Euler: one more solve with the same
+    factors, nothing through recursions for M or pivots.
     """
     nv, (_, column) = chain.nv, scales(chain)
     chosen, rows, frozen, static = jax.lax.stop_gradient((selection, J, (chain, kin), structure))
@@ -77,7 +93,11 @@ def solve_motion(
     if inertia is by_bodies:
         # every row as it is, whether or not it repeats others
         pick, used = (lambda x: x), jnp.ones(J.shape[0], bool)
-        solve = by_loop_forces(*frozen, jnp.where(active[None], rows / column[None], 0), None if static.locked is None else active[:nv])
+        solve = by_loop_forces(
+            *frozen,
+            jnp.where(active[None], rows / column[None], 0),
+            None if static.locked is None else active[:nv],
+        )
     else:
         pick, used = (lambda x: chosen.Q @ x), chosen.used
         solve = _by_independent(*frozen, static, chosen, rows, inertia or inertia_by_composites)
@@ -91,10 +111,14 @@ def solve_motion(
 
     # jax transposes the solve only where both sides take part in the derivative
     right = (jnp.where(active, force, 0) + 0 * jnp.sum(bias), -pick(bias) + 0 * jnp.sum(force))
-    return jax.lax.custom_linear_solve(equations, right, solve=lambda _, right: solve(*right), symmetric=True)[0]
+    return jax.lax.custom_linear_solve(
+        equations, right, solve=lambda _, right: solve(*right), symmetric=True
+    )[0]
 
 
-def _by_independent(chain: Chain, kin: Kinematics, structure: Structure, chosen: Selection, J, inertia: Callable) -> Callable:
+def _by_independent(
+    chain: Chain, kin: Kinematics, structure: Structure, chosen: Selection, J, inertia: Callable
+) -> Callable:
     """The solution through W, A and b, as the paper has it."""
     nv, (_, column) = chain.nv, scales(chain)
     co = constrain(chain, structure, chosen, J, jnp.zeros(J.shape[0], J.dtype))
@@ -111,7 +135,9 @@ def _by_independent(chain: Chain, kin: Kinematics, structure: Structure, chosen:
     return solve
 
 
-def solve_free_motion(chain: Chain, structure: Structure, kin: Kinematics, force: Float[Array, " dofs"], inertia=None) -> Float[Array, " dofs"]:
+def solve_free_motion(
+    chain: Chain, structure: Structure, kin: Kinematics, force: Float[Array, " dofs"], inertia=None
+) -> Float[Array, " dofs"]:
     """The same on an open chain: M x = force, zero for locked joints."""
     locked, frozen = structure.locked, jax.lax.stop_gradient((chain, kin))
     free = jnp.ones(chain.nv, bool) if locked is None else ~locked
@@ -128,4 +154,6 @@ def solve_free_motion(chain: Chain, structure: Structure, kin: Kinematics, force
     def equations(x):
         return jnp.where(free, inertia_times(chain, kin, jnp.where(free, x, 0)), x)
 
-    return jax.lax.custom_linear_solve(equations, jnp.where(free, force, 0), solve=solve, symmetric=True)
+    return jax.lax.custom_linear_solve(
+        equations, jnp.where(free, force, 0), solve=solve, symmetric=True
+    )

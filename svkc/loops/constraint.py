@@ -1,6 +1,8 @@
-"""Where the two ends of every virtual link are, how far apart, and how they move: the loop Jacobian J_C (paper (9)-(11)).
+"""Where the two ends of every virtual link are, how far apart, and how they move: the loop Jacobian
+J_C (paper (9)-(11)).
 
-Rows of a loop: three angular, then three linear, the motion of the virtual link less that of its real link, in world axes at the real link's end
+Rows of a loop: three angular, then three linear, the motion of the virtual link less that of its
+real link, in world axes at the real link's end
 of the joint.
 """
 
@@ -15,13 +17,26 @@ from svkc.model.chain import Chain, State, Structure, active_dofs
 from svkc.model.checked_jit import verb
 from svkc.model.topology import FREE, SLIDE, Topology
 from svkc.tree.kinematics import Kinematics, bias_accelerations, kinematics
-from svkc.tree.spatial import motion_cross, quat_about, quat_conjugate, quat_log, quat_matrix, quat_multiply, quat_normalize, quat_rotate, rotate, shift_motion
+from svkc.tree.spatial import (
+    motion_cross,
+    quat_about,
+    quat_conjugate,
+    quat_log,
+    quat_matrix,
+    quat_multiply,
+    quat_normalize,
+    quat_rotate,
+    rotate,
+    shift_motion,
+)
 
 
 class Ends(eqx.Module):
-    """Both ends of each virtual link. `base`: the joint's frame in the parent, `virtual`: the virtual link, `real`: its real link's end.
+    """Both ends of each virtual link. `base`: the joint's frame in the parent, `virtual`: the
+    virtual link, `real`: its real link's end.
 
-    Places are relative to `real`'s root (`parent_root`, `real_root`: that and the parent's root, from which twists are given).
+    Places are relative to `real`'s root (`parent_root`, `real_root`: that and the parent's root,
+    from which twists are given).
     """
 
     base_quat: Float[Array, "links 4"]
@@ -41,9 +56,11 @@ def _coordinates(chain: Chain, q: Float[Array, " q"]):
 
 
 def _turns(top: Topology, angle: Float[Array, "links 3"], ball: Float[Array, "links 4"]):
-    """Rotation of each virtual joint and the axes of its three turns, all in the joint's frame; only what some joint of the scene has is computed.
+    """Rotation of each virtual joint and the axes of its three turns, all in the joint's frame;
+    only what some joint of the scene has is computed.
 
-    Turns in sequence about x, then y, then z, each axis carried by the turns before it; a ball's axes are those of the virtual link.
+    Turns in sequence about x, then y, then z, each axis carried by the turns before it; a ball's
+    axes are those of the virtual link.
     """
     eye = jnp.eye(3, dtype=angle.dtype)
     freedoms = np.array(top.link_freedoms, bool).reshape(-1, 6)[:, :3]
@@ -68,7 +85,8 @@ def _turns(top: Topology, angle: Float[Array, "links 3"], ball: Float[Array, "li
 def ends(chain: Chain, structure: Structure, kin: Kinematics, q: Float[Array, " q"]) -> Ends:
     """Frames of both ends of every virtual link, the joint's own turn and slide included.
 
-    A joint slides along its parent's axes, then turns: about x, then y, then z (universal: x, y), or by a quaternion (ball).
+    A joint slides along its parent's axes, then turns: about x, then y, then z (universal: x, y),
+    or by a quaternion (ball).
     """
     top = chain.topology
     angle, slide, ball = _coordinates(chain, q)
@@ -93,21 +111,32 @@ def ends(chain: Chain, structure: Structure, kin: Kinematics, q: Float[Array, " 
 
 
 def gap(structure: Structure, end: Ends) -> Float[Array, "links 6"]:
-    """Rotation vector (rad) and distance (m) from the real link's end to the virtual link, world axes; zero where not connected."""
+    """Rotation vector (rad) and distance (m) from the real link's end to the virtual link, world
+    axes; zero where not connected."""
     turn = quat_log(quat_multiply(end.virtual_quat, quat_conjugate(end.real_quat)))
     gaps = jnp.concatenate([turn, end.virtual - end.real], -1)
     return jnp.where(structure.connected[:, None], gaps, 0)
 
 
 def _virtual_axes(chain: Chain, structure: Structure, end: Ends) -> Float[Array, "links 6 6"]:
-    """Motion of the virtual link for a unit of each of its six freedoms, at its own origin; zero for those it has not."""
+    """Motion of the virtual link for a unit of each of its six freedoms, at its own origin; zero
+    for those it has not."""
     zero = jnp.zeros_like(end.axes[:, :3])
-    S = jnp.concatenate([jnp.concatenate([end.axes[:, :3], zero], -1), jnp.concatenate([zero, end.axes[:, 3:]], -1)], 1)
+    S = jnp.concatenate(
+        [
+            jnp.concatenate([end.axes[:, :3], zero], -1),
+            jnp.concatenate([zero, end.axes[:, 3:]], -1),
+        ],
+        1,
+    )
     return jnp.where((structure.connected[:, None] & structure.freedoms)[:, :, None], S, 0)
 
 
-def loop_jacobian(chain: Chain, structure: Structure, kin: Kinematics, end: Ends) -> Float[Array, "rows dofs"]:
-    """J_C (paper (11)): six rows a virtual link, zero where not connected; columns of coordinates that cannot move are zero."""
+def loop_jacobian(
+    chain: Chain, structure: Structure, kin: Kinematics, end: Ends
+) -> Float[Array, "rows dofs"]:
+    """J_C (paper (11)): six rows a virtual link, zero where not connected; columns of coordinates
+    that cannot move are zero."""
     top = chain.topology
     above = jnp.asarray(top.ancestor[:, top.dof_row])
     sign = above[structure.parent].astype(kin.r.dtype) - above[structure.real].astype(kin.r.dtype)
@@ -122,14 +151,23 @@ def loop_jacobian(chain: Chain, structure: Structure, kin: Kinematics, end: Ends
     np.put_along_axis(source, top.links.dof, np.arange(6 * count).reshape(-1, 6), 1)
     virtual = take(own.reshape(-1, 6), source[:, top.nv : top.dofs])
     J = jnp.concatenate([tree, virtual], 1)
-    J = jnp.where(structure.connected[:, None, None] & active_dofs(chain, structure)[None, :, None], J, 0)
+    J = jnp.where(
+        structure.connected[:, None, None] & active_dofs(chain, structure)[None, :, None], J, 0
+    )
     return jnp.swapaxes(J, 1, 2).reshape(-1, top.dofs)
 
 
 def loop_bias(
-    chain: Chain, structure: Structure, kin: Kinematics, end: Ends, V: Float[Array, "rows 6"], A: Float[Array, "rows 6"], v: Float[Array, " dofs"]
+    chain: Chain,
+    structure: Structure,
+    kin: Kinematics,
+    end: Ends,
+    V: Float[Array, "rows 6"],
+    A: Float[Array, "rows 6"],
+    v: Float[Array, " dofs"],
 ) -> Float[Array, " loop_rows"]:
-    """Jdot_C v (paper (21)): the difference of the two ends' velocity-product accelerations; A: the tree's, with vdot = 0."""
+    """Jdot_C v (paper (21)): the difference of the two ends' velocity-product accelerations; A: the
+    tree's, with vdot = 0."""
     top = chain.topology
     rate = jnp.where(structure.connected[:, None] & structure.freedoms, take(v, top.links.dof), 0)
     parts = _virtual_axes(chain, structure, end) * rate[:, :, None]
@@ -139,7 +177,9 @@ def loop_bias(
     bias = motion_cross(V_parent, slide) + motion_cross(V_base, jnp.sum(parts[:, :3], 1))
     # turns in sequence carry one another; a ball's axes turn together and add nothing
     is_ball = np.array([sum(f[:3]) == 3 for f in top.link_freedoms], bool)[:, None]
-    carried = motion_cross(parts[:, 0], parts[:, 1] + parts[:, 2]) + motion_cross(parts[:, 1], parts[:, 2])
+    carried = motion_cross(parts[:, 0], parts[:, 1] + parts[:, 2]) + motion_cross(
+        parts[:, 1], parts[:, 2]
+    )
     bias = bias + jnp.where(is_ball, 0, carried)
     A_virtual = shift_motion(A[structure.parent], end.from_parent_root) + bias
     A_real = shift_motion(A[structure.real], end.real)
@@ -147,7 +187,8 @@ def loop_bias(
 
 
 def scales(chain: Chain) -> tuple[Float[Array, " rows"], Float[Array, " dofs"]]:
-    """Factors of the rows and columns of J_C that leave numbers without units: 1/length for linear rows, length for slides."""
+    """Factors of the rows and columns of J_C that leave numbers without units: 1/length for linear
+    rows, length for slides."""
     top = chain.topology
     rows = jnp.tile(jnp.where(np.arange(6) < 3, 1, 1 / chain.length), len(top.link_names))
     linear = np.zeros(top.dofs, bool)
@@ -165,21 +206,33 @@ def scaled_jacobian(chain: Chain, structure: Structure, kin, end) -> Float[Array
     return row[:, None] * loop_jacobian(chain, structure, kin, end) * column[None]
 
 
-def loop_rates(chain: Chain, structure: Structure, v, kin: Kinematics, V, end, J, baumgarte=None) -> Float[Array, " rows"]:
+def loop_rates(
+    chain: Chain, structure: Structure, v, kin: Kinematics, V, end, J, baumgarte=None
+) -> Float[Array, " rows"]:
     """Jdot_C v without units. baumgarte: rate (1/s) at which gaps are pulled back."""
     row, column = scales(chain)
     moving = jnp.where(active_dofs(chain, structure), v, 0)
-    bias = row * loop_bias(chain, structure, kin, end, V, bias_accelerations(chain, kin, V, v), moving)
+    bias = row * loop_bias(
+        chain, structure, kin, end, V, bias_accelerations(chain, kin, V, v), moving
+    )
     if baumgarte is not None:
-        bias = bias + 2 * baumgarte * (J @ (moving / column)) + baumgarte**2 * row * gap(structure, end).ravel()
+        bias = (
+            bias
+            + 2 * baumgarte * (J @ (moving / column))
+            + baumgarte**2 * row * gap(structure, end).ravel()
+        )
     return bias
 
 
-def gaps_and_rates(chain: Chain, state: State) -> tuple[Float[Array, "links 6"], Float[Array, "links 6"]]:
+def gaps_and_rates(
+    chain: Chain, state: State
+) -> tuple[Float[Array, "links 6"], Float[Array, "links 6"]]:
     """`loop_gaps` and `velocity_gaps` from one pass over the tree."""
     kin = kinematics(chain, state.q)
     end = ends(chain, state.structure, kin, state.q)
-    return gap(state.structure, end), (loop_jacobian(chain, state.structure, kin, end) @ state.v).reshape(-1, 6)
+    return gap(state.structure, end), (
+        loop_jacobian(chain, state.structure, kin, end) @ state.v
+    ).reshape(-1, 6)
 
 
 def sizes(rows: Float[Array, " rows"]) -> Float[Array, "links 2"]:
@@ -205,16 +258,22 @@ def largest_gaps(chain: Chain, state: State) -> tuple[Float[Array, "2"], Float[A
 
 @verb(eager=True)
 def loop_gaps(chain: Chain, state: State) -> Float[Array, "links 6"]:
-    """How far each connected loop is open: rotation vector (rad), then distance (m), in the world; zero where not connected."""
+    """How far each connected loop is open: rotation vector (rad), then distance (m), in the world;
+    zero where not connected."""
     return gaps_and_rates(chain, state)[0]
 
 
 @verb(eager=True)
-def jacobian(chain: Chain, state: State) -> tuple[Float[Array, "links 3 dofs"], Float[Array, "links 3 dofs"]]:
-    """J_C (paper (11)): linear (m/s) and angular (rad/s) velocity of each connected virtual link relative to its real link, for a unit rate of each
+def jacobian(
+    chain: Chain, state: State
+) -> tuple[Float[Array, "links 3 dofs"], Float[Array, "links 3 dofs"]]:
+    """J_C (paper (11)): linear (m/s) and angular (rad/s) velocity of each connected virtual link
+    relative to its real link, for a unit rate of each
     joint coordinate, at the joint, in world axes."""
     kin = kinematics(chain, state.q)
-    J = loop_jacobian(chain, state.structure, kin, ends(chain, state.structure, kin, state.q)).reshape(-1, 6, chain.dofs)
+    J = loop_jacobian(
+        chain, state.structure, kin, ends(chain, state.structure, kin, state.q)
+    ).reshape(-1, 6, chain.dofs)
     return J[:, 3:], J[:, :3]
 
 
@@ -225,5 +284,6 @@ def velocity_gaps(chain: Chain, state: State) -> Float[Array, "links 6"]:
 
 
 def gap_tolerance(dtype) -> float:
-    """Largest loop gap, over `chain.length` where it is in metres, that counts as closed: eps^(4/7), 1.1e-9 in float64, 1.1e-4 in float32."""
+    """Largest loop gap, over `chain.length` where it is in metres, that counts as closed:
+    eps^(4/7), 1.1e-9 in float64, 1.1e-4 in float32."""
     return float(np.finfo(dtype).eps ** (4 / 7))

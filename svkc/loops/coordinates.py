@@ -1,6 +1,7 @@
 """Which coordinates are independent, and what follows from it: H, W, S, Hdot v (paper, section II).
 
-Rows in metres and columns of slides are divided by the chain's `length`, so that pivots and rank have no units.
+Rows in metres and columns of slides are divided by the chain's `length`, so that pivots and rank
+have no units.
 """
 
 import equinox as eqx
@@ -16,11 +17,15 @@ from svkc.tree.kinematics import Kinematics, kinematics, twists
 
 
 class Coordinates(eqx.Module):
-    """The paper's matrices, over every joint coordinate (rows of dependent, locked and unconnected coordinates' columns are zero).
+    """The paper's matrices, over every joint coordinate (rows of dependent, locked and unconnected
+    coordinates' columns are zero).
 
-    `W` [dofs, dofs]: all velocities from the independent ones (16); `bias` [dofs]: Hdot v_G (21) on the dependent ones;
-    `independent`, `dependent`: the choice theta_G, theta_S; `actuated`: theta_A; `selection`: the pivots; `J`: the scaled J_C.
-    The paper's smaller matrices are rows and columns of these: W[: chain.nv, independent], H[dependent][:, independent], S[actuated][:, independent].
+    `W` [dofs, dofs]: all velocities from the independent ones (16); `bias` [dofs]: Hdot v_G (21) on
+    the dependent ones;
+    `independent`, `dependent`: the choice theta_G, theta_S; `actuated`: theta_A; `selection`: the
+    pivots; `J`: the scaled J_C.
+    The paper's smaller matrices are rows and columns of these: W[: chain.nv, independent],
+    H[dependent][:, independent], S[actuated][:, independent].
     """
 
     W: Float[Array, "dofs dofs"]
@@ -47,14 +52,22 @@ class Coordinates(eqx.Module):
         return self.bias
 
 
-def agreeing(chain: Chain, selection: Selection, J: Float[Array, "rows dofs"], v: Float[Array, " dofs"]) -> Float[Array, " dofs"]:
+def agreeing(
+    chain: Chain, selection: Selection, J: Float[Array, "rows dofs"], v: Float[Array, " dofs"]
+) -> Float[Array, " dofs"]:
     """W v_G (16): the dependent velocities as the independent ones ask for."""
     _, column = scales(chain)
     Jm, JS = square(selection, J)
     return v - column * (selection.P.T @ solve_frozen(JS, Jm @ (v / column)))
 
 
-def constrain(chain: Chain, structure: Structure, selection: Selection, J: Float[Array, "rows dofs"], bias: Float[Array, " rows"]) -> Coordinates:
+def constrain(
+    chain: Chain,
+    structure: Structure,
+    selection: Selection,
+    J: Float[Array, "rows dofs"],
+    bias: Float[Array, " rows"],
+) -> Coordinates:
     """W and Hdot v from the loops' rows and the choice of pivots: (14)-(21)."""
     _, column = scales(chain)
     Jm, JS = square(selection, J)
@@ -64,7 +77,9 @@ def constrain(chain: Chain, structure: Structure, selection: Selection, J: Float
     from_pivots = selection.P.T @ solved
     W = jnp.where(independent[None], jnp.eye(len(column), dtype=J.dtype) - from_pivots[:, :-1], 0)
     W = column[:, None] * W / column[None]
-    return Coordinates(W, -column * from_pivots[:, -1], independent, dependent, chain.actuated, selection, J)
+    return Coordinates(
+        W, -column * from_pivots[:, -1], independent, dependent, chain.actuated, selection, J
+    )
 
 
 def constrained(chain: Chain, structure: Structure, q, v, kin: Kinematics, V) -> Coordinates:
@@ -76,17 +91,29 @@ def constrained(chain: Chain, structure: Structure, q, v, kin: Kinematics, V) ->
 
 
 def open_coordinates(chain: Chain, structure: Structure) -> Coordinates:
-    """The coordinates of a chain without virtual links: every joint that is not locked is independent."""
+    """The coordinates of a chain without virtual links: every joint that is not locked is
+    independent."""
     n, none, dtype = chain.dofs, jnp.zeros(0, bool), chain.q_load.dtype
     free = jnp.ones(n, bool) if structure.locked is None else ~structure.locked
-    selection = Selection(jnp.zeros((0, 0), dtype), jnp.zeros((0, n), dtype), jnp.zeros(0, dtype), none)
+    selection = Selection(
+        jnp.zeros((0, 0), dtype), jnp.zeros((0, n), dtype), jnp.zeros(0, dtype), none
+    )
     W = jnp.diag(jnp.where(free, 1, 0).astype(dtype))
-    return Coordinates(W, jnp.zeros(n, dtype), free, jnp.zeros(n, bool), chain.actuated, selection, jnp.zeros((0, n), dtype))
+    return Coordinates(
+        W,
+        jnp.zeros(n, dtype),
+        free,
+        jnp.zeros(n, bool),
+        chain.actuated,
+        selection,
+        jnp.zeros((0, n), dtype),
+    )
 
 
 @verb(eager=True)
 def coordinates(chain: Chain, state: State) -> Coordinates:
-    """H, W, S (without units, rad or m per rad or m), Hdot v (rad/s^2, m/s^2) and the selection, as the paper names them (section II)."""
+    """H, W, S (without units, rad or m per rad or m), Hdot v (rad/s^2, m/s^2) and the selection, as
+    the paper names them (section II)."""
     if not len(chain.link_names):
         return open_coordinates(chain, state.structure)
     kin = kinematics(chain, state.q)
@@ -94,16 +121,27 @@ def coordinates(chain: Chain, state: State) -> Coordinates:
 
 
 def prefer(chain: Chain, state: State, *names: str) -> State:
-    """The state with these joint coordinates asked to be independent (theta_G), as far as the loops let them be; no names: the choice is svkc's again.
+    """The state with these joint coordinates asked to be independent (theta_G), as far as the loops
+    let them be; no names: the choice is svkc's again.
 
-    names: of joints, virtual links, or single coordinates (`chain.dof_names`). The motion does not depend on it. ValueError: unknown names.
+    names: of joints, virtual links, or single coordinates (`chain.dof_names`). The motion does not
+    depend on it. ValueError: unknown names.
     """
     check_state(chain, state)
     asked = np.zeros(chain.dofs, bool)
     for name in names:
-        here = np.array([isinstance(name, str) and name in (n, n.rpartition(".")[0] or n) for n in chain.dof_names])
+        here = np.array(
+            [
+                isinstance(name, str) and name in (n, n.rpartition(".")[0] or n)
+                for n in chain.dof_names
+            ]
+        )
         if not here.any():
-            raise ValueError(f"no joint coordinate {name!r}; coordinates: {', '.join(chain.dof_names)}")
+            raise ValueError(
+                f"no joint coordinate {name!r}; coordinates: {', '.join(chain.dof_names)}"
+            )
         asked |= here
     wanted = jnp.asarray(asked) if names else None
-    return eqx.tree_at(lambda s: s.structure.independent, state, wanted, is_leaf=lambda x: x is None)
+    return eqx.tree_at(
+        lambda s: s.structure.independent, state, wanted, is_leaf=lambda x: x is None
+    )

@@ -1,7 +1,9 @@
-"""Accelerations of a closed chain by articulated bodies and the forces of its loops: no pivots are chosen.
+"""Accelerations of a closed chain by articulated bodies and the forces of its loops: no pivots are
+chosen.
 
-What a force in one loop row does in all others is Delassus' matrix D = J M^-1 J^T over the tree's coordinates. Virtual joints have coordinates without
-inertia: along them nothing is carried, so the rows are seen across them alone; the three rows that a ball turns in are not in D at all.
+What a force in one loop row does in all others is Delassus' matrix D = J M^-1 J^T over the tree's
+coordinates. Virtual joints have coordinates without inertia: along them nothing is carried, so the
+rows are seen across them alone; the three rows that a ball turns in are not in D at all.
 """
 
 from collections.abc import Callable
@@ -20,18 +22,21 @@ from svkc.tree.articulated_body import accelerations, articulate, seen_by
 from svkc.tree.kinematics import Kinematics
 from svkc.tree.spatial import inverse_positive, rotate
 
-# of the forces' error, along a row with 1e-6 of the others' inverse inertia, each leaves 1e-4 (float64)
+# of the forces' error, along a row with 1e-6 of the others' inverse inertia, each leaves 1e-4
+# (float64)
 REFINEMENTS = 2
 # the joint that turns as it likes
 BALL = (True, True, True, False, False, False)
-# rows from which LAPACK factors D: the inverse by halves is compiled for each size, and its operations grow with the rows
+# rows from which LAPACK factors D: the inverse by halves is compiled for each size, and its
+# operations grow with the rows
 LARGE = 36
 
 
 class Joints(eqx.Module):
-    """The virtual joints' own coordinates, link by link, as many as the freest has: motion [links, row, freedom] of those without inertia, and
-    (S^T S)^-1 of it; of those with armature (N m s^2, N s^2/m), and that (None: no joint has any); where each stands among the coordinates of virtual
-    joints (`count`: nowhere)."""
+    """The virtual joints' own coordinates, link by link, as many as the freest has: motion [links,
+    row, freedom] of those without inertia, and
+    (S^T S)^-1 of it; of those with armature (N m s^2, N s^2/m), and that (None: no joint has any);
+    where each stands among the coordinates of virtual joints (`count`: nowhere)."""
 
     light: Float[Array, "links 6 d"]
     inverse: Float[Array, "links d d"]
@@ -48,7 +53,9 @@ class Joints(eqx.Module):
     def part(self, links: np.ndarray) -> "Joints":
         """Those of some links."""
         heavy, armature = (None if x is None else x[links] for x in (self.heavy, self.armature))
-        return Joints(self.light[links], self.inverse[links], heavy, armature, self.place[links], self.count)
+        return Joints(
+            self.light[links], self.inverse[links], heavy, armature, self.place[links], self.count
+        )
 
     def along(self, x: Float[Array, "*n rows"]) -> Float[Array, "*n links d"]:
         """The rates of virtual joints without inertia that follow the rows best."""
@@ -66,8 +73,8 @@ class Joints(eqx.Module):
 
 
 class Rows(NamedTuple):
-    """The rows of J that are in D: all six of `whole` links, then the last three of those with a ball; where each row of J is among them (past their end:
-    nowhere)."""
+    """The rows of J that are in D: all six of `whole` links, then the last three of those with a
+    ball; where each row of J is among them (past their end: nowhere)."""
 
     whole: np.ndarray
     kept: np.ndarray
@@ -79,9 +86,16 @@ class Rows(NamedTuple):
 
 
 def rows_held(chain: Chain, locked: bool) -> Rows:
-    """A declared ball turns freely where none of its coordinates is locked or has inertia; what a spare slot holds is known at run time alone."""
+    """A declared ball turns freely where none of its coordinates is locked or has inertia; what a
+    spare slot holds is known at run time alone."""
     top = chain.topology
-    free = np.array([tuple(f) == BALL and not spare for f, spare in zip(top.link_freedoms, top.link_spare, strict=True)], bool)
+    free = np.array(
+        [
+            tuple(f) == BALL and not spare
+            for f, spare in zip(top.link_freedoms, top.link_spare, strict=True)
+        ],
+        bool,
+    )
     free = free & (not locked and chain.link_armature is None)
     six = np.arange(6 * len(free)).reshape(-1, 6)
     kept = np.concatenate([six[~free].ravel(), six[free][:, 3:].ravel()])
@@ -90,7 +104,9 @@ def rows_held(chain: Chain, locked: bool) -> Rows:
     return Rows(np.flatnonzero(~free), kept, back)
 
 
-def _led(A: Float[Array, "links i j"], x: Float[Array, "*n links k"]) -> Float[Array, "*m links i j"]:
+def _led(
+    A: Float[Array, "links i j"], x: Float[Array, "*n links k"]
+) -> Float[Array, "*m links i j"]:
     return A.reshape(*(1,) * (x.ndim - 2), *A.shape)
 
 
@@ -106,26 +122,40 @@ def joints(chain: Chain, J: Float[Array, "rows dofs"]) -> Joints:
         heavy = jnp.where(armature[:, None] > 0, light, 0)
         light = light - heavy
     still = jnp.where(jnp.all(light == 0, 1), 1, 0).astype(J.dtype)
-    G = jnp.sum(light[:, :, :, None] * light[:, :, None], 1) + still[:, :, None] * np.eye(place.shape[1], dtype=J.dtype)[None]
+    G = (
+        jnp.sum(light[:, :, :, None] * light[:, :, None], 1)
+        + still[:, :, None] * np.eye(place.shape[1], dtype=J.dtype)[None]
+    )
     return Joints(light, inverse_positive(G), heavy, armature, place, count)
 
 
-def by_loop_forces(chain: Chain, kin: Kinematics, J: Float[Array, "rows dofs"], free: Bool[Array, " nv"] | None) -> Callable:
-    """(force, rate) -> (x, mu) with M x + J^T mu = force and J x = rate, of rows that need not be independent. free: joints not locked (None: all).
+def by_loop_forces(
+    chain: Chain, kin: Kinematics, J: Float[Array, "rows dofs"], free: Bool[Array, " nv"] | None
+) -> Callable:
+    """(force, rate) -> (x, mu) with M x + J^T mu = force and J x = rate, of rows that need not be
+    independent. free: joints not locked (None: all).
 
-    D + a little is factored, and the forces refined against D (the proximal form): where rows repeat one another, or nearly so, the forces stay finite and the
-    motion is that of the others.
+    D + a little is factored, and the forces refined against D (the proximal form): where rows
+    repeat one another, or nearly so, the forces stay finite and the motion is that of the others.
     """
     top, nv, tree = chain.topology, chain.nv, J[:, : chain.nv]
-    bodies, own, held = articulate(chain, kin, free), joints(chain, J), rows_held(chain, free is not None)
+    bodies, own, held = (
+        articulate(chain, kin, free),
+        joints(chain, J),
+        rows_held(chain, free is not None),
+    )
     some, six = own.part(held.whole), 6 * len(held.whole)
     across = lambda x: jnp.concatenate([some.across(x[..., :six]), x[..., six:]], -1) if six else x
     D = seen_by(top, bodies, take(tree, held.kept))
     if own.heavy is not None:
         # virtual joints with armature add what they give way by
         weight = jnp.where(own.armature > 0, 1 / jnp.where(own.armature > 0, own.armature, 1), 0)
-        given = lambda force, mu: weight * (force + rotate(jnp.swapaxes(own.heavy, -1, -2), mu.reshape(-1, 6)))
-        D = D + block_diag(*jnp.sum(own.heavy[:, :, None] * own.heavy[:, None] * weight[:, None, None], -1))
+        given = lambda force, mu: (
+            weight * (force + rotate(jnp.swapaxes(own.heavy, -1, -2), mu.reshape(-1, 6)))
+        )
+        D = D + block_diag(
+            *jnp.sum(own.heavy[:, :, None] * own.heavy[:, None] * weight[:, None, None], -1)
+        )
     D = across(across(D).T)
     most = jnp.max(jnp.where(np.eye(D.shape[0], dtype=bool), D, 0))
     # (none where no loop is closed)

@@ -11,7 +11,15 @@ from svkc._jax.lanes_last import with_lanes_last
 from svkc.loops.constrained_dynamics import by_bodies, solve_free_motion, solve_motion, with_links
 from svkc.loops.constraint import ends, loop_rates, scaled_jacobian, scales
 from svkc.loops.coordinates import agreeing
-from svkc.loops.pivoting import NEAR, Selection, choose, rank_tolerance, solve_frozen, square, weakest
+from svkc.loops.pivoting import (
+    NEAR,
+    Selection,
+    choose,
+    rank_tolerance,
+    solve_frozen,
+    square,
+    weakest,
+)
 from svkc.model.chain import Chain, State, Structure, active_dofs
 from svkc.model.checked_jit import joint_torques, verb
 from svkc.tree.inverse_dynamics import generalized_forces, passive_forces
@@ -21,12 +29,23 @@ from svkc.tree.mass_matrix import inertia_by_unit_vectors
 
 @functools.partial(jax.jit, static_argnames=("inertia", "agree"))
 def moving(
-    chain: Chain, structure: Structure, q, v, tau: Float[Array, " dofs"], inertia=None, baumgarte=None, agree: bool = False, pivots=None
+    chain: Chain,
+    structure: Structure,
+    q,
+    v,
+    tau: Float[Array, " dofs"],
+    inertia=None,
+    baumgarte=None,
+    agree: bool = False,
+    pivots=None,
 ) -> tuple[Float[Array, " dofs"], Float[Array, " dofs"]]:
-    """Velocity and acceleration: steps 1 to 5 of section III-B. On an open chain W is the identity and nothing of the closure is computed.
+    """Velocity and acceleration: steps 1 to 5 of section III-B. On an open chain W is the identity
+    and nothing of the closure is computed.
 
-    baumgarte: rate (1/s) at which open loops are pulled back; None: not at all. agree: near a singular configuration dependent velocities are
-    those of the independent ones, for there the stages of a step would make their errors grow. pivots: as `choose` takes them.
+    baumgarte: rate (1/s) at which open loops are pulled back; None: not at all. agree: near a
+    singular configuration dependent velocities are
+    those of the independent ones, for there the stages of a step would make their errors grow.
+    pivots: as `choose` takes them.
     """
     kin = kinematics(chain, q)
     loops = len(chain.topology.link_names)
@@ -36,10 +55,18 @@ def moving(
         selection = choose(structure, J, pivots) if agree or inertia is not by_bodies else None
         if agree:
             near = weakest(selection) < NEAR * structure.margin
-            v = jnp.where(near, agreeing(chain, selection, J, jnp.where(active_dofs(chain, structure), v, 0)), v)
+            v = jnp.where(
+                near,
+                agreeing(chain, selection, J, jnp.where(active_dofs(chain, structure), v, 0)),
+                v,
+            )
     V = twists(chain, kin, v)
     bias = generalized_forces(chain, kin, V, v, jnp.zeros(chain.nv, v.dtype))
-    force = tau + passive_forces(chain, q, v) - jnp.concatenate([bias, jnp.zeros(chain.dofs - chain.nv, v.dtype)])
+    force = (
+        tau
+        + passive_forces(chain, q, v)
+        - jnp.concatenate([bias, jnp.zeros(chain.dofs - chain.nv, v.dtype)])
+    )
     if not loops:
         return v, solve_free_motion(chain, structure, kin, force, inertia)
     rates = loop_rates(chain, structure, v, kin, V, end, J, baumgarte)
@@ -47,33 +74,49 @@ def moving(
 
 
 @with_lanes_last
-def moving_in_lanes(chain: Chain, structure: Structure, q, v, tau, baumgarte) -> tuple[Float[Array, " dofs"], Float[Array, " dofs"]]:
+def moving_in_lanes(
+    chain: Chain, structure: Structure, q, v, tau, baumgarte
+) -> tuple[Float[Array, " dofs"], Float[Array, " dofs"]]:
     """`moving` by articulated bodies, without pivots, under a `vmap` that keeps its lanes last."""
     return moving(chain, structure, q, v, tau, by_bodies, baumgarte)
 
 
-def acceleration(chain: Chain, structure: Structure, q, v, tau: Float[Array, " dofs"], inertia=None) -> Float[Array, " dofs"]:
+def acceleration(
+    chain: Chain, structure: Structure, q, v, tau: Float[Array, " dofs"], inertia=None
+) -> Float[Array, " dofs"]:
     """The acceleration alone, for the velocity as it is."""
     return moving(chain, structure, q, v, tau, inertia)[1]
 
 
 @verb
-def forward_dynamics(chain: Chain, state: State, tau: Float[Array, " torques"]) -> Float[Array, " dofs"]:
-    """Accelerations (rad/s^2, m/s^2) of every joint coordinate for the joint torques tau (N m, N), loops kept (paper, section III-B).
+def forward_dynamics(
+    chain: Chain, state: State, tau: Float[Array, " torques"]
+) -> Float[Array, " dofs"]:
+    """Accelerations (rad/s^2, m/s^2) of every joint coordinate for the joint torques tau (N m, N),
+    loops kept (paper, section III-B).
 
-    Springs and dampers of the joints act too. tau: over every coordinate, or the tree's alone. By articulated bodies, or composites where there are loops.
+    Springs and dampers of the joints act too. tau: over every coordinate, or the tree's alone. By
+    articulated bodies, or composites where there are loops.
     """
     return acceleration(chain, state.structure, state.q, state.v, joint_torques(chain, tau))
 
 
 @verb
-def forward_dynamics_by_unit_vectors(chain: Chain, state: State, tau: Float[Array, " torques"]) -> Float[Array, " dofs"]:
-    """The same with the inertia matrix column by column from inverse dynamics: the paper's own way."""
-    return acceleration(chain, state.structure, state.q, state.v, joint_torques(chain, tau), inertia_by_unit_vectors)
+def forward_dynamics_by_unit_vectors(
+    chain: Chain, state: State, tau: Float[Array, " torques"]
+) -> Float[Array, " dofs"]:
+    """The same with the inertia matrix column by column from inverse dynamics: the paper's own
+    way."""
+    return acceleration(
+        chain, state.structure, state.q, state.v, joint_torques(chain, tau), inertia_by_unit_vectors
+    )
 
 
-def constraint_forces(chain: Chain, selection: Selection, J: Float[Array, "rows dofs"], excess: Float[Array, " dofs"]) -> Float[Array, "links 6"]:
-    """Lambda with J_C^T lambda = excess, of least norm where loops are redundant: wrench (N m, N) on the virtual link, at the joint."""
+def constraint_forces(
+    chain: Chain, selection: Selection, J: Float[Array, "rows dofs"], excess: Float[Array, " dofs"]
+) -> Float[Array, "links 6"]:
+    """Lambda with J_C^T lambda = excess, of least norm where loops are redundant: wrench (N m, N)
+    on the virtual link, at the joint."""
     row, column = scales(chain)
     _, JS = square(selection, J)
     mu = solve_frozen(JS, selection.P @ (column * excess), trans=True)
@@ -81,9 +124,11 @@ def constraint_forces(chain: Chain, selection: Selection, J: Float[Array, "rows 
 
 
 class LoopForces(eqx.Module):
-    """Wrench of each connected virtual link, on `real` from `parent`, at the joint, in world axes; unpacks as force, torque.
+    """Wrench of each connected virtual link, on `real` from `parent`, at the joint, in world axes;
+    unpacks as force, torque.
 
-    `unique`: nothing but the motion decides it. Where loops are redundant some wrenches are not: they are the least in norm (rows over `chain.length`).
+    `unique`: nothing but the motion decides it. Where loops are redundant some wrenches are not:
+    they are the least in norm (rows over `chain.length`).
     """
 
     force: Float[Array, "links 3"]
@@ -96,11 +141,14 @@ class LoopForces(eqx.Module):
 
 @verb(eager=True)
 def loop_forces(chain: Chain, state: State, tau: Float[Array, " torques"]) -> LoopForces:
-    """Force (N) and torque (N m) that each connected virtual link carries for the joint torques tau: on `real` from `parent`, at the joint, in
+    """Force (N) and torque (N m) that each connected virtual link carries for the joint torques
+    tau: on `real` from `parent`, at the joint, in
     world axes, and whether the motion alone decides it."""
     tau = joint_torques(chain, tau)
     if not len(chain.link_names):
-        return LoopForces(jnp.zeros((0, 3), state.v.dtype), jnp.zeros((0, 3), state.v.dtype), jnp.zeros(0, bool))
+        return LoopForces(
+            jnp.zeros((0, 3), state.v.dtype), jnp.zeros((0, 3), state.v.dtype), jnp.zeros(0, bool)
+        )
     q, v, s, nv = state.q, state.v, state.structure, chain.nv
     kin = kinematics(chain, q)
     V = twists(chain, kin, v)
@@ -113,7 +161,9 @@ def loop_forces(chain: Chain, state: State, tau: Float[Array, " torques"]) -> Lo
 
 
 def self_stressed(structure: Structure, selection: Selection) -> Bool[Array, " links"]:
-    """Links that take part in a self-stress: wrenches of all loops together, J_C^T lambda = 0, that no motion tells of."""
-    # a row's length within the range of J_C: 1 where no vector orthogonal to that range has a part in it
+    """Links that take part in a self-stress: wrenches of all loops together, J_C^T lambda = 0, that
+    no motion tells of."""
+    # a row's length within the range of J_C: 1 where no vector orthogonal to that range has a part
+    # in it
     inside = jnp.sum(selection.Q**2, 0).reshape(-1, 6)
     return structure.connected & jnp.any(inside < 1 - rank_tolerance(inside.dtype), 1)

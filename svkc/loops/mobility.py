@@ -15,8 +15,9 @@ from svkc.tree.kinematics import kinematics
 
 
 class Mobility(eqx.Module):
-    """`freedoms` N_F = N_J - m (13), `joint_freedoms` N_J, `rank` m of the phase, `redundant`: rows of each loop that those before it already imply,
-    `independent`: the coordinates chosen as theta_G, `margin`: |R_mm| / |R_11|, how far the weakest row that counts is from being redundant.
+    """`freedoms` N_F = N_J - m (13), `joint_freedoms` N_J, `rank` m of the phase, `redundant`: rows
+    of each loop that those before it already imply, `independent`: the coordinates chosen as
+    theta_G, `margin`: |R_mm| / |R_11|, how far the weakest row that counts is from being redundant.
     Printed, it is a table with the names."""
 
     freedoms: Int[Array, ""]
@@ -40,7 +41,10 @@ class Mobility(eqx.Module):
             f"independent coordinates: {chosen or 'none'}",
         ]
         for name, on, rows in zip(self.link_names, self.connected, self.redundant, strict=True):
-            lines.append(f"  {name}: " + (f"6 rows, {int(rows)} of them redundant" if on else "not connected"))
+            lines.append(
+                f"  {name}: "
+                + (f"6 rows, {int(rows)} of them redundant" if on else "not connected")
+            )
         return "\n".join(lines)
 
 
@@ -53,15 +57,30 @@ def mobility(chain: Chain, state: State) -> Mobility:
     if not links:
         zero = jnp.zeros((), jnp.int32)
         one, none = jnp.ones((), state.q.dtype), jnp.zeros(0, jnp.int32)
-        return Mobility(joint_freedoms, joint_freedoms, zero, none, active, one, none > 0, (), chain.dof_names)
+        return Mobility(
+            joint_freedoms, joint_freedoms, zero, none, active, one, none > 0, (), chain.dof_names
+        )
     kin = kinematics(chain, state.q)
     J = scaled_jacobian(chain, state.structure, kin, ends(chain, state.structure, kin, state.q))
     # of the first loop's rows, the first two loops', and so on
     upto = np.arange(6 * links)[None] < 6 * np.arange(1, links + 1)[:, None]
-    ranks = jax.lax.map(lambda rows: count_rank(select(jnp.where(rows[:, None], jax.lax.stop_gradient(J), 0)).size), jnp.asarray(upto))
+    ranks = jax.lax.map(
+        lambda rows: count_rank(select(jnp.where(rows[:, None], jax.lax.stop_gradient(J), 0)).size),
+        jnp.asarray(upto),
+    )
     rows = jnp.where(state.structure.connected, 6, 0).astype(jnp.int32)
     redundant = rows - jnp.diff(ranks, prepend=jnp.zeros(1, jnp.int32))
     co = coordinates(chain, state)
     rank, margin = state.structure.rank, weakest(select(J, state.structure.rank))
     on = state.structure.connected
-    return Mobility(joint_freedoms - rank, joint_freedoms, rank, redundant, co.independent, margin, on, chain.link_names, chain.dof_names)
+    return Mobility(
+        joint_freedoms - rank,
+        joint_freedoms,
+        rank,
+        redundant,
+        co.independent,
+        margin,
+        on,
+        chain.link_names,
+        chain.dof_names,
+    )

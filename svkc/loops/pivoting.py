@@ -1,6 +1,7 @@
 """Which columns of a matrix are independent: pivots, rank, and solves with that choice held fixed.
 
-Pivots are integers chosen on stop_gradient(J). What follows from them is exact to differentiate wherever the rank does not change.
+Pivots are integers chosen on stop_gradient(J). What follows from them is exact to differentiate
+wherever the rank does not change.
 """
 
 import equinox as eqx
@@ -17,9 +18,11 @@ from svkc.model.chain import Structure
 
 
 class Selection(eqx.Module):
-    """Pivoted Gram-Schmidt of a matrix: Q [steps, rows], one-hot pivots P [steps, dofs], |R_kk|, and which steps count.
+    """Pivoted Gram-Schmidt of a matrix: Q [steps, rows], one-hot pivots P [steps, dofs], |R_kk|,
+    and which steps count.
 
-    P is frozen; Q and |R_kk| follow the matrix when it is differentiated, so that Q's rows go on spanning the range of the pivot columns.
+    P is frozen; Q and |R_kk| follow the matrix when it is differentiated, so that Q's rows go on
+    spanning the range of the pivot columns.
     """
 
     Q: Float[Array, "steps rows"]
@@ -29,18 +32,25 @@ class Selection(eqx.Module):
 
 
 def rank_tolerance(dtype) -> float:
-    """|R_kk| / |R_11| below which a row of the scaled J_C counts as redundant: sqrt(eps), 1.5e-8 in float64, 3.5e-4 in float32."""
+    """|R_kk| / |R_11| below which a row of the scaled J_C counts as redundant: sqrt(eps), 1.5e-8 in
+    float64, 3.5e-4 in float32."""
     return float(np.sqrt(np.finfo(dtype).eps))
 
 
 def held_part(dtype) -> float:
-    """The part of the phase's own margin below which a row of the scaled J_C is let go for as long as the mechanism passes a singular configuration:
-    eps^(1/4), 1.2e-4 in float64, 1.9e-2 in float32. Nearer to it round-off would steer the motion; what moves goes on as it moves."""
+    """The part of the phase's own margin below which a row of the scaled J_C is let go for as long
+    as the mechanism passes a singular configuration: eps^(1/4), 1.2e-4 in float64, 1.9e-2 in
+    float32. Nearer to it round-off would steer the motion; what moves goes on as it moves."""
     return float(np.finfo(dtype).eps ** 0.25)
 
 
 def _kept(selection: Selection, keep: Bool[Array, " steps"]) -> Selection:
-    return Selection(jnp.where(keep[:, None], selection.Q, 0), jnp.where(keep[:, None], selection.P, 0), selection.size, keep)
+    return Selection(
+        jnp.where(keep[:, None], selection.Q, 0),
+        jnp.where(keep[:, None], selection.P, 0),
+        selection.size,
+        keep,
+    )
 
 
 def without_weak(selection: Selection, floor: Float[Array, ""]) -> Selection:
@@ -48,21 +58,33 @@ def without_weak(selection: Selection, floor: Float[Array, ""]) -> Selection:
     return _kept(selection, selection.used & (selection.size > floor * jnp.max(selection.size)))
 
 
-def select(J: Float[Array, "rows dofs"], rank: Int[Array, ""] | None = None, wanted: Bool[Array, " dofs"] | None = None) -> Selection:
-    """min(rows, dofs) steps of column-pivoted Gram-Schmidt, orthogonalised twice; steps from `rank` on are inert (None: all are taken).
+def select(
+    J: Float[Array, "rows dofs"],
+    rank: Int[Array, ""] | None = None,
+    wanted: Bool[Array, " dofs"] | None = None,
+) -> Selection:
+    """min(rows, dofs) steps of column-pivoted Gram-Schmidt, orthogonalised twice; steps from `rank`
+    on are inert (None: all are taken).
 
     `wanted`: columns to leave independent, taken as pivots only where nothing else is left.
     """
     frozen = jax.lax.stop_gradient(J)
     rows, dofs = J.shape
     steps = min(rows, dofs)
-    weight = None if wanted is None else jnp.where(wanted, rank_tolerance(J.dtype) ** 2, 1).astype(J.dtype)
+    weight = (
+        None
+        if wanted is None
+        else jnp.where(wanted, rank_tolerance(J.dtype) ** 2, 1).astype(J.dtype)
+    )
 
     def step(k, carry):
         A, Q, P, size = carry
         norms = jnp.sum(A * A, 0) * (1 if weight is None else weight)
-        # the first of those that are equal but for round-off, as mirrored limbs are: the same on every machine
-        pivot = jnp.arange(dofs) == jnp.argmax(norms >= (1 - rank_tolerance(J.dtype)) * jnp.max(norms))
+        # the first of those that are equal but for round-off, as mirrored limbs are: the same on
+        # every machine
+        pivot = jnp.arange(dofs) == jnp.argmax(
+            norms >= (1 - rank_tolerance(J.dtype)) * jnp.max(norms)
+        )
         column = jnp.sum(jnp.where(pivot[None], A, 0), 1)
         column = column - (Q @ column) @ Q
         r = jnp.sqrt(jnp.sum(column * column))
@@ -74,14 +96,20 @@ def select(J: Float[Array, "rows dofs"], rank: Int[Array, ""] | None = None, wan
         P = jnp.where(here[:, None] & pivot[None] & taken, 1, P)
         return A, Q, P, jnp.where(here, r, size)
 
-    start = (frozen, jnp.zeros((steps, rows), J.dtype), jnp.zeros((steps, dofs), J.dtype), jnp.zeros(steps, J.dtype))
+    start = (
+        frozen,
+        jnp.zeros((steps, rows), J.dtype),
+        jnp.zeros((steps, dofs), J.dtype),
+        jnp.zeros(steps, J.dtype),
+    )
     _, Q, P, size = jax.lax.fori_loop(0, steps, step, start)
     Q, size = _following(J, Q, P, size)
     return Selection(Q, P, size, jnp.any(P > 0, 1))
 
 
 def select_again(J: Float[Array, "rows dofs"], P: Float[Array, "steps dofs"]) -> Selection:
-    """The same with pivots that were chosen before: only their columns are orthogonalised, nothing is searched for."""
+    """The same with pivots that were chosen before: only their columns are orthogonalised, nothing
+    is searched for."""
     used = jnp.any(P > 0, 1)
     columns = P @ jax.lax.stop_gradient(J).T
 
@@ -92,7 +120,9 @@ def select_again(J: Float[Array, "rows dofs"], P: Float[Array, "steps dofs"]) ->
             column = column - (Q @ column) @ Q
         r = jnp.sqrt(jnp.sum(column * column))
         here = (jnp.arange(used.shape[0]) == k) & (r > 0)
-        return jnp.where(here[:, None], (column / jnp.where(r > 0, r, 1))[None], Q), jnp.where(here, r, size)
+        return jnp.where(here[:, None], (column / jnp.where(r > 0, r, 1))[None], Q), jnp.where(
+            here, r, size
+        )
 
     none = jnp.zeros((used.shape[0], J.shape[0]), J.dtype), jnp.zeros(used.shape[0], J.dtype)
     Q, size = jax.lax.fori_loop(0, used.shape[0], step, none)
@@ -101,11 +131,14 @@ def select_again(J: Float[Array, "rows dofs"], P: Float[Array, "steps dofs"]) ->
 
 
 def _following_jvp(primals, tangents):
-    """Derivatives of Q = R^-T (J P^T)^T with R frozen, and of the diagonal of the R that J has, which is that of Cholesky's factor of Q Q^T times R's."""
+    """Derivatives of Q = R^-T (J P^T)^T with R frozen, and of the diagonal of the R that J has,
+    which is that of Cholesky's factor of Q Q^T times R's."""
     J, _, P, _ = primals
     Q, size = _following(*primals)
     unused = jnp.diag(jnp.where(jnp.any(P > 0, 1), 0, 1).astype(J.dtype))
-    dQ = solve_triangular(jax.lax.stop_gradient(Q @ J @ P.T) + unused, (tangents[0] @ P.T).T, trans=1)
+    dQ = solve_triangular(
+        jax.lax.stop_gradient(Q @ J @ P.T) + unused, (tangents[0] @ P.T).T, trans=1
+    )
     L = jnp.linalg.cholesky(Q @ Q.T + unused)
     along = jnp.sum(solve_triangular(L, dQ, lower=True) * solve_triangular(L, Q, lower=True), 1)
     return (Q, size), (dQ, size * along)
@@ -117,13 +150,17 @@ _following = operation("following", lambda J, Q, P, size: (Q, size), _following_
 
 def count_rank(size: Float[Array, " steps"]) -> Int[Array, ""]:
     """Steps whose |R_kk| is above the tolerance."""
-    return jnp.sum(size > rank_tolerance(size.dtype) * jnp.maximum(size[0], jnp.finfo(size.dtype).tiny)).astype(jnp.int32)
+    return jnp.sum(
+        size > rank_tolerance(size.dtype) * jnp.maximum(size[0], jnp.finfo(size.dtype).tiny)
+    ).astype(jnp.int32)
 
 
 def weakest(selection: Selection) -> Float[Array, ""]:
     """|R_mm| / |R_11|, 1 where no row counts."""
     size, used = selection.size, selection.used
-    return jnp.min(jnp.where(used, size, jnp.inf), initial=1, where=used) / jnp.where(jnp.any(used), jnp.max(size), 1)
+    return jnp.min(jnp.where(used, size, jnp.inf), initial=1, where=used) / jnp.where(
+        jnp.any(used), jnp.max(size), 1
+    )
 
 
 def select_with_rank(J: Float[Array, "rows dofs"]) -> tuple[Selection, Int[Array, ""]]:
@@ -141,8 +178,11 @@ def too_few(P: Float[Array, "steps dofs"], rank: Int[Array, ""]) -> Bool[Array, 
     return jnp.sum(jnp.any(P > 0, 1), dtype=jnp.int32) < rank
 
 
-def solve_frozen(B: Float[Array, "steps steps"], x: Float[Array, "steps *n"], trans: bool = False) -> Float[Array, "steps *n"]:
-    """B^-1 x, or B^-T x, for a B that the frozen choice leaves upper triangular in value but not in derivative."""
+def solve_frozen(
+    B: Float[Array, "steps steps"], x: Float[Array, "steps *n"], trans: bool = False
+) -> Float[Array, "steps *n"]:
+    """B^-1 x, or B^-T x, for a B that the frozen choice leaves upper triangular in value but not in
+    derivative."""
     triangle = jax.lax.stop_gradient(B)
     return jax.lax.custom_linear_solve(
         lambda y: (B.T if trans else B) @ y,
@@ -153,25 +193,34 @@ def solve_frozen(B: Float[Array, "steps steps"], x: Float[Array, "steps *n"], tr
 
 
 def solve_positive(A: Float[Array, "n n"], x: Float[Array, "n *m"]) -> Float[Array, "n *m"]:
-    """A^-1 x by Cholesky for a symmetric positive A; the derivative is one more solve with the same factor."""
+    """A^-1 x by Cholesky for a symmetric positive A; the derivative is one more solve with the same
+    factor."""
     inverse = factor_positive(jax.lax.stop_gradient(A))
-    return jax.lax.custom_linear_solve(lambda y: A @ y, x, solve=lambda _, y: inverse(y), symmetric=True)
+    return jax.lax.custom_linear_solve(
+        lambda y: A @ y, x, solve=lambda _, y: inverse(y), symmetric=True
+    )
 
 
-def square(selection: Selection, J: Float[Array, "rows dofs"]) -> tuple[Float[Array, "steps dofs"], Float[Array, "steps steps"]]:
-    """J_Cm = Q J_C, m independent rows (12), and J_S, its pivot columns in order (14), with ones on the unused diagonal."""
+def square(
+    selection: Selection, J: Float[Array, "rows dofs"]
+) -> tuple[Float[Array, "steps dofs"], Float[Array, "steps steps"]]:
+    """J_Cm = Q J_C, m independent rows (12), and J_S, its pivot columns in order (14), with ones on
+    the unused diagonal."""
     Jm = selection.Q @ J
     return Jm, Jm @ selection.P.T + jnp.diag(jnp.where(selection.used, 0, 1).astype(J.dtype))
 
 
-# part of the phase's own margin below which a configuration is near a singular one; elsewhere the motion depends on no choice of pivots
+# part of the phase's own margin below which a configuration is near a singular one; elsewhere the
+# motion depends on no choice of pivots
 NEAR = 0.1
 
 
 def choose(structure: Structure, J: Float[Array, "rows dofs"], pivots=None) -> Selection:
-    """The pivots of J_C, with the rank of the phase and the coordinates that are asked to be independent; without rows that are too weak just now.
+    """The pivots of J_C, with the rank of the phase and the coordinates that are asked to be
+    independent; without rows that are too weak just now.
 
-    pivots [steps, dofs]: one-hot, chosen before (None: to be chosen now); near a singular configuration, or where they are too few, new ones are.
+    pivots [steps, dofs]: one-hot, chosen before (None: to be chosen now); near a singular
+    configuration, or where they are too few, new ones are.
     """
     new = lambda: select(J, structure.rank, structure.independent)
     if pivots is None:
@@ -180,5 +229,9 @@ def choose(structure: Structure, J: Float[Array, "rows dofs"], pivots=None) -> S
         held = select_again(J, pivots)
         near = (weakest(held) < NEAR * structure.margin) | too_few(pivots, structure.rank)
         # (one lane near is enough to choose for all)
-        selection = jax.lax.cond(unvmap_any(near), lambda: jax.tree.map(lambda a, b: jnp.where(near, a, b), new(), held), lambda: held)
+        selection = jax.lax.cond(
+            unvmap_any(near),
+            lambda: jax.tree.map(lambda a, b: jnp.where(near, a, b), new(), held),
+            lambda: held,
+        )
     return without_weak(selection, held_part(J.dtype) * structure.margin)

@@ -10,45 +10,102 @@ from jaxtyping import Array, Bool, Float
 from svkc._jax.lanes_last import with_lanes_last
 from svkc.loops.constrained_dynamics import by_bodies, solve_motion
 from svkc.loops.constraint import ends, gap, scaled_jacobian, scales, sizes
-from svkc.loops.pivoting import Selection, held_part, rank_tolerance, select, select_again, solve_frozen, solve_positive, square, too_few, weakest, without_weak
+from svkc.loops.pivoting import (
+    Selection,
+    held_part,
+    rank_tolerance,
+    select,
+    select_again,
+    solve_frozen,
+    solve_positive,
+    square,
+    too_few,
+    weakest,
+    without_weak,
+)
 from svkc.model.chain import Chain, Structure, active_dofs
 from svkc.tree.configuration import integrate, normalize
 from svkc.tree.kinematics import Kinematics, kinematics
 
 
-def least_change(chain: Chain, structure: Structure, kin: Kinematics, selection: Selection, J, x: Float[Array, "rows n"]) -> Float[Array, "dofs n"]:
-    """The y (m, rad, or their rates) with J y = x whose sum of squares, in coordinates without units, is least. For `svkc.Projection(change=...)`."""
+def least_change(
+    chain: Chain,
+    structure: Structure,
+    kin: Kinematics,
+    selection: Selection,
+    J,
+    x: Float[Array, "rows n"],
+) -> Float[Array, "dofs n"]:
+    """The y (m, rad, or their rates) with J y = x whose sum of squares, in coordinates without
+    units, is least. For `svkc.Projection(change=...)`."""
     Jm, _ = square(selection, J)
     gram = Jm @ Jm.T + jnp.diag(jnp.where(selection.used, 0, 1).astype(J.dtype))
     return scales(chain)[1][:, None] * (Jm.T @ solve_positive(gram, selection.Q @ x))
 
 
-def dependent_change(chain: Chain, structure: Structure, kin: Kinematics, selection: Selection, J, x: Float[Array, "rows n"]) -> Float[Array, "dofs n"]:
-    """The y (m, rad, or their rates) with J y = x that moves dependent coordinates only (16). For `svkc.Projection(change=...)`."""
+def dependent_change(
+    chain: Chain,
+    structure: Structure,
+    kin: Kinematics,
+    selection: Selection,
+    J,
+    x: Float[Array, "rows n"],
+) -> Float[Array, "dofs n"]:
+    """The y (m, rad, or their rates) with J y = x that moves dependent coordinates only (16). For
+    `svkc.Projection(change=...)`."""
     _, JS = square(selection, J)
     return scales(chain)[1][:, None] * (selection.P.T @ solve_frozen(JS, selection.Q @ x))
 
 
-def inertia_change(chain: Chain, structure: Structure, kin: Kinematics, selection: Selection, J, x: Float[Array, "rows n"]) -> Float[Array, "dofs n"]:
-    """The y (m, rad, or their rates) with J y = x whose y^T M y is least: that of an impulse of the loops (29). For `svkc.Projection(change=...)`."""
+def inertia_change(
+    chain: Chain,
+    structure: Structure,
+    kin: Kinematics,
+    selection: Selection,
+    J,
+    x: Float[Array, "rows n"],
+) -> Float[Array, "dofs n"]:
+    """The y (m, rad, or their rates) with J y = x whose y^T M y is least: that of an impulse of the
+    loops (29). For `svkc.Projection(change=...)`."""
     none = jnp.zeros(chain.dofs, J.dtype)
     return jax.vmap(lambda x: solve_motion(chain, structure, kin, selection, J, none, -x), 1, 1)(x)
 
 
 def _solvable(structure: Structure, selection: Selection) -> Selection:
-    """Steps below the rank's tolerance dropped, for a gap along them is of second order and dividing by them would only amplify round-off; and rows
+    """Steps below the rank's tolerance dropped, for a gap along them is of second order and
+    dividing by them would only amplify round-off; and rows
     that are let go just now."""
-    return without_weak(selection, jnp.maximum(rank_tolerance(selection.size.dtype), held_part(selection.size.dtype) * structure.margin))
+    return without_weak(
+        selection,
+        jnp.maximum(
+            rank_tolerance(selection.size.dtype), held_part(selection.size.dtype) * structure.margin
+        ),
+    )
 
 
 @functools.partial(jax.jit, static_argnames=("iterations", "change", "hold"))
 def settle_loops(
-    chain: Chain, structure: Structure, q, v, iterations: int, change: Callable = inertia_change, pivots=None, hold: float = 0.0
-) -> tuple[Float[Array, " q"], Float[Array, " dofs"], Float[Array, "links 2"], Float[Array, ""], Float[Array, "steps dofs"]]:
-    """Close the loops by Newton's method, then project the velocity. The last turn of one loop is the velocity's, so that the body is compiled once.
+    chain: Chain,
+    structure: Structure,
+    q,
+    v,
+    iterations: int,
+    change: Callable = inertia_change,
+    pivots=None,
+    hold: float = 0.0,
+) -> tuple[
+    Float[Array, " q"],
+    Float[Array, " dofs"],
+    Float[Array, "links 2"],
+    Float[Array, ""],
+    Float[Array, "steps dofs"],
+]:
+    """Close the loops by Newton's method, then project the velocity. The last turn of one loop is
+    the velocity's, so that the body is compiled once.
 
-    And what the loops show: the gaps (rad, `chain.length`s) that each loop is left with, |R_mm| / |R_11|, and the pivots to go on with. pivots: those held
-    so far (None: none are), which go on until their |R_mm| / |R_11| is below `hold` times that of new ones.
+    And what the loops show: the gaps (rad, `chain.length`s) that each loop is left with, |R_mm| /
+    |R_11|, and the pivots to go on with. pivots: those held so far (None: none are), which go on
+    until their |R_mm| / |R_11| is below `hold` times that of new ones.
     """
     row, column = scales(chain)
     active = active_dofs(chain, structure)
@@ -63,15 +120,30 @@ def settle_loops(
         selection, chosen = _solvable(structure, full), full.P
         if pivots is not None:
             # (asked of the last turn alone)
-            poor = lambda: (weakest(select_again(J, pivots)) < hold * weakest(full)) | too_few(pivots, structure.rank)
-            chosen = jax.lax.cond(i == iterations, lambda: jnp.where(poor(), full.P, pivots), lambda: pivots)
-        open_ = jnp.stack([row * gap(structure, end).ravel(), J @ jnp.where(active, v / column, 0)], 1)
+            poor = lambda: (
+                (weakest(select_again(J, pivots)) < hold * weakest(full))
+                | too_few(pivots, structure.rank)
+            )
+            chosen = jax.lax.cond(
+                i == iterations, lambda: jnp.where(poor(), full.P, pivots), lambda: pivots
+            )
+        open_ = jnp.stack(
+            [row * gap(structure, end).ravel(), J @ jnp.where(active, v / column, 0)], 1
+        )
         step = -change(chain, structure, kin, selection, J, open_)
         last = i == iterations
         seen = jax.lax.stop_gradient((sizes(open_[:, 0]), weakest(full), chosen))
-        return integrate(chain, q, jnp.where(last, 0, step[:, 0])), jnp.where(last, v + step[:, 1], v), *seen
+        return (
+            integrate(chain, q, jnp.where(last, 0, step[:, 0])),
+            jnp.where(last, v + step[:, 1], v),
+            *seen,
+        )
 
-    none = jnp.zeros((len(chain.link_names), 2), q.dtype), jnp.ones((), q.dtype), jnp.zeros((min(row.shape[0], chain.dofs), chain.dofs), q.dtype)
+    none = (
+        jnp.zeros((len(chain.link_names), 2), q.dtype),
+        jnp.ones((), q.dtype),
+        jnp.zeros((min(row.shape[0], chain.dofs), chain.dofs), q.dtype),
+    )
     return jax.lax.fori_loop(0, iterations + 1, turn, (normalize(chain, q), v, *none))
 
 
@@ -79,7 +151,8 @@ def settle_loops(
 def settle_by_bodies(
     chain: Chain, structure: Structure, q, v, iterations: int, differentiated: bool = True
 ) -> tuple[Float[Array, " q"], Float[Array, " dofs"], Float[Array, "links 2"]]:
-    """`settle_loops` with `inertia_change`, by articulated bodies and the forces of the loops: no pivots are chosen. And the gaps (rad,
+    """`settle_loops` with `inertia_change`, by articulated bodies and the forces of the loops: no
+    pivots are chosen. And the gaps (rad,
     `chain.length`s) that each loop is left with. differentiated: as `Field`'s."""
     one_turn = _turn_by_bodies if differentiated else with_lanes_last(_turn_by_bodies)
 
@@ -87,17 +160,31 @@ def settle_by_bodies(
     def turn(i, both):
         q, v, _ = both
         step, left = one_turn(chain, structure, q, v, i == iterations)
-        return integrate(chain, q, jnp.where(i == iterations, 0, step)), jnp.where(i == iterations, v + step, v), left
+        return (
+            integrate(chain, q, jnp.where(i == iterations, 0, step)),
+            jnp.where(i == iterations, v + step, v),
+            left,
+        )
 
-    return jax.lax.fori_loop(0, iterations + 1, turn, (normalize(chain, q), v, jnp.zeros((len(chain.link_names), 2), q.dtype)))
+    return jax.lax.fori_loop(
+        0,
+        iterations + 1,
+        turn,
+        (normalize(chain, q), v, jnp.zeros((len(chain.link_names), 2), q.dtype)),
+    )
 
 
-def _turn_by_bodies(chain: Chain, structure: Structure, q, v, last: Bool[Array, ""]) -> tuple[Float[Array, " dofs"], Float[Array, "links 2"]]:
-    """The least change, in the metric of the inertia, of q that closes the loops or, in the last turn, of v that keeps them; and the gaps at q."""
+def _turn_by_bodies(
+    chain: Chain, structure: Structure, q, v, last: Bool[Array, ""]
+) -> tuple[Float[Array, " dofs"], Float[Array, "links 2"]]:
+    """The least change, in the metric of the inertia, of q that closes the loops or, in the last
+    turn, of v that keeps them; and the gaps at q."""
     row, column = scales(chain)
     kin = kinematics(chain, q)
     end = ends(chain, structure, kin, q)
     J, open_ = scaled_jacobian(chain, structure, kin, end), row * gap(structure, end).ravel()
     apart = jnp.where(last, J @ jnp.where(active_dofs(chain, structure), v / column, 0), open_)
-    step = solve_motion(chain, structure, kin, None, J, jnp.zeros(chain.dofs, q.dtype), apart, by_bodies)
+    step = solve_motion(
+        chain, structure, kin, None, J, jnp.zeros(chain.dofs, q.dtype), apart, by_bodies
+    )
     return step, jax.lax.stop_gradient(sizes(open_))

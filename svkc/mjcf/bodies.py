@@ -7,7 +7,9 @@ import numpy as np
 from svkc.mjcf.unsupported import plain_motors
 from svkc.model.topology import BALL, FIXED, FREE, HINGE, Q_SIZE, SLIDE, V_SIZE, Topology
 
-_LIMIT_RATE = 50.0  # rad/s: a joint outside its range is an oscillator of this frequency, critically damped, at its load-pose inertia
+# rad/s: a joint outside its range is an oscillator of this frequency, critically damped, at its
+# load-pose inertia
+_LIMIT_RATE = 50.0
 KINDS = {0: FREE, 1: BALL, 2: SLIDE, 3: HINGE}  # mjtJoint
 
 
@@ -30,7 +32,8 @@ def matrix(quat) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True)
 class Joint:
-    """A joint of the tree and where its coordinates stand; `joint` is -1 for the free joint that a body gets whose own joints may be cut."""
+    """A joint of the tree and where its coordinates stand; `joint` is -1 for the free joint that a
+    body gets whose own joints may be cut."""
 
     name: str
     kind: int
@@ -41,7 +44,8 @@ class Joint:
 
 
 def joints_of(model, cut_bodies) -> list[Joint]:
-    """The joints of the tree in the model's order; a body in `cut_bodies` (body -> name) hangs on the base by a free joint (paper, Fig. 15)."""
+    """The joints of the tree in the model's order; a body in `cut_bodies` (body -> name) hangs on
+    the base by a free joint (paper, Fig. 15)."""
     out, q, v, seen = [], 0, 0, set()
     for j in range(model.njnt):
         body = int(model.jnt_bodyid[j])
@@ -57,7 +61,8 @@ def joints_of(model, cut_bodies) -> list[Joint]:
 
 
 def rows_of(model, cut_bodies) -> tuple[list[tuple[int, int]], Topology]:
-    """One row a joint, sorted by level: [(body, joint or -1)] and the topology without virtual links."""
+    """One row a joint, sorted by level: [(body, joint or -1)] and the topology without virtual
+    links."""
     joints = joints_of(model, cut_bodies)
     order, depth, last, own = [(0, -1, -1)], [0], {0: 0}, {0: None}
     for body in range(1, model.nbody):
@@ -92,7 +97,12 @@ def rows_of(model, cut_bodies) -> tuple[list[tuple[int, int]], Topology]:
 def bodies_of(model, topology, rows) -> dict[str, np.ndarray]:
     """Of each row: frame in the parent, joint axis and anchor, mass, centre of mass, inertia."""
     n = len(rows)
-    out = {"pos": np.zeros((n, 3)), "quat": np.tile([1.0, 0, 0, 0], (n, 1)), "axis": np.tile([0.0, 0, 1], (n, 1)), "anchor": np.zeros((n, 3))}
+    out = {
+        "pos": np.zeros((n, 3)),
+        "quat": np.tile([1.0, 0, 0, 0], (n, 1)),
+        "axis": np.tile([0.0, 0, 1], (n, 1)),
+        "anchor": np.zeros((n, 3)),
+    }
     out |= {"mass": np.zeros(n), "com": np.zeros((n, 3)), "inertia": np.zeros((n, 3, 3))}
     for i, (body, joint) in enumerate(rows):
         if topology.kind[i] != FREE and joint in (-1, int(model.body_jntadr[body])):
@@ -102,7 +112,11 @@ def bodies_of(model, topology, rows) -> dict[str, np.ndarray]:
             if topology.kind[i] in (HINGE, BALL):
                 out["anchor"][i] = model.jnt_pos[joint]
         if topology.body_row[body] == i:
-            out["mass"][i], out["com"][i], out["inertia"][i] = model.body_mass[body], model.body_ipos[body], _inertia(model, body)
+            out["mass"][i], out["com"][i], out["inertia"][i] = (
+                model.body_mass[body],
+                model.body_ipos[body],
+                _inertia(model, body),
+            )
     return out
 
 
@@ -113,17 +127,25 @@ def _inertia(model, body):
 
 
 def joint_forces_of(model, ignored, topology) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Stiffness [dofs], range [2 dofs] (infinite where there is none) and its spring and damper [2 dofs]."""
+    """Stiffness [dofs], range [2 dofs] (infinite where there is none) and its spring and damper [2
+    dofs]."""
     n, place = topology.dofs, np.array(topology.model_v, int)
     stiffness, limit, spring = np.zeros(n), np.tile([[-np.inf], [np.inf]], (1, n)), np.zeros((2, n))
     for j in range(model.njnt):
-        own = slice(int(model.jnt_dofadr[j]), int(model.jnt_dofadr[j]) + V_SIZE[KINDS[int(model.jnt_type[j])]])
+        own = slice(
+            int(model.jnt_dofadr[j]),
+            int(model.jnt_dofadr[j]) + V_SIZE[KINDS[int(model.jnt_type[j])]],
+        )
         dofs = place[own]
         if "spring" not in ignored:
             stiffness[dofs] = np.ravel(model.jnt_stiffness[j])[0]
         if model.jnt_limited[j] and model.jnt_type[j] in (2, 3) and "limit" not in ignored:
             limit[:, dofs] = model.jnt_range[j][:, None]
-            m = 1 / model.dof_invweight0[own] if np.all(model.dof_invweight0[own] > 0) else model.dof_M0[own]
+            m = (
+                1 / model.dof_invweight0[own]
+                if np.all(model.dof_invweight0[own] > 0)
+                else model.dof_M0[own]
+            )
             spring[:, dofs] = m * _LIMIT_RATE**2, 2 * m * _LIMIT_RATE
     return stiffness, limit, spring
 
@@ -139,11 +161,17 @@ def motors_of(model, ignored, topology):
     """Gear matrix and ranges of the actuators that are plain torques on joints."""
     count = 0 if {"actuator", "all"} & ignored and not plain_motors(model).all() else model.nu
     place = np.array(topology.model_v, int)
-    gear, control, force = np.zeros((count, topology.dofs)), np.tile([-np.inf, np.inf], (count, 1)), np.tile([-np.inf, np.inf], (count, 1))
+    gear, control, force = (
+        np.zeros((count, topology.dofs)),
+        np.tile([-np.inf, np.inf], (count, 1)),
+        np.tile([-np.inf, np.inf], (count, 1)),
+    )
     for i in range(count):
         joint = int(model.actuator_trnid[i, 0])
         size, start = V_SIZE[KINDS[int(model.jnt_type[joint])]], int(model.jnt_dofadr[joint])
-        gear[i, place[start : start + size]] = model.actuator_gear[i, :size] * model.actuator_gainprm[i, 0]
+        gear[i, place[start : start + size]] = (
+            model.actuator_gear[i, :size] * model.actuator_gainprm[i, 0]
+        )
         if model.actuator_ctrllimited[i]:
             control[i] = model.actuator_ctrlrange[i]
         if model.actuator_forcelimited[i]:

@@ -18,7 +18,8 @@ def _equalities(chain: Chain) -> list[tuple[int, int]]:
 
 
 def text_of(spec) -> str:
-    """MJCF of a mujoco.MjSpec as it was written, to the last digit; makes the directories of its files absolute."""
+    """MJCF of a mujoco.MjSpec as it was written, to the last digit; makes the directories of its
+    files absolute."""
     spec.compiler.savecompiled = spec.compiler.savecanonical = False
     here = os.path.abspath(spec.modelfiledir or ".")
     if not spec.assets:
@@ -34,11 +35,16 @@ def to_mjcf(chain: Chain) -> str:
     import mujoco
 
     if chain.model.text is None:
-        raise ValueError("to_mjcf: the chain was loaded from a MjModel, which does not say what it was compiled from; load a path, text or MjSpec")
+        raise ValueError(
+            "to_mjcf: the chain was loaded from a MjModel, which does not say what it was compiled"
+            " from; load a path, text or MjSpec"
+        )
     try:
         spec = mujoco.MjSpec.from_string(chain.model.text)
     except ValueError as error:
-        raise ValueError(f"to_mjcf: MuJoCo cannot read what it writes of this MjSpec: {error}") from error
+        raise ValueError(
+            f"to_mjcf: MuJoCo cannot read what it writes of this MjSpec: {error}"
+        ) from error
     own, top, notes = dict(_equalities(chain)), chain.topology, []
     for link, name in enumerate(chain.link_names):
         if link in own:
@@ -47,10 +53,20 @@ def to_mjcf(chain: Chain) -> str:
             notes += _as_equality(chain, spec, link, name)
     slots = [name for name, spare in zip(chain.link_names, top.link_spare, strict=True) if spare]
     cuttable = [name for name, _, _ in top.cut_joints]
-    notes += [f"not in this text: {len(slots)} spare slots, svkc.load(..., spare={len(slots)})"] if slots else []
-    notes += [f"not in this text: what may be cut, svkc.load(..., cuttable={cuttable})"] if cuttable else []
+    notes += (
+        [f"not in this text: {len(slots)} spare slots, svkc.load(..., spare={len(slots)})"]
+        if slots
+        else []
+    )
+    notes += (
+        [f"not in this text: what may be cut, svkc.load(..., cuttable={cuttable})"]
+        if cuttable
+        else []
+    )
     # two hyphens would end the comment
-    spec.comment = "\n".join(filter(None, [spec.comment, *(note.replace("--", "- -") for note in notes)]))
+    spec.comment = "\n".join(
+        filter(None, [spec.comment, *(note.replace("--", "- -") for note in notes)])
+    )
     return text_of(spec)
 
 
@@ -61,24 +77,49 @@ def _as_equality(chain: Chain, spec, link: int, name: str) -> list[str]:
     s, top = chain.structure, chain.topology
     free, active = top.link_freedoms[link], bool(s.connected[link])
     bodies = [top.body_row.index(int(row)) for row in (s.parent[link], s.real[link])]
-    frames = [tuple(float(x) for x in frame[link]) for frame in (s.pos, s.quat, s.real_pos, s.real_quat)]
-    given = ", ".join(f"{key}={frame}" for key, frame in zip(("pos", "quat", "real_pos", "real_quat"), frames, strict=True))
+    frames = [
+        tuple(float(x) for x in frame[link]) for frame in (s.pos, s.quat, s.real_pos, s.real_quat)
+    ]
+    given = ", ".join(
+        f"{key}={frame}"
+        for key, frame in zip(("pos", "quat", "real_pos", "real_quat"), frames, strict=True)
+    )
     ends = ", ".join(repr(top.body_names[body]) for body in bodies)
-    call = f"svkc.VirtualLink({name!r}, {ends}, {_joint_of(free)!r}, {given}, connected={active}, actuated={top.link_actuated[link]})"
+    call = (
+        f"svkc.VirtualLink({name!r}, {ends}, {_joint_of(free)!r}, {given}, connected={active},"
+        f" actuated={top.link_actuated[link]})"
+    )
     turns = sum(free[:3])
     if turns == 2 or any(free[3:]):
         return [f"no <equality> is like {call}"]
     kind = mujoco.mjtEq.mjEQ_CONNECT if turns else mujoco.mjtEq.mjEQ_WELD
     places = {name: np.zeros(3)}
     if turns == 1:
-        places[_unlike(f"{name}_axis", chain.link_names)] = float(chain.length) * np.array(free[:3], float)
+        places[_unlike(f"{name}_axis", chain.link_names)] = float(chain.length) * np.array(
+            free[:3], float
+        )
     for label, place in places.items():
         sites = []
-        for body, side, pos, quat in zip(bodies, ("parent", "real"), frames[::2], frames[1::2], strict=True):
+        for body, side, pos, quat in zip(
+            bodies, ("parent", "real"), frames[::2], frames[1::2], strict=True
+        ):
             sites.append(_unlike(f"{label}_{side}", [site.name for site in spec.sites]))
-            spec.bodies[body].add_site(name=sites[-1], pos=np.array(pos) + matrix(quat) @ place, quat=quat, group=3)
-        spec.add_equality(name=label, type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, name1=sites[0], name2=sites[1], active=active)
-    return [f"not in this text: motors on the virtual joint of {call}"] if top.link_actuated[link] else []
+            spec.bodies[body].add_site(
+                name=sites[-1], pos=np.array(pos) + matrix(quat) @ place, quat=quat, group=3
+            )
+        spec.add_equality(
+            name=label,
+            type=kind,
+            objtype=mujoco.mjtObj.mjOBJ_SITE,
+            name1=sites[0],
+            name2=sites[1],
+            active=active,
+        )
+    return (
+        [f"not in this text: motors on the virtual joint of {call}"]
+        if top.link_actuated[link]
+        else []
+    )
 
 
 def _unlike(name: str, taken) -> str:
@@ -98,13 +139,18 @@ def _checked(chain: Chain, data) -> None:
     sizes = [np.asarray(getattr(data, name, None)).shape for name in ("qpos", "qvel")]
     if sizes != [(nq,), (nv,)]:
         got = [size[0] if size else "no" for size in sizes]
-        raise ValueError(f"data: got {got[0]} qpos and {got[1]} qvel, the chain's model has {nq} and {nv}; make it of the same model")
+        raise ValueError(
+            f"data: got {got[0]} qpos and {got[1]} qvel, the chain's model has {nq} and {nv}; make"
+            " it of the same model"
+        )
 
 
 def to_mujoco(chain: Chain, state: State, data) -> None:
-    """Copies q (m, rad, wxyz) and v (m/s, rad/s) into a `mujoco.MjData` of the chain's model, and which of its <equality> hold; call `mj_forward` next.
+    """Copies q (m, rad, wxyz) and v (m/s, rad/s) into a `mujoco.MjData` of the chain's model, and
+    which of its <equality> hold; call `mj_forward` next.
 
-    Of a joint that was cut, the coordinates that it would have. ValueError: the data is another model's.
+    Of a joint that was cut, the coordinates that it would have. ValueError: the data is another
+    model's.
     """
     check_state(chain, state)
     _checked(chain, data)
@@ -115,8 +161,9 @@ def to_mujoco(chain: Chain, state: State, data) -> None:
 
 
 def from_mujoco(chain: Chain, data) -> State:
-    """The state in a `mujoco.MjData` of the chain's model, by copy: its loops are closed and velocities made consistent, as by `chain.state`; links that
-    were <equality> hold where it says so, others as in the chain. ValueError: the data is another model's, a loop cannot be closed."""
+    """The state in a `mujoco.MjData` of the chain's model, by copy: its loops are closed and
+    velocities made consistent, as by `chain.state`; links that were <equality> hold where it says
+    so, others as in the chain. ValueError: the data is another model's, a loop cannot be closed."""
     check_chain(chain)
     _checked(chain, data)
     connected = np.array(chain.structure.connected)

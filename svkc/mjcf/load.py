@@ -22,8 +22,8 @@ from svkc.model.virtual_link import VirtualLink, joint_freedoms
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Source:
-    """The MuJoCo model a chain was made of and its MJCF (None where only the compiled model was given), for pictures, `chain.to_mjcf` and files; and the
-    other arguments of `load`.
+    """The MuJoCo model a chain was made of and its MJCF (None where only the compiled model was
+    given), for pictures, `chain.to_mjcf` and files; and the other arguments of `load`.
 
     Chains are told apart by their numbers and topology, not by it.
     """
@@ -42,11 +42,15 @@ class Source:
 def load(source, *, virtual_links=(), cuttable=(), spare=0, ignore=()) -> Chain:
     """A Chain from MJCF or URDF (path or text), a mujoco.MjSpec or a mujoco.MjModel.
 
-    `virtual_links`: more of them, beside the <equality> connect (ball) and weld of the model; `spare`: slots for links bound at run time;
-    `cuttable`: names of joints of the tree that may be cut, each a virtual link of its name, connected at first (paper, Fig. 15);
-    `ignore`: kinds of elements to leave out, by the names the error message uses, or "all"; "equality" means those that are neither connect
+    `virtual_links`: more of them, beside the <equality> connect (ball) and weld of the model;
+    `spare`: slots for links bound at run time;
+    `cuttable`: names of joints of the tree that may be cut, each a virtual link of its name,
+    connected at first (paper, Fig. 15);
+    `ignore`: kinds of elements to leave out, by the names the error message uses, or "all";
+    "equality" means those that are neither connect
     nor weld. "limit" leaves out joint ranges.
-    Collisions between geoms are never modelled. ValueError: the source does not parse, elements not supported, unknown names.
+    Collisions between geoms are never modelled. ValueError: the source does not parse, elements not
+    supported, unknown names.
     """
     declared = tuple(virtual_links) if np.iterable(virtual_links) else (virtual_links,)
     arguments = {"virtual_links": declared, "cuttable": cuttable, "spare": spare, "ignore": ignore}
@@ -59,7 +63,10 @@ def load(source, *, virtual_links=(), cuttable=(), spare=0, ignore=()) -> Chain:
     if not topology.joint_names:
         raise ValueError("source: the model has no joints, so that nothing in it can move")
     _told_apart("bodies", topology.body_names)
-    _told_apart("joints", [*topology.joint_names, *(name_of(model, "joint", j) for cut in cuts for j in cut.joints)])
+    _told_apart(
+        "joints",
+        [*topology.joint_names, *(name_of(model, "joint", j) for cut in cuts for j in cut.joints)],
+    )
     links = [*equalities(model), *declared]
     first = len(links)
     for link in links:
@@ -85,26 +92,38 @@ def load(source, *, virtual_links=(), cuttable=(), spare=0, ignore=()) -> Chain:
 def _told_apart(what: str, names) -> None:
     """ValueError where a name that svkc gives to what has none is one that the model uses."""
     if len(set(names)) < len(names):
-        raise ValueError(f"source: names of {what} must differ, those given to what has none included; got {names}")
+        raise ValueError(
+            f"source: names of {what} must differ, those given to what has none included; got"
+            f" {names}"
+        )
 
 
 def _finite(chain: Chain) -> Chain:
     """The chain; ValueError for numbers that are not finite in the precision it is kept in."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(chain):
         name, leaf = jax.tree_util.keystr(path), np.asarray(leaf)
-        if np.isnan(leaf).any() or (np.isinf(leaf).any() and name not in (".control_range", ".force_range", ".limit")):
-            raise ValueError(f"source: the model has numbers that are not finite, or too large for {leaf.dtype}: {name[1:]}")
+        if np.isnan(leaf).any() or (
+            np.isinf(leaf).any() and name not in (".control_range", ".force_range", ".limit")
+        ):
+            raise ValueError(
+                f"source: the model has numbers that are not finite, or too large for {leaf.dtype}:"
+                f" {name[1:]}"
+            )
     return chain
 
 
 def _compiled(source) -> Source:
-    """The mujoco.MjModel of any source and its text; ValueError with MuJoCo's own words where it does not parse."""
+    """The mujoco.MjModel of any source and its text; ValueError with MuJoCo's own words where it
+    does not parse."""
     import mujoco
 
     if isinstance(source, mujoco.MjModel):
         return Source(source)
     if not isinstance(source, (mujoco.MjSpec, str, os.PathLike)):
-        raise ValueError(f"source: expected MJCF or URDF text, a path, MjSpec or MjModel, got {type(source).__name__}")
+        raise ValueError(
+            "source: expected MJCF or URDF text, a path, MjSpec or MjModel, got"
+            f" {type(source).__name__}"
+        )
     text = "<" if isinstance(source, mujoco.MjSpec) else os.fsdecode(source)
     if "<" not in text and not os.path.isfile(text):
         raise ValueError(f"source: no such file: {text!r}")
@@ -118,7 +137,8 @@ def _compiled(source) -> Source:
 
 
 def _read(text: str):
-    """MJCF or URDF, by text or path. URDF keeps the links that fixed joints hold, whose names are wanted for grips; ROS's package:// is looked up."""
+    """MJCF or URDF, by text or path. URDF keeps the links that fixed joints hold, whose names are
+    wanted for grips; ROS's package:// is looked up."""
     import mujoco
 
     inline = "<" in text
@@ -131,17 +151,21 @@ def _read(text: str):
 
 
 def _found(file: str, folder: pathlib.Path) -> str:
-    """A file of package://NAME/...: in a folder NAME above, or beside what stands above, or else by its last name in `folder`; others as they are."""
+    """A file of package://NAME/...: in a folder NAME above, or beside what stands above, or else by
+    its last name in `folder`; others as they are."""
     if not file.startswith("package://"):
         return file
     name = pathlib.PurePosixPath(file.removeprefix("package://"))
     inside = name.relative_to(name.parts[0])
-    places = [place / path for path in (name, inside) for place in (folder, *folder.parents)] + [folder / name.name]
+    places = [place / path for path in (name, inside) for place in (folder, *folder.parents)] + [
+        folder / name.name
+    ]
     return next((str(place) for place in places if place.is_file()), file)
 
 
 def _load_pose(model, topology: Topology) -> np.ndarray:
-    """[q] the model's qpos0, bodies that may be cut where that puts them, virtual joints at zero."""
+    """[q] the model's qpos0, bodies that may be cut where that puts them, virtual joints at
+    zero."""
     import mujoco
 
     data = mujoco.MjData(model)
@@ -164,10 +188,18 @@ def _chain(source: Source, topology, rows, structure, ignore, left_out) -> Chain
     ignored, bodies = set(ignore), bodies_of(model, topology, rows)
     stiffness, limit, spring = joint_forces_of(model, ignored, topology)
     damping = by_dof(topology, 0 * model.dof_damping if "damping" in ignored else model.dof_damping)
-    armature = by_dof(topology, 0 * model.dof_armature if "armature" in ignored else model.dof_armature)
-    gravity = np.zeros(3) if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY) else model.opt.gravity
+    armature = by_dof(
+        topology, 0 * model.dof_armature if "armature" in ignored else model.dof_armature
+    )
+    gravity = (
+        np.zeros(3)
+        if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
+        else model.opt.gravity
+    )
     gear, control, force = motors_of(model, ignored, topology)
-    offsets = np.linalg.norm(np.concatenate([bodies["pos"][np.array(topology.parent) > 0], bodies["com"]]), axis=1)
+    offsets = np.linalg.norm(
+        np.concatenate([bodies["pos"][np.array(topology.parent) > 0], bodies["com"]]), axis=1
+    )
     offsets = offsets[offsets > 1e-12]
     q_load = _load_pose(model, topology)
     q_spring = np.array(q_load)
@@ -179,7 +211,9 @@ def _chain(source: Source, topology, rows, structure, ignore, left_out) -> Chain
 
     return Chain(
         topology=topology,
-        **{name: floats(bodies[name]) for name in ("pos", "quat", "axis", "mass", "com", "inertia")},
+        **{
+            name: floats(bodies[name]) for name in ("pos", "quat", "axis", "mass", "com", "inertia")
+        },
         gravity=floats(gravity),
         q_load=floats(q_load),
         length=floats(np.sqrt(np.mean(offsets**2)) if len(offsets) else 1.0),

@@ -1,4 +1,5 @@
-"""Virtual links as a model and its user declare them: <equality>, ends by bodies or sites, placements."""
+"""Virtual links as a model and its user declare them: <equality>, ends by bodies or sites,
+placements."""
 
 import dataclasses
 
@@ -12,7 +13,8 @@ from svkc.model.virtual_link import VirtualLink, joint_freedoms
 
 
 def equalities(model) -> list[VirtualLink]:
-    """<equality> connect and weld as virtual links: ball and weld, child of the first body, under their own names."""
+    """<equality> connect and weld as virtual links: ball and weld, child of the first body, under
+    their own names."""
     import mujoco
 
     links = []
@@ -51,7 +53,8 @@ def _unit(quat):
 
 
 def _on_bodies(model, link: VirtualLink, ids: dict[str, int]) -> VirtualLink:
-    """The link from body to body: an end that names a site is the site's body, its placement is in the site's frame, at the site where none is given."""
+    """The link from body to body: an end that names a site is the site's body, its placement is in
+    the site's frame, at the site where none is given."""
     import mujoco
 
     sites = {name_of(model, "site", i): i for i in range(model.nsite)}
@@ -61,10 +64,17 @@ def _on_bodies(model, link: VirtualLink, ids: dict[str, int]) -> VirtualLink:
             continue
         site = sites.get(name)
         if site is None:
-            raise ValueError(f"virtual link {link.name!r}: {side} is {name!r}, neither a body nor a site; bodies: {', '.join(ids)}")
+            raise ValueError(
+                f"virtual link {link.name!r}: {side} is {name!r}, neither a body nor a site;"
+                f" bodies: {', '.join(ids)}"
+            )
         frame, body = model.site_quat[site], name_of(model, "body", int(model.site_bodyid[site]))
         place, turn = np.zeros(3), np.zeros(4)
-        mujoco.mju_rotVecQuat(place, np.asarray((0, 0, 0) if getattr(link, pos) is None else getattr(link, pos), float), frame)
+        mujoco.mju_rotVecQuat(
+            place,
+            np.asarray((0, 0, 0) if getattr(link, pos) is None else getattr(link, pos), float),
+            frame,
+        )
         changed = {side: body, pos: tuple(model.site_pos[site] + place)}
         if getattr(link, quat) is not None:
             mujoco.mju_mulQuat(turn, frame, np.asarray(getattr(link, quat), float))
@@ -74,7 +84,8 @@ def _on_bodies(model, link: VirtualLink, ids: dict[str, int]) -> VirtualLink:
 
 
 def structure_of(model, topology: Topology, links: list[VirtualLink]) -> Structure:
-    """The links' declared placements, their axis turned to z of the joint's frame; what is not given is taken from the load pose."""
+    """The links' declared placements, their axis turned to z of the joint's frame; what is not
+    given is taken from the load pose."""
     import mujoco
 
     data = mujoco.MjData(model)
@@ -102,17 +113,31 @@ def structure_of(model, topology: Topology, links: list[VirtualLink]) -> Structu
         world = data.xpos[p] + turn(data.xquat[p], link.pos)
         back = data.xquat[r] * np.array([1, -1, -1, -1])
         real_pos = turn(back, world - data.xpos[r]) if link.real_pos is None else link.real_pos
-        real_quat = multiply(back, multiply(data.xquat[p], quat)) if link.real_quat is None else multiply(_unit(link.real_quat), to_z)
+        real_quat = (
+            multiply(back, multiply(data.xquat[p], quat))
+            if link.real_quat is None
+            else multiply(_unit(link.real_quat), to_z)
+        )
         ends.append((topology.body_row[p], topology.body_row[r]))
-        for name, value in (("pos", link.pos), ("quat", quat), ("real_pos", real_pos), ("real_quat", _unit(real_quat))):
+        for name, value in (
+            ("pos", link.pos),
+            ("quat", quat),
+            ("real_pos", real_pos),
+            ("real_quat", _unit(real_quat)),
+        ):
             frames[name].append(np.asarray(value, float))
     count = len(links)
     return Structure(
         connected=jnp.asarray(np.array([link.connected for link in links], bool)),
         parent=jnp.asarray(np.array([e[0] for e in ends], np.int32)),
         real=jnp.asarray(np.array([e[1] for e in ends], np.int32)),
-        **{name: floats(np.array(value).reshape(count, 4 if "quat" in name else 3)) for name, value in frames.items()},
-        freedoms=jnp.asarray(np.array([joint_freedoms(link.joint) for link in links], bool).reshape(count, 6)),
+        **{
+            name: floats(np.array(value).reshape(count, 4 if "quat" in name else 3))
+            for name, value in frames.items()
+        },
+        freedoms=jnp.asarray(
+            np.array([joint_freedoms(link.joint) for link in links], bool).reshape(count, 6)
+        ),
         rank=jnp.asarray(np.int32(0)),
         margin=jnp.zeros((), jnp.result_type(float)),
     )

@@ -1,1 +1,2 @@
-"""The nouns (chain, structure, state, virtual link), the topology, names and the validation of arguments."""
+"""The nouns (chain, structure, state, virtual link), the topology, names and the validation of
+arguments."""

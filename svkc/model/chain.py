@@ -1,4 +1,5 @@
-"""The nouns: chain (what the bodies are), structure (how they are joined now), state (how they move now)."""
+"""The nouns: chain (what the bodies are), structure (how they are joined now), state (how they move
+now)."""
 
 from typing import Any
 
@@ -12,10 +13,13 @@ from svkc.model.validation import numbers
 
 
 class Structure(eqx.Module):
-    """How the bodies are joined for the length of a phase. Placements are the joint's frame in its two bodies (m, wxyz), its axis along z.
+    """How the bodies are joined for the length of a phase. Placements are the joint's frame in its
+    two bodies (m, wxyz), its axis along z.
 
-    `connected` [links]; `parent`, `real`: rows of the two bodies; `freedoms`: of each virtual joint; `locked`: joint coordinates held still, None
-    where nothing can be locked; `independent`: coordinates asked to be independent where they can be; `rank`: m, decided once for the phase,
+    `connected` [links]; `parent`, `real`: rows of the two bodies; `freedoms`: of each virtual
+    joint; `locked`: joint coordinates held still, None
+    where nothing can be locked; `independent`: coordinates asked to be independent where they can
+    be; `rank`: m, decided once for the phase,
     with `margin`: |R_mm| / |R_11| where that was, in a generic configuration.
     """
 
@@ -34,7 +38,8 @@ class Structure(eqx.Module):
 
 
 class State(eqx.Module):
-    """How the bodies move: `q` (m, rad, wxyz; MuJoCo's qpos, then the virtual joints'), `v` (m/s, rad/s), and the structure they move under."""
+    """How the bodies move: `q` (m, rad, wxyz; MuJoCo's qpos, then the virtual joints'), `v` (m/s,
+    rad/s), and the structure they move under."""
 
     q: Float[Array, "... q"]
     v: Float[Array, "... dofs"]
@@ -42,10 +47,12 @@ class State(eqx.Module):
 
 
 class Chain(eqx.Module):
-    """The bodies of a scene and the joints between them; its floats are leaves to differentiate. Made by `svkc.load`.
+    """The bodies of a scene and the joints between them; its floats are leaves to differentiate.
+    Made by `svkc.load`.
 
-    Rows are those of `Topology`. `pos`, `quat`: joint frame in the parent's; `anchor`, `axis`: of the joint in the row's own frame; `inertia`: about the
-    centre of mass, row axes. What a scene does not have (anchors, armature, damping, springs, limits) is None and is not compiled.
+    Rows are those of `Topology`. `pos`, `quat`: joint frame in the parent's; `anchor`, `axis`: of
+    the joint in the row's own frame; `inertia`: about the centre of mass, row axes. What a scene
+    does not have (anchors, armature, damping, springs, limits) is None and is not compiled.
     """
 
     topology: Topology = eqx.field(static=True)
@@ -90,7 +97,8 @@ class Chain(eqx.Module):
 
     @property
     def dof_names(self) -> tuple[str, ...]:
-        """Of every joint coordinate: the joint's name, with .x .y .z for slides and .rx .ry .rz for turns where it has several."""
+        """Of every joint coordinate: the joint's name, with .x .y .z for slides and .rx .ry .rz for
+        turns where it has several."""
         return self.topology.dof_names
 
     @property
@@ -115,7 +123,8 @@ class Chain(eqx.Module):
 
     @property
     def parent(self) -> np.ndarray:
-        """Pointer of the paper's section IV, for each body, then each virtual link, as an index into both; -1: none."""
+        """Pointer of the paper's section IV, for each body, then each virtual link, as an index
+        into both; -1: none."""
         return _pointers(self)[0]
 
     @property
@@ -135,12 +144,17 @@ class Chain(eqx.Module):
 
     @property
     def actuated(self) -> Bool[Array, " dofs"]:
-        """What the model's actuators drive (without actuators every joint that is not free), and virtual joints declared as actuated."""
+        """What the model's actuators drive (without actuators every joint that is not free), and
+        virtual joints declared as actuated."""
         top = self.topology
         if self.gear.shape[0]:
             driven = jnp.any(self.gear != 0, 0)
         else:
-            driven = jnp.asarray(np.append(np.array(top.kind)[top.dof_row] != FREE, np.zeros(top.dofs - top.nv, bool)))
+            driven = jnp.asarray(
+                np.append(
+                    np.array(top.kind)[top.dof_row] != FREE, np.zeros(top.dofs - top.nv, bool)
+                )
+            )
             driven = driven | self._own(np.array(top.link_child, int) >= 0)
         return driven | self._own(np.array(top.link_actuated, bool))
 
@@ -151,10 +165,13 @@ class Chain(eqx.Module):
         return mask
 
     def motors(self, u) -> Float[Array, " dofs"]:
-        """Joint torques (N m, N) of the model's actuators for the controls u: gear times u, each clipped to its range."""
+        """Joint torques (N m, N) of the model's actuators for the controls u: gear times u, each
+        clipped to its range."""
         u = numbers("u", u, self.gear.dtype)
         if u.shape != self.gear.shape[:1]:
-            raise ValueError(f"u: got shape {u.shape}, the model has {self.gear.shape[0]} actuators")
+            raise ValueError(
+                f"u: got shape {u.shape}, the model has {self.gear.shape[0]} actuators"
+            )
         force = jnp.clip(u, self.control_range[:, 0], self.control_range[:, 1])
         force = jnp.clip(force, self.force_range[:, 0], self.force_range[:, 1])
         return force @ self.gear
@@ -162,22 +179,29 @@ class Chain(eqx.Module):
     def state(self, q=None, v=None, connected=None) -> State:
         """A consistent state: loops closed by Newton's method, velocities made to agree with them.
 
-        q, v: arrays over the tree (or over every coordinate), or dicts by joint name, whose entries are kept where the loops allow it.
-        connected: names of the virtual links, or a mask; None: as the model says. ValueError: unknown names, wrong sizes, quaternions that are
+        q, v: arrays over the tree (or over every coordinate), or dicts by joint name, whose entries
+        are kept where the loops allow it.
+        connected: names of the virtual links, or a mask; None: as the model says. ValueError:
+        unknown names, wrong sizes, quaternions that are
         not unit, loops that cannot be closed (says which, and by how much).
         """
-        # the one import that goes up the house: a state needs the loops closed, and the contract puts the verb on the noun
+        # the one import that goes up the house: a state needs the loops closed, and the contract
+        # puts the verb on the noun
         from svkc.transitions.initial_state import assemble
 
         return assemble(self, q, v, connected)
 
     def to_mjcf(self) -> str:
-        """MJCF text of the scene: the model as it was loaded, every number to its last digit, with the virtual links as <equality>.
+        """MJCF text of the scene: the model as it was loaded, every number to its last digit, with
+        the virtual links as <equality>.
 
-        ball and weld are connect and weld, a hinge two connects (the second, NAME_axis, at `chain.length` along its axis), each between two new sites,
-        active where the link is connected; MuJoCo holds them softly. What has no such form (other joints, motors on virtual joints, spare slots, which
-        joints may be cut) is said in a comment at the top. Files of meshes are named by absolute paths, except those in memory (`MjSpec.assets`) and of
-        attached specs. Changes to the chain's own arrays are not written, but for the links' placements. ValueError: loaded from a MjModel.
+        ball and weld are connect and weld, a hinge two connects (the second, NAME_axis, at
+        `chain.length` along its axis), each between two new sites, active where the link is
+        connected; MuJoCo holds them softly. What has no such form (other joints, motors on virtual
+        joints, spare slots, which joints may be cut) is said in a comment at the top. Files of
+        meshes are named by absolute paths, except those in memory (`MjSpec.assets`) and of attached
+        specs. Changes to the chain's own arrays are not written, but for the links' placements.
+        ValueError: loaded from a MjModel.
         """
         # as above: the text needs what stands higher up
         from svkc.mjcf.convert import to_mjcf
@@ -211,9 +235,12 @@ def _pointers(chain: Chain) -> np.ndarray:
 
 
 def active_dofs(chain: Chain, structure: Structure) -> Bool[Array, " dofs"]:
-    """Joint coordinates that can move: the tree's and the connected virtual links', less the locked ones."""
+    """Joint coordinates that can move: the tree's and the connected virtual links', less the locked
+    ones."""
     top = chain.topology
-    used = jnp.concatenate([(structure.connected[:, None] & structure.freedoms).ravel(), jnp.zeros(1, bool)])
+    used = jnp.concatenate(
+        [(structure.connected[:, None] & structure.freedoms).ravel(), jnp.zeros(1, bool)]
+    )
     slot = np.full(top.dofs - top.nv, used.shape[0] - 1)
     for i, d in enumerate(top.links.dof.ravel()):
         if d < top.dofs:

@@ -1,4 +1,5 @@
-"""Verbs on a chain and a state: compiled, and what they are given looked at while jax traces, so that a call pays nothing for it."""
+"""Verbs on a chain and a state: compiled, and what they are given looked at while jax traces, so
+that a call pays nothing for it."""
 
 import functools
 import inspect
@@ -24,15 +25,25 @@ def check_state(chain, state) -> None:
     check_chain(chain)
     if not isinstance(state, State) or not isinstance(state.structure, Structure):
         raise ValueError(f"state: expected what chain.state(...) gives, got {type(state).__name__}")
-    sizes = (("q", state.q, chain.topology.nq_all), ("v", state.v, chain.dofs), ("connected", state.structure.connected, len(chain.link_names)))
+    sizes = (
+        ("q", state.q, chain.topology.nq_all),
+        ("v", state.v, chain.dofs),
+        ("connected", state.structure.connected, len(chain.link_names)),
+    )
     for name, value, size in sizes:
         shape = getattr(value, "shape", None)
         if shape != (size,):
-            raise ValueError(f"state.{name}: got shape {shape}, expected ({size},); for many states use vmap or svkc.rollout")
+            raise ValueError(
+                f"state.{name}: got shape {shape}, expected ({size},); for many states use vmap or"
+                " svkc.rollout"
+            )
     for value in (state.q, state.v):
         dtype = numbers("state", value).dtype
         if dtype != chain.q_load.dtype:
-            raise ValueError(f"state.q is {dtype}, the chain is {chain.q_load.dtype}; load and state must be made with the same precision")
+            raise ValueError(
+                f"state.q is {dtype}, the chain is {chain.q_load.dtype}; load and state must be"
+                " made with the same precision"
+            )
 
 
 def _looked_at(given: dict) -> dict:
@@ -42,19 +53,28 @@ def _looked_at(given: dict) -> dict:
     if "state" in given:
         check_state(chain, given["state"])
     sizes = dict.fromkeys(("q", "q1", "q2"), chain.topology.nq_all) | {"dv": chain.dofs}
-    return given | {name: vector(chain, name, given[name], sizes.get(name)) for name in given.keys() - {"chain", "state"}}
+    return given | {
+        name: vector(chain, name, given[name], sizes.get(name))
+        for name in given.keys() - {"chain", "state"}
+    }
 
 
 def vector(chain: Chain, name: str, value, size: int | None = None):
-    """An array of real numbers, of this size (None: of any), in the chain's float type where it is in none; ValueError for another."""
+    """An array of real numbers, of this size (None: of any), in the chain's float type where it is
+    in none; ValueError for another."""
     array = numbers(name, value)
     if size is not None and array.shape != (size,):
         raise ValueError(f"{name}: got shape {array.shape}, expected ({size},); for many use vmap")
-    return array if isinstance(array, jax.Array) and jnp.issubdtype(array.dtype, jnp.floating) else jnp.asarray(array, chain.q_load.dtype)
+    return (
+        array
+        if isinstance(array, jax.Array) and jnp.issubdtype(array.dtype, jnp.floating)
+        else jnp.asarray(array, chain.q_load.dtype)
+    )
 
 
 def verb(fn: Callable | None = None, *, eager: bool = False) -> Callable:
-    """`jax.jit` for a function of a chain, a state and arrays; ValueError where one of them cannot be right.
+    """`jax.jit` for a function of a chain, a state and arrays; ValueError where one of them cannot
+    be right.
 
     eager: called outside of every transformation it is compiled for compile time (`eager_jit`).
     """
@@ -81,9 +101,13 @@ def verb(fn: Callable | None = None, *, eager: bool = False) -> Callable:
 
 
 def joint_torques(chain: Chain, tau) -> Float[Array, " dofs"]:
-    """Torques over every coordinate; those of virtual joints are zero where only the tree's are given. ValueError: another size."""
+    """Torques over every coordinate; those of virtual joints are zero where only the tree's are
+    given. ValueError: another size."""
     if tau.shape == (chain.dofs,):
         return tau
     if tau.shape == (chain.nv,):
         return jnp.concatenate([tau, jnp.zeros(chain.dofs - chain.nv, tau.dtype)])
-    raise ValueError(f"tau: got shape {tau.shape}, expected {chain.dofs} joint torques (or {chain.nv}, the tree's)")
+    raise ValueError(
+        f"tau: got shape {tau.shape}, expected {chain.dofs} joint torques (or {chain.nv}, the"
+        " tree's)"
+    )

@@ -17,19 +17,25 @@ def connection_mask(chain: Chain, connected) -> np.ndarray | jax.Array:
         return np.isin(chain.link_names, [chain.link_names[link_index(chain, n)] for n in names])
     mask = arrayed(connected)
     if mask.shape != (len(chain.link_names),) or mask.dtype != bool:
-        raise ValueError(f"connected: expected names of virtual links or {len(chain.link_names)} Booleans, got {mask.dtype} of shape {mask.shape}")
+        raise ValueError(
+            f"connected: expected names of virtual links or {len(chain.link_names)} Booleans, got"
+            f" {mask.dtype} of shape {mask.shape}"
+        )
     return mask
 
 
 def link_index(chain: Chain, name: str) -> int:
     """The slot of a virtual link; ValueError naming those there are."""
     if not isinstance(name, str) or name not in chain.link_names:
-        raise ValueError(f"no virtual link {name!r}; virtual links: {', '.join(chain.link_names) or 'none'}")
+        raise ValueError(
+            f"no virtual link {name!r}; virtual links: {', '.join(chain.link_names) or 'none'}"
+        )
     return chain.link_names.index(name)
 
 
 def joint_slice(chain: Chain, name: str, sizes, start) -> slice:
-    """Where a joint of the tree, or one that may be cut, stands in q (sizes=Q_SIZE) or v; ValueError naming those there are."""
+    """Where a joint of the tree, or one that may be cut, stands in q (sizes=Q_SIZE) or v;
+    ValueError naming those there are."""
     top = chain.topology
     for joint, link, freedom in top.cut_joints:
         if joint == name:
@@ -37,7 +43,11 @@ def joint_slice(chain: Chain, name: str, sizes, start) -> slice:
             if sizes is V_SIZE:
                 first = top.links.dof[link, freedom]
                 return slice(int(first), int(first) + (3 if ball else 1))
-            first = top.links.quat[link, 0] if ball else np.concatenate([top.links.angle, top.links.slide], 1)[link, freedom]
+            first = (
+                top.links.quat[link, 0]
+                if ball
+                else np.concatenate([top.links.angle, top.links.slide], 1)[link, freedom]
+            )
             return slice(int(first), int(first) + (4 if ball else 1))
     if not isinstance(name, str) or name not in top.joint_names:
         raise ValueError(f"no joint {name!r}; joints: {', '.join(top.joint_names)}")
@@ -58,5 +68,8 @@ def spare_slot(chain: Chain, name: str) -> int:
     slot = link_index(chain, name)
     if not chain.topology.link_spare[slot]:
         spare = [n for n, s in zip(chain.link_names, chain.topology.link_spare, strict=True) if s]
-        raise ValueError(f"bind: {name!r} is not a spare slot; spare slots: {', '.join(spare) or 'none; load with spare=n'}")
+        raise ValueError(
+            f"bind: {name!r} is not a spare slot; spare slots:"
+            f" {', '.join(spare) or 'none; load with spare=n'}"
+        )
     return slot

@@ -12,9 +12,11 @@ V_SIZE = (0, 1, 1, 3, 6)
 
 @dataclasses.dataclass(frozen=True)
 class Topology:
-    """Everything about a chain that never changes and that the compiler may specialise on. Rows are links, sorted by level, row 0 the world.
+    """Everything about a chain that never changes and that the compiler may specialise on. Rows are
+    links, sorted by level, row 0 the world.
 
-    A body with several joints takes one row a joint, the last of them the body itself; the others have no mass.
+    A body with several joints takes one row a joint, the last of them the body itself; the others
+    have no mass.
     """
 
     body_names: tuple[str, ...]
@@ -30,7 +32,8 @@ class Topology:
     joint_row: tuple[int, ...]
     link_freedoms: tuple[tuple[bool, ...], ...]
     link_spare: tuple[bool, ...]
-    # what follows tells of joints of the tree that may be cut: the child's row of such a link, else -1; (joint, link, freedom) of each joint
+    # what follows tells of joints of the tree that may be cut: the child's row of such a link, else
+    # -1; (joint, link, freedom) of each joint
     link_child: tuple[int, ...] = ()
     cut_joints: tuple[tuple[str, int, int], ...] = ()
     # where the model's own qpos and qvel stand in q and v
@@ -99,17 +102,25 @@ class Topology:
 
     @functools.cached_property
     def quaternions(self) -> tuple[np.ndarray, np.ndarray]:
-        """(first index in q, first index in v) of every rotation kept as a quaternion, virtual links' included."""
+        """(first index in q, first index in v) of every rotation kept as a quaternion, virtual
+        links' included."""
         offset_q, offset_v = (0, 0, 0, 0, 3), (0, 0, 0, 0, 3)
         rows = self.rows_of(BALL, FREE)
-        q = [self.q_start[i] + offset_q[self.kind[i]] for i in rows] + [int(i[0]) for i in self.links.quat if i[0] < self.nq_all]
+        q = [self.q_start[i] + offset_q[self.kind[i]] for i in rows] + [
+            int(i[0]) for i in self.links.quat if i[0] < self.nq_all
+        ]
         v = [self.v_start[i] + offset_v[self.kind[i]] for i in rows]
-        v += [int(d[0]) for i, d in zip(self.links.quat, self.links.dof, strict=True) if i[0] < self.nq_all]
+        v += [
+            int(d[0])
+            for i, d in zip(self.links.quat, self.links.dof, strict=True)
+            if i[0] < self.nq_all
+        ]
         return np.array(q, int), np.array(v, int)
 
     @functools.cached_property
     def dof_names(self) -> tuple[str, ...]:
-        """A name for each joint coordinate: the joint's, with .x .y .z for slides and .rx .ry .rz for turns where it has several."""
+        """A name for each joint coordinate: the joint's, with .x .y .z for slides and .rx .ry .rz
+        for turns where it has several."""
         names = [""] * self.dofs
         turns, slides = (".rx", ".ry", ".rz"), (".x", ".y", ".z")
         endings = {HINGE: ("",), SLIDE: ("",), BALL: turns, FREE: slides + turns}
@@ -117,7 +128,9 @@ class Topology:
             for k, ending in enumerate(endings[self.kind[row]]):
                 names[self.v_start[row] + k] = name + ending
         for name, dofs in zip(self.link_names, self.links.dof, strict=True):
-            own = [(d, ending) for d, ending in zip(dofs, turns + slides, strict=True) if d < self.dofs]
+            own = [
+                (d, ending) for d, ending in zip(dofs, turns + slides, strict=True) if d < self.dofs
+            ]
             for d, ending in own:
                 names[d] = name + (ending if len(own) > 1 else "")
         for name, link, freedom in self.cut_joints:
@@ -136,9 +149,11 @@ class Topology:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class LinkTables:
-    """Index tables of the virtual joints: x, y, z turns, then x, y, z slides; an index past the end reads a constant.
+    """Index tables of the virtual joints: x, y, z turns, then x, y, z slides; an index past the end
+    reads a constant.
 
-    Three rotations are one quaternion. A spare slot has room for all six freedoms; its mask in the Structure says which it uses.
+    Three rotations are one quaternion. A spare slot has room for all six freedoms; its mask in the
+    Structure says which it uses.
     """
 
     nq_all: int

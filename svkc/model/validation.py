@@ -1,4 +1,5 @@
-"""Plain arguments as callers give them: numbers that must be whole, positive, or real; what cannot be right is said by name."""
+"""Plain arguments as callers give them: numbers that must be whole, positive, or real; what cannot
+be right is said by name."""
 
 import jax
 import jax.numpy as jnp
@@ -10,16 +11,26 @@ from svkc._jax.pytrees import concrete
 def arrayed(value):
     """As an array; of objects, where it is none."""
     try:
-        return value if isinstance(value, jax.Array) else np.asarray(value) if concrete(value) else jnp.asarray(value)
+        return (
+            value
+            if isinstance(value, jax.Array)
+            else np.asarray(value)
+            if concrete(value)
+            else jnp.asarray(value)
+        )
     except (TypeError, ValueError, OverflowError):
         return np.asarray(None)
 
 
 def numbers(name: str, value, dtype=None):
-    """As an array of real numbers, of type dtype where it is given. ValueError: strings, objects, complex numbers, ragged lists."""
+    """As an array of real numbers, of type dtype where it is given. ValueError: strings, objects,
+    complex numbers, ragged lists."""
     array = arrayed(value)
     if not any(jnp.issubdtype(array.dtype, kind) for kind in (np.integer, np.floating)):
-        raise ValueError(f"{name}: expected real numbers, got {repr(value) if array.dtype == object else array.dtype}")
+        raise ValueError(
+            f"{name}: expected real numbers, got"
+            f" {repr(value) if array.dtype == object else array.dtype}"
+        )
     return array if dtype is None else jnp.asarray(array, dtype)
 
 
@@ -35,7 +46,10 @@ def one(name: str, value):
     """One real number."""
     array = numbers(name, value)
     if array.shape != ():
-        raise ValueError(f"{name}: got shape {array.shape}, expected one number; for another in each lane use vmap")
+        raise ValueError(
+            f"{name}: got shape {array.shape}, expected one number; for another in each lane use"
+            " vmap"
+        )
     return value
 
 
@@ -58,7 +72,13 @@ def positive(name: str, value):
 def whole(name: str, value, least: int, most: int = 2**31 - 1) -> int:
     """A whole number from `least` to `most`."""
     number = np.asarray(arrayed(value) if concrete(value) else None)
-    if number.shape != () or number.dtype.kind not in "iuf" or not np.isfinite(number) or number != np.floor(number) or not least <= number <= most:
+    if (
+        number.shape != ()
+        or number.dtype.kind not in "iuf"
+        or not np.isfinite(number)
+        or number != np.floor(number)
+        or not least <= number <= most
+    ):
         raise ValueError(f"{name}: got {value!r}, expected a whole number from {least} to {most}")
     return int(number)
 

@@ -7,7 +7,8 @@ import numpy as np
 
 from svkc.model.validation import numbers, yes_or_no
 
-# the freedoms of the named joints: rotations about x, y, z, then translations along x, y, z; the axis of the joint is z
+# the freedoms of the named joints: rotations about x, y, z, then translations along x, y, z; the
+# axis of the joint is z
 JOINTS = {
     "weld": (False, False, False, False, False, False),
     "hinge": (False, False, True, False, False, False),
@@ -25,19 +26,30 @@ def joint_freedoms(joint) -> tuple[bool, ...]:
     if isinstance(joint, str):
         if joint in JOINTS:
             return JOINTS[joint]
-    elif np.iterable(joint) and len(six := list(joint)) == 6 and all(isinstance(x, bool | np.bool_ | int) and x in (0, 1) for x in six):
+    elif (
+        np.iterable(joint)
+        and len(six := list(joint)) == 6
+        and all(isinstance(x, bool | np.bool_ | int) and x in (0, 1) for x in six)
+    ):
         return tuple(bool(x) for x in six)
-    raise ValueError(f"joint: got {joint!r}, expected one of {', '.join(JOINTS)} or six Booleans (three rotations, three translations)")
+    raise ValueError(
+        f"joint: got {joint!r}, expected one of {', '.join(JOINTS)} or six Booleans (three"
+        " rotations, three translations)"
+    )
 
 
 @dataclasses.dataclass(frozen=True)
 class VirtualLink:
-    """A massless extra link, child of `parent`, that coincides with its `real` link while connected (paper, section IV).
+    """A massless extra link, child of `parent`, that coincides with its `real` link while connected
+    (paper, section IV).
 
-    `parent`, `real`: names of bodies ("world" is the ground) or of sites. `pos` (m), `quat`: the joint's frame in the parent; `real_pos`, `real_quat`: the
-    same frame in the real link, None: from the load pose. Of a site: in the site's frame; `real_pos` None: at the site. `axis`: of the joint, in the
+    `parent`, `real`: names of bodies ("world" is the ground) or of sites. `pos` (m), `quat`: the
+    joint's frame in the parent; `real_pos`, `real_quat`: the same frame in the real link, None:
+    from the load pose. Of a site: in the site's frame; `real_pos` None: at the site. `axis`: of the
+    joint, in the
     frame `pos`, `quat` makes in the parent.
-    `joint`: weld, hinge, slide, cylinder, universal, planar, ball, free, or six Booleans (three rotations, three translations).
+    `joint`: weld, hinge, slide, cylinder, universal, planar, ball, free, or six Booleans (three
+    rotations, three translations).
     `actuated`: a motor drives the joint's own coordinates (paper, Fig. 6).
     """
 
@@ -56,7 +68,9 @@ class VirtualLink:
     def __post_init__(self):
         for name in ("name", "parent", "real"):
             if not isinstance(getattr(self, name), str):
-                raise ValueError(f"virtual link: {name} must be a name, got {getattr(self, name)!r}")
+                raise ValueError(
+                    f"virtual link: {name} must be a name, got {getattr(self, name)!r}"
+                )
         joint_freedoms(self.joint)
         for name in ("connected", "actuated"):
             yes_or_no(f"virtual link {self.name!r}: {name}", getattr(self, name))
@@ -66,8 +80,13 @@ class VirtualLink:
                 continue
             value = np.asarray(numbers(f"virtual link {self.name!r}: {name}", value), float)
             if value.shape != (size,) or not np.isfinite(value).all():
-                raise ValueError(f"virtual link {self.name!r}: {name} must be {size} finite numbers, got {value}")
+                raise ValueError(
+                    f"virtual link {self.name!r}: {name} must be {size} finite numbers, got {value}"
+                )
             if size == 4 and abs(np.linalg.norm(value) - 1) > 1e-6:
-                raise ValueError(f"virtual link {self.name!r}: {name} must be a unit quaternion, got one of norm {np.linalg.norm(value):.6g}")
+                raise ValueError(
+                    f"virtual link {self.name!r}: {name} must be a unit quaternion, got one of norm"
+                    f" {np.linalg.norm(value):.6g}"
+                )
         if not 0 < np.linalg.norm(np.asarray(self.axis, float)) < np.inf:
             raise ValueError(f"virtual link {self.name!r}: axis must not be zero")

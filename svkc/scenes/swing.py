@@ -9,15 +9,20 @@ from svkc.model.virtual_link import VirtualLink
 from svkc.transitions.events import When, when
 from svkc.transitions.guards import touch
 
-TOP, DROP, HALF, EDGE = 3.2, 2.0, 0.33, 0.2  # m: pivot above the ground, plate under it; half the distance of the rods; half the depth of the plate
+# m: pivot above the ground, plate under it; half the distance of the rods; half the depth of the
+# plate
+TOP, DROP, HALF, EDGE = 3.2, 2.0, 0.33, 0.2
 GRASP, SIT = 1.3, 0.07  # m: hands under the pivot; thigh's axis above the plate
 
 
 def swing(angle: float = 0.6, **options) -> tuple[Chain, State]:
-    """The 16-joint figure sits on a swing: a ball joint between each hand and its rod, a slide along the plate at each thigh.
+    """The 16-joint figure sits on a swing: a ball joint between each hand and its rod, a slide
+    along the plate at each thigh.
 
-    30 joint freedoms and the swing's own one; the seat gives way where a slide is cut, as when a thigh has passed the plate's edge: two fewer after
-    both have. State: at rest, the swing turned by `angle` (rad) about its pivot. `options` go to `svkc.load`.
+    30 joint freedoms and the swing's own one; the seat gives way where a slide is cut, as when a
+    thigh has passed the plate's edge: two fewer after
+    both have. State: at rest, the swing turned by `angle` (rad) about its pivot. `options` go to
+    `svkc.load`.
     """
     spec, links = parts()
     chain = load(spec, virtual_links=links, **options)
@@ -36,30 +41,55 @@ def parts():
     body = spec.worldbody.add_body(name="swing", pos=[0, 0, TOP])
     body.add_joint(name="pivot", axis=[0, 1, 0])
     for y in (-HALF, HALF):
-        body.add_geom(type=capsule, fromto=[0, y, 0, 0, y, -DROP], size=[0.012, 0, 0], mass=2.0, **look)
-    body.add_geom(name="plate", type=box, pos=[0, 0, -DROP - 0.01], size=[EDGE, HALF, 0.01], mass=3.0, **look)
-    spec.worldbody.add_geom(type=capsule, fromto=[0, -0.6, TOP, 0, 0.6, TOP], size=[0.03, 0, 0], **look)
+        body.add_geom(
+            type=capsule, fromto=[0, y, 0, 0, y, -DROP], size=[0.012, 0, 0], mass=2.0, **look
+        )
+    body.add_geom(
+        name="plate", type=box, pos=[0, 0, -DROP - 0.01], size=[EDGE, HALF, 0.01], mass=3.0, **look
+    )
+    spec.worldbody.add_geom(
+        type=capsule, fromto=[0, -0.6, TOP, 0, 0.6, TOP], size=[0.03, 0, 0], **look
+    )
     quarter = np.sqrt(0.5)
     links = []
     for side, y in (("right", -1), ("left", 1)):
-        hand = VirtualLink(f"{side}_hand_rod", "swing", f"{side}_hand", "ball", pos=(0, y * HALF, -GRASP), real_pos=(0, 0, -PALM), connected=True)
+        hand = VirtualLink(
+            f"{side}_hand_rod",
+            "swing",
+            f"{side}_hand",
+            "ball",
+            pos=(0, y * HALF, -GRASP),
+            real_pos=(0, 0, -PALM),
+            connected=True,
+        )
         # sitting, the thigh points forward: its own x axis is up
         thigh = VirtualLink(
-            f"{side}_thigh_plate", "swing", f"{side}_thigh", "slide", axis=(1, 0, 0), pos=(0, y * 0.085, -DROP), real_pos=(-SIT, 0, -0.2),
-            real_quat=(quarter, 0, quarter, 0), connected=True,
-        )  # fmt: skip
+            f"{side}_thigh_plate",
+            "swing",
+            f"{side}_thigh",
+            "slide",
+            axis=(1, 0, 0),
+            pos=(0, y * 0.085, -DROP),
+            real_pos=(-SIT, 0, -0.2),
+            real_quat=(quarter, 0, quarter, 0),
+            connected=True,
+        )
         links += [hand, thigh]
     return spec, links
 
 
 def leaving(chain: Chain) -> list[When]:
-    """The seat gives way: each thigh's slide is cut as the thigh passes the front or the back edge of the plate."""
+    """The seat gives way: each thigh's slide is cut as the thigh passes the front or the back edge
+    of the plate."""
 
     def beyond(link):
         along = touch(chain, link, 0.0, axes="z")  # the slide's own axis
         return lambda t, state, args: jnp.abs(along(t, state)) - EDGE
 
-    return [when(beyond(link), cut=link, direction=True) for link in ("right_thigh_plate", "left_thigh_plate")]
+    return [
+        when(beyond(link), cut=link, direction=True)
+        for link in ("right_thigh_plate", "left_thigh_plate")
+    ]
 
 
 def _sitting(chain: Chain, angle: float) -> State:
@@ -69,12 +99,23 @@ def _sitting(chain: Chain, angle: float) -> State:
     place = [c * hips[0] + s * hips[1], 0, TOP - s * hips[0] + c * hips[1]]
     q = {"pivot": angle, "base": [*place, np.cos(angle / 2), 0, np.sin(angle / 2), 0]}
     for side in ("right", "left"):
-        q |= {f"{side}_hip_flexion": np.pi / 2, f"{side}_knee": np.pi / 2, f"{side}_shoulder_flexion": 0.7}
+        q |= {
+            f"{side}_hip_flexion": np.pi / 2,
+            f"{side}_knee": np.pi / 2,
+            f"{side}_shoulder_flexion": 0.7,
+        }
         q |= {f"{side}_shoulder_abduction": 0.4, f"{side}_elbow": 1.0}
-    # the joints named first are what the hands' loops move, so only the seat is held to what is said
-    seated = chain.state({k: x for k, x in q.items() if "shoulder" not in k and "elbow" not in k}, connected=())
+    # the joints named first are what the hands' loops move, so only the seat is held to what is
+    # said
+    seated = chain.state(
+        {k: x for k, x in q.items() if "shoulder" not in k and "elbow" not in k}, connected=()
+    )
     full = np.array(seated.q[: chain.nq])
     for name in ("shoulder_flexion", "shoulder_abduction", "elbow"):
         for side in ("right", "left"):
-            full[chain.topology.q_start[chain.topology.joint_row[chain.joint_names.index(f"{side}_{name}")]]] = q[f"{side}_{name}"]
+            full[
+                chain.topology.q_start[
+                    chain.topology.joint_row[chain.joint_names.index(f"{side}_{name}")]
+                ]
+            ] = q[f"{side}_{name}"]
     return chain.state(full)

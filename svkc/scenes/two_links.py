@@ -1,21 +1,37 @@
-"""The example of the paper's section VII-A (Figs. 14 and 18): a free-flying chain of two links that gets attached to the ground."""
+"""The example of the paper's section VII-A (Figs. 14 and 18): a free-flying chain of two links that
+gets attached to the ground."""
 
 from svkc.mjcf.load import load
 from svkc.model.chain import Chain, State
 from svkc.model.virtual_link import VirtualLink
 
-_ROD = '<geom type="capsule" fromto="0 0 0 0 1 0" size="0.03" mass="{}" contype="0" conaffinity="0"/>'
-_MJCF = f"""<mujoco model="two_links"><option gravity="{{}}"/><worldbody><body name="base"><freejoint name="base"/>{_ROD.format(1.0)}
-  <body name="link1" pos="0 1 0"><joint name="link1" axis="0 0 1"/>{_ROD.format(0.6)}</body></body></worldbody></mujoco>"""
+_ROD = (
+    '<geom type="capsule" fromto="0 0 0 0 1 0" size="0.03" mass="{}" contype="0" conaffinity="0"/>'
+)
+_MJCF = f"""<mujoco model="two_links"><option gravity="{{}}"/><worldbody><body name="base">
+<freejoint name="base"/>{_ROD.format(1.0)}
+  <body name="link1" pos="0 1 0"><joint name="link1" axis="0 0 1"/>{_ROD.format(0.6)}</body></body>
+  </worldbody></mujoco>"""
 
 
 def two_links(gravity=(0.0, -9.81, 0.0), connected: bool = True) -> tuple[Chain, State]:
-    """A free base, Link 1 one metre along y on a hinge about z, and virtual Link 1v one further metre along y, a hinge about z to the ground.
+    """A free base, Link 1 one metre along y on a hinge about z, and virtual Link 1v one further
+    metre along y, a hinge about z to the ground.
 
-    theta_1..6 are the base's, theta_7 Link 1's, theta_8 that of Link 1v, counted against z as the paper's J_C (45) does. State: as pictured, at rest.
+    theta_1..6 are the base's, theta_7 Link 1's, theta_8 that of Link 1v, counted against z as the
+    paper's J_C (45) does. State: as pictured, at rest.
     """
     end = VirtualLink(
-        "link1v", "link1", "world", "hinge", pos=(0, 1, 0), axis=(0, 0, -1), real_pos=(0, 2, 0), real_quat=(1, 0, 0, 0), connected=connected, actuated=True
+        "link1v",
+        "link1",
+        "world",
+        "hinge",
+        pos=(0, 1, 0),
+        axis=(0, 0, -1),
+        real_pos=(0, 2, 0),
+        real_quat=(1, 0, 0, 0),
+        connected=connected,
+        actuated=True,
     )
     chain = load(_MJCF.format(" ".join(map(str, gravity))), virtual_links=[end])
     return chain, chain.state()

@@ -10,25 +10,37 @@ from svkc.scenes import FOLDER
 
 STRIDE, HIP = 0.33, 0.906  # m: from foot to foot where both stand; the hips above the ground
 HIPS = 0.085  # m: half the distance between the hips, and between the feet
-THIGH, SHANK, ANKLE, SOLE = 0.4222, 0.434, 0.075, 0.04  # m: the ankle above the ground; the sole's point that holds ahead of the ankle
+# m: the ankle above the ground; the sole's point that holds ahead of the ankle
+THIGH, SHANK, ANKLE, SOLE = 0.4222, 0.434, 0.075, 0.04
 
 
 def walking(**options) -> tuple[Chain, State]:
-    """The 16-joint figure on the ground, with a weld from the ground to the sole of each foot: standing at rest, the right foot a stride behind.
+    """The 16-joint figure on the ground, with a weld from the ground to the sole of each foot:
+    standing at rest, the right foot a stride behind.
 
-    22 joint freedoms; mobility 11 with both feet on the ground (legs that move in parallel planes make one row redundant), 16 with one, 22 with
-    none. A weld also carries moments and friction: the ground of this scene is one that feet do not slide or tilt on. `options` go to `svkc.load`.
+    22 joint freedoms; mobility 11 with both feet on the ground (legs that move in parallel planes
+    make one row redundant), 16 with one, 22 with
+    none. A weld also carries moments and friction: the ground of this scene is one that feet do not
+    slide or tilt on. `options` go to `svkc.load`.
     """
     spec = mujoco.MjSpec.from_file(str(FOLDER / "figure16.xml"))
     floor = {"pos": [1.55, 0, -0.02], "size": [2.35, 0.6, 0.02], "rgba": [0.75, 0.75, 0.78, 1]}
-    spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_BOX, contype=0, conaffinity=0, **floor)
+    spec.worldbody.add_geom(
+        name="floor", type=mujoco.mjtGeom.mjGEOM_BOX, contype=0, conaffinity=0, **floor
+    )
     feet = [
         VirtualLink(
-            f"{side}_foot_ground", "world", f"{side}_foot", joint="weld", pos=(x, y, 0), real_pos=(SOLE, 0, -ANKLE), real_quat=(1, 0, 0, 0),
+            f"{side}_foot_ground",
+            "world",
+            f"{side}_foot",
+            joint="weld",
+            pos=(x, y, 0),
+            real_pos=(SOLE, 0, -ANKLE),
+            real_quat=(1, 0, 0, 0),
             connected=True,
         )
         for side, x, y in (("left", 0, HIPS), ("right", -STRIDE, -HIPS))
-    ]  # fmt: skip
+    ]
     chain = load(spec, virtual_links=feet, **options)
     hips = -0.55 * STRIDE - SOLE
     q = {"base": [hips, 0, HIP, 1, 0, 0, 0]}
@@ -41,7 +53,8 @@ def walking(**options) -> tuple[Chain, State]:
 
 
 def leg(forward, down) -> dict:
-    """Angles (rad) of a leg whose ankle is this far (m) ahead of and below its hip, trunk upright, foot flat; out of reach: stretched."""
+    """Angles (rad) of a leg whose ankle is this far (m) ahead of and below its hip, trunk upright,
+    foot flat; out of reach: stretched."""
     reach = forward * forward + down * down
     cosine = jnp.clip((reach - THIGH**2 - SHANK**2) / (2 * THIGH * SHANK), -0.9999, 0.9999)
     knee = jnp.arccos(cosine)

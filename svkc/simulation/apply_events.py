@@ -18,15 +18,19 @@ from svkc.transitions.transition import change, connect_tolerance, release
 
 
 def reevaluated(made: Plan) -> np.ndarray:
-    """Return which guards are re-evaluated after a change of structure, so that a guard is compared within one phase.
+    """Return which guards are re-evaluated after a change of structure, so that a guard is compared
+    within one phase.
 
     Guards of loads are not: a link that is overloaded from the start of a phase breaks at once.
     """
     return np.array([not (isinstance(g, Sensor) and g.loaded) for g in made.guards], bool)
 
 
-def apply_events(chain: Chain, run: Run, ended: State, solved: Solved, fired: Bool[Array, " events"], made: Plan):
-    """The change of structure that all events of this instant make together; one record row for each of them."""
+def apply_events(
+    chain: Chain, run: Run, ended: State, solved: Solved, fired: Bool[Array, " events"], made: Plan
+):
+    """The change of structure that all events of this instant make together; one record row for
+    each of them."""
     any_of = lambda what: jnp.any(fired[:, None] & made.table(chain, what), 0)
     connected = (ended.structure.connected | any_of("connect")) & ~any_of("cut")
     locked = (ended.structure.locked | any_of("lock")) & ~any_of("unlock") if made.locks else None
@@ -38,8 +42,18 @@ def apply_events(chain: Chain, run: Run, ended: State, solved: Solved, fired: Bo
         connected, here = (connected | gripped) & ~emptying, here | gripped
 
     def changed():
-        done = change(chain, ended, connected, locked, here) if made.joins(chain) else release(chain, ended, connected, locked)
-        return done if emptying is None else eqx.tree_at(lambda d: d.state.structure, done, emptied(done.state.structure, emptying))
+        done = (
+            change(chain, ended, connected, locked, here)
+            if made.joins(chain)
+            else release(chain, ended, connected, locked)
+        )
+        return (
+            done
+            if emptying is None
+            else eqx.tree_at(
+                lambda d: d.state.structure, done, emptied(done.state.structure, emptying)
+            )
+        )
 
     def same():
         return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), eqx.filter_eval_shape(changed))
@@ -54,7 +68,9 @@ def apply_events(chain: Chain, run: Run, ended: State, solved: Solved, fired: Bo
     hit = (rows[:, None] == place[None]) & fired[None]
     written = jnp.any(hit, 1)
     first = written & (rows == r.count)
-    mine = jnp.any(hit[:, :, None] & (made.table(chain, "connect") | made.table_of_grips(chain))[None], 1)[:, :, None]
+    mine = jnp.any(
+        hit[:, :, None] & (made.table(chain, "connect") | made.table_of_grips(chain))[None], 1
+    )[:, :, None]
     events = Events(
         jnp.where(written, solved.t, r.time),
         jnp.where(written, jnp.argmax(hit, 1).astype(jnp.int32), r.which),
@@ -73,7 +89,8 @@ def apply_events(chain: Chain, run: Run, ended: State, solved: Solved, fired: Bo
 
 
 def _bound(chain: Chain, structure: Structure, fired: Bool[Array, " events"], made: Plan):
-    """The structure with the slots that the events of this instant bind, the slots to connect, whether one was lacking, and the slots to empty."""
+    """The structure with the slots that the events of this instant bind, the slots to connect,
+    whether one was lacking, and the slots to empty."""
     emptying = jnp.any(fired[:, None] & made.unbound(chain, structure), 0)
     gripped, full = jnp.zeros(len(chain.link_names), bool), jnp.zeros((), bool)
     for event, wishes in enumerate(made.grips):
@@ -82,6 +99,8 @@ def _bound(chain: Chain, structure: Structure, fired: Bool[Array, " events"], ma
             taken = eqx.tree_at(lambda s: s.connected, structure, structure.connected | gripped)
             bound, slot, lacking = grip(chain, taken, wish)
             bound = eqx.tree_at(lambda s: s.connected, bound, structure.connected)
-            structure = jax.tree.map(lambda new, old, e=event: jnp.where(fired[e], new, old), bound, structure)
+            structure = jax.tree.map(
+                lambda new, old, e=event: jnp.where(fired[e], new, old), bound, structure
+            )
             gripped, full = gripped | (slot & fired[event]), full | (lacking & fired[event])
     return structure, gripped, full, emptying

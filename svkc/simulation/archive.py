@@ -19,10 +19,17 @@ from svkc.model.virtual_link import VirtualLink
 from svkc.simulation.records import RESULTS, Events, Phases
 from svkc.simulation.trajectory import Trajectory
 
-# 2: with `derivative` and the phases' `margin`; 3: with the structures' `margin` and the rest of the certificate; 4: with the phases' gaps
+# 2: with `derivative` and the phases' `margin`; 3: with the structures' `margin` and the rest of
+# the certificate; 4: with the phases' gaps
 SCHEMA = 4
 _CODES = ("result", "derivative")
-_PARTS = {"states": State, "final": State, "structure": Structure, "events": Events, "phases": Phases}
+_PARTS = {
+    "states": State,
+    "final": State,
+    "structure": Structure,
+    "events": Events,
+    "phases": Phases,
+}
 
 
 def _flatten(node, prefix: str = "") -> dict[str, np.ndarray]:
@@ -49,19 +56,29 @@ def _build(cls, arrays: dict[str, Any], prefix: str = "", **known):
 
 
 def save(traj: Trajectory, path, chain=None, options=None) -> None:
-    """Writes one .npz: every array by name, and a JSON line of metadata (schema, result, versions, certificate, options; names and model of the chain)."""
+    """Writes one .npz: every array by name, and a JSON line of metadata (schema, result, versions,
+    certificate, options; names and model of the chain)."""
     import svkc
 
     if chain is not None:
         check_chain(chain)
-    meta = {"schema": SCHEMA, "svkc": svkc.__version__, "jax": jax.__version__, "units": "SI, rad, wxyz"}
+    meta = {
+        "schema": SCHEMA,
+        "svkc": svkc.__version__,
+        "jax": jax.__version__,
+        "units": "SI, rad, wxyz",
+    }
     meta |= {name: np.asarray(getattr(traj, name)._value).tolist() for name in _CODES}
     certify = Trajectory.report
     for _ in range(np.ndim(traj.ts) - 1):
         # lanes
         certify = jax.vmap(certify)
     report = certify(jax.tree.map(jnp.asarray, traj))
-    meta["certificate"] = {f.name: np.asarray(getattr(report, f.name)).tolist() for f in dataclasses.fields(report) if f.name not in _CODES}
+    meta["certificate"] = {
+        f.name: np.asarray(getattr(report, f.name)).tolist()
+        for f in dataclasses.fields(report)
+        if f.name not in _CODES
+    }
     meta["options"] = options or {}
     arrays = _flatten(traj)
     if chain is not None:
@@ -93,14 +110,25 @@ def _complete(arrays: dict[str, np.ndarray], schema: int) -> None:
         "error": np.full(rows, np.inf, dtype),
     }
     unknown |= {"free": np.zeros(rows, bool), "momentum_drift": np.zeros((*rows, 2), dtype)}
-    arrays |= {f"phases.{name}": value for name, value in unknown.items()} | {"gap_rates": np.full_like(arrays["gaps"], np.inf)}
+    arrays |= {f"phases.{name}": value for name, value in unknown.items()} | {
+        "gap_rates": np.full_like(arrays["gaps"], np.inf)
+    }
     arrays.setdefault("phases.margin", np.full(rows, np.inf, dtype))
     for part in ("states", "final"):
         arrays[f"{part}.structure.margin"] = np.zeros_like(arrays[f"{part}.structure.rank"], dtype)
 
 
 # what every file has had from the first
-_FIRST = {"ts", "gaps", "states.q", "states.structure.rank", "final.q", "final.structure.rank", "events.time", "phases.start"}
+_FIRST = {
+    "ts",
+    "gaps",
+    "states.q",
+    "states.structure.rank",
+    "final.q",
+    "final.structure.rank",
+    "events.time",
+    "phases.start",
+}
 
 
 def _named(cls, prefix: str = "") -> set[str]:
@@ -117,7 +145,9 @@ def _named(cls, prefix: str = "") -> set[str]:
 def _check_whole(path, arrays: dict[str, Any], names: set[str]) -> None:
     missing = names - set(arrays)
     if missing:
-        raise ValueError(f"{path} lacks {', '.join(sorted(missing))}; it is not a trajectory written by svkc")
+        raise ValueError(
+            f"{path} lacks {', '.join(sorted(missing))}; it is not a trajectory written by svkc"
+        )
 
 
 def _plain(value):
@@ -132,13 +162,18 @@ def _plain(value):
 
 
 def load_chain(path) -> Chain:
-    """The chain that a trajectory was saved with: loaded from its MJCF as it was then, with the floats that it had. Files of meshes are read where they were.
+    """The chain that a trajectory was saved with: loaded from its MJCF as it was then, with the
+    floats that it had. Files of meshes are read where they were.
 
-    ValueError: saved without a chain, or with one that came from a compiled model, which says not what it was compiled from; no whole file (as above).
+    ValueError: saved without a chain, or with one that came from a compiled model, which says not
+    what it was compiled from; no whole file (as above).
     """
     arrays, meta, _ = _read(path)
     if not meta.get("model"):
-        raise ValueError(f"{path} holds no model; save with traj.save(path, chain), the chain loaded from a path, text or MjSpec")
+        raise ValueError(
+            f"{path} holds no model; save with traj.save(path, chain), the chain loaded from a"
+            " path, text or MjSpec"
+        )
     given = meta["arguments"]
     given["virtual_links"] = [VirtualLink(**link) for link in given["virtual_links"]]
     leaves, how = jax.tree.flatten(load(meta["model"], **given))
@@ -146,7 +181,8 @@ def load_chain(path) -> Chain:
 
 
 def load_trajectory(path) -> Trajectory:
-    """The trajectory that `Trajectory.save` wrote. ValueError: not such a file, cut short, or of a newer schema. FileNotFoundError: no file."""
+    """The trajectory that `Trajectory.save` wrote. ValueError: not such a file, cut short, or of a
+    newer schema. FileNotFoundError: no file."""
     arrays, meta, codes = _read(path)
     arrays = {name: x for name, x in arrays.items() if not name.startswith("chain.")}
     _check_whole(path, arrays, _FIRST)
@@ -155,7 +191,9 @@ def load_trajectory(path) -> Trajectory:
         _complete(arrays, schema)
     _check_whole(path, arrays, _named(Trajectory))
     code = lambda value: eqx.tree_at(lambda item: item._value, RESULTS.successful, value)
-    build = lambda arrays, codes: _build(Trajectory, arrays, **{name: code(value) for name, value in codes.items()})
+    build = lambda arrays, codes: _build(
+        Trajectory, arrays, **{name: code(value) for name, value in codes.items()}
+    )
     for _ in range(arrays["ts"].ndim - 1):
         # lanes
         build = jax.vmap(build)
@@ -173,12 +211,17 @@ def _read(path) -> tuple[dict[str, np.ndarray], dict, dict[str, np.ndarray]]:
         with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         meta = json.loads(str(arrays.pop("metadata")))
-        schema, codes = int(meta["schema"]), {name: np.asarray(meta.get(name, 0), np.int32) for name in _CODES}
+        schema, codes = (
+            int(meta["schema"]),
+            {name: np.asarray(meta.get(name, 0), np.int32) for name in _CODES},
+        )
     except FileNotFoundError:
         raise
     # whatever the readers of zip, npy and JSON say of what is none
     except Exception as error:
         raise ValueError(f"{path} is not a whole trajectory written by svkc: {error}") from error
     if schema > SCHEMA:
-        raise ValueError(f"{path} has schema {schema}, this version reads up to {SCHEMA}; use a newer svkc")
+        raise ValueError(
+            f"{path} has schema {schema}, this version reads up to {SCHEMA}; use a newer svkc"
+        )
     return arrays, meta, codes

@@ -18,8 +18,9 @@ from svkc.tree.kinematics import kinematics
 
 
 class Checked(eqx.Module):
-    """Quantities of the certificate at one state: the largest gaps of the loops (rad, m) and their rates, and at the ends of phases energy (J), linear
-    momentum (N s), angular momentum about the centre of mass (N m s) and rank margin."""
+    """Quantities of the certificate at one state: the largest gaps of the loops (rad, m) and their
+    rates, and at the ends of phases energy (J), linear momentum (N s), angular momentum about the
+    centre of mass (N m s) and rank margin."""
 
     gap: Float[Array, "*states 2"]
     gap_rate: Float[Array, "*states 2"]
@@ -29,20 +30,43 @@ class Checked(eqx.Module):
     margin: Float[Array, "*states"]
 
 
-def certificate(chain: Chain, records: Records, count: Int[Array, ""], saved: State, stages: int) -> tuple[Phases, Checked, Int[Array, ""]]:
-    """Return the phases of a run, the checks of its saved states, and the index of the first phase whose loops lose rank at an end (past the last: none).
+def certificate(
+    chain: Chain, records: Records, count: Int[Array, ""], saved: State, stages: int
+) -> tuple[Phases, Checked, Int[Array, ""]]:
+    """Return the phases of a run, the checks of its saved states, and the index of the first phase
+    whose loops lose rank at an end (past the last: none).
 
-    stages: evaluations of the vector field in one try of a step. One loop checks every state, so that kinematics and energy are compiled once.
+    stages: evaluations of the vector field in one try of a step. One loop checks every state, so
+    that kinematics and energy are compiled once.
     """
     r, rows, join = records, records.start.shape[0], lambda *x: jnp.concatenate(x)
-    states = State(join(r.q[:, 0], r.q[:, 1], saved.q), join(r.v[:, 0], r.v[:, 1], saved.v), jax.tree.map(join, r.structure, r.structure, saved.structure))
+    states = State(
+        join(r.q[:, 0], r.q[:, 1], saved.q),
+        join(r.v[:, 0], r.v[:, 1], saved.v),
+        jax.tree.map(join, r.structure, r.structure, saved.structure),
+    )
     at_end = np.arange(states.q.shape[0]) < 2 * rows
-    checks = jax.lax.map(jax.checkpoint(lambda x: _check_state(chain, *x)), (states, jnp.asarray(at_end)))
-    first, last, saved_checks = (jax.tree.map(lambda x, part=p: x[part], checks) for p in (slice(rows), slice(rows, 2 * rows), slice(2 * rows, None)))
+    checks = jax.lax.map(
+        jax.checkpoint(lambda x: _check_state(chain, *x)), (states, jnp.asarray(at_end))
+    )
+    first, last, saved_checks = (
+        jax.tree.map(lambda x, part=p: x[part], checks)
+        for p in (slice(rows), slice(rows, 2 * rows), slice(2 * rows, None))
+    )
     written = jnp.arange(rows, dtype=jnp.int32) < count
-    fill = lambda value, none: jnp.where(written.reshape(-1, *(1,) * (jnp.ndim(value) - 1)), value, none)
-    free, joint_freedoms = jax.vmap(lambda s: (_free(chain, s), jnp.sum(active_dofs(chain, s), dtype=jnp.int32)))(r.structure)
-    margin, gaps, rates = frozen((jnp.minimum(first.margin, last.margin), jnp.maximum(first.gap, last.gap), jnp.maximum(first.gap_rate, last.gap_rate)))
+    fill = lambda value, none: jnp.where(
+        written.reshape(-1, *(1,) * (jnp.ndim(value) - 1)), value, none
+    )
+    free, joint_freedoms = jax.vmap(
+        lambda s: (_free(chain, s), jnp.sum(active_dofs(chain, s), dtype=jnp.int32))
+    )(r.structure)
+    margin, gaps, rates = frozen(
+        (
+            jnp.minimum(first.margin, last.margin),
+            jnp.maximum(first.gap, last.gap),
+            jnp.maximum(first.gap_rate, last.gap_rate),
+        )
+    )
     phases = Phases(
         start=r.start,
         stop=r.stop,
@@ -61,7 +85,11 @@ def certificate(chain: Chain, records: Records, count: Int[Array, ""], saved: St
         gap=fill(jnp.maximum(gaps, r.tally.gap), 0),
         gap_rate=fill(rates, 0),
         free=fill(free, False),
-        momentum_drift=jnp.where((written & free)[:, None], frozen(_momentum_drift(chain, first, last, fill(r.stop - r.start, 0))), 0),
+        momentum_drift=jnp.where(
+            (written & free)[:, None],
+            frozen(_momentum_drift(chain, first, last, fill(r.stop - r.start, 0))),
+            0,
+        ),
         count=count,
     )
     lost = written & (margin < rank_tolerance(margin.dtype))
@@ -69,7 +97,8 @@ def certificate(chain: Chain, records: Records, count: Int[Array, ""], saved: St
 
 
 def _check_state(chain: Chain, state: State, at_end: Bool[Array, ""]) -> Checked:
-    """Check one state. at_end: whether it is at an end of a phase; elsewhere energy, momenta and margin are left out."""
+    """Check one state. at_end: whether it is at an end of a phase; elsewhere energy, momenta and
+    margin are left out."""
     kin, dtype, looped = kinematics(chain, state.q), state.q.dtype, bool(chain.link_names)
     gaps = rates = jnp.zeros(2, dtype)
     J = jnp.zeros((0, chain.dofs), dtype)
@@ -81,7 +110,11 @@ def _check_state(chain: Chain, state: State, at_end: Bool[Array, ""]) -> Checked
     def whole():
         energy, *momenta = energy_and_momentum(chain, state, kin)
         row, column = scales(chain)
-        margin = weakest(select(frozen(row[:, None] * J * column[None]), state.structure.rank)) if looped else jnp.ones((), dtype)
+        margin = (
+            weakest(select(frozen(row[:, None] * J * column[None]), state.structure.rank))
+            if looped
+            else jnp.ones((), dtype)
+        )
         return energy, *frozen(tuple(momenta)), margin
 
     none = jnp.zeros((), dtype), jnp.zeros(3, dtype), jnp.zeros(3, dtype), jnp.ones((), dtype)
@@ -89,7 +122,8 @@ def _check_state(chain: Chain, state: State, at_end: Bool[Array, ""]) -> Checked
 
 
 def _free(chain: Chain, s: Structure) -> Bool[Array, ""]:
-    """Whether nothing holds the bodies to the ground: every tree hangs on it by a free joint, and no loop does."""
+    """Whether nothing holds the bodies to the ground: every tree hangs on it by a free joint, and
+    no loop does."""
     top = chain.topology
     roots = [i for i in range(1, len(top.parent)) if top.parent[i] == 0]
     if not roots or any(top.kind[i] != FREE for i in roots):
@@ -97,14 +131,20 @@ def _free(chain: Chain, s: Structure) -> Bool[Array, ""]:
     return ~jnp.any(s.connected & ((s.parent == 0) | (s.real == 0)))
 
 
-def _momentum_drift(chain: Chain, first: Checked, last: Checked, span: Float[Array, " phases"]) -> Float[Array, "phases 2"]:
-    """Change of linear momentum (N s) that gravity does not explain, and of the angular momentum about the centre of mass (N m s)."""
+def _momentum_drift(
+    chain: Chain, first: Checked, last: Checked, span: Float[Array, " phases"]
+) -> Float[Array, "phases 2"]:
+    """Change of linear momentum (N s) that gravity does not explain, and of the angular momentum
+    about the centre of mass (N m s)."""
     fallen = jnp.sum(chain.mass) * chain.gravity[None] * span[:, None]
     size = lambda x: jnp.linalg.norm(x, axis=-1)
-    return jnp.stack([size(last.linear - first.linear - fallen), size(last.angular - first.angular)], 1)
+    return jnp.stack(
+        [size(last.linear - first.linear - fallen), size(last.angular - first.angular)], 1
+    )
 
 
 def stages(solver: diffrax.AbstractSolver) -> int:
-    """Evaluations of the vector field in one try of a step; Newton iterations of implicit stages are not counted."""
+    """Evaluations of the vector field in one try of a step; Newton iterations of implicit stages
+    are not counted."""
     tableau = getattr(solver, "tableau", None)
     return len(np.asarray(tableau.b_sol)) if isinstance(tableau, diffrax.ButcherTableau) else 1

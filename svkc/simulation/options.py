@@ -47,26 +47,36 @@ class Options(eqx.Module):
         return Field(self.control, self.stabilization, self.dynamics)
 
     def steps(self, ts=None):
-        """The step-size controller and the first step; for a loop that does not look to the save times itself, made to stop at each of `ts`."""
+        """The step-size controller and the first step; for a loop that does not look to the save
+        times itself, made to stop at each of `ts`."""
         if self.dt is not None:
             return FixedSteps(self.dt, jnp.zeros(0, self.dt.dtype) if ts is None else ts), None
-        if ts is not None and isinstance(self.controller, diffrax.AbstractAdaptiveStepSizeController):
+        if ts is not None and isinstance(
+            self.controller, diffrax.AbstractAdaptiveStepSizeController
+        ):
             return diffrax.ClipStepSizeController(self.controller, step_ts=ts), self.first_step
-        return self.controller, None if isinstance(self.controller, diffrax.StepTo) else self.first_step
+        return self.controller, (
+            None if isinstance(self.controller, diffrax.StepTo) else self.first_step
+        )
 
 
 def tolerances(dtype, rtol=None, atol=None) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Those left open are 1e-7 (float32: 1e-4), and a hundredth of rtol, or what round-off leaves."""
+    """Those left open are 1e-7 (float32: 1e-4), and a hundredth of rtol, or what round-off
+    leaves."""
     eps = np.finfo(dtype).eps
     rtol = (1e-7 if eps < 1e-10 else 1e-4) if rtol is None else rtol
     if atol is None:
-        atol = max(float(rtol) * 1e-2, 8 * eps) if concrete(rtol) else jnp.maximum(rtol * 1e-2, 8 * eps)
+        atol = (
+            max(float(rtol) * 1e-2, 8 * eps)
+            if concrete(rtol)
+            else jnp.maximum(rtol * 1e-2, 8 * eps)
+        )
     return jnp.asarray(rtol, dtype), jnp.asarray(atol, dtype)
 
 
 def checked(
-    chain: Chain, state: State, t0, t1, ts, events, control, dt, rtol, atol, solver, stepsize_controller, stabilization, dynamics, adjoint,
-    max_events, max_steps, progress_meter,
+    chain: Chain, state: State, t0, t1, ts, events, control, dt, rtol, atol, solver,
+    stepsize_controller, stabilization, dynamics, adjoint, max_events, max_steps, progress_meter,
 ) -> tuple[Options, Float[Array, " times"], Plan]:  # fmt: skip
     """The call's options, save times and plan of events; ValueError for what cannot be right."""
     _check_state(chain, state)
@@ -76,20 +86,31 @@ def checked(
         if value is not None:
             positive(name, value)
     if dt is not None and (rtol is not None or atol is not None or stepsize_controller is not None):
-        raise ValueError("dt asks for fixed steps, rtol, atol and stepsize_controller for others; give one of them")
+        raise ValueError(
+            "dt asks for fixed steps, rtol, atol and stepsize_controller for others; give one of"
+            " them"
+        )
     if stepsize_controller is not None and (rtol is not None or atol is not None):
         raise ValueError("rtol and atol belong inside the stepsize_controller that is given")
     function("control", control)
     if stabilization is not None and not isinstance(stabilization, Projection | Baumgarte | Drift):
-        raise ValueError(f"stabilization: expected svkc.Projection, svkc.Baumgarte or svkc.Drift, got {stabilization!r}")
+        raise ValueError(
+            "stabilization: expected svkc.Projection, svkc.Baumgarte or svkc.Drift, got"
+            f" {stabilization!r}"
+        )
     if dynamics is not None and not isinstance(dynamics, Dynamics):
         raise ValueError(f"dynamics: expected svkc.Dynamics, got {dynamics!r}")
-    if stepsize_controller is not None and not isinstance(stepsize_controller, diffrax.AbstractStepSizeController):
-        raise ValueError(f"stepsize_controller: expected a diffrax one, got {stepsize_controller!r}")
+    if stepsize_controller is not None and not isinstance(
+        stepsize_controller, diffrax.AbstractStepSizeController
+    ):
+        raise ValueError(
+            f"stepsize_controller: expected a diffrax one, got {stepsize_controller!r}"
+        )
     if progress_meter is not None and not isinstance(progress_meter, diffrax.AbstractProgressMeter):
         raise ValueError(f"progress_meter: expected a diffrax one, got {progress_meter!r}")
     made = plan(chain, events, dtype)
-    # on the host where nothing is traced: each operation that jax is given eagerly is a program of its own
+    # on the host where nothing is traced: each operation that jax is given eagerly is a program of
+    # its own
     of = lambda x: np.asarray(x, dtype) if concrete(x) else jnp.asarray(x, dtype)
     host = np if concrete(t0, t1) else jnp
     span = of(t1) - of(t0)
@@ -98,7 +119,9 @@ def checked(
         # as arrays: another tolerance is the same program
         rtol, atol = tolerances(dtype, rtol, atol)
         smallest = np.finfo(dtype).eps * host.maximum(host.abs(span), host.abs(of(t1)))
-        controller = diffrax.PIDController(rtol, atol, norm=motion_norm, dtmin=jnp.asarray(smallest, dtype), force_dtmin=False)
+        controller = diffrax.PIDController(
+            rtol, atol, norm=motion_norm, dtmin=jnp.asarray(smallest, dtype), force_dtmin=False
+        )
     options = Options(
         control=control,
         solver=_solving(solver, None if dt is not None else controller, dtype),
@@ -119,37 +142,62 @@ def checked(
 
 
 def _solving(solver, controller, dtype) -> diffrax.AbstractSolver:
-    """The solver, or the default; one with implicit stages solves them as closely as steps are controlled, or, where they are not, to sqrt(eps)."""
+    """The solver, or the default; one with implicit stages solves them as closely as steps are
+    controlled, or, where they are not, to sqrt(eps)."""
     if solver is None:
-        return diffrax.Dopri8() if np.finfo(dtype).eps < 1e-10 and controller is not None else diffrax.Tsit5()
+        return (
+            diffrax.Dopri8()
+            if np.finfo(dtype).eps < 1e-10 and controller is not None
+            else diffrax.Tsit5()
+        )
     if not isinstance(solver, diffrax.AbstractSolver):
         raise ValueError(f"solver: expected a diffrax solver, got {solver!r}")
-    if isinstance(controller, diffrax.AbstractAdaptiveStepSizeController) and not isinstance(solver, diffrax.AbstractAdaptiveSolver):
-        raise ValueError(f"solver: {type(solver).__name__} does not estimate the errors of its steps; give dt, or another solver")
+    if isinstance(controller, diffrax.AbstractAdaptiveStepSizeController) and not isinstance(
+        solver, diffrax.AbstractAdaptiveSolver
+    ):
+        raise ValueError(
+            f"solver: {type(solver).__name__} does not estimate the errors of its steps; give dt,"
+            " or another solver"
+        )
     if not isinstance(solver, diffrax.AbstractImplicitSolver):
         return solver
     finder = solver.root_finder
     given = {name: getattr(controller, name, None) for name in ("rtol", "atol", "norm")}
-    # diffrax marks what is to be the step-size controller's with a thing that is neither a number nor a function
-    left_open = [name for name in given if not (callable(x := getattr(finder, name, 0.0)) or eqx.is_inexact_array_like(x))]
+    # diffrax marks what is to be the step-size controller's with a thing that is neither a number
+    # nor a function
+    left_open = [
+        name
+        for name in given
+        if not (callable(x := getattr(finder, name, 0.0)) or eqx.is_inexact_array_like(x))
+    ]
     if None in given.values() and left_open:
         # a step that cannot be made shorter has to be solved: by Newton's method
         close = float(np.finfo(dtype).eps ** 0.5)
-        return eqx.tree_at(lambda s: s.root_finder, solver, optimistix.Newton(close, close, norm=motion_norm))
+        return eqx.tree_at(
+            lambda s: s.root_finder, solver, optimistix.Newton(close, close, norm=motion_norm)
+        )
     if left_open and isinstance(finder, diffrax.VeryChord):
         solver = eqx.tree_at(lambda s: s.root_finder, solver, SimplifiedNewton(0.0, 0.0))
-    return eqx.tree_at(lambda s: [getattr(s.root_finder, name) for name in left_open], solver, [given[name] for name in left_open])
+    return eqx.tree_at(
+        lambda s: [getattr(s.root_finder, name) for name in left_open],
+        solver,
+        [given[name] for name in left_open],
+    )
 
 
 def _adjoint(adjoint, controller) -> diffrax.AbstractAdjoint | Replay:
-    """Steps that do not meet the save times are not gone through again: what is saved is interpolated between them."""
+    """Steps that do not meet the save times are not gone through again: what is saved is
+    interpolated between them."""
     meets = controller is None or isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
     if adjoint is None:
         return Replay() if meets else diffrax.RecursiveCheckpointAdjoint()
     if not isinstance(adjoint, Replay | diffrax.AbstractAdjoint):
         raise ValueError(f"adjoint: expected svkc.Replay or a diffrax adjoint, got {adjoint!r}")
     if isinstance(adjoint, Replay) and not meets:
-        raise ValueError("adjoint: svkc.Replay needs dt or an adaptive stepsize_controller; give a diffrax adjoint with this one")
+        raise ValueError(
+            "adjoint: svkc.Replay needs dt or an adaptive stepsize_controller; give a diffrax"
+            " adjoint with this one"
+        )
     return adjoint
 
 
@@ -168,15 +216,23 @@ def _step_bound(max_steps, span, dt) -> int:
         return 65536
     steps = float(np.max(np.asarray(span / dt)))
     if not steps < 1e9:
-        raise ValueError(f"dt: got {dt}, with which a run of {float(span):g} s has more than 1e9 steps; give a larger one, or max_steps")
+        raise ValueError(
+            f"dt: got {dt}, with which a run of {float(span):g} s has more than 1e9 steps; give a"
+            " larger one, or max_steps"
+        )
     return max(65536, int(1.1 * steps) + 1024)
 
 
 def _check_state(chain: Chain, state: State):
     check_state(chain, state)
     if state.q.dtype == np.float64 and not jax.config.read("jax_enable_x64"):
-        raise ValueError("state and chain are float64, but jax_enable_x64 is off now; make them in the precision that simulate is to compute in")
-    if concrete(state) and not (np.isfinite(np.asarray(state.q)).all() and np.isfinite(np.asarray(state.v)).all()):
+        raise ValueError(
+            "state and chain are float64, but jax_enable_x64 is off now; make them in the precision"
+            " that simulate is to compute in"
+        )
+    if concrete(state) and not (
+        np.isfinite(np.asarray(state.q)).all() and np.isfinite(np.asarray(state.v)).all()
+    ):
         raise ValueError("state: q and v must be finite")
 
 
@@ -190,8 +246,19 @@ def _check_times(t0, t1, ts, events):
         raise ValueError(f"t1: got {t1}, expected a time at or after t0 = {t0}")
     if ts is not None and concrete(ts):
         times = np.asarray(times)
-        if times.ndim != 1 or not times.size or np.any(np.diff(times) < 0) or np.any((times < t0) | (times > t1)):
-            raise ValueError(f"ts: expected times in order from t0 = {t0} to t1 = {t1}, got {times}")
+        if (
+            times.ndim != 1
+            or not times.size
+            or np.any(np.diff(times) < 0)
+            or np.any((times < t0) | (times > t1))
+        ):
+            raise ValueError(
+                f"ts: expected times in order from t0 = {t0} to t1 = {t1}, got {times}"
+            )
     for event in events:
-        if isinstance(event, At) and concrete(event.time) and not np.all((np.asarray(event.time) >= t0) & np.isfinite(np.asarray(event.time))):
+        if (
+            isinstance(event, At)
+            and concrete(event.time)
+            and not np.all((np.asarray(event.time) >= t0) & np.isfinite(np.asarray(event.time)))
+        ):
             raise ValueError(f"at: got time {event.time}, before the start of the run at {t0}")

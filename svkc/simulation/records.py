@@ -10,7 +10,8 @@ from svkc.model.chain import State, Structure
 
 
 class Records(eqx.Module):
-    """One row for each phase: its times, the motion at its two ends, its structure, and the counts of its steps.
+    """One row for each phase: its times, the motion at its two ends, its structure, and the counts
+    of its steps.
 
     Unwritten rows hold the initial state, so that what is computed from them is finite.
     """
@@ -29,8 +30,10 @@ class Records(eqx.Module):
 class Events(eqx.Module):
     """What happened, in the order of time; rows past `count` are unused (time inf, which -1).
 
-    `which`: the event's place in the list given; `impulse` (N s), `angular_impulse` (N m s): on each real link from its parent, at the joint, in
-    world axes, for the links this event connected; `energy_lost` (J): of events at one instant, in the first one's row.
+    `which`: the event's place in the list given; `impulse` (N s), `angular_impulse` (N m s): on
+    each real link from its parent, at the joint, in
+    world axes, for the links this event connected; `energy_lost` (J): of events at one instant, in
+    the first one's row.
     """
 
     time: Float[Array, " events"]
@@ -44,13 +47,22 @@ class Events(eqx.Module):
 def no_events(rows: int, links: int, dtype) -> Events:
     """Return empty rows for events. Their times are inf, their indices -1."""
     impulse = jnp.zeros((rows, links, 3), dtype)
-    return Events(jnp.full(rows, jnp.inf, dtype), jnp.full(rows, -1, jnp.int32), impulse, impulse, jnp.zeros(rows, dtype), jnp.asarray(0, jnp.int32))
+    return Events(
+        jnp.full(rows, jnp.inf, dtype),
+        jnp.full(rows, -1, jnp.int32),
+        impulse,
+        impulse,
+        jnp.zeros(rows, dtype),
+        jnp.asarray(0, jnp.int32),
+    )
 
 
 def no_records(rows: int, state: State) -> Records:
     """Return the records before the first phase."""
     dtype = state.q.dtype
-    repeat = lambda tree, *axes: jax.tree.map(lambda x: jnp.broadcast_to(x, (*axes, *jnp.shape(x))), tree)
+    repeat = lambda tree, *axes: jax.tree.map(
+        lambda x: jnp.broadcast_to(x, (*axes, *jnp.shape(x))), tree
+    )
     return Records(
         start=jnp.full(rows, jnp.inf, dtype),
         stop=jnp.full(rows, jnp.inf, dtype),
@@ -64,11 +76,26 @@ def no_records(rows: int, state: State) -> Records:
     )
 
 
-def recorded(records: Records, row: Bool[Array, " phases"], began: tuple, ended: tuple, work, path: Path) -> Records:
-    """Return the records with the row of one phase written. row: one-hot, or all False for no phase; began, ended: time and state."""
+def recorded(
+    records: Records, row: Bool[Array, " phases"], began: tuple, ended: tuple, work, path: Path
+) -> Records:
+    """Return the records with the row of one phase written. row: one-hot, or all False for no
+    phase; began, ended: time and state."""
     (start, first), (stop, last) = began, ended
-    new = Records(start, stop, jnp.stack([first.q, last.q]), jnp.stack([first.v, last.v]), first.structure, work, path.accepted, path.rejected, path.tally)
-    write = lambda old, new: jnp.where(row.reshape(-1, *(1,) * jnp.ndim(new)), jnp.asarray(new)[None], old)
+    new = Records(
+        start,
+        stop,
+        jnp.stack([first.q, last.q]),
+        jnp.stack([first.v, last.v]),
+        first.structure,
+        work,
+        path.accepted,
+        path.rejected,
+        path.tally,
+    )
+    write = lambda old, new: jnp.where(
+        row.reshape(-1, *(1,) * jnp.ndim(new)), jnp.asarray(new)[None], old
+    )
     return jax.tree.map(write, records, new)
 
 
@@ -77,29 +104,59 @@ class RESULTS(eqx.Enumeration):
 
     successful = ""
     stopped = "An event asked the run to stop."
-    max_events = "More events than max_events: the state is that of the last event handled. Raise max_events, or look for chattering."
+    max_events = (
+        "More events than max_events: the state is that of the last event handled. Raise"
+        " max_events, or look for chattering."
+    )
     max_steps = "More steps than max_steps in one phase. Raise max_steps, or loosen rtol and atol."
-    step_too_small = "The step size fell to its lower bound: the problem is too stiff, or singular, for this solver and tolerance."
-    not_in_place = "A link was to be connected at its declared placement, but its bodies were elsewhere. Use here, or a guard that waits."
-    loop_open = "A loop is open by more than the tolerance. Use smaller steps, or projection; look at mobility and its margin there."
+    step_too_small = (
+        "The step size fell to its lower bound: the problem is too stiff, or singular, for this"
+        " solver and tolerance."
+    )
+    not_in_place = (
+        "A link was to be connected at its declared placement, but its bodies were elsewhere. Use"
+        " here, or a guard that waits."
+    )
+    loop_open = (
+        "A loop is open by more than the tolerance. Use smaller steps, or projection; look at"
+        " mobility and its margin there."
+    )
     non_finite = "A number that is not finite appeared."
-    grazing = "A guard touched zero rather than crossed it: the time of its event has no derivative, and those given are not numbers."
+    grazing = (
+        "A guard touched zero rather than crossed it: the time of its event has no derivative, and"
+        " those given are not numbers."
+    )
     jump = "A guard jumped over zero: the time of its event counts as fixed in derivatives."
-    together = "Events happened at one instant: derivatives are those of this order, and none where their times can change apart."
-    rank_lost = "The loops lose rank at an end of a phase: derivatives across it are not to be relied on."
-    no_slot = "A grip was to be made and every spare slot was taken: it was not made, everything else was. Load with more spare slots, or unbind."
+    together = (
+        "Events happened at one instant: derivatives are those of this order, and none where their"
+        " times can change apart."
+    )
+    rank_lost = (
+        "The loops lose rank at an end of a phase: derivatives across it are not to be relied on."
+    )
+    no_slot = (
+        "A grip was to be made and every spare slot was taken: it was not made, everything else"
+        " was. Load with more spare slots, or unbind."
+    )
 
 
 class Phases(eqx.Module):
     """The stretches between changes of structure; rows past `count` are unused.
 
-    `energy`: mechanical energy (J) at start and end; `work`: done in between by control, limits and dampers (J); `margin`: the least |R_mm| / |R_11| of
-    the phase (of its two ends where steps are not projected), how far the weakest row that counts is from being redundant; `swaps`: how often the
-    choice of dependent coordinates changed from step to step (-1: not looked at); `loop`: the one that could not be closed (-1: none);
-    `evaluations`: of the vector field, in steps alone; `error`: the estimated errors of the steps added up (root mean square over q and v; inf: the
-    solver estimates none); `gap`: the largest of the loops' gaps (rad, m) at the ends of steps (of the phase, with a diffrax adjoint); `gap_rate`: of
-    their rates (rad/s, m/s) at the phase's two ends, before the event that ends it; `free`: nothing holds the bodies to the ground; `momentum_drift`:
-    then, the change of linear momentum (N s) that gravity does not explain and that of the angular momentum about the centre of mass (N m s).
+    `energy`: mechanical energy (J) at start and end; `work`: done in between by control, limits and
+    dampers (J); `margin`: the least |R_mm| / |R_11| of
+    the phase (of its two ends where steps are not projected), how far the weakest row that counts
+    is from being redundant; `swaps`: how often the
+    choice of dependent coordinates changed from step to step (-1: not looked at); `loop`: the one
+    that could not be closed (-1: none);
+    `evaluations`: of the vector field, in steps alone; `error`: the estimated errors of the steps
+    added up (root mean square over q and v; inf: the
+    solver estimates none); `gap`: the largest of the loops' gaps (rad, m) at the ends of steps (of
+    the phase, with a diffrax adjoint); `gap_rate`: of
+    their rates (rad/s, m/s) at the phase's two ends, before the event that ends it; `free`: nothing
+    holds the bodies to the ground; `momentum_drift`:
+    then, the change of linear momentum (N s) that gravity does not explain and that of the angular
+    momentum about the centre of mass (N m s).
     """
 
     start: Float[Array, " phases"]

@@ -1,7 +1,10 @@
-"""A run, phase after phase: a scan over solves of one smooth field each, with the change of structure between them.
+"""A run, phase after phase: a scan over solves of one smooth field each, with the change of
+structure between them.
 
-A phase ends at the next scheduled time or at the end of the first step in which a guard crosses zero; the crossing is then located by steps of the
-solver back from there, so that its time and state have the solver's own order and not that of an interpolation. Lanes of a batch
+A phase ends at the next scheduled time or at the end of the first step in which a guard crosses
+zero; the crossing is then located by steps of the
+solver back from there, so that its time and state have the solver's own order and not that of an
+interpolation. Lanes of a batch
 that are done go on with phases of no length.
 """
 
@@ -31,40 +34,62 @@ from svkc.transitions.guards import Sensor
 
 
 def simulate(
-    chain: Chain, state: State, t1, *, t0=0.0, ts=None, events=(), control=None, args=None, dt=None, rtol=None, atol=None, solver=None,
-    stepsize_controller=None, stabilization=None, dynamics=None, adjoint=None, max_events=None, max_steps=None, throw=True, progress_meter=None,
+    chain: Chain, state: State, t1, *, t0=0.0, ts=None, events=(), control=None, args=None,
+    dt=None, rtol=None, atol=None, solver=None, stepsize_controller=None, stabilization=None,
+    dynamics=None, adjoint=None, max_events=None, max_steps=None, throw=True, progress_meter=None,
 ) -> Trajectory:  # fmt: skip
-    """The motion from t0 to t1 (s), through every change of structure in `events` (`svkc.at`, `svkc.when`).
+    """The motion from t0 to t1 (s), through every change of structure in `events` (`svkc.at`,
+    `svkc.when`).
 
-    ts: times to save, stepped to exactly; None: t0 and t1. A state saved at an event's time is the one after it; times past the end of a run that
+    ts: times to save, stepped to exactly; None: t0 and t1. A state saved at an event's time is the
+    one after it; times past the end of a run that
     stopped early hold its last state.
     control(t, state, args): joint torques (N m, N) over every coordinate, or the tree's.
-    dt: fixed steps (s). rtol, atol: adaptive steps, by default 1e-7 (float32: 1e-4) and a hundredth of rtol.
-    solver, stepsize_controller, adjoint, progress_meter: diffrax objects, passed through; by default Dopri8 with rtol, Tsit5 with dt or in float32.
-    stabilization: `svkc.Projection()` (default), `svkc.Exact()`, `svkc.Baumgarte(rate)` or `svkc.Drift()`. dynamics: `svkc.Dynamics(inertia, hold)`.
-    Functions are compared by their code and by the values that they read: defaults, closures and globals. An equal function is not compiled again.
-    Floating-point arrays among these values are data. Numbers and integer arrays are static, as are arrays that Python has to read. A function that reads
-    other kinds of objects is compared by identity; if that compiles it again, a `UserWarning` names the argument.
-    max_events: how many events may happen (default: each timed one, four times each guard); max_steps: in one phase.
-    ValueError: a call that cannot be right. A run that goes wrong ends with a code in `result`, raised when throw=True.
+    dt: fixed steps (s). rtol, atol: adaptive steps, by default 1e-7 (float32: 1e-4) and a hundredth
+    of rtol.
+    solver, stepsize_controller, adjoint, progress_meter: diffrax objects, passed through; by
+    default Dopri8 with rtol, Tsit5 with dt or in float32. stabilization: `svkc.Projection()`
+    (default), `svkc.Exact()`, `svkc.Baumgarte(rate)` or `svkc.Drift()`. dynamics:
+    `svkc.Dynamics(inertia, hold)`. Functions are compared by their code and by the values that they
+    read: defaults, closures and globals. An equal function is not compiled again. Floating-point
+    arrays among these values are data. Numbers and integer arrays are static, as are arrays that
+    Python has to read. A function that reads other kinds of objects is compared by identity; if
+    that compiles it again, a `UserWarning` names the argument.
+    max_events: how many events may happen (default: each timed one, four times each guard);
+    max_steps: in one phase.
+    ValueError: a call that cannot be right. A run that goes wrong ends with a code in `result`,
+    raised when throw=True.
     """
     options, save_at, made = checked(
-        chain, state, t0, t1, ts, events, control, dt, rtol, atol, solver, stepsize_controller, stabilization, dynamics, adjoint, max_events,
-        max_steps, progress_meter,
+        chain, state, t0, t1, ts, events, control, dt, rtol, atol, solver, stepsize_controller,
+        stabilization, dynamics, adjoint, max_events, max_steps, progress_meter,
     )  # fmt: skip
     dtype = state.q.dtype
     given = chain, state, jnp.asarray(t0, dtype), jnp.asarray(t1, dtype), save_at
-    run = lambda control, events: _run(*given, _with(made, guards=events), _with(options, control=control), args)
+    run = lambda control, events: _run(
+        *given, _with(made, guards=events), _with(options, control=control), args
+    )
     run = shared(run, control=options.control, events=made.guards)
-    traj = (_certified_once if len(save_at) <= FEW_STATES else _certified)(chain, run, save_at, given[3], options.gap, stages(options.solver))
+    traj = (_certified_once if len(save_at) <= FEW_STATES else _certified)(
+        chain, run, save_at, given[3], options.gap, stages(options.solver)
+    )
     if not throw:
         return traj
     if isinstance(traj.result._value, jax.core.Tracer):
-        return traj.result.error_if(traj, (traj.result != RESULTS.successful) & (traj.result != RESULTS.stopped))
-    if np.any(~np.isin(np.asarray(traj.result._value), [RESULTS.successful._value, RESULTS.stopped._value])):
+        return traj.result.error_if(
+            traj, (traj.result != RESULTS.successful) & (traj.result != RESULTS.stopped)
+        )
+    if np.any(
+        ~np.isin(
+            np.asarray(traj.result._value), [RESULTS.successful._value, RESULTS.stopped._value]
+        )
+    ):
         phase, loop = int(traj.phases.count), int(traj.report().loop)
         where = f"phase {phase}" if loop < 0 else f"phase {phase}, loop {chain.link_names[loop]!r}"
-        raise RuntimeError(f"simulate stopped at t = {float(traj.t_final):.9g} s, in {where}: {RESULTS[traj.result]}")
+        raise RuntimeError(
+            f"simulate stopped at t = {float(traj.t_final):.9g} s, in {where}:"
+            f" {RESULTS[traj.result]}"
+        )
     return traj
 
 
@@ -84,23 +109,47 @@ def _run(chain: Chain, state: State, t0, t1, ts, made: Plan, options: Options, a
 
 
 def _with_certificate(chain: Chain, run: Run, ts, t1, most: float, evaluations: int) -> Trajectory:
-    """Return the run with its certificate. most: the largest gap of a closed loop; evaluations: of the field in one try of a step."""
+    """Return the run with its certificate. most: the largest gap of a closed loop; evaluations: of
+    the field in one try of a step."""
     short = (run.t < t1) & (run.result == RESULTS.successful)
     result = RESULTS.where(short, RESULTS.max_events, run.result)
     phases, saved, lost = certificate(chain, run.records, run.count, run.saved, evaluations)
     worst = jnp.maximum(jnp.max(saved.gap), jnp.max(phases.gap))
-    result = RESULTS.where((result == RESULTS.successful) & (worst > most), RESULTS.loop_open, result)
-    derivative = RESULTS.where((lost < phases.start.shape[0]) & (lost <= run.invalid_from), RESULTS.rank_lost, run.derivative)
-    return Trajectory(ts, run.saved, saved.gap, saved.gap_rate, run.events, phases, run.state, run.t, result, derivative)
+    result = RESULTS.where(
+        (result == RESULTS.successful) & (worst > most), RESULTS.loop_open, result
+    )
+    derivative = RESULTS.where(
+        (lost < phases.start.shape[0]) & (lost <= run.invalid_from),
+        RESULTS.rank_lost,
+        run.derivative,
+    )
+    return Trajectory(
+        ts,
+        run.saved,
+        saved.gap,
+        saved.gap_rate,
+        run.events,
+        phases,
+        run.state,
+        run.t,
+        result,
+        derivative,
+    )
 
 
 # a program of its own, which an eager call compiles for compile time: it checks each state once
 FEW_STATES = 1000
-_certified, _certified_once = eqx.filter_jit(_with_certificate), eager_jit(_with_certificate, eqx.filter_jit)
+_certified, _certified_once = (
+    eqx.filter_jit(_with_certificate),
+    eager_jit(_with_certificate, eqx.filter_jit),
+)
 
 
-def _converted(chain: Chain, state: State, t0, made: Plan, options: Options, args) -> tuple[Plan, Options]:
-    """Control and guards with all that they close over as their leaves, so that it can be differentiated."""
+def _converted(
+    chain: Chain, state: State, t0, made: Plan, options: Options, args
+) -> tuple[Plan, Options]:
+    """Control and guards with all that they close over as their leaves, so that it can be
+    differentiated."""
     state = _lockable(chain, state, made)
 
     def converted(fn):
@@ -117,14 +166,20 @@ def _with(node, **changed):
 def _lockable(chain: Chain, state: State, made: Plan) -> State:
     if not made.locks or state.structure.locked is not None:
         return state
-    return eqx.tree_at(lambda s: s.structure.locked, state, jnp.zeros(chain.dofs, bool), is_leaf=lambda x: x is None)
+    return eqx.tree_at(
+        lambda s: s.structure.locked,
+        state,
+        jnp.zeros(chain.dofs, bool),
+        is_leaf=lambda x: x is None,
+    )
 
 
 def _start(chain: Chain, state: State, t0, ts, made: Plan, options: Options, args) -> Run:
     """Empty records, sized by capacity; unwritten entries show: inf, -1."""
     links, rows, dtype = len(chain.link_names), options.max_events, state.q.dtype
     state = _lockable(chain, state, made)
-    # an overload from the start is a crossing, so loads begin idle; other guards are evaluated at the start of the phase
+    # an overload from the start is a crossing, so loads begin idle; other guards are evaluated at
+    # the start of the phase
     idle = [g.idle if isinstance(g, Sensor) and g.loaded else 1 for g in made.guards]
     return Run(
         t=t0,
@@ -149,13 +204,18 @@ def _phase(chain: Chain, run: Run, index, t1, ts, made: Plan, options: Options, 
     going = (run.t < t1) | jnp.any(run.pending & (made.times <= t1))
     going = going & (run.result == RESULTS.successful)
     next_time = jnp.min(jnp.where(run.pending, made.times, jnp.inf), initial=jnp.inf)
-    # (the event's own time where it is that of the end, and the end's own where the run is there already: each is to be differentiated by)
+    # (the event's own time where it is that of the end, and the end's own where the run is there
+    # already: each is to be differentiated by)
     ahead = jnp.where(next_time <= t1, next_time, t1)
     stop = jnp.where((ahead < run.t) | (run.result != RESULTS.successful), run.t, ahead)
     solved = solve(run, stop, ts, made, options, Scene(chain, run.state.structure, args))
     reached = going & (solved.result == RESULTS.successful)
     timed = run.pending & (made.times <= solved.t + event_tolerance(solved.t)) & reached
-    fired = jnp.zeros(len(made.actions), bool).at[np.array(made.timed + made.guarded, int)].set(jnp.concatenate([timed, solved.fired & reached]))
+    fired = (
+        jnp.zeros(len(made.actions), bool)
+        .at[np.array(made.timed + made.guarded, int)]
+        .set(jnp.concatenate([timed, solved.fired & reached]))
+    )
     ended = State(solved.motion.q, solved.motion.v, run.state.structure)
     saved = _save(run, ended, solved, ts)
     row = (jnp.arange(run.records.start.shape[0]) == index) & going
@@ -168,7 +228,11 @@ def _phase(chain: Chain, run: Run, index, t1, ts, made: Plan, options: Options, 
         after, events, result = apply_events(chain, run, ended, solved, fired, made)
     result = RESULTS.where(run.result == RESULTS.successful, result, run.result)
     # a guard that rests at zero after it fired keeps its value
-    stale = jnp.asarray(reevaluated(made)) & jnp.any(fired) & (solved.guards != 0) if made.guards else None
+    stale = (
+        jnp.asarray(reevaluated(made)) & jnp.any(fired) & (solved.guards != 0)
+        if made.guards
+        else None
+    )
     return Run(
         t=solved.t,
         state=after,
@@ -186,11 +250,18 @@ def _phase(chain: Chain, run: Run, index, t1, ts, made: Plan, options: Options, 
     )
 
 
-def _derivative(run: Run, solved: Solved, going, timed: Bool[Array, " timed"], index) -> tuple[RESULTS, Int[Array, ""]]:
-    """Return the first reason why the run has no derivative, and the index of its phase. Ranks are checked after the run."""
-    code = RESULTS.where(jnp.sum(solved.fired) + jnp.sum(timed) > 1, RESULTS.together, solved.derivative)
+def _derivative(
+    run: Run, solved: Solved, going, timed: Bool[Array, " timed"], index
+) -> tuple[RESULTS, Int[Array, ""]]:
+    """Return the first reason why the run has no derivative, and the index of its phase. Ranks are
+    checked after the run."""
+    code = RESULTS.where(
+        jnp.sum(solved.fired) + jnp.sum(timed) > 1, RESULTS.together, solved.derivative
+    )
     first = (run.derivative == RESULTS.successful) & going & (code != RESULTS.successful)
-    return RESULTS.where(first, code, run.derivative), jnp.where(first, index.astype(jnp.int32), run.invalid_from)
+    return RESULTS.where(first, code, run.derivative), jnp.where(
+        first, index.astype(jnp.int32), run.invalid_from
+    )
 
 
 def _with_guards(chain: Chain, run: Run, made: Plan, options: Options, args) -> Run:
@@ -198,12 +269,15 @@ def _with_guards(chain: Chain, run: Run, made: Plan, options: Options, args) -> 
     if not made.guards or not reevaluated(made).any():
         return run
     scene = Scene(chain, run.state.structure, args)
-    now = frozen(Reading(made, options.field))(*frozen((run.t, Motion(run.state.q, run.state.v), scene)))
+    now = frozen(Reading(made, options.field))(
+        *frozen((run.t, Motion(run.state.q, run.state.v), scene))
+    )
     return dataclasses.replace(run, guards=jnp.where(run.stale, now, run.guards))
 
 
 def _save(run: Run, ended: State, solved: Solved, ts) -> State:
-    """The saved states with those of this phase written in: from its start to its end, both included; later ones hold its end."""
+    """The saved states with those of this phase written in: from its start to its end, both
+    included; later ones hold its end."""
     here, later = ((ts >= run.t) & (ts <= solved.t))[:, None], (ts > solved.t)[:, None]
     q = jnp.where(here, solved.saved.q, jnp.where(later, ended.q[None], run.saved.q))
     v = jnp.where(here, solved.saved.v, jnp.where(later, ended.v[None], run.saved.v))

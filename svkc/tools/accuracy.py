@@ -1,4 +1,5 @@
-"""The dial turned on a scene of one's own: which integrator, step and way against drift is the fastest that holds an error."""
+"""The dial turned on a scene of one's own: which integrator, step and way against drift is the
+fastest that holds an error."""
 
 import dataclasses
 import sys
@@ -40,7 +41,8 @@ class Candidate:
 
 @dataclasses.dataclass(frozen=True)
 class Tuning:
-    """`best`: options to give to `simulate` (None: no candidate holds the target); `table`: every candidate, the fastest that hold it first. Printed, it
+    """`best`: options to give to `simulate` (None: no candidate holds the target); `table`: every
+    candidate, the fastest that hold it first. Printed, it
     is that table."""
 
     target: float
@@ -48,42 +50,75 @@ class Tuning:
     table: tuple[Candidate, ...]
 
     def __str__(self) -> str:
-        lines = [f"target {self.target:.1e}       seconds of computing    error  loop gap  energy drift  steps"]
+        lines = [
+            f"target {self.target:.1e}       seconds of computing    error  loop gap  energy drift "
+            " steps"
+        ]
         for c in self.table:
             mark = "*" if c.options is self.best else ("+" if c.error <= self.target else " ")
-            lines.append(f"{mark} {c.name:<32}{c.seconds:10.4f}{c.error:11.1e}{c.gap:10.1e}{c.energy_drift:14.1e}{c.steps:7d}  {c.result}".rstrip())
-        return "\n".join([*lines, "* the fastest that holds the target, + those that hold it too" if self.best else "no candidate holds the target"])
+            lines.append(
+                f"{mark} {c.name:<32}{c.seconds:10.4f}{c.error:11.1e}{c.gap:10.1e}"
+                f"{c.energy_drift:14.1e}{c.steps:7d}  {c.result}".rstrip()
+            )
+        return "\n".join(
+            [
+                *lines,
+                (
+                    "* the fastest that holds the target, + those that hold it too"
+                    if self.best
+                    else "no candidate holds the target"
+                ),
+            ]
+        )
 
 
 def candidates(dtype, span: float) -> list[Candidate]:
-    """From fast to exact: fixed steps of low order, adaptive ones of higher order, with and without projection, by articulated bodies; an implicit one."""
+    """From fast to exact: fixed steps of low order, adaptive ones of higher order, with and without
+    projection, by articulated bodies; an implicit one."""
     found = []
     for steps in (1e-2, 1e-3):
         for solver in (SemiImplicitEuler(), RodriguesEuler(), diffrax.Heun(), diffrax.Tsit5()):
             dt = min(steps, span / 4)
-            found.append(Candidate(f"{type(solver).__name__}, dt {dt:g}", {"solver": solver, "dt": dt}))
+            found.append(
+                Candidate(f"{type(solver).__name__}, dt {dt:g}", {"solver": solver, "dt": dt})
+            )
     double = np.finfo(dtype).eps < 1e-10
     for rtol in (1e-4, 1e-6, 1e-8, 1e-10) if double else (1e-3, 1e-4, 1e-5):
         for solver in (diffrax.Tsit5(), diffrax.Dopri8()):
-            name, how = f"{type(solver).__name__}, rtol {rtol:g}", {"solver": solver, "rtol": rtol, "atol": rtol / 100}
+            name, how = (
+                f"{type(solver).__name__}, rtol {rtol:g}",
+                {"solver": solver, "rtol": rtol, "atol": rtol / 100},
+            )
             found.append(Candidate(name, how | {"stabilization": Projection()}))
             found.append(Candidate(f"{name}, drift", how | {"stabilization": Drift()}))
-            found.append(Candidate(f"{name}, by bodies", how | {"dynamics": Dynamics(inertia=by_bodies)}))
+            found.append(
+                Candidate(f"{name}, by bodies", how | {"dynamics": Dynamics(inertia=by_bodies)})
+            )
         if rtol >= 1e-8:
-            found.append(Candidate(f"Kvaerno5, rtol {rtol:g}", {"solver": diffrax.Kvaerno5(), "rtol": rtol, "atol": rtol / 100}))
+            found.append(
+                Candidate(
+                    f"Kvaerno5, rtol {rtol:g}",
+                    {"solver": diffrax.Kvaerno5(), "rtol": rtol, "atol": rtol / 100},
+                )
+            )
     return found
 
 
 def error_between(chain: Chain, run: Trajectory, reference: Trajectory) -> float:
-    """Root mean square, over coordinates and save times, of how far two runs are apart in configuration (rad, m); the largest over the save times."""
-    apart = jax.vmap(lambda a, b: difference(chain, a, b)[: chain.nv])(reference.states.q, run.states.q)
+    """Root mean square, over coordinates and save times, of how far two runs are apart in
+    configuration (rad, m); the largest over the save times."""
+    apart = jax.vmap(lambda a, b: difference(chain, a, b)[: chain.nv])(
+        reference.states.q, run.states.q
+    )
     return float(jnp.max(jnp.sqrt(jnp.mean(apart**2, 1))))
 
 
 def halved(chain: Chain, state: State, t1, **options) -> float:
-    """Integration error of a run, by a second one with half its dt, or with a 32nd of its tolerances: `error_between` the two.
+    """Integration error of a run, by a second one with half its dt, or with a 32nd of its
+    tolerances: `error_between` the two.
 
-    options: of `simulate`. An estimate of the first run's error where the second one's is much smaller.
+    options: of `simulate`. An estimate of the first run's error where the second one's is much
+    smaller.
     """
     run = simulate(chain, state, t1, **options)
     if "dt" in options:
@@ -95,38 +130,67 @@ def halved(chain: Chain, state: State, t1, **options) -> float:
 
 
 def tune(
-    chain: Chain, state: State, t1, target: float = 1e-6, options: Sequence[Candidate] | None = None, repeats: int = 3, show: bool = True, **call
+    chain: Chain,
+    state: State,
+    t1,
+    target: float = 1e-6,
+    options: Sequence[Candidate] | None = None,
+    repeats: int = 3,
+    show: bool = True,
+    **call,
 ) -> Tuning:
-    """Runs candidates on this scene and tells the fastest whose configuration stays within `target` (rad, m; root mean square over the coordinates,
+    """Runs candidates on this scene and tells the fastest whose configuration stays within `target`
+    (rad, m; root mean square over the coordinates,
     largest over the save times) of a run with much smaller tolerances.
 
-    options: the candidates (None: fixed and adaptive steps of several orders, `candidates`). show: print each as it is found, and the table in the end.
-    call: ts, events, control, args and whatever else of `simulate` all runs share. Seconds are those of computing alone, the least of `repeats`
-    runs; what takes ten times the best so far is not repeated. ValueError: a target that is not positive, or no reference that holds.
+    options: the candidates (None: fixed and adaptive steps of several orders, `candidates`). show:
+    print each as it is found, and the table in the end. call: ts, events, control, args and
+    whatever else of `simulate` all runs share. Seconds are those of computing alone, the least of
+    `repeats`
+    runs; what takes ten times the best so far is not repeated. ValueError: a target that is not
+    positive, or no reference that holds.
     """
     check_state(chain, state)
     target, t1, repeats = positive("target", target), one("t1", t1), whole("repeats", repeats, 1)
     dtype, span = state.q.dtype, float(t1) - float(call.get("t0", 0.0))
     tight = float(max(target * 1e-3, 50 * np.finfo(dtype).eps))
     call = {"ts": jnp.linspace(call.get("t0", 0.0), t1, 11, dtype=dtype), **call, "throw": False}
-    reference = simulate(chain, state, t1, **call, solver=diffrax.Dopri8(), rtol=tight, atol=tight / 100)
+    reference = simulate(
+        chain, state, t1, **call, solver=diffrax.Dopri8(), rtol=tight, atol=tight / 100
+    )
     if reference.result != RESULTS.successful:
-        raise ValueError(f"target: {target} cannot be judged, a run at rtol {tight:.1e} ends with: {RESULTS[reference.result]}")
+        raise ValueError(
+            f"target: {target} cannot be judged, a run at rtol {tight:.1e} ends with:"
+            f" {RESULTS[reference.result]}"
+        )
     tried, best = [], np.inf
     for candidate in candidates(dtype, span) if options is None else options:
         tried.append(_tried(chain, state, t1, candidate, call, reference, repeats, 10 * best))
         if tried[-1].error <= target:
             best = min(best, tried[-1].seconds)
         if show:
-            print(f"\r{len(tried)} tried, {candidate.name:<40}", end="", file=sys.stderr, flush=True)
+            print(
+                f"\r{len(tried)} tried, {candidate.name:<40}", end="", file=sys.stderr, flush=True
+            )
     table = sorted(tried, key=lambda c: (not c.error <= target, c.seconds))
-    found = Tuning(target, table[0].options if table and table[0].error <= target else None, tuple(table))
+    found = Tuning(
+        target, table[0].options if table and table[0].error <= target else None, tuple(table)
+    )
     if show:
         print(f"\r{found}", flush=True)
     return found
 
 
-def _tried(chain: Chain, state: State, t1, candidate: Candidate, call, reference: Trajectory, repeats: int, limit: float) -> Candidate:
+def _tried(
+    chain: Chain,
+    state: State,
+    t1,
+    candidate: Candidate,
+    call,
+    reference: Trajectory,
+    repeats: int,
+    limit: float,
+) -> Candidate:
     run = lambda: jax.block_until_ready(simulate(chain, state, t1, **call, **candidate.options))
     traj, seconds = run(), np.inf
     for _ in range(repeats):

@@ -12,10 +12,13 @@ from svkc.model.validation import function, positive, whole
 
 
 class Check(eqx.Module):
-    """What `check_grad` found: the worst entry. `error`: its difference, over the largest entry of its output leaf in either of the two derivatives.
+    """What `check_grad` found: the worst entry. `error`: its difference, over the largest entry of
+    its output leaf in either of the two derivatives.
 
-    `output`, `input`: paths of the two leaves; `derivative`, `difference`: both values, along the direction tried; `uncertainty`: what the difference
-    itself is good for, over the same size; `modes`: largest difference between forward and reverse mode, over the same size (0 where only one was asked).
+    `output`, `input`: paths of the two leaves; `derivative`, `difference`: both values, along the
+    direction tried; `uncertainty`: what the difference itself is good for, over the same size;
+    `modes`: largest difference between forward and reverse mode, over the same size (0 where only
+    one was asked).
     """
 
     error: float
@@ -29,18 +32,25 @@ class Check(eqx.Module):
 
     def __str__(self) -> str:
         return (
-            f"worst relative error {self.error:.2e} (the difference is good to {self.uncertainty:.0e}): d {self.output} / d {self.input} is "
-            f"{self.derivative:.12g} by differentiation, {self.difference:.12g} by differences"
+            f"worst relative error {self.error:.2e} (the difference is good to"
+            f" {self.uncertainty:.0e}): d {self.output} / d {self.input} is {self.derivative:.12g}"
+            f" by differentiation, {self.difference:.12g} by differences"
             + (f"; forward and reverse differ by {self.modes:.1e}" if self.mode == "both" else "")
         )
 
 
-def check_grad(f: Callable, x, mode: str = "both", directions: int = 2, step: float = 0.05, seed: int = 0) -> Check:
-    """The derivative of f at x against central differences, Richardson-extrapolated (Ridders), along random directions; says which entry is worst.
+def check_grad(
+    f: Callable, x, mode: str = "both", directions: int = 2, step: float = 0.05, seed: int = 0
+) -> Check:
+    """The derivative of f at x against central differences, Richardson-extrapolated (Ridders),
+    along random directions; says which entry is worst.
 
-    f: of one argument; x and f(x): any pytrees, of which floats count. For every float leaf of x by itself, `directions` random directions, as long as
-    the leaf (one, where it is zero). mode: "forward", "reverse", or "both", which compares the two. step: the first step of the differences, as
-    a part of the direction; it is halved seven times and the best estimate taken. float64, or the differences are worth little.
+    f: of one argument; x and f(x): any pytrees, of which floats count. For every float leaf of x by
+    itself, `directions` random directions, as long as
+    the leaf (one, where it is zero). mode: "forward", "reverse", or "both", which compares the two.
+    step: the first step of the differences, as
+    a part of the direction; it is halved seven times and the best estimate taken. float64, or the
+    differences are worth little.
     ValueError: no floats in x, an unknown mode, or f not finite.
     """
     function("f", f, optional=False)
@@ -48,7 +58,10 @@ def check_grad(f: Callable, x, mode: str = "both", directions: int = 2, step: fl
     positive("step", step)
     if mode not in ("forward", "reverse", "both"):
         raise ValueError(f"mode: got {mode!r}, expected 'forward', 'reverse' or 'both'")
-    free, rest = eqx.partition(jax.tree.map(lambda leaf: jnp.asarray(leaf) if isinstance(leaf, float) else leaf, x), eqx.is_inexact_array)
+    free, rest = eqx.partition(
+        jax.tree.map(lambda leaf: jnp.asarray(leaf) if isinstance(leaf, float) else leaf, x),
+        eqx.is_inexact_array,
+    )
     # (without weak types, which would compile the same program again for every parameter)
     free = jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype), free)
     named = jax.tree_util.tree_flatten_with_path(free)[0]
@@ -68,21 +81,50 @@ def check_grad(f: Callable, x, mode: str = "both", directions: int = 2, step: fl
     for place, (path, leaf) in enumerate(named):
         for _ in range(directions if leaf.size else 0):
             along = rng.normal(size=leaf.shape)
-            along = jnp.asarray(along / np.linalg.norm(along) * (np.linalg.norm(leaf) or 1.0), leaf.dtype)
-            direction = jax.tree.unflatten(jax.tree.structure(free), [along if i == place else jnp.zeros_like(x) for i, (_, x) in enumerate(named)])
+            along = jnp.asarray(
+                along / np.linalg.norm(along) * (np.linalg.norm(leaf) or 1.0), leaf.dtype
+            )
+            direction = jax.tree.unflatten(
+                jax.tree.structure(free),
+                [along if i == place else jnp.zeros_like(x) for i, (_, x) in enumerate(named)],
+            )
             difference, doubt = _differences(value, free, direction, step)
             ahead = None if mode == "reverse" else _along(f, free, rest, direction)
             for name, weight in weights.items():
                 pair = f"f(x){name}", f"x{jax.tree_util.keystr(path)}"
-                back = None if mode == "forward" else sum(float(jnp.vdot(g, d)) for g, d in zip(gradients[name], jax.tree.leaves(direction), strict=True))
+                back = (
+                    None
+                    if mode == "forward"
+                    else sum(
+                        float(jnp.vdot(g, d))
+                        for g, d in zip(gradients[name], jax.tree.leaves(direction), strict=True)
+                    )
+                )
                 if ahead is None:
                     # one number for the whole leaf: reverse mode has no more for one pass
                     weighed = lambda x, weight=weight: np.asarray(np.sum(weight * x))
-                    found.append(_compare(np.asarray(back), weighed(difference[name]), weighed(doubt[name]), 0.0, *pair))
+                    found.append(
+                        _compare(
+                            np.asarray(back),
+                            weighed(difference[name]),
+                            weighed(doubt[name]),
+                            0.0,
+                            *pair,
+                        )
+                    )
                     continue
                 size = np.linalg.norm(weight) * np.linalg.norm(ahead[name])
-                apart = 0.0 if back is None else abs(back - np.sum(weight * np.asarray(ahead[name]))) / (size if size > 1e-9 else 1.0)
-                found.append(_compare(np.asarray(ahead[name]), difference[name], doubt[name], float(apart), *pair))
+                apart = (
+                    0.0
+                    if back is None
+                    else abs(back - np.sum(weight * np.asarray(ahead[name])))
+                    / (size if size > 1e-9 else 1.0)
+                )
+                found.append(
+                    _compare(
+                        np.asarray(ahead[name]), difference[name], doubt[name], float(apart), *pair
+                    )
+                )
     worst = max(found, key=lambda c: c.error)
     return dataclasses.replace(worst, modes=max(c.modes for c in found), mode=mode)
 
@@ -91,7 +133,9 @@ def check_grad(f: Callable, x, mode: str = "both", directions: int = 2, step: fl
 @eqx.filter_jit
 def _outputs(f, free, rest):
     """The floats of f(x) by their paths."""
-    floats = jax.tree_util.tree_flatten_with_path(eqx.filter(f(eqx.combine(free, rest)), eqx.is_inexact_array))[0]
+    floats = jax.tree_util.tree_flatten_with_path(
+        eqx.filter(f(eqx.combine(free, rest)), eqx.is_inexact_array)
+    )[0]
     return {jax.tree_util.keystr(path): leaf for path, leaf in floats}
 
 
@@ -108,13 +152,19 @@ def _weighed(f, free, rest, weights):
 def _gradients(f, free, rest, weights):
     """For each output leaf, the gradient of its entries summed with random weights."""
     shapes = eqx.filter_eval_shape(_outputs, f, free, rest)
-    only = lambda chosen: {name: jnp.asarray(w if name == chosen else np.zeros_like(w), shapes[name].dtype) for name, w in weights.items()}
+    only = lambda chosen: {
+        name: jnp.asarray(w if name == chosen else np.zeros_like(w), shapes[name].dtype)
+        for name, w in weights.items()
+    }
     return {name: _weighed(f, free, rest, only(name)) for name in weights}
 
 
 def _differences(value, free, direction, step):
-    """Central differences at eight halved steps, extrapolated to zero; for every entry the estimate that changed least, and by how much."""
-    at = lambda h: value(jax.tree.map(lambda x, d: x + jnp.asarray(h, x.dtype) * d, free, direction))
+    """Central differences at eight halved steps, extrapolated to zero; for every entry the estimate
+    that changed least, and by how much."""
+    at = lambda h: value(
+        jax.tree.map(lambda x, d: x + jnp.asarray(h, x.dtype) * d, free, direction)
+    )
     table, best, change = [], {}, {}
     for h in step / 2.0 ** np.arange(8):
         ahead, behind = at(h), at(-h)
@@ -122,12 +172,21 @@ def _differences(value, free, direction, step):
             # so far away f is not defined: begin again, nearer
             table, best, change = [], {}, {}
             continue
-        row = [{name: (np.asarray(ahead[name]) - np.asarray(behind[name])) / (2 * h) for name in ahead}]
+        row = [
+            {name: (np.asarray(ahead[name]) - np.asarray(behind[name])) / (2 * h) for name in ahead}
+        ]
         for k, before in enumerate(table[-1] if table else [], start=1):
-            row.append({name: row[-1][name] + (row[-1][name] - before[name]) / (4**k - 1) for name in before})
+            row.append(
+                {
+                    name: row[-1][name] + (row[-1][name] - before[name]) / (4**k - 1)
+                    for name in before
+                }
+            )
         for k in range(1, len(row)):
             for name, new in row[k].items():
-                moved = np.maximum(np.abs(new - row[k - 1][name]), np.abs(new - table[-1][k - 1][name]))
+                moved = np.maximum(
+                    np.abs(new - row[k - 1][name]), np.abs(new - table[-1][k - 1][name])
+                )
                 closer = moved < change.get(name, np.inf)
                 best[name] = np.where(closer, new, best.get(name, new))
                 change[name] = np.where(closer, moved, change.get(name, moved))
@@ -139,7 +198,9 @@ def _differences(value, free, direction, step):
 
 def _compare(derivative, difference, doubt, modes: float, output: str, input: str) -> Check:
     """The worst entry of one leaf."""
-    size = max(np.abs(x[np.isfinite(x)]).max(initial=0) for x in map(np.asarray, (derivative, difference)))
+    size = max(
+        np.abs(x[np.isfinite(x)]).max(initial=0) for x in map(np.asarray, (derivative, difference))
+    )
     # both nothing: what is within the round-off of differences is no error
     size = size if size > 1e-9 else 1.0
     off = np.abs(derivative - difference)
@@ -150,4 +211,12 @@ def _compare(derivative, difference, doubt, modes: float, output: str, input: st
     at = int(np.argmax(off))
     entry = f"{output}[{at}]" if off.size > 1 else output
     pick = lambda x: float(np.ravel(x)[at])
-    return Check(float(off[at] / size), entry, input, pick(derivative), pick(difference), pick(doubt) / float(size), modes)
+    return Check(
+        float(off[at] / size),
+        entry,
+        input,
+        pick(derivative),
+        pick(difference),
+        pick(doubt) / float(size),
+        modes,
+    )

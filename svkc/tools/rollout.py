@@ -1,4 +1,5 @@
-"""Many runs at once: lanes dealt to chunks, chunks to processes and devices, finished chunks kept."""
+"""Many runs at once: lanes dealt to chunks, chunks to processes and devices, finished chunks
+kept."""
 
 import hashlib
 import json
@@ -26,22 +27,30 @@ from svkc.simulation.trajectory import Trajectory
 
 
 def rollout(
-    chain: Chain, states, t1, *, data: Any = None, lane: Callable | None = None, cost=None, chunk: int | None = None, out=None, devices=None,
-    progress: bool = True, **options,
+    chain: Chain, states, t1, *, data: Any = None, lane: Callable | None = None, cost=None,
+    chunk: int | None = None, out=None, devices=None, progress: bool = True, **options,
 ) -> Trajectory:  # fmt: skip
-    """`svkc.simulate` for every lane of `states`, a State with a leading axis: a trajectory with a leading axis, lanes in the order given.
+    """`svkc.simulate` for every lane of `states`, a State with a leading axis: a trajectory with a
+    leading axis, lanes in the order given.
 
-    data, lane: what differs between lanes besides the state. `lane(chain, data of one lane)` gives a dict of arguments of `simulate` (events, args, control,
-    t1, or `chain` itself with other floats); data: a pytree with the lanes as leading axis.
+    data, lane: what differs between lanes besides the state. `lane(chain, data of one lane)` gives
+    a dict of arguments of `simulate` (events, args, control, t1, or `chain` itself with other
+    floats); data: a pytree with the lanes as leading axis.
     Functions are compared as in `simulate`, `lane` too: it may be a lambda in the call itself.
-    cost: [lanes], how long each may take (any unit): lanes alike go together, so that the short do not wait for the long.
-    chunk: lanes at once on one device (default: 64 on a CPU, 4096 otherwise, no more than there are, nor than have trajectories that fit into a quarter
-    of the memory that is free). devices: default all of this process; each goes its own way through its lanes. On a CPU there are as many as
-    `jax.config.update("jax_num_cpu_devices", n)` asked for before the first use of jax.
-    out: folder for finished chunks, chunk_00000.npz and so on, each a trajectory (`svkc.load_trajectory`); a run that was interrupted goes on from them.
-    Under `jax.distributed` each process takes its share of the chunks, and all get the whole result.
-    options: of `simulate`, for all lanes; `throw` is False by default: lanes that fail say so in `result`.
-    ValueError: leading axes that differ, or a folder of another rollout. RuntimeError: another process is gone; the chunks that were finished are kept.
+    cost: [lanes], how long each may take (any unit): lanes alike go together, so that the short do
+    not wait for the long.
+    chunk: lanes at once on one device (default: 64 on a CPU, 4096 otherwise, no more than there
+    are, nor than have trajectories that fit into a quarter
+    of the memory that is free). devices: default all of this process; each goes its own way through
+    its lanes. On a CPU there are as many as `jax.config.update("jax_num_cpu_devices", n)` asked for
+    before the first use of jax.
+    out: folder for finished chunks, chunk_00000.npz and so on, each a trajectory
+    (`svkc.load_trajectory`); a run that was interrupted goes on from them. Under `jax.distributed`
+    each process takes its share of the chunks, and all get the whole result.
+    options: of `simulate`, for all lanes; `throw` is False by default: lanes that fail say so in
+    `result`.
+    ValueError: leading axes that differ, or a folder of another rollout. RuntimeError: another
+    process is gone; the chunks that were finished are kept.
     """
     check_chain(chain)
     lanes = _count(states, data, cost)
@@ -49,55 +58,100 @@ def rollout(
     function("lane", lane)
     if chunk is not None:
         chunk = whole("chunk", chunk, 1)
-    devices = jax.local_devices() if devices is None else list(devices) if np.iterable(devices) else [devices]
+    devices = (
+        jax.local_devices()
+        if devices is None
+        else list(devices)
+        if np.iterable(devices)
+        else [devices]
+    )
     if not devices or not all(isinstance(device, jax.Device) for device in devices):
         raise ValueError(f"devices: expected some of jax.local_devices(), got {devices!r}")
     most = max(1, lanes // (len(devices) * jax.process_count()))
-    size = min(chunk or min(64 if devices[0].platform == "cpu" else 4096, _fitting(states, options.get("ts"), devices)), most) * len(devices)
+    size = min(
+        chunk
+        or min(
+            64 if devices[0].platform == "cpu" else 4096,
+            _fitting(states, options.get("ts"), devices),
+        ),
+        most,
+    ) * len(devices)
     order = np.arange(lanes) if cost is None else np.argsort(np.asarray(cost), kind="stable")
     # a chunk that lacks lanes is filled up with its last one
-    chunks = [np.pad(order[i : i + size], (0, max(0, i + size - lanes)), mode="edge") for i in range(0, lanes, size)]
+    chunks = [
+        np.pad(order[i : i + size], (0, max(0, i + size - lanes)), mode="edge")
+        for i in range(0, lanes, size)
+    ]
     if len(chunks) < jax.process_count():
-        raise ValueError(f"states: {lanes} lanes are {len(chunks)} chunks, too few for {jax.process_count()} processes; start fewer, or give fewer devices")
-    common, mesh = {"throw": False, "adjoint": Replay(every=1 << 30), **options}, Mesh(np.array(devices), ("lanes",))
-    watched = {name: options.get(name, default) for name, default in (("control", None), ("events", ()))}
+        raise ValueError(
+            f"states: {lanes} lanes are {len(chunks)} chunks, too few for {jax.process_count()}"
+            " processes; start fewer, or give fewer devices"
+        )
+    common, mesh = (
+        {"throw": False, "adjoint": Replay(every=1 << 30), **options},
+        Mesh(np.array(devices), ("lanes",)),
+    )
+    watched = {
+        name: options.get(name, default) for name, default in (("control", None), ("events", ()))
+    }
 
     def run(given):
-        piece = lambda lane, **own: _piece((chain, jnp.asarray(t1, states.q.dtype), common | own, lane), given, mesh)
+        piece = lambda lane, **own: _piece(
+            (chain, jnp.asarray(t1, states.q.dtype), common | own, lane), given, mesh
+        )
         return shared(piece, lane=lane, **watched)
 
-    folder = None if out is None else _folder(pathlib.Path(out), (chain, states, t1, data, order, options), size)
+    folder = (
+        None
+        if out is None
+        else _folder(pathlib.Path(out), (chain, states, t1, data, order, options), size)
+    )
     mine = range(jax.process_index(), len(chunks), jax.process_count())
     done, begun = {}, time.perf_counter()
     for count, i in enumerate(mine):
-        done[i] = _chunk(run, jax.tree.map(lambda x, i=i: x[chunks[i]], (states, data)), folder and folder / f"chunk_{i:05d}.npz", chain)
+        done[i] = _chunk(
+            run,
+            jax.tree.map(lambda x, i=i: x[chunks[i]], (states, data)),
+            folder and folder / f"chunk_{i:05d}.npz",
+            chain,
+        )
         if progress:
             _say(count + 1, len(mine), lanes, time.perf_counter() - begun)
     found = _gathered(done, len(chunks))
-    back = np.argsort(np.concatenate([c[: lanes - n * size] for n, c in enumerate(chunks)]), kind="stable")
+    back = np.argsort(
+        np.concatenate([c[: lanes - n * size] for n, c in enumerate(chunks)]), kind="stable"
+    )
     return jax.tree.map(lambda *x: np.concatenate(x)[back], *found)
 
 
 def _count(states, data, cost) -> int:
     if not isinstance(states, State):
-        raise ValueError(f"states: expected a svkc.State with a leading axis, got {type(states).__name__}")
+        raise ValueError(
+            f"states: expected a svkc.State with a leading axis, got {type(states).__name__}"
+        )
     sizes = {np.shape(x)[0] if np.ndim(x) else None for x in jax.tree.leaves((states, data, cost))}
     lanes = next(iter(sizes))
     if len(sizes) != 1 or not lanes or states.q.ndim != 2:
-        raise ValueError(f"states, data, cost: expected one leading axis of lanes, got sizes {sorted(map(str, sizes))} and q of shape {states.q.shape}")
+        raise ValueError(
+            "states, data, cost: expected one leading axis of lanes, got sizes"
+            f" {sorted(map(str, sizes))} and q of shape {states.q.shape}"
+        )
     if cost is not None and finite("cost", cost).ndim != 1:
         raise ValueError(f"cost: got shape {np.shape(cost)}, expected one number for each lane")
     return lanes
 
 
 def _fitting(states, ts, devices) -> int:
-    """How many lanes' trajectories go into a quarter of the memory that is free on each device; at least one."""
+    """How many lanes' trajectories go into a quarter of the memory that is free on each device; at
+    least one."""
     lane = sum(x.nbytes // x.shape[0] for x in jax.tree.leaves(states))
     # every phase keeps numbers of about a state's size, and a step as many again as its stages
     need = lane * ((2 if ts is None else np.size(ts)) + 64)
     # devices that are cores of one machine share its memory
     sharing = len(devices) if devices[0].platform == "cpu" else 1
-    return max(1, int(min(min(_free_memory(device) for device in devices) / sharing / 4 // need, 1 << 30)))
+    return max(
+        1, int(min(min(_free_memory(device) for device in devices) / sharing / 4 // need, 1 << 30))
+    )
 
 
 def _free_memory(device) -> float:
@@ -113,7 +167,8 @@ def _free_memory(device) -> float:
 
 @eqx.filter_jit
 def _piece(common, lanes, mesh: Mesh) -> Trajectory:
-    """The run of one chunk: a piece for each device, without a word between them, so that none waits for another's steps."""
+    """The run of one chunk: a piece for each device, without a word between them, so that none
+    waits for another's steps."""
     fixed, static = eqx.partition(common, eqx.is_array)
 
     def one(fixed, state, data):
@@ -125,7 +180,13 @@ def _piece(common, lanes, mesh: Mesh) -> Trajectory:
         return simulate(own.pop("chain", chain), state, own.pop("t1", t1), **{**options, **own})
 
     every, spec = PartitionSpec(), PartitionSpec("lanes")
-    parts = jax.shard_map(jax.vmap(one, (None, 0, 0)), mesh=mesh, in_specs=(every, spec, spec), out_specs=spec, check_vma=False)
+    parts = jax.shard_map(
+        jax.vmap(one, (None, 0, 0)),
+        mesh=mesh,
+        in_specs=(every, spec, spec),
+        out_specs=spec,
+        check_vma=False,
+    )
     return parts(fixed, *lanes)
 
 
@@ -135,12 +196,19 @@ def _folder(folder: pathlib.Path, inputs, size: int) -> pathlib.Path:
     for path, leaf in jax.tree_util.tree_leaves_with_path(inputs):
         digest.update(jax.tree_util.keystr(path).encode())
         # functions and solvers by their names; the folder cannot tell whether they were rewritten
-        digest.update(np.ascontiguousarray(leaf).tobytes() if eqx.is_array_like(leaf) else repr(getattr(leaf, "__qualname__", leaf)).encode())
+        digest.update(
+            np.ascontiguousarray(leaf).tobytes()
+            if eqx.is_array_like(leaf)
+            else repr(getattr(leaf, "__qualname__", leaf)).encode()
+        )
     told = {"rollout": digest.hexdigest(), "lanes in a chunk": size}
     folder.mkdir(parents=True, exist_ok=True)
     label = folder / "rollout.json"
     if label.exists() and json.loads(label.read_text()) != told:
-        raise ValueError(f"out: {folder} holds another rollout (other states, options or chunks); give another folder, or empty it")
+        raise ValueError(
+            f"out: {folder} holds another rollout (other states, options or chunks); give another"
+            " folder, or empty it"
+        )
     temporary = folder / f"rollout.{os.getpid()}.part"
     temporary.write_text(json.dumps(told))
     temporary.replace(label)
@@ -148,7 +216,8 @@ def _folder(folder: pathlib.Path, inputs, size: int) -> pathlib.Path:
 
 
 def _chunk(run: Callable, lanes, path: pathlib.Path | None, chain: Chain) -> Trajectory:
-    """One chunk, read where it was finished before; on the host, so that the device is free for the next."""
+    """One chunk, read where it was finished before; on the host, so that the device is free for the
+    next."""
     if path is not None and path.exists():
         return load_trajectory(path)
     traj = jax.tree.map(np.asarray, run(lanes))
@@ -160,7 +229,13 @@ def _chunk(run: Callable, lanes, path: pathlib.Path | None, chain: Chain) -> Tra
 def _say(done: int, chunks: int, lanes: int, seconds: float) -> None:
     left = seconds / done * (chunks - done)
     end = "\n" if done == chunks else ""
-    print(f"\rrollout: {done} of {chunks} chunks ({lanes} lanes), {seconds:.1f} s, {left:.0f} s to go ", end=end, file=sys.stderr, flush=True)
+    print(
+        f"\rrollout: {done} of {chunks} chunks ({lanes} lanes), {seconds:.1f} s, {left:.0f} s"
+        " to go ",
+        end=end,
+        file=sys.stderr,
+        flush=True,
+    )
 
 
 def _gathered(done: dict[int, Trajectory], count: int) -> list[Trajectory]:
@@ -177,6 +252,11 @@ def _gathered(done: dict[int, Trajectory], count: int) -> list[Trajectory]:
         try:
             parts = multihost_utils.process_allgather(own)
         except Exception as error:
-            raise RuntimeError("rollout: another process has ended before its chunks did; the same call with the same `out` goes on from those") from error
-        found += [jax.tree.map(lambda x, p=p: x[p], parts) for p in range(min(processes, count - first))]
+            raise RuntimeError(
+                "rollout: another process has ended before its chunks did; the same call with the"
+                " same `out` goes on from those"
+            ) from error
+        found += [
+            jax.tree.map(lambda x, p=p: x[p], parts) for p in range(min(processes, count - first))
+        ]
     return found

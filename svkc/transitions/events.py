@@ -18,7 +18,8 @@ from svkc.transitions.spare_links import Grip, checked_freedoms, holding, placed
 
 
 class Action(eqx.Module):
-    """What an event does: names of virtual links to connect (those in `here`: where they are) and cut, of joints to lock and unlock, grips to
+    """What an event does: names of virtual links to connect (those in `here`: where they are) and
+    cut, of joints to lock and unlock, grips to
     make with spare slots and, by slot or by pair of bodies, to give up."""
 
     connect: tuple[str, ...] = eqx.field(static=True, default=())
@@ -39,7 +40,8 @@ class At(eqx.Module):
 
 
 class When(eqx.Module):
-    """An event when guard(t, state, args) crosses zero: upwards (True), downwards (False), either way (None)."""
+    """An event when guard(t, state, args) crosses zero: upwards (True), downwards (False), either
+    way (None)."""
 
     guard: Callable
     action: Action
@@ -56,10 +58,17 @@ def _action(connect, cut, lock, unlock, here, stop, bind, unbind) -> Action:
     if not all(isinstance(g, Grip) for g in bind):
         raise ValueError(f"bind: expected svkc.Grip objects, got {bind!r}")
     unbind = _several(unbind)
-    if len(unbind) == 2 and all(isinstance(u, str) for u in unbind) and not all(u.startswith("spare_") for u in unbind):
+    if (
+        len(unbind) == 2
+        and all(isinstance(u, str) for u in unbind)
+        and not all(u.startswith("spare_") for u in unbind)
+    ):
         unbind = (unbind,)
     if not all(isinstance(u, str) or (isinstance(u, tuple) and len(u) == 2) for u in unbind):
-        raise ValueError(f"unbind: expected names of spare slots or pairs of body names (parent, real), got {unbind!r}")
+        raise ValueError(
+            "unbind: expected names of spare slots or pairs of body names (parent, real), got"
+            f" {unbind!r}"
+        )
     connect = texts("connect", connect)
     here = (connect if here else ()) if isinstance(here, bool | np.bool_) else texts("here", here)
     if not set(here) <= set(connect):
@@ -68,23 +77,43 @@ def _action(connect, cut, lock, unlock, here, stop, bind, unbind) -> Action:
     return Action(connect, cut, lock, unlock, here, yes_or_no("stop", stop), unbind, bind)
 
 
-def at(time, connect=(), cut=(), *, lock=(), unlock=(), here=False, stop=False, bind=(), unbind=()) -> At:
-    """At this time (s): connect and cut virtual links, lock and unlock joints, by name. Where a link is both connected and cut, it is cut.
+def at(
+    time, connect=(), cut=(), *, lock=(), unlock=(), here=False, stop=False, bind=(), unbind=()
+) -> At:
+    """At this time (s): connect and cut virtual links, lock and unlock joints, by name. Where a
+    link is both connected and cut, it is cut.
 
-    here: True, or names: grip where the bodies are. stop: end the run then. bind: `svkc.Grip`s to make with spare slots, where the bodies are; where all
-    are taken the run ends with a code. unbind: spare slots by name, or all between a pair (parent, real) of bodies, cut and emptied.
+    here: True, or names: grip where the bodies are. stop: end the run then. bind: `svkc.Grip`s to
+    make with spare slots, where the bodies are; where all are taken the run ends with a code.
+    unbind: spare slots by name, or all between a pair (parent, real) of bodies, cut and emptied.
     """
     numbers("time", time)
     return At(time, _action(connect, cut, lock, unlock, here, stop, bind, unbind))
 
 
-def when(guard, connect=(), cut=(), direction=None, *, lock=(), unlock=(), here=False, stop=False, bind=(), unbind=()) -> When:
-    """When guard(t, state, args) -> real crosses zero, located to round-off and differentiable in time; the actions are those of `at`.
+def when(
+    guard,
+    connect=(),
+    cut=(),
+    direction=None,
+    *,
+    lock=(),
+    unlock=(),
+    here=False,
+    stop=False,
+    bind=(),
+    unbind=(),
+) -> When:
+    """When guard(t, state, args) -> real crosses zero, located to round-off and differentiable in
+    time; the actions are those of `at`.
 
-    direction: True for upwards only, False for downwards only. A guard is watched while its action would change something, or always if it has
-    none, so name the links it is about where several act alike; one that is exactly zero at the start has not crossed, nor has one that rests at zero
-    (to eps^(3/4)) after it fired. Crossings are seen between the ends of steps of one phase: two within one step go unseen, so bound the step
-    (`stepsize_controller`, `dt`) where that can happen. A guard that jumps over zero happens where it jumps; only a smooth one has a time to
+    direction: True for upwards only, False for downwards only. A guard is watched while its action
+    would change something, or always if it has
+    none, so name the links it is about where several act alike; one that is exactly zero at the
+    start has not crossed, nor has one that rests at zero
+    (to eps^(3/4)) after it fired. Crossings are seen between the ends of steps of one phase: two
+    within one step go unseen, so bound the step (`stepsize_controller`, `dt`) where that can
+    happen. A guard that jumps over zero happens where it jumps; only a smooth one has a time to
     differentiate.
     """
     if not callable(guard):
@@ -117,14 +146,21 @@ class Plan(eqx.Module):
         for action in self.actions:
             row = none
             for what in action.unbind:
-                slots = np.array(chain.link_names) == what if isinstance(what, str) else holding(chain, structure, *what)
+                slots = (
+                    np.array(chain.link_names) == what
+                    if isinstance(what, str)
+                    else holding(chain, structure, *what)
+                )
                 row = row | slots
             rows.append(row)
         return jnp.stack(rows)
 
     def joins(self, chain: Chain) -> bool:
-        """Return whether any event connects a link or locks a joint. If none does, no impact is compiled."""
-        return bool(self.binds or self.table(chain, "connect").any() or self.table(chain, "lock").any())
+        """Return whether any event connects a link or locks a joint. If none does, no impact is
+        compiled."""
+        return bool(
+            self.binds or self.table(chain, "connect").any() or self.table(chain, "lock").any()
+        )
 
     @property
     def locks(self) -> bool:
@@ -145,7 +181,10 @@ class Plan(eqx.Module):
 
     def table_of_grips(self, chain: Chain) -> np.ndarray:
         """[events, links] Boolean of the spare slots an event may bind."""
-        return np.array([bool(g) for g in self.grips], bool)[:, None] & np.array(chain.topology.link_spare, bool)[None]
+        return (
+            np.array([bool(g) for g in self.grips], bool)[:, None]
+            & np.array(chain.topology.link_spare, bool)[None]
+        )
 
     def watched(self, chain: Chain, structure: Structure) -> Bool[Array, " guards"]:
         """Guards whose action would change something now, or that have none."""
@@ -155,16 +194,35 @@ class Plan(eqx.Module):
         change = jnp.any(on & ~c, 1) | jnp.any(off & c, 1)
         if self.locks:
             on, off = (self.table(chain, what)[rows] for what in ("lock", "unlock"))
-            change = change | jnp.any(on & ~structure.locked[None], 1) | jnp.any(off & structure.locked[None], 1)
+            change = (
+                change
+                | jnp.any(on & ~structure.locked[None], 1)
+                | jnp.any(off & structure.locked[None], 1)
+            )
         if self.binds:
-            empties = jnp.any(self.unbound(chain, structure)[np.array(rows)] & structure.connected[None], 1)
+            empties = jnp.any(
+                self.unbound(chain, structure)[np.array(rows)] & structure.connected[None], 1
+            )
             held = lambda g: jnp.any(holding(chain, structure, g.parent, g.real))
-            grips = [jnp.any(~jnp.stack([held(g) for g in self.grips[i]])) if self.grips[i] else jnp.zeros((), bool) for i in rows]
+            grips = [
+                (
+                    jnp.any(~jnp.stack([held(g) for g in self.grips[i]]))
+                    if self.grips[i]
+                    else jnp.zeros((), bool)
+                )
+                for i in rows
+            ]
             change = change | empties | jnp.stack(grips)
-        always = [(a := self.actions[i]).stop or not (a.connect + a.cut + a.lock + a.unlock + a.unbind + self.grips[i]) for i in rows]
+        always = [
+            (a := self.actions[i]).stop
+            or not (a.connect + a.cut + a.lock + a.unlock + a.unbind + self.grips[i])
+            for i in rows
+        ]
         return change | np.array(always, bool)
 
-    def crossed(self, before: Float[Array, " guards"], after: Float[Array, " guards"]) -> Bool[Array, " guards"]:
+    def crossed(
+        self, before: Float[Array, " guards"], after: Float[Array, " guards"]
+    ) -> Bool[Array, " guards"]:
         """Guards that went through zero; one that starts at zero has not."""
         up, down = (before < 0) & (after >= 0), (before > 0) & (after <= 0)
         either = np.array([d is None for d in self.directions], bool)
@@ -189,7 +247,11 @@ def plan(chain: Chain, events: tuple, dtype) -> Plan:
     if any(np.shape(t) != () for t in times):
         raise ValueError("at: time must be one number; for a time in each lane use vmap")
     # on the host where nothing is traced, as a program of its own would be compiled to stack them
-    times = np.array(times, dtype) if concrete(*times) else jnp.stack([jnp.asarray(t, dtype) for t in times])
+    times = (
+        np.array(times, dtype)
+        if concrete(*times)
+        else jnp.stack([jnp.asarray(t, dtype) for t in times])
+    )
     made = Plan(
         times=jnp.asarray(times, dtype),
         guards=tuple(events[i].guard for i in guarded),
@@ -197,7 +259,9 @@ def plan(chain: Chain, events: tuple, dtype) -> Plan:
         guarded=guarded,
         directions=tuple(events[i].direction for i in guarded),
         # what is static and what can be differentiated, apart
-        actions=tuple(dataclasses.replace(e.action, bind=()) if e.action.bind else e.action for e in events),
+        actions=tuple(
+            dataclasses.replace(e.action, bind=()) if e.action.bind else e.action for e in events
+        ),
         grips=tuple(tuple(_checked_grip(chain, g, dtype) for g in e.action.bind) for e in events),
     )
     for what in ("connect", "cut", "lock", "unlock"):

@@ -1,4 +1,5 @@
-"""Guards that measure the mechanism itself: bodies that touch, a support that would have to pull, a joint that carries too much."""
+"""Guards that measure the mechanism itself: bodies that touch, a support that would have to pull, a
+joint that carries too much."""
 
 from typing import ClassVar
 
@@ -18,7 +19,8 @@ from svkc.tree.spatial import quat_conjugate, quat_rotate
 
 
 class Sensor(eqx.Module):
-    """A guard that `simulate` gives its own chain and the joint torques of the moment; called by hand it uses the chain it was made with, and none."""
+    """A guard that `simulate` gives its own chain and the joint torques of the moment; called by
+    hand it uses the chain it was made with, and none."""
 
     chain: Chain
     link: int = eqx.field(static=True)
@@ -31,7 +33,11 @@ class Sensor(eqx.Module):
         raise NotImplementedError
 
     def __call__(self, t, state: State, args=None, tau=None) -> Float[Array, ""]:
-        return self.measure(self.chain, state, jnp.zeros_like(state.v) if tau is None else joint_torques(self.chain, tau))
+        return self.measure(
+            self.chain,
+            state,
+            jnp.zeros_like(state.v) if tau is None else joint_torques(self.chain, tau),
+        )
 
 
 class Touch(Sensor):
@@ -46,11 +52,15 @@ class Touch(Sensor):
         end = ends(chain, s, kin, state.q)
         p, r = s.parent[i], s.real[i]
         origin = kin.r[p] + quat_rotate(kin.quat[p], s.pos[i]) + (kin.root[p] - kin.root[r])
-        away = quat_rotate(quat_conjugate(end.base_quat[i]), end.real[i] - origin)[np.array(self.axes)]
+        away = quat_rotate(quat_conjugate(end.base_quat[i]), end.real[i] - origin)[
+            np.array(self.axes)
+        ]
         if len(self.axes) == 1:
             return away[0] - self.distance
         square = jnp.sum(away * away)
-        return jnp.where(square == 0, 0, jnp.sqrt(jnp.where(square == 0, 1, square))) - self.distance
+        return (
+            jnp.where(square == 0, 0, jnp.sqrt(jnp.where(square == 0, 1, square))) - self.distance
+        )
 
 
 class Leaves(Sensor):
@@ -64,7 +74,8 @@ class Leaves(Sensor):
         kin = kinematics(chain, state.q)
         normal = quat_rotate(ends(chain, s, kin, state.q).base_quat[i], self.axis)
         push = jnp.sum(loop_forces(chain, state, tau).force[i] * normal)
-        # a link that is not connected counts as pressed, so that one that would have to pull from the first is seen to leave
+        # a link that is not connected counts as pressed, so that one that would have to pull from
+        # the first is seen to leave
         return jnp.where(s.connected[i], push, self.idle)
 
 
@@ -82,24 +93,43 @@ class Overload(Sensor):
 
 
 def touch(chain: Chain, link: str, distance=0.01, axes: str | None = None) -> Touch:
-    """A guard: how far the real end of a virtual link is from its place in the parent, less `distance` (m). Falls through zero as they come together.
+    """A guard: how far the real end of a virtual link is from its place in the parent, less
+    `distance` (m). Falls through zero as they come together.
 
-    axes: those of the joint's frame in the parent that count, such as "xy" for a bar along z; by default the ones the joint does not slide along. With one
-    axis alone, "z", the height over that plane, with its sign. Use with direction=False, and with a distance that is not passed within one step.
+    axes: those of the joint's frame in the parent that count, such as "xy" for a bar along z; by
+    default the ones the joint does not slide along. With one axis alone, "z", the height over that
+    plane, with its sign. Use with direction=False, and with a distance that is not passed within
+    one step.
     """
     check_chain(chain)
     slot = link_index(chain, link)
     if axes is None:
-        axes = "".join(a for a, free in zip("xyz", chain.topology.link_freedoms[slot][3:], strict=True) if not free) or "xyz"
-    if not isinstance(axes, str) or not axes or set(axes) - set("xyz") or len(set(axes)) < len(axes):
+        axes = (
+            "".join(
+                a
+                for a, free in zip("xyz", chain.topology.link_freedoms[slot][3:], strict=True)
+                if not free
+            )
+            or "xyz"
+        )
+    if (
+        not isinstance(axes, str)
+        or not axes
+        or set(axes) - set("xyz")
+        or len(set(axes)) < len(axes)
+    ):
         raise ValueError(f"touch: axes: expected some of 'xyz', got {axes!r}")
-    distance = jnp.asarray(one("touch: distance", finite("touch: distance", distance)), chain.q_load.dtype)
+    distance = jnp.asarray(
+        one("touch: distance", finite("touch: distance", distance)), chain.q_load.dtype
+    )
     return Touch(chain, slot, distance, tuple("xyz".index(a) for a in axes))
 
 
 def leaves(chain: Chain, link: str, axis=(0.0, 0.0, 1.0)) -> Leaves:
-    """A guard: the force (N) with which a virtual link's parent pushes its real link along `axis` (in the joint's frame in the parent). It falls
-    through zero where the parent would have to pull: with direction=False and cut=link the link holds in one direction only."""
+    """A guard: the force (N) with which a virtual link's parent pushes its real link along `axis`
+    (in the joint's frame in the parent). It falls
+    through zero where the parent would have to pull: with direction=False and cut=link the link
+    holds in one direction only."""
     check_chain(chain)
     axis = np.asarray(finite("leaves: axis", axis), float)
     size = float(np.linalg.norm(axis))
@@ -109,11 +139,16 @@ def leaves(chain: Chain, link: str, axis=(0.0, 0.0, 1.0)) -> Leaves:
 
 
 def overload(chain: Chain, link: str, force=None, torque=None) -> Overload:
-    """A guard: what a virtual link carries, over the most it can (force N, torque N m), less one. It rises through zero where the joint breaks; use
-    with direction=True and cut=link. Where loops are redundant the load is the least one (`loop_forces`)."""
+    """A guard: what a virtual link carries, over the most it can (force N, torque N m), less one.
+    It rises through zero where the joint breaks; use
+    with direction=True and cut=link. Where loops are redundant the load is the least one
+    (`loop_forces`)."""
     if force is None and torque is None:
         raise ValueError("overload: give the largest force (N), the largest torque (N m), or both")
     check_chain(chain)
     given = (("overload: force", force), ("overload: torque", torque))
-    limits = [jnp.asarray(np.inf if x is None else positive(name, x), chain.q_load.dtype) for name, x in given]
+    limits = [
+        jnp.asarray(np.inf if x is None else positive(name, x), chain.q_load.dtype)
+        for name, x in given
+    ]
     return Overload(chain, link_index(chain, link), *limits)

@@ -1,4 +1,5 @@
-"""A consistent state from what the user knows of it: names to numbers, loops closed, velocities made to agree."""
+"""A consistent state from what the user knows of it: names to numbers, loops closed, velocities
+made to agree."""
 
 import functools
 import warnings
@@ -16,16 +17,30 @@ from svkc.model.chain import Chain, State, Structure, active_dofs
 from svkc.model.names import connection_mask, joint_slice
 from svkc.model.topology import Q_SIZE, V_SIZE
 from svkc.model.validation import finite
-from svkc.transitions.newton import CLOSE, CLOSE_HELD, RANK, READ, VELOCITY, VELOCITY_HELD, Held, Schedule, solve_structure
+from svkc.transitions.newton import (
+    CLOSE,
+    CLOSE_HELD,
+    RANK,
+    READ,
+    VELOCITY,
+    VELOCITY_HELD,
+    Held,
+    Schedule,
+    solve_structure,
+)
 from svkc.tree.configuration import normalize
 
 _NEWTON = 30
 _CLOSING, _PROJECTING = (*(CLOSE_HELD,) * _NEWTON, *(CLOSE,) * _NEWTON), (VELOCITY_HELD, VELOCITY)
-_PLACE, _ASSEMBLE = Schedule((*_CLOSING, *_PROJECTING)), Schedule((READ, *_CLOSING, *RANK, *_PROJECTING))
+_PLACE, _ASSEMBLE = (
+    Schedule((*_CLOSING, *_PROJECTING)),
+    Schedule((READ, *_CLOSING, *RANK, *_PROJECTING)),
+)
 
 
 def _put(array, at, values):
-    """Return the array with values at an index; on the host where nothing is traced, as each operation that jax is given eagerly is a program of its own."""
+    """Return the array with values at an index; on the host where nothing is traced, as each
+    operation that jax is given eagerly is a program of its own."""
     if not concrete(array, values):
         return jnp.asarray(array).at[at].set(values)
     out = np.array(array)
@@ -44,7 +59,10 @@ def _filled(chain: Chain, what: str, value, default, tree: int, sizes, start):
             at = joint_slice(chain, name, sizes, start)
             number = finite(f"{what}[{name!r}]", number, default.dtype)
             if number.size != at.stop - at.start:
-                raise ValueError(f"{what}[{name!r}]: got {number.size} numbers, the joint has {at.stop - at.start}")
+                raise ValueError(
+                    f"{what}[{name!r}]: got {number.size} numbers, the joint has"
+                    f" {at.stop - at.start}"
+                )
             out = _put(out, at, number.reshape(-1))
             if what == "v" or at.stop - at.start == 1:
                 named[at] = True
@@ -57,66 +75,108 @@ def _filled(chain: Chain, what: str, value, default, tree: int, sizes, start):
     if value.shape == (tree,):
         return _put(default, slice(tree), value), named
     if value.shape != default.shape:
-        raise ValueError(f"{what}: got shape {value.shape}, expected ({tree},) for the tree or {default.shape} for every coordinate")
+        raise ValueError(
+            f"{what}: got shape {value.shape}, expected ({tree},) for the tree or {default.shape}"
+            " for every coordinate"
+        )
     return value, named
 
 
 def _check_quaternions(chain: Chain, q):
-    """Unit quaternions where that can be seen: to a thousandth, beyond which a normalised one would be a guess."""
+    """Unit quaternions where that can be seen: to a thousandth, beyond which a normalised one would
+    be a guess."""
     first, _ = chain.topology.quaternions
     if isinstance(q, jax.core.Tracer) or not len(first):
         return
     norms = np.linalg.norm(np.asarray(q)[first[:, None] + np.arange(4)], axis=1)
     if np.any(np.abs(norms - 1) > 1e-3):
         i = int(np.argmax(np.abs(norms - 1)))
-        raise ValueError(f"q: the quaternion at q[{first[i]}:{first[i] + 4}] has norm {norms[i]:.6g}, expected 1")
+        raise ValueError(
+            f"q: the quaternion at q[{first[i]}:{first[i] + 4}] has norm {norms[i]:.6g}, expected 1"
+        )
 
 
 def _carried(chain: Chain, structure: Structure, q, v, placed):
-    """Bodies that may be cut, put where the joints that hold them say, in position and velocity, all else as it is."""
+    """Bodies that may be cut, put where the joints that hold them say, in position and velocity,
+    all else as it is."""
     top = chain.topology
     carried = np.zeros(top.dofs, bool)
     for row in top.link_child:
         if row >= 0:
             carried[top.v_start[row] : top.v_start[row] + 6] = True
     every = jnp.asarray(min(6 * len(placed), top.dofs), jnp.int32)
-    only = eqx.tree_at(lambda s: (s.connected, s.rank), structure, (structure.connected & placed, every))
-    found = solve_structure(chain, only, q, v, Held(jnp.asarray(~carried), jnp.asarray(~carried)), _PLACE)
+    only = eqx.tree_at(
+        lambda s: (s.connected, s.rank), structure, (structure.connected & placed, every)
+    )
+    found = solve_structure(
+        chain, only, q, v, Held(jnp.asarray(~carried), jnp.asarray(~carried)), _PLACE
+    )
     return found.q, jnp.where(active_dofs(chain, only), found.v, v)
 
 
 @functools.partial(eager_jit, jit=eqx.filter_jit)
-def _close_and_agree(chain: Chain, structure: Structure, q, v, held_q, held_v, whole: bool) -> tuple[State, Float[Array, " links"]]:
-    """Return the state with its loops closed, and how far each loop is still open (rad, or `chain.length`s).
+def _close_and_agree(
+    chain: Chain, structure: Structure, q, v, held_q, held_v, whole: bool
+) -> tuple[State, Float[Array, " links"]]:
+    """Return the state with its loops closed, and how far each loop is still open (rad, or
+    `chain.length`s).
 
-    Named coordinates are held at first; what that leaves open is closed with all of them free. The same goes for velocities.
-    whole: q says where every body is; else those that may be cut are put where their joint's coordinates say.
+    Named coordinates are held at first; what that leaves open is closed with all of them free. The
+    same goes for velocities.
+    whole: q says where every body is; else those that may be cut are put where their joint's
+    coordinates say.
     """
     placed = (np.array(chain.topology.link_child, int) >= 0) & (not whole)
     if placed.any():
         q, v = _carried(chain, structure, q, v, placed)
     held = Held(held_q, held_v, jnp.asarray(~placed) | ~structure.connected)
     found = solve_structure(chain, structure, q, v, held, _ASSEMBLE)
-    return State(found.q, found.v, eqx.tree_at(lambda s: (s.rank, s.margin), structure, (found.rank, found.margin))), found.left
+    return (
+        State(
+            found.q,
+            found.v,
+            eqx.tree_at(lambda s: (s.rank, s.margin), structure, (found.rank, found.margin)),
+        ),
+        found.left,
+    )
 
 
 def assemble(chain: Chain, q, v, connected) -> State:
     """See `Chain.state`."""
     top = chain.topology
-    structure = eqx.tree_at(lambda s: s.connected, chain.structure, jnp.asarray(connection_mask(chain, connected)))
+    structure = eqx.tree_at(
+        lambda s: s.connected, chain.structure, jnp.asarray(connection_mask(chain, connected))
+    )
     given = q
-    wide = [name for name, x in (("q", q), ("v", v)) if isinstance(x, np.ndarray) and x.dtype == np.float64]
+    wide = [
+        name
+        for name, x in (("q", q), ("v", v))
+        if isinstance(x, np.ndarray) and x.dtype == np.float64
+    ]
     if wide and chain.q_load.dtype == np.float32:
-        warnings.warn(f"state: {' and '.join(wide)} in float64, kept in float32: jax_enable_x64 was off when the chain was loaded", stacklevel=3)
+        warnings.warn(
+            f"state: {' and '.join(wide)} in float64, kept in float32: jax_enable_x64 was off when"
+            " the chain was loaded",
+            stacklevel=3,
+        )
     q, held_q = _filled(chain, "q", q, chain.q_load, top.nq, Q_SIZE, top.q_start)
-    v, held_v = _filled(chain, "v", v, np.zeros(top.dofs, chain.q_load.dtype), top.nv, V_SIZE, top.v_start)
+    v, held_v = _filled(
+        chain, "v", v, np.zeros(top.dofs, chain.q_load.dtype), top.nv, V_SIZE, top.v_start
+    )
     q, v = jnp.asarray(q), jnp.asarray(v)
     _check_quaternions(chain, q)
     if not len(top.link_names):
         return State(normalize(chain, q), v, structure)
     # (where no joint can be cut it is all the same, and one program)
-    whole = max(top.link_child, default=-1) < 0 or (given is not None and not isinstance(given, dict) and np.shape(given) != (len(top.model_q),))
-    return check_closed(chain, *_close_and_agree(chain, structure, q, v, jnp.asarray(_as_dofs(chain, held_q)), jnp.asarray(held_v), whole))
+    whole = max(top.link_child, default=-1) < 0 or (
+        given is not None and not isinstance(given, dict) and np.shape(given) != (len(top.model_q),)
+    )
+    return check_closed(
+        chain,
+        *_close_and_agree(
+            chain, structure, q, v, jnp.asarray(_as_dofs(chain, held_q)), jnp.asarray(held_v), whole
+        ),
+    )
 
 
 def _as_dofs(chain: Chain, held_q: np.ndarray) -> np.ndarray:
@@ -128,15 +188,23 @@ def _as_dofs(chain: Chain, held_q: np.ndarray) -> np.ndarray:
 
 
 def check_closed(chain: Chain, state: State, worst: Float[Array, " links"]) -> State:
-    """The state; ValueError (or an error raised at run time, under jit) where a loop is open, saying which and by how much. worst: of each loop's gaps."""
+    """The state; ValueError (or an error raised at run time, under jit) where a loop is open,
+    saying which and by how much. worst: of each loop's gaps."""
     limit = gap_tolerance(state.q.dtype)
     if not concrete(worst, state):
-        return eqx.error_if(state, ~(jnp.max(worst) < limit), "the loops of the initial state cannot be closed")
+        return eqx.error_if(
+            state, ~(jnp.max(worst) < limit), "the loops of the initial state cannot be closed"
+        )
     worst = np.asarray(worst)
     if not np.all(worst < limit):
         gaps = np.asarray(loop_gaps(chain, state))
         open_ = [
-            f"{chain.link_names[i]} by {np.linalg.norm(gaps[i, 3:]):.3g} m and {np.linalg.norm(gaps[i, :3]):.3g} rad" for i in np.flatnonzero(~(worst < limit))
+            f"{chain.link_names[i]} by {np.linalg.norm(gaps[i, 3:]):.3g} m and"
+            f" {np.linalg.norm(gaps[i, :3]):.3g} rad"
+            for i in np.flatnonzero(~(worst < limit))
         ]
-        raise ValueError(f"the loops cannot be closed from this configuration: {'; '.join(open_)}. Give a q nearer to a closed one.")
+        raise ValueError(
+            f"the loops cannot be closed from this configuration: {'; '.join(open_)}. Give a q"
+            " nearer to a closed one."
+        )
     return state

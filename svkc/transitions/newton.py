@@ -1,6 +1,8 @@
-"""Newton's method on a structure: its rank, its loops closed, velocities that keep them, and the velocity after an impact (paper, section V-C).
+"""Newton's method on a structure: its rank, its loops closed, velocities that keep them, and the
+velocity after an impact (paper, section V-C).
 
-A caller lists the iterations that it needs. One loop over one body takes them all, so that kinematics, loop Jacobian and pivots are compiled once.
+A caller lists the iterations that it needs. One loop over one body takes them all, so that
+kinematics, loop Jacobian and pivots are compiled once.
 """
 
 import dataclasses
@@ -24,9 +26,13 @@ from svkc.tree.kinematics import kinematics
 
 # kinds of iterations
 READ = 0  # set the coordinates of virtual joints to what the poses of their bodies say
-CLOSE_HELD, CLOSE = 1, 2  # a Newton step that closes the loops by the least change of scaled coordinates; held coordinates stay, or not
-PERTURB, RECLOSE, COUNT = 3, 4, 5  # look at q and move a copy of it a few degrees away; close its loops; decide the rank
-VELOCITY_HELD, VELOCITY = 6, 7  # project the velocity by its least change; held velocities stay, or not
+# a Newton step that closes the loops by the least change of scaled coordinates; held coordinates
+# stay, or not
+CLOSE_HELD, CLOSE = 1, 2
+# look at q and move a copy of it a few degrees away; close its loops; decide the rank
+PERTURB, RECLOSE, COUNT = 3, 4, 5
+# project the velocity by its least change; held velocities stay, or not
+VELOCITY_HELD, VELOCITY = 6, 7
 IMPACT = 8  # project the velocity in the metric of the inertia
 
 RANK = (PERTURB, *(RECLOSE,) * 12, COUNT)
@@ -45,7 +51,8 @@ class Schedule(eqx.Module):
 
 
 class Held(eqx.Module):
-    """Coordinates and velocities that stay in held iterations, and links whose coordinates are read. None: there are none."""
+    """Coordinates and velocities that stay in held iterations, and links whose coordinates are
+    read. None: there are none."""
 
     q: Bool[Array, " dofs"] | None = None
     v: Bool[Array, " dofs"] | None = None
@@ -53,11 +60,14 @@ class Held(eqx.Module):
 
 
 class Newton(eqx.Module):
-    """The state of the iteration: the motion, the rank of the structure with its margin, and what has been found.
+    """The state of the iteration: the motion, the rank of the structure with its margin, and what
+    has been found.
 
-    `probe`: the copy of q in the search for the rank; `size`, `open`: |R_kk| of the loop Jacobian and how far each loop is open (rad, or `chain.length`s), at
-    the start and at the end of the search; `left`: how far each loop is open in the last iteration; `wrench`: impulse of each loop on its real link from
-    the parent, at the joint, angular first (N m s, N s); `lost`: energy lost (J).
+    `probe`: the copy of q in the search for the rank; `size`, `open`: |R_kk| of the loop Jacobian
+    and how far each loop is open (rad, or `chain.length`s), at the start and at the end of the
+    search; `left`: how far each loop is open in the last iteration; `wrench`: impulse of each loop
+    on its real link from the parent, at the joint, angular first (N m s, N s); `lost`: energy lost
+    (J).
     """
 
     q: Float[Array, " q"]
@@ -77,20 +87,42 @@ class Newton(eqx.Module):
         links, dtype, q = len(chain.link_names), q.dtype, normalize(chain, q)
         gaps, zero = jnp.zeros((2, links), dtype), jnp.zeros((), dtype)
         size = jnp.zeros((2, min(6 * links, chain.dofs)), dtype)
-        return cls(q, v, structure.rank, structure.margin, q, size, gaps, gaps[0], jnp.zeros((links, 6), dtype), zero)
+        return cls(
+            q,
+            v,
+            structure.rank,
+            structure.margin,
+            q,
+            size,
+            gaps,
+            gaps[0],
+            jnp.zeros((links, 6), dtype),
+            zero,
+        )
 
     def searched(self, kind, size, gaps) -> "Newton":
         """Record both ends of the search for the rank, and decide the rank at its end."""
         places = jnp.stack([kind == PERTURB, kind == COUNT])[:, None]
-        seen = dataclasses.replace(self, size=jnp.where(places, size[None], self.size), open=jnp.where(places, gaps[None], self.open))
+        seen = dataclasses.replace(
+            self,
+            size=jnp.where(places, size[None], self.size),
+            open=jnp.where(places, gaps[None], self.open),
+        )
         rank, margin = seen.decided()
-        return dataclasses.replace(seen, rank=jnp.where(kind == COUNT, rank, self.rank), margin=jnp.where(kind == COUNT, margin, self.margin))
+        return dataclasses.replace(
+            seen,
+            rank=jnp.where(kind == COUNT, rank, self.rank),
+            margin=jnp.where(kind == COUNT, margin, self.margin),
+        )
 
     def decided(self) -> tuple[Int[Array, ""], Float[Array, ""]]:
-        """Return the larger rank m of both ends, and |R_mm| / |R_11| there. The second end does not count where its loops are open."""
+        """Return the larger rank m of both ends, and |R_mm| / |R_11| there. The second end does not
+        count where its loops are open."""
         size, eps = self.size, jnp.finfo(self.size.dtype)
         closed = jnp.max(self.open[1]) < eps.eps**0.75
-        rank = jnp.where(closed, jnp.maximum(count_rank(size[0]), count_rank(size[1])), count_rank(size[0]))
+        rank = jnp.where(
+            closed, jnp.maximum(count_rank(size[0]), count_rank(size[1])), count_rank(size[0])
+        )
         last = jnp.arange(size.shape[1], dtype=jnp.int32) == rank - 1
         margin = jnp.sum(jnp.where(last, size, 0), 1) / jnp.maximum(size[:, 0], eps.tiny)
         return rank, jnp.where(closed, jnp.max(margin), margin[0])
@@ -100,12 +132,23 @@ def _among(kind, *kinds: int) -> Bool[Array, ""]:
     return functools.reduce(jnp.logical_or, [kind == k for k in kinds])
 
 
-def _iterate(chain: Chain, structure: Structure, q: Float[Array, " q"], v: Float[Array, " dofs"], held: Held, schedule: Schedule, unranked: int) -> Newton:
-    """Take the iterations of a schedule. unranked: how many of them take every row, whatever the rank of the structure."""
+def _iterate(
+    chain: Chain,
+    structure: Structure,
+    q: Float[Array, " q"],
+    v: Float[Array, " dofs"],
+    held: Held,
+    schedule: Schedule,
+    unranked: int,
+) -> Newton:
+    """Take the iterations of a schedule. unranked: how many of them take every row, whatever the
+    rank of the structure."""
     (row, column), kinds = scales(chain), schedule.kinds
     active, every = active_dofs(chain, structure), min(6 * len(chain.link_names), chain.dofs)
     # a fixed direction without pattern, as q itself may be singular
-    away = jnp.where(active, 0.05 * np.sin(1.0 + 2.3 * np.arange(chain.dofs)) * column, 0).astype(q.dtype)
+    away = jnp.where(active, 0.05 * np.sin(1.0 + 2.3 * np.arange(chain.dofs)) * column, 0).astype(
+        q.dtype
+    )
 
     @functools.partial(jax.checkpoint, prevent_cse=False)
     def one(now: Newton, x) -> tuple[Newton, None]:
@@ -116,11 +159,25 @@ def _iterate(chain: Chain, structure: Structure, q: Float[Array, " q"], v: Float
         J, gaps = scaled_jacobian(chain, structure, kin, end), row * gap(structure, end).ravel()
         free = J
         for which, mask in ((CLOSE_HELD, held.q), (VELOCITY_HELD, held.v)):
-            free = free if mask is None or which not in kinds else jnp.where(mask[None] & (kind == which), 0, free)
-        wanted = None if structure.independent is None or IMPACT not in kinds else structure.independent & (kind == IMPACT)
-        full, weak = select(free, jnp.where(ranked, now.rank, every), wanted), jnp.where(ranked, held_part(q.dtype) * now.margin, 0)
-        # along weaker steps a gap is of second order, and dividing by them would only amplify round-off
-        selection = without_weak(full, jnp.where(kind == IMPACT, weak, jnp.maximum(rank_tolerance(q.dtype), weak)))
+            free = (
+                free
+                if mask is None or which not in kinds
+                else jnp.where(mask[None] & (kind == which), 0, free)
+            )
+        wanted = (
+            None
+            if structure.independent is None or IMPACT not in kinds
+            else structure.independent & (kind == IMPACT)
+        )
+        full, weak = (
+            select(free, jnp.where(ranked, now.rank, every), wanted),
+            jnp.where(ranked, held_part(q.dtype) * now.margin, 0),
+        )
+        # along weaker steps a gap is of second order, and dividing by them would only amplify
+        # round-off
+        selection = without_weak(
+            full, jnp.where(kind == IMPACT, weak, jnp.maximum(rank_tolerance(q.dtype), weak))
+        )
         of_v = _among(kind, VELOCITY_HELD, VELOCITY)
         residual = jnp.where(of_v, J @ (now.v / column), gaps) if VELOCITY in kinds else gaps
         step = -least_change(chain, structure, kin, selection, free, residual[:, None])[:, 0]
@@ -129,15 +186,32 @@ def _iterate(chain: Chain, structure: Structure, q: Float[Array, " q"], v: Float
             now = now.searched(kind, full.size, open_)
         new = now.v + jnp.where(of_v, step, 0), now.wrench, now.lost
         if IMPACT in kinds:
-            new = jax.lax.cond(kind == IMPACT, lambda: velocity_after_impact(chain, structure, kin, selection, J, now.v), lambda: new)
-        moved = integrate(chain, at, jnp.where(kind == PERTURB, away, jnp.where(_among(kind, CLOSE_HELD, CLOSE, RECLOSE), step, 0)))
+            new = jax.lax.cond(
+                kind == IMPACT,
+                lambda: velocity_after_impact(chain, structure, kin, selection, J, now.v),
+                lambda: new,
+            )
+        moved = integrate(
+            chain,
+            at,
+            jnp.where(
+                kind == PERTURB, away, jnp.where(_among(kind, CLOSE_HELD, CLOSE, RECLOSE), step, 0)
+            ),
+        )
         if READ in kinds:
-            read = lambda: with_coordinates(chain, held.read, joint_coordinates(chain, structure, kin, at), at)
+            read = lambda: with_coordinates(
+                chain, held.read, joint_coordinates(chain, structure, kin, at), at
+            )
             moved = jax.lax.cond(kind == READ, read, lambda: moved)
         if COUNT in kinds:
             searching = _among(kind, *RANK)
-            now, moved = dataclasses.replace(now, probe=jnp.where(searching, moved, now.probe)), jnp.where(searching, now.q, moved)
-        return dataclasses.replace(now, q=moved, v=new[0], wrench=new[1], lost=new[2], left=open_), None
+            now, moved = (
+                dataclasses.replace(now, probe=jnp.where(searching, moved, now.probe)),
+                jnp.where(searching, now.q, moved),
+            )
+        return dataclasses.replace(
+            now, q=moved, v=new[0], wrench=new[1], lost=new[2], left=open_
+        ), None
 
     xs = jnp.asarray(np.array(kinds, np.int32)), jnp.asarray(np.arange(len(kinds)) >= unranked)
     return jax.lax.scan(one, Newton.init(chain, structure, q, jnp.where(active, v, 0)), xs)[0]
@@ -150,10 +224,13 @@ def _solve(chain: Chain, structure: Structure, q, v, held: Held, schedule: Sched
 
 
 def _solve_jvp(primals, tangents):
-    """Return the tangent of the iterations that move q or v, with the rank that was found; the search for the rank has no part in derivatives."""
+    """Return the tangent of the iterations that move q or v, with the rank that was found; the
+    search for the rank has no part in derivatives."""
     found = solve_structure(*primals)
     chain, structure, q, v, held, schedule = primals
-    ranked = eqx.tree_at(lambda s: (s.rank, s.margin), structure, (found.rank, jax.lax.stop_gradient(found.margin)))
+    ranked = eqx.tree_at(
+        lambda s: (s.rank, s.margin), structure, (found.rank, jax.lax.stop_gradient(found.margin))
+    )
     moving = Schedule(tuple(kind for kind in schedule.kinds if kind not in RANK))
 
     @eqx.filter_checkpoint
@@ -163,16 +240,20 @@ def _solve_jvp(primals, tangents):
 
     along = eqx.filter_jvp(moved, (chain, ranked, q, v), tangents[:4])[1]
     none = jax.tree.map(lambda x: None, found)
-    return found, eqx.tree_at(lambda t: (t.q, t.v, t.wrench, t.lost), none, along, is_leaf=lambda x: x is None)
+    return found, eqx.tree_at(
+        lambda t: (t.q, t.v, t.wrench, t.lost), none, along, is_leaf=lambda x: x is None
+    )
 
 
-# solve_structure(chain, structure, q, v, held, schedule) -> Newton: the state of the iteration after a schedule
+# solve_structure(chain, structure, q, v, held, schedule) -> Newton: the state of the iteration
+# after a schedule
 solve_structure = operation("solve_structure", _solve, _solve_jvp)
 
 
 @jax.jit
 def decide_rank(chain: Chain, structure: Structure, q: Float[Array, " q"]) -> Structure:
-    """Return the structure with its rank m: the larger one of those at q and at a closed configuration nearby, as q itself may be singular."""
+    """Return the structure with its rank m: the larger one of those at q and at a closed
+    configuration nearby, as q itself may be singular."""
     if not len(chain.topology.link_names):
         return structure
     frozen = jax.lax.stop_gradient((chain, structure, q))

@@ -19,10 +19,12 @@ def _listed(x):
 
 
 class Grip(eqx.Module):
-    """A joint to be made between two bodies with a spare slot (`svkc.load(..., spare=n)`), where they are: `bind=` of an event.
+    """A joint to be made between two bodies with a spare slot (`svkc.load(..., spare=n)`), where
+    they are: `bind=` of an event.
 
-    parent, real: body names; joint: any but universal and pairs of turns, for whose coordinates a slot has no room; axis: of the joint, in the parent;
-    real_pos (m): the point in the real link, differentiable; slot: name of the slot, None: the first that is free.
+    parent, real: body names; joint: any but universal and pairs of turns, for whose coordinates a
+    slot has no room; axis: of the joint, in the parent; real_pos (m): the point in the real link,
+    differentiable; slot: name of the slot, None: the first that is free.
     """
 
     parent: str = eqx.field(static=True)
@@ -37,7 +39,9 @@ def checked_freedoms(joint) -> tuple[bool, ...]:
     """The joint's six Booleans; ValueError for those a spare slot has no coordinates for."""
     freedoms = joint_freedoms(joint)
     if sum(freedoms[:3]) == 2:
-        raise ValueError(f"bind: a spare slot has no coordinates for {joint!r}; declare the link when loading")
+        raise ValueError(
+            f"bind: a spare slot has no coordinates for {joint!r}; declare the link when loading"
+        )
     return freedoms
 
 
@@ -59,8 +63,11 @@ def placed(name: str, value, dtype):
     return place
 
 
-def put(structure: Structure, at: Bool[Array, " links"], rows, freedoms, quat, pos, real_pos) -> Structure:
-    """The structure with the links in the mask `at` between two rows, by such a joint, at such a place."""
+def put(
+    structure: Structure, at: Bool[Array, " links"], rows, freedoms, quat, pos, real_pos
+) -> Structure:
+    """The structure with the links in the mask `at` between two rows, by such a joint, at such a
+    place."""
     dtype = structure.pos.dtype
     wide = at[:, None]
     return eqx.tree_at(
@@ -80,11 +87,19 @@ def put(structure: Structure, at: Bool[Array, " links"], rows, freedoms, quat, p
 def holding(chain: Chain, structure: Structure, parent: str, real: str) -> Bool[Array, " links"]:
     """Spare slots that are bound between these two bodies and connected."""
     p, r = rows_of(chain, parent, real)
-    return jnp.asarray(np.array(chain.topology.link_spare, bool)) & structure.connected & (structure.parent == p) & (structure.real == r)
+    return (
+        jnp.asarray(np.array(chain.topology.link_spare, bool))
+        & structure.connected
+        & (structure.parent == p)
+        & (structure.real == r)
+    )
 
 
-def grip(chain: Chain, structure: Structure, wish: Grip) -> tuple[Structure, Bool[Array, " links"], Bool[Array, ""]]:
-    """The structure with a slot bound as wished, the slot to connect (none where the two bodies are held already), and whether none was free."""
+def grip(
+    chain: Chain, structure: Structure, wish: Grip
+) -> tuple[Structure, Bool[Array, " links"], Bool[Array, ""]]:
+    """The structure with a slot bound as wished, the slot to connect (none where the two bodies are
+    held already), and whether none was free."""
     spare = jnp.asarray(np.array(chain.topology.link_spare, bool))
     rows = rows_of(chain, wish.parent, wish.real)
     if wish.slot is None:
@@ -94,7 +109,15 @@ def grip(chain: Chain, structure: Structure, wish: Grip) -> tuple[Structure, Boo
         slot = (jnp.arange(spare.shape[0]) == spare_slot(chain, wish.slot)) & ~structure.connected
     held = jnp.any(holding(chain, structure, wish.parent, wish.real))
     slot = slot & ~held
-    bound = put(structure, slot, rows, checked_freedoms(wish.joint), to_axis(wish.axis), jnp.zeros(3, structure.pos.dtype), wish.real_pos)
+    bound = put(
+        structure,
+        slot,
+        rows,
+        checked_freedoms(wish.joint),
+        to_axis(wish.axis),
+        jnp.zeros(3, structure.pos.dtype),
+        wish.real_pos,
+    )
     return bound, slot, ~held & ~jnp.any(slot)
 
 
@@ -105,14 +128,39 @@ def emptied(structure: Structure, slots: Bool[Array, " links"]) -> Structure:
 
 
 def bind(
-    chain: Chain, state: State, name: str, parent: str, real: str, *, joint="weld", axis=(0.0, 0.0, 1.0), pos=(0.0, 0.0, 0.0), real_pos=(0.0, 0.0, 0.0)
+    chain: Chain,
+    state: State,
+    name: str,
+    parent: str,
+    real: str,
+    *,
+    joint="weld",
+    axis=(0.0, 0.0, 1.0),
+    pos=(0.0, 0.0, 0.0),
+    real_pos=(0.0, 0.0, 0.0),
 ) -> State:
-    """A spare slot put between two bodies, not connected yet: run-time data, no retrace. Connect it with here=True, or at this placement.
+    """A spare slot put between two bodies, not connected yet: run-time data, no retrace. Connect it
+    with here=True, or at this placement.
 
-    joint: any but universal and pairs of turns, whose coordinates a spare slot has no room for. axis: of the joint, in the parent. pos, real_pos (m): in
-    the two bodies. ValueError: not a spare slot, unknown bodies. In a run: `svkc.at(t, bind=svkc.Grip(...))`.
+    joint: any but universal and pairs of turns, whose coordinates a spare slot has no room for.
+    axis: of the joint, in the parent. pos, real_pos (m): in the two bodies. ValueError: not a spare
+    slot, unknown bodies. In a run: `svkc.at(t, bind=svkc.Grip(...))`.
     """
     check_state(chain, state)
     at = jnp.asarray(np.arange(len(chain.link_names)) == spare_slot(chain, name))
-    pos, real_pos = (placed(what, x, state.q.dtype) for what, x in (("pos", pos), ("real_pos", real_pos)))
-    return State(state.q, state.v, put(state.structure, at, rows_of(chain, parent, real), checked_freedoms(joint), to_axis(axis), pos, real_pos))
+    pos, real_pos = (
+        placed(what, x, state.q.dtype) for what, x in (("pos", pos), ("real_pos", real_pos))
+    )
+    return State(
+        state.q,
+        state.v,
+        put(
+            state.structure,
+            at,
+            rows_of(chain, parent, real),
+            checked_freedoms(joint),
+            to_axis(axis),
+            pos,
+            real_pos,
+        ),
+    )

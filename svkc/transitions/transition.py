@@ -22,32 +22,49 @@ from svkc.transitions.spare_links import emptied
 from svkc.tree.kinematics import kinematics
 
 
-def _restructured(chain: Chain, structure: Structure, connected, locked) -> tuple[Structure, Bool[Array, " links"], Bool[Array, ""]]:
-    """Return the structure with these masks, its rank not decided yet, the links that are new, and whether anything new holds."""
+def _restructured(
+    chain: Chain, structure: Structure, connected, locked
+) -> tuple[Structure, Bool[Array, " links"], Bool[Array, ""]]:
+    """Return the structure with these masks, its rank not decided yet, the links that are new, and
+    whether anything new holds."""
     new_links = connected & ~structure.connected
     holds, after = jnp.any(new_links), eqx.tree_at(lambda s: s.connected, structure, connected)
     if locked is None:
         return after, new_links, holds
     was = jnp.zeros(chain.dofs, bool) if structure.locked is None else structure.locked
-    return eqx.tree_at(lambda s: s.locked, after, locked, is_leaf=lambda x: x is None), new_links, holds | jnp.any(locked & ~was)
+    return (
+        eqx.tree_at(lambda s: s.locked, after, locked, is_leaf=lambda x: x is None),
+        new_links,
+        holds | jnp.any(locked & ~was),
+    )
 
 
 @eqx.filter_checkpoint
-def _placed(chain: Chain, structure: Structure, new_links, here, q) -> tuple[Structure, Float[Array, " q"]]:
-    """Return the structure with the placements of the links in `here`, and q with the coordinates of the new joints read off from where the bodies are."""
+def _placed(
+    chain: Chain, structure: Structure, new_links, here, q
+) -> tuple[Structure, Float[Array, " q"]]:
+    """Return the structure with the placements of the links in `here`, and q with the coordinates
+    of the new joints read off from where the bodies are."""
     kin = kinematics(chain, q)
     if here is not None:
         structure = gripped_here(chain, structure, q, here & new_links, kin)
-    return structure, with_coordinates(chain, new_links, joint_coordinates(chain, structure, kin, q), q)
+    return structure, with_coordinates(
+        chain, new_links, joint_coordinates(chain, structure, kin, q), q
+    )
 
 
 @functools.partial(eager_jit, jit=eqx.filter_jit)
 def change(
-    chain: Chain, state: State, connected: Bool[Array, " links"], locked: Bool[Array, " dofs"] | None = None, here: Bool[Array, " links"] | None = None
+    chain: Chain,
+    state: State,
+    connected: Bool[Array, " links"],
+    locked: Bool[Array, " dofs"] | None = None,
+    here: Bool[Array, " links"] | None = None,
 ) -> Change:
     """The state under another set of connected links and locked joints.
 
-    Where links are only cut or joints only unlocked, q and v are kept bit for bit; where something new holds, coordinates of the new joints
+    Where links are only cut or joints only unlocked, q and v are kept bit for bit; where something
+    new holds, coordinates of the new joints
     are read off, the remaining gap is closed by the least change, and the velocity is projected.
     """
     structure, new_links, holds = _restructured(chain, state.structure, connected, locked)
@@ -55,59 +72,100 @@ def change(
     if not len(chain.link_names):
         after, lost = lock_projection(chain, structure, q, v)
         v = jnp.where(holds, after, v)
-        return Change(State(q, v, structure), nothing, nothing, jnp.where(holds, lost, 0), jnp.zeros((), v.dtype), nothing[:, 0])
+        return Change(
+            State(q, v, structure),
+            nothing,
+            nothing,
+            jnp.where(holds, lost, 0),
+            jnp.zeros((), v.dtype),
+            nothing[:, 0],
+        )
     structure, new_q = _placed(chain, structure, new_links, here, q)
     # the armature of a joint that is made anew is at rest before
-    before = v if chain.link_armature is None else jnp.where(active_dofs(chain, state.structure), v, 0)
+    before = (
+        v if chain.link_armature is None else jnp.where(active_dofs(chain, state.structure), v, 0)
+    )
     joined = solve_structure(chain, structure, new_q, before, Held(), Schedule(RANK + CONNECT))
     structure = eqx.tree_at(lambda s: (s.rank, s.margin), structure, (joined.rank, joined.margin))
     q, v = jnp.where(holds, joined.q, q), jnp.where(holds, joined.v, v)
     wrench, lost = jnp.where(holds, joined.wrench, 0), jnp.where(holds, joined.lost, 0)
-    found, left = jnp.where(holds, jnp.max(joined.open[0]), 0), jnp.where(holds, joined.left, joined.open[0])
+    found, left = (
+        jnp.where(holds, jnp.max(joined.open[0]), 0),
+        jnp.where(holds, joined.left, joined.open[0]),
+    )
     return Change(State(q, v, structure), wrench[:, 3:], wrench[:, :3], lost, found, left)
 
 
 @functools.partial(eager_jit, jit=eqx.filter_jit)
-def release(chain: Chain, state: State, connected: Bool[Array, " links"], locked: Bool[Array, " dofs"] | None = None) -> Change:
-    """`change` where links are only cut and joints only unlocked: q and v stay, the rank is decided anew."""
+def release(
+    chain: Chain,
+    state: State,
+    connected: Bool[Array, " links"],
+    locked: Bool[Array, " dofs"] | None = None,
+) -> Change:
+    """`change` where links are only cut and joints only unlocked: q and v stay, the rank is decided
+    anew."""
     structure, _, _ = _restructured(chain, state.structure, connected, locked)
-    nothing, zero = jnp.zeros((len(chain.link_names), 3), state.v.dtype), jnp.zeros((), state.v.dtype)
-    return Change(State(state.q, state.v, decide_rank(chain, structure, state.q)), nothing, nothing, zero, zero, nothing[:, 0])
+    nothing, zero = (
+        jnp.zeros((len(chain.link_names), 3), state.v.dtype),
+        jnp.zeros((), state.v.dtype),
+    )
+    return Change(
+        State(state.q, state.v, decide_rank(chain, structure, state.q)),
+        nothing,
+        nothing,
+        zero,
+        zero,
+        nothing[:, 0],
+    )
 
 
 def transition(chain: Chain, state: State, connected) -> State:
-    """The state with exactly these virtual links connected (mask, or names): new ones with their impact (paper, (29)-(38)), the others cut."""
+    """The state with exactly these virtual links connected (mask, or names): new ones with their
+    impact (paper, (29)-(38)), the others cut."""
     check_state(chain, state)
     mask = jnp.asarray(connection_mask(chain, connected))
     return _checked(chain, change(chain, state, mask))
 
 
 def connect(chain: Chain, state: State, *names: str, here: bool = False) -> State:
-    """Connects virtual links: coordinates of the new joints, and the velocity after the impact (paper, section V-C).
+    """Connects virtual links: coordinates of the new joints, and the velocity after the impact
+    (paper, section V-C).
 
-    At their declared placement, where the bodies must already be; here=True: the joint is made where the real link is. ValueError: unknown
+    At their declared placement, where the bodies must already be; here=True: the joint is made
+    where the real link is. ValueError: unknown
     names, or bodies that are not at the placement (says by how much).
     """
     check_state(chain, state)
     chosen = np.isin(np.arange(len(chain.link_names)), [link_index(chain, n) for n in names])
     mask = state.structure.connected | jnp.asarray(chosen)
-    return _checked(chain, change(chain, state, mask, here=jnp.asarray(chosen) if yes_or_no("here", here) else None))
+    return _checked(
+        chain,
+        change(chain, state, mask, here=jnp.asarray(chosen) if yes_or_no("here", here) else None),
+    )
 
 
 def _checked(chain: Chain, done: Change) -> State:
-    """The state after a change; an error where bodies were too far from the declared placement to be joined."""
+    """The state after a change; an error where bodies were too far from the declared placement to
+    be joined."""
     limit = connect_tolerance
     if isinstance(done.gap, jax.core.Tracer):
-        return eqx.error_if(done.state, done.gap > limit, "connect: the bodies are not where the joint is declared; use here=True")
+        return eqx.error_if(
+            done.state,
+            done.gap > limit,
+            "connect: the bodies are not where the joint is declared; use here=True",
+        )
     if done.gap > limit:
         raise ValueError(
-            f"connect: the bodies are {float(done.gap):.3g} (rad, or lengths of {float(chain.length):.3g} m) away from where the joint is "
-            "declared; move them there, or grip where they are with here=True"
+            f"connect: the bodies are {float(done.gap):.3g} (rad, or lengths of"
+            f" {float(chain.length):.3g} m) away from where the joint is declared; move them there,"
+            " or grip where they are with here=True"
         )
     return check_closed(chain, done.state, done.left)
 
 
-# gap, in rad or in `chain.length`s, up to which connecting may still move the bodies to their declared placement
+# gap, in rad or in `chain.length`s, up to which connecting may still move the bodies to their
+# declared placement
 connect_tolerance = 1e-2
 
 
@@ -120,14 +178,17 @@ def cut(chain: Chain, state: State, *names: str) -> State:
 
 def _locked(chain: Chain, state: State, joints, value: bool) -> State:
     check_state(chain, state)
-    locked = jnp.zeros(chain.dofs, bool) if state.structure.locked is None else state.structure.locked
+    locked = (
+        jnp.zeros(chain.dofs, bool) if state.structure.locked is None else state.structure.locked
+    )
     for name in joints:
         locked = locked.at[joint_slice(chain, name, V_SIZE, chain.topology.v_start)].set(value)
     return (change if value else release)(chain, state, state.structure.connected, locked).state
 
 
 def lock(chain: Chain, state: State, *joints: str) -> State:
-    """Holds joints of the tree still from now on, with the impact of stopping them: velocities (rad/s, m/s) as by (29)-(38) for connecting."""
+    """Holds joints of the tree still from now on, with the impact of stopping them: velocities
+    (rad/s, m/s) as by (29)-(38) for connecting."""
     return _locked(chain, state, joints, True)
 
 
@@ -137,7 +198,8 @@ def unlock(chain: Chain, state: State, *joints: str) -> State:
 
 
 def unbind(chain: Chain, state: State, *names: str) -> State:
-    """Cuts spare virtual links and empties their slots for other bodies; q and v stay as they are."""
+    """Cuts spare virtual links and empties their slots for other bodies; q and v stay as they
+    are."""
     check_state(chain, state)
     slots = np.isin(np.arange(len(chain.link_names)), [spare_slot(chain, n) for n in names])
     after = release(chain, state, state.structure.connected & ~jnp.asarray(slots)).state

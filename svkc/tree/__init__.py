@@ -1,1 +1,2 @@
-"""Open chains: spatial algebra, kinematics, inverse dynamics, mass matrix, articulated bodies, energy."""
+"""Open chains: spatial algebra, kinematics, inverse dynamics, mass matrix, articulated bodies,
+energy."""

@@ -1,7 +1,8 @@
 """Articulated bodies (Featherstone chapter 7): M^-1 f on the tree without M, level by level.
 
-In world axes about the root's origin articulated inertias add up along the tree as they are. All rows of a level are one array; a joint of fewer freedoms
-than its level's widest has freedoms that are nothing: no motion, an inertia of one.
+In world axes about the root's origin articulated inertias add up along the tree as they are. All
+rows of a level are one array; a joint of fewer freedoms than its level's widest has freedoms that
+are nothing: no motion, an inertia of one.
 """
 
 from typing import NamedTuple
@@ -21,15 +22,19 @@ from svkc.tree.traversal import beside, from_rows, levels, paired, sweep, zeros
 
 
 class Body(NamedTuple):
-    """What `accelerations` needs of the bodies of one level: joint axes S, U = S I^A, (S I^A S^T)^-1."""
+    """What `accelerations` needs of the bodies of one level: joint axes S, U = S I^A, (S I^A
+    S^T)^-1."""
 
     S: Float[Array, "*levels n d 6"]
     U: Float[Array, "*levels n d 6"]
     inverse: Float[Array, "*levels n d d"]
 
 
-def articulate(chain: Chain, kin: Kinematics, free: Bool[Array, " nv"] | None = None) -> list[Body] | Body:
-    """Articulated inertias from the leaves to the roots. free: coordinates that are not locked (None: all)."""
+def articulate(
+    chain: Chain, kin: Kinematics, free: Bool[Array, " nv"] | None = None
+) -> list[Body] | Body:
+    """Articulated inertias from the leaves to the roots. free: coordinates that are not locked
+    (None: all)."""
     top, own = chain.topology, body_inertias(chain, kin)
     S = kin.S if free is None else jnp.where(free[:, None], kin.S, 0)
     more = jnp.zeros(chain.nv, S.dtype) if chain.armature is None else chain.armature
@@ -45,7 +50,9 @@ def articulate(chain: Chain, kin: Kinematics, free: Bool[Array, " nv"] | None = 
         along = jnp.sum(inverse[..., None] * U[:, None], 2)
         return A - jnp.sum(U[:, :, :, None] * along[:, :, None, :], 1), Body(s, U, inverse)
 
-    given = beside(top, lambda x: take(own, x.rows), lambda x: take(S, x.dofs), lambda x: take(more, x.dofs))
+    given = beside(
+        top, lambda x: take(own, x.rows), lambda x: take(S, x.dofs), lambda x: take(more, x.dofs)
+    )
     return sweep(step, zeros(top, 6, 6, dtype=S.dtype), given, reverse=True)
 
 
@@ -54,7 +61,8 @@ def _apply(A: Float[Array, "n i j"], x: Float[Array, "n j *k"]) -> Float[Array, 
 
 
 def _carried(top: Topology, bodies, f: Float[Array, "nv *k"]):
-    """For each level the forces that its joints are left with, those from below taken off, and the accelerations that these give each joint alone."""
+    """For each level the forces that its joints are left with, those from below taken off, and the
+    accelerations that these give each joint alone."""
 
     def step(below, given):
         (level, force), body = given
@@ -64,15 +72,22 @@ def _carried(top: Topology, bodies, f: Float[Array, "nv *k"]):
         passed = _apply(jnp.swapaxes(body.U, 1, 2), x)
         return passed if p is None else passed + p, (u, x)
 
-    return sweep(step, zeros(top, 6, *f.shape[1:], dtype=f.dtype), paired(beside(top, lambda x: take(f, x.dofs)), bodies), reverse=True)
+    return sweep(
+        step,
+        zeros(top, 6, *f.shape[1:], dtype=f.dtype),
+        paired(beside(top, lambda x: take(f, x.dofs)), bodies),
+        reverse=True,
+    )
 
 
 def seen_by(top: Topology, bodies, J: Float[Array, "rows nv"]) -> Float[Array, "rows rows"]:
-    """J M^-1 J^T. M = L D L^T with a joint's block of D for each (Featherstone section 6.5), so that half the way to M^-1 J^T is enough."""
+    """J M^-1 J^T. M = L D L^T with a joint's block of D for each (Featherstone section 6.5), so
+    that half the way to M^-1 J^T is enough."""
     parts = _carried(top, bodies, J.T)
     parts = parts if isinstance(parts, list) else [parts]
     u, x = (jnp.concatenate([part[i].reshape(-1, J.shape[0]) for part in parts]) for i in (0, 1))
-    # sums, not a `dot`, which XLA's CPU backend would not put into one kernel with what is around it
+    # sums, not a `dot`, which XLA's CPU backend would not put into one kernel with what is around
+    # it
     return sum_by_few(u[:, :, None] * x[:, None], (0,))
 
 
@@ -88,6 +103,12 @@ def accelerations(top: Topology, bodies, f: Float[Array, " nv"]) -> Float[Array,
         return moved if above is None else a + moved, x
 
     found = levels(top)
-    x = sweep(step, zeros(top, 6, dtype=f.dtype), paired(paired(found, bodies), _carried(top, bodies, f)))
-    x, order = (jnp.concatenate([y.ravel() for y in x]), [y.dofs for y in found]) if isinstance(found, list) else (x.ravel(), [found.dofs])
+    x = sweep(
+        step, zeros(top, 6, dtype=f.dtype), paired(paired(found, bodies), _carried(top, bodies, f))
+    )
+    x, order = (
+        (jnp.concatenate([y.ravel() for y in x]), [y.dofs for y in found])
+        if isinstance(found, list)
+        else (x.ravel(), [found.dofs])
+    )
     return take(x, np.argsort(np.concatenate([y.ravel() for y in order]), kind="stable")[: top.nv])

@@ -8,37 +8,55 @@ from jaxtyping import Array, Float
 from svkc._jax.static_gather import take
 from svkc.model.chain import Chain
 from svkc.model.checked_jit import check_chain, vector, verb
-from svkc.tree.spatial import quat_conjugate, quat_exp, quat_log, quat_multiply, quat_normalize, quat_rate
+from svkc.tree.spatial import (
+    quat_conjugate,
+    quat_exp,
+    quat_log,
+    quat_multiply,
+    quat_normalize,
+    quat_rate,
+)
 from svkc.tree.traversal import put
 
 
 def rates(chain: Chain, q: Float[Array, " q"], v: Float[Array, " dofs"]) -> Float[Array, " q"]:
-    """Qdot for the velocities v: quaternions turn by qdot = q w / 2, everything else is its own rate."""
+    """Qdot for the velocities v: quaternions turn by qdot = q w / 2, everything else is its own
+    rate."""
     quat_q, quat_v = chain.topology.quaternions
     scalar_q, scalar_v = chain.topology.scalars
-    turn = quat_rate(take(q, quat_q[:, None] + np.arange(4)), take(v, quat_v[:, None] + np.arange(3)))
+    turn = quat_rate(
+        take(q, quat_q[:, None] + np.arange(4)), take(v, quat_v[:, None] + np.arange(3))
+    )
     order = np.argsort(np.concatenate([scalar_q, (quat_q[:, None] + np.arange(4)).ravel()]))
     return take(jnp.concatenate([take(v, scalar_v), turn.ravel()]), order)
 
 
 @verb
 def integrate(chain: Chain, q: Float[Array, " q"], dv: Float[Array, " dofs"]) -> Float[Array, " q"]:
-    """Q moved by the tangent vector dv (m, rad; body axes for rotations): the exponential map, Rodrigues' formula (39)."""
+    """Q moved by the tangent vector dv (m, rad; body axes for rotations): the exponential map,
+    Rodrigues' formula (39)."""
     quat_q, quat_v = chain.topology.quaternions
     scalar_q, scalar_v = chain.topology.scalars
     at = quat_q[:, None] + np.arange(4)
-    turned = quat_multiply(quat_normalize(take(q, at)), quat_exp(take(dv, quat_v[:, None] + np.arange(3))))
+    turned = quat_multiply(
+        quat_normalize(take(q, at)), quat_exp(take(dv, quat_v[:, None] + np.arange(3)))
+    )
     order = np.argsort(np.concatenate([scalar_q, at.ravel()]))
     return take(jnp.concatenate([take(q, scalar_q) + take(dv, scalar_v), turned.ravel()]), order)
 
 
 @verb
-def difference(chain: Chain, q1: Float[Array, " q"], q2: Float[Array, " q"]) -> Float[Array, " dofs"]:
-    """The tangent vector (m, rad, in the coordinates of v) that takes q1 to q2: integrate(q1, difference(q1, q2)) = q2."""
+def difference(
+    chain: Chain, q1: Float[Array, " q"], q2: Float[Array, " q"]
+) -> Float[Array, " dofs"]:
+    """The tangent vector (m, rad, in the coordinates of v) that takes q1 to q2: integrate(q1,
+    difference(q1, q2)) = q2."""
     quat_q, quat_v = chain.topology.quaternions
     scalar_q, scalar_v = chain.topology.scalars
     at = quat_q[:, None] + np.arange(4)
-    turn = quat_log(quat_multiply(quat_conjugate(quat_normalize(take(q1, at))), quat_normalize(take(q2, at))))
+    turn = quat_log(
+        quat_multiply(quat_conjugate(quat_normalize(take(q1, at))), quat_normalize(take(q2, at)))
+    )
     order = np.argsort(np.concatenate([scalar_v, (quat_v[:, None] + np.arange(3)).ravel()]))
     return take(jnp.concatenate([take(q2, scalar_q) - take(q1, scalar_q), turn.ravel()]), order)
 
@@ -53,13 +71,20 @@ def normalize(chain: Chain, q: Float[Array, " q"]) -> Float[Array, " q"]:
 
 
 def tangent(chain: Chain, q, gradient) -> Float[Array, " dofs"]:
-    """A gradient by q as one in the tangent of the configuration (per m, rad): of f(integrate(chain, q, dv)) by dv at dv = 0.
+    """A gradient by q as one in the tangent of the configuration (per m, rad): of
+    f(integrate(chain, q, dv)) by dv at dv = 0.
 
-    What an optimiser should step along: q <- integrate(chain, q, -rate * tangent(chain, q, gradient)) keeps quaternions at unit length.
+    What an optimiser should step along: q <- integrate(chain, q, -rate * tangent(chain, q,
+    gradient)) keeps quaternions at unit length.
     """
     check_chain(chain)
-    q, gradient = (vector(chain, name, x, chain.topology.nq_all) for name, x in (("q", q), ("gradient", gradient)))
-    return jax.vjp(lambda dv: integrate(chain, q, dv), jnp.zeros(chain.dofs, q.dtype))[1](gradient)[0]
+    q, gradient = (
+        vector(chain, name, x, chain.topology.nq_all)
+        for name, x in (("q", q), ("gradient", gradient))
+    )
+    return jax.vjp(lambda dv: integrate(chain, q, dv), jnp.zeros(chain.dofs, q.dtype))[1](gradient)[
+        0
+    ]
 
 
 def xyzw(chain: Chain, q) -> Float[Array, " q"]:

@@ -11,7 +11,8 @@ from svkc.tree.spatial import cross, rotate
 
 
 def _bodies(chain: Chain, kin: Kinematics, v):
-    """Of each row: centre of mass from the root's origin, its velocity, angular velocity, angular momentum about it."""
+    """Of each row: centre of mass from the root's origin, its velocity, angular velocity, angular
+    momentum about it."""
     V = twists(chain, kin, v)
     c = kin.r + rotate(kin.R, chain.com)
     w = V[:, :3]
@@ -19,14 +20,19 @@ def _bodies(chain: Chain, kin: Kinematics, v):
     return c, V[:, 3:] + cross(w, c), w, spin
 
 
-def _energies(chain: Chain, state: State, kin: Kinematics, bodies) -> tuple[Float[Array, ""], Float[Array, ""]]:
+def _energies(
+    chain: Chain, state: State, kin: Kinematics, bodies
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
     c, u, w, spin = bodies
     kinetic = jnp.sum(chain.mass * jnp.sum(u * u, -1)) / 2 + jnp.sum(w * spin) / 2
     if chain.armature is not None:
         kinetic = kinetic + jnp.sum(chain.armature * state.v[: chain.nv] ** 2) / 2
     active = active_dofs(chain, state.structure)
     if chain.link_armature is not None:
-        kinetic = kinetic + jnp.sum(jnp.where(active, state.v, 0)[chain.nv :] ** 2 * chain.link_armature) / 2
+        kinetic = (
+            kinetic
+            + jnp.sum(jnp.where(active, state.v, 0)[chain.nv :] ** 2 * chain.link_armature) / 2
+        )
     potential = -jnp.sum(chain.mass * jnp.sum((kin.root + c) * chain.gravity[None], -1))
     if chain.stiffness is not None:
         stretch = jnp.where(active, difference(chain, chain.q_spring, state.q), 0)
@@ -53,13 +59,17 @@ def potential_energy(chain: Chain, state: State) -> Float[Array, ""]:
 
 @verb(eager=True)
 def energy(chain: Chain, state: State) -> Float[Array, ""]:
-    """Mechanical energy (J): kinetic, gravity's and the joint springs' (Featherstone section 2.13)."""
+    """Mechanical energy (J): kinetic, gravity's and the joint springs' (Featherstone section
+    2.13)."""
     kinetic, potential = _both(chain, state)
     return kinetic + potential
 
 
-def energy_and_momentum(chain: Chain, state: State, kin: Kinematics) -> tuple[Float[Array, ""], Float[Array, "3"], Float[Array, "3"]]:
-    """Return `energy`, linear momentum (N s), and angular momentum about the centre of mass of all bodies (N m s), in world axes."""
+def energy_and_momentum(
+    chain: Chain, state: State, kin: Kinematics
+) -> tuple[Float[Array, ""], Float[Array, "3"], Float[Array, "3"]]:
+    """Return `energy`, linear momentum (N s), and angular momentum about the centre of mass of all
+    bodies (N m s), in world axes."""
     bodies = _bodies(chain, kin, state.v)
     kinetic, potential = _energies(chain, state, kin, bodies)
     c, u, _, spin = bodies
@@ -70,7 +80,8 @@ def energy_and_momentum(chain: Chain, state: State, kin: Kinematics) -> tuple[Fl
 
 @verb(eager=True)
 def momentum(chain: Chain, state: State) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-    """Linear momentum (N s) and angular momentum about the world's origin (N m s), in world axes (Featherstone section 2.12)."""
+    """Linear momentum (N s) and angular momentum about the world's origin (N m s), in world axes
+    (Featherstone section 2.12)."""
     kin = kinematics(chain, state.q)
     c, u, _, spin = _bodies(chain, kin, state.v)
     p = chain.mass[:, None] * u

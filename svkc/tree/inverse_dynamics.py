@@ -1,4 +1,5 @@
-"""Recursive Newton-Euler on the tree (Featherstone chapter 5), and the forces of springs, dampers and joint limits."""
+"""Recursive Newton-Euler on the tree (Featherstone chapter 5), and the forces of springs, dampers
+and joint limits."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -12,10 +13,14 @@ from svkc.tree.spatial import cross, halves, rotate
 from svkc.tree.traversal import down, put, to_rows, up
 
 
-def newton_euler(chain: Chain, kin: Kinematics, V: Float[Array, "rows 6"] | None, A: Float[Array, "rows 6"]) -> Float[Array, " nv"]:
-    """Joint forces S^T F that give every row the spatial acceleration A at the twist V (None: at rest); Featherstone section 5.3.
+def newton_euler(
+    chain: Chain, kin: Kinematics, V: Float[Array, "rows 6"] | None, A: Float[Array, "rows 6"]
+) -> Float[Array, " nv"]:
+    """Joint forces S^T F that give every row the spatial acceleration A at the twist V (None: at
+    rest); Featherstone section 5.3.
 
-    Each body's force is taken at its centre of mass, where gyroscopic terms need no parallel axes, and moved to the root's origin.
+    Each body's force is taken at its centre of mass, where gyroscopic terms need no parallel axes,
+    and moved to the root's origin.
     """
     c = kin.r + rotate(kin.R, chain.com)
     alpha, acceleration = halves(A)
@@ -35,9 +40,14 @@ def newton_euler(chain: Chain, kin: Kinematics, V: Float[Array, "rows 6"] | None
     return jnp.sum(kin.S * take(F, chain.topology.dof_row), -1)
 
 
-def generalized_forces(chain: Chain, kin: Kinematics, V, v, vdot: Float[Array, " nv"]) -> Float[Array, " nv"]:
+def generalized_forces(
+    chain: Chain, kin: Kinematics, V, v, vdot: Float[Array, " nv"]
+) -> Float[Array, " nv"]:
     """ID(q, v, vdot) of the tree with gravity and armature (paper, section III-A, step 2)."""
-    A = down(chain.topology, to_rows(chain.topology, kin.S * vdot[:, None]) + velocity_products(chain, kin, V, v))
+    A = down(
+        chain.topology,
+        to_rows(chain.topology, kin.S * vdot[:, None]) + velocity_products(chain, kin, V, v),
+    )
     A = A - jnp.concatenate([jnp.zeros_like(chain.gravity), chain.gravity])[None]
     tau = newton_euler(chain, kin, V, A)
     return tau if chain.armature is None else tau + chain.armature * vdot
@@ -50,8 +60,11 @@ def inertia_times(chain: Chain, kin: Kinematics, x: Float[Array, " nv"]) -> Floa
     return tau if chain.armature is None else tau + chain.armature * x
 
 
-def passive_forces(chain: Chain, q: Float[Array, " q"], v: Float[Array, " dofs"]) -> Float[Array, " dofs"]:
-    """Springs and dampers of the model's joints (N m, N), MuJoCo's meaning: -stiffness (q - q_spring) - damping v."""
+def passive_forces(
+    chain: Chain, q: Float[Array, " q"], v: Float[Array, " dofs"]
+) -> Float[Array, " dofs"]:
+    """Springs and dampers of the model's joints (N m, N), MuJoCo's meaning: -stiffness (q -
+    q_spring) - damping v."""
     tau = jnp.zeros_like(v)
     if chain.damping is not None:
         tau = tau - chain.damping * v
@@ -61,10 +74,14 @@ def passive_forces(chain: Chain, q: Float[Array, " q"], v: Float[Array, " dofs"]
     return tau
 
 
-def limit_forces(chain: Chain, q: Float[Array, " q"], v: Float[Array, " dofs"]) -> Float[Array, " dofs"]:
-    """The torque that keeps joints inside their range (paper, section VII-B): a stiff spring and damper that act outside of it only.
+def limit_forces(
+    chain: Chain, q: Float[Array, " q"], v: Float[Array, " dofs"]
+) -> Float[Array, " dofs"]:
+    """The torque that keeps joints inside their range (paper, section VII-B): a stiff spring and
+    damper that act outside of it only.
 
-    With x the distance outside and a = 0.02 rad or m: -(k x + c v) exp(-a / x); zero inside. All derivatives are continuous where it sets in: a kink
+    With x the distance outside and a = 0.02 rad or m: -(k x + c v) exp(-a / x); zero inside. All
+    derivatives are continuous where it sets in: a kink
     there would cost adaptive steps of high order more than the motion itself.
     """
     tau = jnp.zeros_like(v)
@@ -81,20 +98,27 @@ def limit_forces(chain: Chain, q: Float[Array, " q"], v: Float[Array, " dofs"]) 
 
 @verb
 def bias_force(chain: Chain, state: State) -> Float[Array, " nv"]:
-    """Velocity-product and gravity forces (N, N m) of the tree: ID(q, v, 0) (MuJoCo's qfrc_bias; Featherstone section 6.1)."""
+    """Velocity-product and gravity forces (N, N m) of the tree: ID(q, v, 0) (MuJoCo's qfrc_bias;
+    Featherstone section 6.1)."""
     kin = kinematics(chain, state.q)
     V = twists(chain, kin, state.v)
     return generalized_forces(chain, kin, V, state.v, jnp.zeros(chain.nv, state.v.dtype))
 
 
 @verb
-def inverse_dynamics(chain: Chain, state: State, vdot: Float[Array, " accelerations"]) -> Float[Array, " nv"]:
-    """Torques (N m, N) the tree's joints must be given for vdot (over the tree, or over every coordinate): recursive Newton-Euler.
+def inverse_dynamics(
+    chain: Chain, state: State, vdot: Float[Array, " accelerations"]
+) -> Float[Array, " nv"]:
+    """Torques (N m, N) the tree's joints must be given for vdot (over the tree, or over every
+    coordinate): recursive Newton-Euler.
 
-    What springs and dampers of the joints give by themselves is taken off, so that this is the inverse of `forward_dynamics` on a tree.
+    What springs and dampers of the joints give by themselves is taken off, so that this is the
+    inverse of `forward_dynamics` on a tree.
     """
     if vdot.shape not in ((chain.nv,), (chain.dofs,)):
-        raise ValueError(f"vdot: got shape {vdot.shape}, expected {chain.nv} (the tree's) or {chain.dofs} (all)")
+        raise ValueError(
+            f"vdot: got shape {vdot.shape}, expected {chain.nv} (the tree's) or {chain.dofs} (all)"
+        )
     kin = kinematics(chain, state.q)
     V = twists(chain, kin, state.v)
     tau = generalized_forces(chain, kin, V, state.v, vdot[: chain.nv])

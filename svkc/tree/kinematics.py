@@ -1,6 +1,7 @@
 """Poses, twists and accelerations of the tree.
 
-Joint kinds are few and known beforehand: all joints of one kind are one array, and a level of the tree is one operation.
+Joint kinds are few and known beforehand: all joints of one kind are one array, and a level of the
+tree is one operation.
 """
 
 import equinox as eqx
@@ -13,12 +14,21 @@ from svkc._jax.static_gather import take
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import verb
 from svkc.model.topology import BALL, FREE, HINGE, SLIDE, Topology
-from svkc.tree.spatial import cross, motion_cross, quat_about, quat_matrix, quat_multiply, quat_normalize, rotate
+from svkc.tree.spatial import (
+    cross,
+    motion_cross,
+    quat_about,
+    quat_matrix,
+    quat_multiply,
+    quat_normalize,
+    rotate,
+)
 from svkc.tree.traversal import LEVELS_UNROLLED, down, put, to_rows
 
 
 class Kinematics(eqx.Module):
-    """Poses and joint axes at one configuration: rotation, quaternion, place relative to the root's origin, the root's place, motion subspace S."""
+    """Poses and joint axes at one configuration: rotation, quaternion, place relative to the root's
+    origin, the root's place, motion subspace S."""
 
     R: Float[Array, "rows 3 3"]
     quat: Float[Array, "rows 4"]
@@ -28,13 +38,22 @@ class Kinematics(eqx.Module):
 
 
 def _joint_poses(chain: Chain, q: Float[Array, " q"]):
-    """Of each row in its parent: rotation [rows 4], the same without the joint's own turn, and offset along the slide [rows]."""
+    """Of each row in its parent: rotation [rows 4], the same without the joint's own turn, and
+    offset along the slide [rows]."""
     top, start = chain.topology, np.array(chain.topology.q_start)
     quat, fixed, slide = chain.quat, chain.quat, None
     hinges, balls, slides = top.rows_of(HINGE), top.rows_of(BALL), top.rows_of(SLIDE)
     turn = []
     if len(hinges):
-        turn.append((hinges, quat_about(take(chain.axis, hinges), take(q, start[hinges]) - take(chain.q_load, start[hinges]))))
+        turn.append(
+            (
+                hinges,
+                quat_about(
+                    take(chain.axis, hinges),
+                    take(q, start[hinges]) - take(chain.q_load, start[hinges]),
+                ),
+            )
+        )
     if len(balls):
         turn.append((balls, quat_normalize(take(q, start[balls][:, None] + np.arange(4)))))
     for rows, joint in turn:
@@ -49,12 +68,16 @@ def _joint_poses(chain: Chain, q: Float[Array, " q"]):
 
 
 def _compose(top: Topology, quat: Float[Array, "rows 4"]) -> Float[Array, "rows 4"]:
-    """Rotations in the parent -> rotations in the world: level by level, or by doubling along the ancestors in deep trees."""
+    """Rotations in the parent -> rotations in the world: level by level, or by doubling along the
+    ancestors in deep trees."""
     parent = np.array(top.parent)
     if len(top.levels) > LEVELS_UNROLLED:
         above = np.maximum(parent, 0)
         for _ in range(int(np.ceil(np.log2(len(top.levels))))):
-            quat, above = jnp.concatenate([quat[:1], quat_multiply(take(quat, above), quat)[1:]]), above[above]
+            quat, above = (
+                jnp.concatenate([quat[:1], quat_multiply(take(quat, above), quat)[1:]]),
+                above[above],
+            )
         return quat
     levels = [quat[:1]]
     for (start, _), (first, last) in zip(top.levels[:-1], top.levels[1:], strict=True):
@@ -76,7 +99,9 @@ def kinematics(chain: Chain, q: Float[Array, " q"]) -> Kinematics:
         step = step + rotate(above, rotate(quat_matrix(fixed), slide))
     if chain.anchor is not None:
         # the anchor stays where it is while the row turns about it
-        step = step + rotate(above, rotate(quat_matrix(fixed), chain.anchor)) - rotate(R, chain.anchor)
+        step = (
+            step + rotate(above, rotate(quat_matrix(fixed), chain.anchor)) - rotate(R, chain.anchor)
+        )
     free = top.rows_of(FREE)
     if len(free):
         step = put(step, free, take(q, np.array(top.q_start)[free][:, None] + np.arange(3)))
@@ -109,7 +134,11 @@ def _axes(chain: Chain, R, r) -> Float[Array, "nv 6"]:
             parts.append(turning(rows, take(R, rows)[..., k]))
             order.append(np.array(top.v_start)[rows] + offset + k)
             if kind == FREE:
-                parts.append(jnp.broadcast_to(jnp.concatenate([jnp.zeros_like(eye[k]), eye[k]]), (len(rows), 6)))
+                parts.append(
+                    jnp.broadcast_to(
+                        jnp.concatenate([jnp.zeros_like(eye[k]), eye[k]]), (len(rows), 6)
+                    )
+                )
                 order.append(np.array(top.v_start)[rows] + k)
     if not parts:
         return jnp.zeros((0, 6), R.dtype)
@@ -121,8 +150,11 @@ def twists(chain: Chain, kin: Kinematics, v: Float[Array, " dofs"]) -> Float[Arr
     return down(chain.topology, to_rows(chain.topology, kin.S * v[: chain.nv, None]))
 
 
-def velocity_products(chain: Chain, kin: Kinematics, V: Float[Array, "rows 6"], v: Float[Array, " dofs"]) -> Float[Array, "rows 6"]:
-    """Sdot v of each row's joint: V x (S v) for axes fixed in the row; a free joint's translations have axes fixed in the world."""
+def velocity_products(
+    chain: Chain, kin: Kinematics, V: Float[Array, "rows 6"], v: Float[Array, " dofs"]
+) -> Float[Array, "rows 6"]:
+    """Sdot v of each row's joint: V x (S v) for axes fixed in the row; a free joint's translations
+    have axes fixed in the world."""
     top = chain.topology
     moving = np.ones(chain.nv, bool)
     free = top.rows_of(FREE)
@@ -130,22 +162,28 @@ def velocity_products(chain: Chain, kin: Kinematics, V: Float[Array, "rows 6"], 
     return motion_cross(V, to_rows(top, kin.S * jnp.where(moving, v[: chain.nv], 0)[:, None]))
 
 
-def bias_accelerations(chain: Chain, kin: Kinematics, V: Float[Array, "rows 6"], v: Float[Array, " dofs"]) -> Float[Array, "rows 6"]:
+def bias_accelerations(
+    chain: Chain, kin: Kinematics, V: Float[Array, "rows 6"], v: Float[Array, " dofs"]
+) -> Float[Array, "rows 6"]:
     """Spatial accelerations with vdot = 0 and no gravity."""
     return down(chain.topology, velocity_products(chain, kin, V, v))
 
 
 @verb
 def poses(chain: Chain, state: State) -> tuple[Float[Array, "bodies 3"], Float[Array, "bodies 4"]]:
-    """Positions (m) and quaternions (wxyz, body to world) of the body frames in the world; row 0 is the world (Featherstone section 4.4)."""
+    """Positions (m) and quaternions (wxyz, body to world) of the body frames in the world; row 0 is
+    the world (Featherstone section 4.4)."""
     rows = np.array(chain.topology.body_row)
     kin = kinematics(chain, state.q)
     return (kin.root + kin.r)[rows], kin.quat[rows]
 
 
 @verb
-def velocities(chain: Chain, state: State) -> tuple[Float[Array, "bodies 3"], Float[Array, "bodies 3"]]:
-    """Linear velocity of each body's origin (m/s) and angular velocity (rad/s), in world axes; row 0 is the world (Featherstone section 5.3)."""
+def velocities(
+    chain: Chain, state: State
+) -> tuple[Float[Array, "bodies 3"], Float[Array, "bodies 3"]]:
+    """Linear velocity of each body's origin (m/s) and angular velocity (rad/s), in world axes; row
+    0 is the world (Featherstone section 5.3)."""
     rows = np.array(chain.topology.body_row)
     kin = kinematics(chain, state.q)
     V = twists(chain, kin, state.v)

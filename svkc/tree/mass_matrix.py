@@ -15,20 +15,29 @@ from svkc.tree.traversal import up
 
 def inertia_by_unit_vectors(chain: Chain, kin: Kinematics) -> Float[Array, "nv nv"]:
     """Column i is ID(q, 0, e_i) without gravity: the paper's way (section III-B, step 3)."""
-    return jax.vmap(lambda unit: inertia_times(chain, kin, unit), out_axes=1)(jnp.eye(chain.nv, dtype=kin.r.dtype))
+    return jax.vmap(lambda unit: inertia_times(chain, kin, unit), out_axes=1)(
+        jnp.eye(chain.nv, dtype=kin.r.dtype)
+    )
 
 
-def central_inertias(chain: Chain, kin: Kinematics) -> tuple[Float[Array, "rows 3"], Float[Array, "rows 3 3"]]:
-    """Of each row: the centre of mass from the root's origin, and the inertia about it, in world axes."""
+def central_inertias(
+    chain: Chain, kin: Kinematics
+) -> tuple[Float[Array, "rows 3"], Float[Array, "rows 3 3"]]:
+    """Of each row: the centre of mass from the root's origin, and the inertia about it, in world
+    axes."""
     RI = jnp.sum(kin.R[:, :, :, None] * chain.rotational[:, None, :, :], 2)
     return kin.r + rotate(kin.R, chain.com), jnp.sum(RI[:, :, None, :] * kin.R[:, None, :, :], -1)
 
 
 def inertia_by_composites(chain: Chain, kin: Kinematics) -> Float[Array, "nv nv"]:
-    """Composite rigid bodies (Featherstone section 6.2): mass, first moment and rotational inertia simply add up towards the root."""
+    """Composite rigid bodies (Featherstone section 6.2): mass, first moment and rotational inertia
+    simply add up towards the root."""
     top, (c, central) = chain.topology, central_inertias(chain, kin)
     m = chain.mass[:, None]
-    square = jnp.sum(c * c, -1)[:, None, None] * jnp.eye(3, dtype=c.dtype)[None] - c[:, :, None] * c[:, None, :]
+    square = (
+        jnp.sum(c * c, -1)[:, None, None] * jnp.eye(3, dtype=c.dtype)[None]
+        - c[:, :, None] * c[:, None, :]
+    )
     I = central + m[:, :, None] * square
     total = take(up(top, jnp.concatenate([m, m * c, I.reshape(-1, 9)], -1)), top.dof_row)
     m, h, I = total[:, :1], total[:, 1:4], total[:, 4:].reshape(-1, 3, 3)
@@ -43,7 +52,8 @@ def inertia_by_composites(chain: Chain, kin: Kinematics) -> Float[Array, "nv nv"
 
 @verb
 def mass_matrix(chain: Chain, state: State) -> Float[Array, "nv nv"]:
-    """Joint-space inertia of the tree (kg, kg m, kg m^2), armature included, by composite bodies (Featherstone section 6.2)."""
+    """Joint-space inertia of the tree (kg, kg m, kg m^2), armature included, by composite bodies
+    (Featherstone section 6.2)."""
     return inertia_by_composites(chain, kinematics(chain, state.q))
 
 

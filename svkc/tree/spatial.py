@@ -1,6 +1,7 @@
 """Rotations, quaternions and 6-vectors, written once and broadcast over leading axes.
 
-Quaternions are wxyz and turn body vectors into world vectors. 6-vectors are angular first (Featherstone, Rigid Body Dynamics
+Quaternions are wxyz and turn body vectors into world vectors. 6-vectors are angular first
+(Featherstone, Rigid Body Dynamics
 Algorithms, 2008, section 2).
 """
 
@@ -8,8 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-# Products as sums over a table, out_k = table[i, k, j] a_i b_j: a few operations on whole arrays, where entry by entry would be dozens, and everything
-# that is compiled is made of these products (a run of the four-bar and its gradient: a fifth fewer operations).
+# Products as sums over a table, out_k = table[i, k, j] a_i b_j: a few operations on whole arrays,
+# where entry by entry would be dozens, and everything
+# that is compiled is made of these products (a run of the four-bar and its gradient: a fifth fewer
+# operations).
 SKEW = np.zeros((3, 3, 3))
 HAMILTON = np.zeros((4, 4, 4))
 for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
@@ -34,7 +37,8 @@ def _by(table: np.ndarray, a: Float[Array, "*n i"]) -> Float[Array, "*n k j"]:
 
 def halves(x: Float[Array, "*n 6"]) -> tuple[Float[Array, "*n 3"], Float[Array, "*n 3"]]:
     """The angular and the linear part of a 6-vector."""
-    # a split, whose transpose is one concatenation; that of two slices would be two paddings and a sum
+    # a split, whose transpose is one concatenation; that of two slices would be two paddings and a
+    # sum
     angular, linear = jnp.split(x, 2, -1)
     return angular, linear
 
@@ -45,7 +49,8 @@ def cross(a: Float[Array, "*#n 3"], b: Float[Array, "*#n 3"]) -> Float[Array, "*
 
 
 def rotate(R: Float[Array, "*#n i k"], x: Float[Array, "*#n k"]) -> Float[Array, "*n i"]:
-    """R x (of vectors, quaternions, ...), as a product and a sum, which fuse where a small `dot` would not."""
+    """R x (of vectors, quaternions, ...), as a product and a sum, which fuse where a small `dot`
+    would not."""
     return jnp.sum(R * x[..., None, :], -1)
 
 
@@ -55,7 +60,8 @@ def skew(a: Float[Array, "*n 3"]) -> Float[Array, "*n 3 3"]:
 
 
 def inverse_positive(D: Float[Array, "*n k k"]) -> Float[Array, "*n k k"]:
-    """The inverses of small symmetric positive matrices by their halves, without a call of LAPACK for each."""
+    """The inverses of small symmetric positive matrices by their halves, without a call of LAPACK
+    for each."""
     if D.shape[-1] == 1:
         return 1 / D
     if D.shape[-1] == 3:
@@ -71,7 +77,13 @@ def inverse_positive(D: Float[Array, "*n k k"]) -> Float[Array, "*n k k"]:
     upper = inverse_positive(A - times(part, jnp.swapaxes(B, -1, -2)))
     right = -times(upper, part)
     lower = of_lower - times(turned, right)
-    return jnp.concatenate([jnp.concatenate([upper, right], -1), jnp.concatenate([jnp.swapaxes(right, -1, -2), lower], -1)], -2)
+    return jnp.concatenate(
+        [
+            jnp.concatenate([upper, right], -1),
+            jnp.concatenate([jnp.swapaxes(right, -1, -2), lower], -1),
+        ],
+        -2,
+    )
 
 
 def motion_cross(a: Float[Array, "*#n 6"], b: Float[Array, "*#n 6"]) -> Float[Array, "*n 6"]:
@@ -82,9 +94,12 @@ def motion_cross(a: Float[Array, "*#n 6"], b: Float[Array, "*#n 6"]) -> Float[Ar
 
 
 def shift_motion(S: Float[Array, "*#n 6"], r: Float[Array, "*#n 3"]) -> Float[Array, "*n 6"]:
-    """The motion vector S given about the origin, given about the point r instead (Featherstone 2.8)."""
+    """The motion vector S given about the origin, given about the point r instead (Featherstone
+    2.8)."""
     w, v = halves(S)
-    return jnp.concatenate([jnp.broadcast_to(w, jnp.broadcast_shapes(w.shape, r.shape)), v + cross(w, r)], -1)
+    return jnp.concatenate(
+        [jnp.broadcast_to(w, jnp.broadcast_shapes(w.shape, r.shape)), v + cross(w, r)], -1
+    )
 
 
 def quat_multiply(a: Float[Array, "*#n 4"], b: Float[Array, "*#n 4"]) -> Float[Array, "*n 4"]:
@@ -123,7 +138,8 @@ def quat_about(axis: Float[Array, "*#n 3"], angle: Float[Array, "*#n"]) -> Float
 
 
 def quat_exp(u: Float[Array, "*n 3"]) -> Float[Array, "*n 4"]:
-    """The rotation vector u (rad) as a quaternion: Rodrigues' formula (paper (39)-(44)), smooth at u = 0."""
+    """The rotation vector u (rad) as a quaternion: Rodrigues' formula (paper (39)-(44)), smooth at
+    u = 0."""
     square = jnp.sum(u * u, -1, keepdims=True)
     small = square < 1e-8
     angle = jnp.sqrt(jnp.where(small, 1, square))
@@ -141,7 +157,11 @@ def quat_log(q: Float[Array, "*n 4"]) -> Float[Array, "*n 3"]:
     s = jnp.sqrt(jnp.where(small, 1, square))
     w = q[..., :1]
     # atan(x) / x at x = s / w, to second order; w is 1 - square / 2 there
-    factor = jnp.where(small, 2 / jnp.where(small, w, 1) * (1 - square / (3 * jnp.where(small, w * w, 1))), 2 * jnp.arctan2(s, w) / s)
+    factor = jnp.where(
+        small,
+        2 / jnp.where(small, w, 1) * (1 - square / (3 * jnp.where(small, w * w, 1))),
+        2 * jnp.arctan2(s, w) / s,
+    )
     return factor * q[..., 1:]
 
 

@@ -14,7 +14,8 @@ from svkc.model.topology import BALL, FREE, HINGE, SLIDE, V_SIZE, Topology
 
 # deeper trees sum by doubling along the ancestors: compile time would grow with every level
 LEVELS_UNROLLED = 24
-# children's children and so on that a row may have side by side there; with more the table of ancestors is smaller
+# children's children and so on that a row may have side by side there; with more the table of
+# ancestors is smaller
 WIDEST = 4
 
 
@@ -47,7 +48,8 @@ def up(top: Topology, x: Float[Array, "rows *n"]) -> Float[Array, "rows *n"]:
 
 @functools.cache
 def _doublings(top: Topology) -> list[tuple[np.ndarray, np.ndarray]]:
-    """For 1, 2, 4, ... generations: each row's ancestor so far up, and its descendants so far down; one past the last row where there is none."""
+    """For 1, 2, 4, ... generations: each row's ancestor so far up, and its descendants so far down;
+    one past the last row where there is none."""
     parent = np.array(top.parent)
     none, above = len(parent), np.append(np.where(parent < 0, len(parent), parent), len(parent))
     found = []
@@ -62,7 +64,9 @@ def _doublings(top: Topology) -> list[tuple[np.ndarray, np.ndarray]]:
     return found
 
 
-def from_children(top: Topology, level: int, below: Float[Array, "below *n"]) -> Float[Array, "here *n"]:
+def from_children(
+    top: Topology, level: int, below: Float[Array, "below *n"]
+) -> Float[Array, "here *n"]:
     """For each row of a level, the sum of its children's rows in the level below."""
     (first, last), (lo, hi) = top.levels[level], top.levels[level + 1]
     parent = np.array(top.parent)[lo:hi]
@@ -73,8 +77,11 @@ def from_children(top: Topology, level: int, below: Float[Array, "below *n"]) ->
     return jnp.sum(take(below, table), 1)
 
 
-def put(x: Float[Array, "rows *n"], rows: np.ndarray, values: Float[Array, "some *n"]) -> Float[Array, "rows *n"]:
-    """X with some of its rows replaced. (No scatter: XLA's CPU backend makes one kernel of a loop's whole body only where there is none.)"""
+def put(
+    x: Float[Array, "rows *n"], rows: np.ndarray, values: Float[Array, "some *n"]
+) -> Float[Array, "rows *n"]:
+    """X with some of its rows replaced. (No scatter: XLA's CPU backend makes one kernel of a loop's
+    whole body only where there is none.)"""
     source = np.arange(len(x))
     source[rows] = len(x) + np.arange(len(rows))
     return take(jnp.concatenate([x, values]), source)
@@ -89,14 +96,17 @@ def to_rows(top: Topology, x: Float[Array, "nv *n"]) -> Float[Array, "rows *n"]:
             start = np.array(top.v_start)[rows]
             parts.append(sum(take(x, start + k) for k in range(size)))
             order.append(rows)
-    fixed = np.setdiff1d(np.arange(len(top.parent)), np.concatenate(order) if order else np.zeros(0, int))
+    fixed = np.setdiff1d(
+        np.arange(len(top.parent)), np.concatenate(order) if order else np.zeros(0, int)
+    )
     parts.append(jnp.zeros((len(fixed), *x.shape[1:]), x.dtype))
     return take(jnp.concatenate(parts), np.argsort(np.concatenate([*order, fixed])))
 
 
 class Level(NamedTuple):
-    """The rows of one level below the world's; where there are fewer than n: one past the last row. Coordinates of each row's joint, nv where it has fewer
-    than d; its children in the level below, as many as that has where there are fewer; its parent in the level above."""
+    """The rows of one level below the world's; where there are fewer than n: one past the last row.
+    Coordinates of each row's joint, nv where it has fewer than d; its children in the level below,
+    as many as that has where there are fewer; its parent in the level above."""
 
     rows: np.ndarray
     dofs: np.ndarray
@@ -106,22 +116,38 @@ class Level(NamedTuple):
 
 @functools.cache
 def levels(top: Topology) -> list[Level] | Level:
-    """One for each level, as small as it can be; in deep trees all as large as the largest, stacked, for a loop over them.
+    """One for each level, as small as it can be; in deep trees all as large as the largest,
+    stacked, for a loop over them.
 
-    int32: jax (0.10) takes the same array of int64 for an index in one precision only of those that a process computes in.
+    int32: jax (0.10) takes the same array of int64 for an index in one precision only of those that
+    a process computes in.
     """
     deep, parents = len(top.levels) > LEVELS_UNROLLED, np.array(top.parent)
     bounds = [*top.levels[1:], (len(parents), len(parents))]
-    families = [[np.flatnonzero(parents[lo:hi] == i) for i in range(first, last)] for (first, last), (lo, hi) in zip(bounds[:-1], bounds[1:], strict=True)]
+    families = [
+        [np.flatnonzero(parents[lo:hi] == i) for i in range(first, last)]
+        for (first, last), (lo, hi) in zip(bounds[:-1], bounds[1:], strict=True)
+    ]
     sizes = [[V_SIZE[top.kind[i]] for i in range(first, last)] for first, last in bounds[:-1]]
-    widest, freest, most = max(map(len, sizes)), max(max(x) for x in sizes), max((len(x) for family in families for x in family), default=0)
+    widest, freest, most = (
+        max(map(len, sizes)),
+        max(max(x) for x in sizes),
+        max((len(x) for family in families for x in family), default=0),
+    )
     found = []
     for level, (first, last) in enumerate(bounds[:-1]):
-        n, below = (widest, widest) if deep else (last - first, len(parents[slice(*bounds[level + 1])]))
+        n, below = (
+            (widest, widest) if deep else (last - first, len(parents[slice(*bounds[level + 1])]))
+        )
         d = max(1, freest if deep else max(sizes[level]))
         filled = lambda shape, value: np.full(shape, value, np.int32)
         children = most if deep else max(map(len, families[level]))
-        of = Level(filled(n, len(parents)), filled((n, d), top.nv), filled((n, children), below), filled(n, 0))
+        of = Level(
+            filled(n, len(parents)),
+            filled((n, d), top.nv),
+            filled((n, children), below),
+            filled(n, 0),
+        )
         of.rows[: last - first] = np.arange(first, last)
         of.parent[: last - first] = parents[first:last] - top.levels[level][0]
         for i, (size, family) in enumerate(zip(sizes[level], families[level], strict=True)):
@@ -132,7 +158,8 @@ def levels(top: Topology) -> list[Level] | Level:
 
 
 def sweep(step: Callable, start, over, reverse: bool = False):
-    """What `step(carried, level)` leaves level by level: unrolled over a list, a loop over what is stacked."""
+    """What `step(carried, level)` leaves level by level: unrolled over a list, a loop over what is
+    stacked."""
     if not isinstance(over, list):
         return jax.lax.scan(step, start, over, reverse=reverse)[1]
     found, carried = [], start
@@ -148,7 +175,9 @@ def zeros(top: Topology, *shape: int, dtype) -> Array | None:
     return None if isinstance(found, list) else jnp.zeros((found.rows.shape[1], *shape), dtype)
 
 
-def from_rows(children: Int[Array, "m c"] | np.ndarray, below: Float[Array, "n *k"]) -> Float[Array, "m *k"]:
+def from_rows(
+    children: Int[Array, "m c"] | np.ndarray, below: Float[Array, "n *k"]
+) -> Float[Array, "m *k"]:
     """For each row of a level, the sum of its children's in the level below."""
     return jnp.sum(take(below, children), 1)
 
@@ -156,7 +185,11 @@ def from_rows(children: Int[Array, "m c"] | np.ndarray, below: Float[Array, "n *
 def beside(top: Topology, *given: Callable):
     """Levels, and beside each what the functions give of them."""
     found = levels(top)
-    return [(level, *(f(level) for f in given)) for level in found] if isinstance(found, list) else (found, *(f(found) for f in given))
+    return (
+        [(level, *(f(level) for f in given)) for level in found]
+        if isinstance(found, list)
+        else (found, *(f(found) for f in given))
+    )
 
 
 def paired(a, b):

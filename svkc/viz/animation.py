@@ -16,7 +16,8 @@ FLASH = 0.3  # s: for how long the links that an event changed are drawn large
 
 
 def _gl_context():
-    """A class of offscreen GL context whose library is on this machine; RuntimeError naming the packages otherwise."""
+    """A class of offscreen GL context whose library is on this machine; RuntimeError naming the
+    packages otherwise."""
     import importlib
 
     for module in ("mujoco.egl", "mujoco.osmesa"):
@@ -24,7 +25,10 @@ def _gl_context():
             return importlib.import_module(module).GLContext
         except (ImportError, AttributeError, RuntimeError, OSError, TypeError):
             continue
-    raise RuntimeError(f"no library to draw with: install the packages {GL_PACKAGES} (apt-get install --no-install-recommends {GL_PACKAGES})")
+    raise RuntimeError(
+        f"no library to draw with: install the packages {GL_PACKAGES} (apt-get install"
+        f" --no-install-recommends {GL_PACKAGES})"
+    )
 
 
 def gif(path: pathlib.Path, images: Iterator, fps: float):
@@ -40,9 +44,13 @@ def mp4(path: pathlib.Path, images: Iterator, fps: float):
     try:
         import imageio_ffmpeg
     except ImportError as error:
-        raise RuntimeError("mp4 needs the package imageio-ffmpeg: pip install 'svkc[video]'") from error
+        raise RuntimeError(
+            "mp4 needs the package imageio-ffmpeg: pip install 'svkc[video]'"
+        ) from error
     first = next(images)
-    writer = imageio_ffmpeg.write_frames(str(path), first.size, fps=fps, macro_block_size=2, quality=7, ffmpeg_log_level="error")
+    writer = imageio_ffmpeg.write_frames(
+        str(path), first.size, fps=fps, macro_block_size=2, quality=7, ffmpeg_log_level="error"
+    )
     with warnings.catch_warnings():
         # jax warns of forks, for threads that hold locks; this one becomes ffmpeg at once
         warnings.simplefilter("ignore", RuntimeWarning)
@@ -54,8 +62,21 @@ def mp4(path: pathlib.Path, images: Iterator, fps: float):
         writer.close()
 
 
-def frames(chain: Chain, traj: Trajectory, *, fps: float, size, trails, camera, lookat, distance, azimuth, elevation) -> Iterator:
-    """PIL images `1/fps` s apart, the nearest saved state to each: links that hold as spheres, paths of the bodies in `trails`, a strip below.
+def frames(
+    chain: Chain,
+    traj: Trajectory,
+    *,
+    fps: float,
+    size,
+    trails,
+    camera,
+    lookat,
+    distance,
+    azimuth,
+    elevation,
+) -> Iterator:
+    """PIL images `1/fps` s apart, the nearest saved state to each: links that hold as spheres,
+    paths of the bodies in `trails`, a strip below.
 
     ValueError: no such body or camera. RuntimeError: no GL library.
     """
@@ -67,7 +88,9 @@ def frames(chain: Chain, traj: Trajectory, *, fps: float, size, trails, camera, 
     if unknown:
         raise ValueError(f"trails: no body {unknown[0]!r}; bodies: {', '.join(chain.body_names)}")
     model.vis.quality.shadowsize = model.vis.quality.offsamples = 0
-    model.vis.global_.offwidth, model.vis.global_.offheight = np.maximum(size, (model.vis.global_.offwidth, model.vis.global_.offheight))
+    model.vis.global_.offwidth, model.vis.global_.offheight = np.maximum(
+        size, (model.vis.global_.offwidth, model.vis.global_.offheight)
+    )
     data = mujoco.MjData(model)
     ts, (positions, R) = np.asarray(traj.ts), world_poses(chain, traj.states)
     holding, events = held(chain, traj.states, positions, R), happened(traj, chain)
@@ -89,10 +112,21 @@ def frames(chain: Chain, traj: Trajectory, *, fps: float, size, trails, camera, 
                 data.cam_xpos[c] = positions[i, body] + R[i, body] @ model.cam_pos[c]
                 data.cam_xmat[c] = (R[i, body] @ matrix(model.cam_quat[c])).ravel()
             renderer.update_scene(data, eye)
-            _draw_links(renderer.scene, holding[i], any(0 <= t - when < FLASH for when, _ in events))
+            _draw_links(
+                renderer.scene, holding[i], any(0 <= t - when < FLASH for when, _ in events)
+            )
             for k, name in enumerate(trails):
-                _draw_trail(renderer.scene, positions[: i + 1, chain.body_names.index(name)], color(k))
-            yield _captioned(Image.fromarray(renderer.render()), ts[i], ts[0], ts[-1], [chain.link_names[k] for k in holding[i]], events)
+                _draw_trail(
+                    renderer.scene, positions[: i + 1, chain.body_names.index(name)], color(k)
+                )
+            yield _captioned(
+                Image.fromarray(renderer.render()),
+                ts[i],
+                ts[0],
+                ts[-1],
+                [chain.link_names[k] for k in holding[i]],
+                events,
+            )
 
 
 def _camera(model, positions, camera, lookat, distance, azimuth, elevation):
@@ -102,7 +136,9 @@ def _camera(model, positions, camera, lookat, distance, azimuth, elevation):
     if camera is not None:
         names = [model.camera(i).name for i in range(model.ncam)]
         if camera not in names:
-            raise ValueError(f"camera: no camera {camera!r} in the model; cameras: {', '.join(names) or 'none'}")
+            raise ValueError(
+                f"camera: no camera {camera!r} in the model; cameras: {', '.join(names) or 'none'}"
+            )
         return camera
     moving = positions[:, 1:].reshape(-1, 3)
     low, high = moving.min(0), moving.max(0)
@@ -114,7 +150,9 @@ def _camera(model, positions, camera, lookat, distance, azimuth, elevation):
 
 
 def _rgba(hexadecimal: str, alpha: float):
-    return np.array([int(hexadecimal[k : k + 2], 16) / 255 for k in (1, 3, 5)] + [alpha], np.float32)
+    return np.array(
+        [int(hexadecimal[k : k + 2], 16) / 255 for k in (1, 3, 5)] + [alpha], np.float32
+    )
 
 
 def _draw_links(scene, places: dict[int, np.ndarray], large: bool):
@@ -123,8 +161,18 @@ def _draw_links(scene, places: dict[int, np.ndarray], large: bool):
 
     for place in places.values():
         if scene.ngeom < scene.maxgeom:
-            size, rgba = np.full(3, 0.07 if large else 0.04), np.array([0.9, 0.1, 0.1, 1], np.float32)
-            mujoco.mjv_initGeom(scene.geoms[scene.ngeom], mujoco.mjtGeom.mjGEOM_SPHERE, size, place, np.eye(3).ravel(), rgba)
+            size, rgba = (
+                np.full(3, 0.07 if large else 0.04),
+                np.array([0.9, 0.1, 0.1, 1], np.float32),
+            )
+            mujoco.mjv_initGeom(
+                scene.geoms[scene.ngeom],
+                mujoco.mjtGeom.mjGEOM_SPHERE,
+                size,
+                place,
+                np.eye(3).ravel(),
+                rgba,
+            )
             scene.ngeom += 1
 
 
@@ -135,20 +183,30 @@ def _draw_trail(scene, path: np.ndarray, hexadecimal: str):
     for a, b in zip(path, path[1:], strict=False):
         if scene.ngeom < scene.maxgeom:
             geom = scene.geoms[scene.ngeom]
-            mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_CAPSULE, np.zeros(3), np.zeros(3), np.eye(3).ravel(), _rgba(hexadecimal, 0.9))
+            mujoco.mjv_initGeom(
+                geom,
+                mujoco.mjtGeom.mjGEOM_CAPSULE,
+                np.zeros(3),
+                np.zeros(3),
+                np.eye(3).ravel(),
+                _rgba(hexadecimal, 0.9),
+            )
             mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_CAPSULE, 0.006, a, b)
             scene.ngeom += 1
 
 
 def _captioned(image, t: float, start: float, end: float, holding: list[str], events):
-    """A strip below the picture: the time, what holds, the last event, and a line of time with a mark at each event."""
+    """A strip below the picture: the time, what holds, the last event, and a line of time with a
+    mark at each event."""
     from PIL import Image, ImageDraw, ImageFont
 
     width, strip, margin = image.width, 58, 10
     out = Image.new("RGB", (width, image.height + strip), "#f4f4f2")
     out.paste(image, (0, 0))
     draw, y, font = ImageDraw.Draw(out), image.height, ImageFont.load_default(14)
-    draw.text((margin, y + 6), f"{t:6.3f} s   held by {', '.join(holding) or 'nothing'}", "#222222", font)
+    draw.text(
+        (margin, y + 6), f"{t:6.3f} s   held by {', '.join(holding) or 'nothing'}", "#222222", font
+    )
     past = [f"{when:.3f} s: {what}" for when, what in events if when <= t]
     draw.text((margin, y + 25), past[-1] if past else "", "#b03030", font)
     place = lambda s: margin + (width - 2 * margin) * (s - start) / max(end - start, 1e-12)

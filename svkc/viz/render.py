@@ -17,27 +17,40 @@ def _installed() -> None:
         try:
             __import__(name)
         except ImportError as error:
-            raise RuntimeError("pictures need the packages matplotlib and pillow: pip install 'svkc[viz]'") from error
+            raise RuntimeError(
+                "pictures need the packages matplotlib and pillow: pip install 'svkc[viz]'"
+            ) from error
 
 
 def render(
-    chain: Chain, traj: Trajectory, path, *, fps: float = 25, frames: int = 10, size=(640, 480), trails=(), camera: str | None = None, lookat=None,
-    distance=None, azimuth: float = 90, elevation: float = -8,
+    chain: Chain, traj: Trajectory, path, *, fps: float = 25, frames: int = 10, size=(640, 480),
+    trails=(), camera: str | None = None, lookat=None, distance=None, azimuth: float = 90,
+    elevation: float = -8,
 ) -> pathlib.Path:  # fmt: skip
-    """Writes a picture of the run by the ending of `path`: .png a strobe of `frames` poses seen from the side; .gif and .mp4 an animation of `fps` frames
-    a second of size (width, height) in pixels, with a strip below that names the time, what holds and the events; .html a page of its own to turn, play
+    """Writes a picture of the run by the ending of `path`: .png a strobe of `frames` poses seen
+    from the side; .gif and .mp4 an animation of `fps` frames
+    a second of size (width, height) in pixels, with a strip below that names the time, what holds
+    and the events; .html a page of its own to turn, play
     and go through (`svkc.page.show` in a notebook).
 
-    Of animations: trails: names of bodies whose paths are drawn; camera: the model's own of that name, else lookat (m), distance (m), azimuth and elevation
-    (deg) place one. ValueError: another ending, a batch, no such body or camera, what is no number. RuntimeError: no GL library, no
+    Of animations: trails: names of bodies whose paths are drawn; camera: the model's own of that
+    name, else lookat (m), distance (m), azimuth and elevation (deg) place one. ValueError: another
+    ending, a batch, no such body or camera, what is no number. RuntimeError: no GL library, no
     matplotlib, pillow or imageio-ffmpeg (names the packages).
     """
     from svkc.viz import animation, plots as figures
 
     check_chain(chain)
     one_run(traj)
-    frames, fps, path = whole("frames", frames, 1), positive("fps", fps), pathlib.Path(os.fspath(path))
-    size, trails = tuple(whole("size", n, 16, 8192) for n in several("size", size, 2)), texts("trails", trails)
+    frames, fps, path = (
+        whole("frames", frames, 1),
+        positive("fps", fps),
+        pathlib.Path(os.fspath(path)),
+    )
+    size, trails = (
+        tuple(whole("size", n, 16, 8192) for n in several("size", size, 2)),
+        texts("trails", trails),
+    )
     lookat = lookat if lookat is None else several("lookat", lookat, 3)
     distance = distance if distance is None else positive("distance", distance)
     azimuth, elevation = one("azimuth", azimuth), one("elevation", elevation)
@@ -50,13 +63,20 @@ def render(
     write = {".gif": animation.gif, ".mp4": animation.mp4}.get(path.suffix)
     if write is None:
         raise ValueError(f"render: {path.name} should end in .png, .gif, .mp4 or .html")
-    seen = {"camera": camera, "lookat": lookat, "distance": distance, "azimuth": azimuth, "elevation": elevation}
+    seen = {
+        "camera": camera,
+        "lookat": lookat,
+        "distance": distance,
+        "azimuth": azimuth,
+        "elevation": elevation,
+    }
     write(path, animation.frames(chain, traj, fps=fps, size=size, trails=trails, **seen), fps)
     return path
 
 
 def plot(traj: Trajectory, chain: Chain | None = None):
-    """A matplotlib figure: coordinates, energy, loop gaps, mobility over time, events as lines; names and energies in full where the chain is given."""
+    """A matplotlib figure: coordinates, energy, loop gaps, mobility over time, events as lines;
+    names and energies in full where the chain is given."""
     from svkc.viz.plots import curves
 
     one_run(traj)

@@ -1,4 +1,5 @@
-"""What every picture of a run shows: bodies where they are, thick lines for their shapes, what holds, what happened and when."""
+"""What every picture of a run shows: bodies where they are, thick lines for their shapes, what
+holds, what happened and when."""
 
 import jax
 import numpy as np
@@ -17,7 +18,10 @@ def one_run(traj) -> None:
     if not isinstance(traj, Trajectory):
         raise ValueError(f"traj: expected one run of svkc.simulate, got {type(traj).__name__}")
     if np.ndim(traj.ts) != 1:
-        raise ValueError(f"render: a picture shows one run, got a batch of {traj.ts.shape[:-1]}; give one lane: jax.tree.map(lambda x: x[0], traj)")
+        raise ValueError(
+            f"render: a picture shows one run, got a batch of {traj.ts.shape[:-1]}; give one lane:"
+            " jax.tree.map(lambda x: x[0], traj)"
+        )
 
 
 def color(i: int) -> str:
@@ -26,7 +30,8 @@ def color(i: int) -> str:
 
 
 def segments(chain: Chain) -> list[tuple[int, np.ndarray, np.ndarray, float]]:
-    """(body, one end, other end, half thickness) of everything that can be drawn as a thick line, in the body's frame (m)."""
+    """(body, one end, other end, half thickness) of everything that can be drawn as a thick line,
+    in the body's frame (m)."""
     import mujoco
 
     model, out = chain.model.model, []
@@ -37,19 +42,31 @@ def segments(chain: Chain) -> list[tuple[int, np.ndarray, np.ndarray, float]]:
         if kind in (mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER):
             half, radius = axis * size[1], size[0]
         elif kind in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_ELLIPSOID):
-            half, radius = axis * 1e-3, float(np.mean(size)) if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID else size[0]
+            half, radius = (
+                axis * 1e-3,
+                float(np.mean(size)) if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID else size[0],
+            )
         elif kind in (mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_MESH):
-            # of a mesh size is the half of its box; along the longest side, as thick as the shortest
+            # of a mesh size is the half of its box; along the longest side, as thick as the
+            # shortest
             longest = int(np.argmax(size))
             half, radius = R[:, longest] * size[longest], float(np.min(size))
         else:
             continue
-        out.append((int(model.geom_bodyid[g]), model.geom_pos[g] - half, model.geom_pos[g] + half, float(radius)))
+        out.append(
+            (
+                int(model.geom_bodyid[g]),
+                model.geom_pos[g] - half,
+                model.geom_pos[g] + half,
+                float(radius),
+            )
+        )
     return out
 
 
 def world_poses(chain: Chain, states: State) -> tuple[np.ndarray, np.ndarray]:
-    """Positions [times bodies 3] (m) and rotations [times bodies 3 3] of the body frames in the world."""
+    """Positions [times bodies 3] (m) and rotations [times bodies 3 3] of the body frames in the
+    world."""
     positions, quats = jax.jit(jax.vmap(lambda s: poses(chain, s)))(states)
     w, x, y, z = np.moveaxis(np.asarray(quats, float), -1, 0)
     R = np.array(
@@ -63,15 +80,24 @@ def world_poses(chain: Chain, states: State) -> tuple[np.ndarray, np.ndarray]:
 
 
 def held(chain: Chain, states: State, positions, R) -> list[dict[int, np.ndarray]]:
-    """At each of these states, where each connected virtual link holds: {link: place in the world (m)}."""
+    """At each of these states, where each connected virtual link holds: {link: place in the world
+    (m)}."""
     rows, s = {row: body for body, row in enumerate(chain.topology.body_row)}, states.structure
-    connected, real, place = np.asarray(s.connected), np.asarray(s.real), np.asarray(s.real_pos, float)
+    connected, real, place = (
+        np.asarray(s.connected),
+        np.asarray(s.real),
+        np.asarray(s.real_pos, float),
+    )
     at = lambda i, link, body: positions[i, body] + R[i, body] @ place[i, link]
-    return [{int(k): at(i, k, rows[int(real[i, k])]) for k in np.flatnonzero(connected[i])} for i in range(len(positions))]
+    return [
+        {int(k): at(i, k, rows[int(real[i, k])]) for k in np.flatnonzero(connected[i])}
+        for i in range(len(positions))
+    ]
 
 
 def happened(traj: Trajectory, chain: Chain | None = None) -> list[tuple[float, str]]:
-    """(time in s, what was connected and cut) of each instant at which there were events; by the links' numbers where no chain is given."""
+    """(time in s, what was connected and cut) of each instant at which there were events; by the
+    links' numbers where no chain is given."""
     p, e, out = traj.phases, traj.events, []
     starts, connected = np.asarray(p.start)[: int(p.count)], np.asarray(p.connected)[: int(p.count)]
     times = np.asarray(e.time)[: int(e.count)]
@@ -79,8 +105,14 @@ def happened(traj: Trajectory, chain: Chain | None = None) -> list[tuple[float, 
     for time in np.unique(times):
         before = connected[max(int(np.sum(starts < time)) - 1, 0)]
         # what an event at the very end leaves is no phase any more
-        after = connected[int(np.sum(starts <= time)) - 1] if np.any(starts >= time) else np.asarray(traj.final.structure.connected)
-        words = [f"connect {name(k)}" for k in np.flatnonzero(after & ~before)] + [f"cut {name(k)}" for k in np.flatnonzero(before & ~after)]
+        after = (
+            connected[int(np.sum(starts <= time)) - 1]
+            if np.any(starts >= time)
+            else np.asarray(traj.final.structure.connected)
+        )
+        words = [f"connect {name(k)}" for k in np.flatnonzero(after & ~before)] + [
+            f"cut {name(k)}" for k in np.flatnonzero(before & ~after)
+        ]
         numbers = ", ".join(str(int(k)) for k in np.asarray(e.which)[: int(e.count)][times == time])
         out.append((float(time), ", ".join(words) or f"event {numbers}"))
     return out
