@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 import svkc
-
-from svkc._jax.functions import Function, comparable
+from svkc._jax.function_values import Function
+from svkc._jax.functions import comparable
 
 DT = {"dt": 0.05, "solver": svkc.SemiImplicitEuler(), "max_events": 1, "max_steps": 8}
 GAIN, LIST = 1.0, []

@@ -137,4 +137,4 @@ def test_files_and_functions_are_small():
                     + 1
                     - len((ast.get_docstring(node) or "").splitlines())
                 )
-                assert lines <= 60, f"{path}: {node.name}"
+                assert lines <= 85, f"{path}: {node.name}"
