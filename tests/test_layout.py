@@ -5,6 +5,7 @@ import ast
 import functools
 import itertools
 import pathlib
+import re
 
 ROOT = pathlib.Path(__file__).parent.parent / "svkc"
 # a package may import from those to its left and from itself
@@ -138,3 +139,11 @@ def test_files_and_functions_are_small():
                     - len((ast.get_docstring(node) or "").splitlines())
                 )
                 assert lines <= 85, f"{path}: {node.name}"
+
+
+def test_the_page_on_the_architecture_names_what_there_is():
+    page = (ROOT.parent / "docs" / "architecture.md").read_text()
+    assert not [
+        path for path in re.findall(r"`(svkc/[\w/.]+)`", page) if not (ROOT.parent / path).exists()
+    ]
+    assert not [name for name in ORDER if not re.search(rf"\b{name}\b", page)]
