@@ -1,12 +1,16 @@
-"""Steps put back onto the loops within diffrax's own loop, for diffrax's own adjoints."""
+"""The integration of one phase by diffrax's own loop, for diffrax's own adjoints."""
 
 import functools
 from typing import Any, ClassVar
 
 import diffrax
 import jax
+import jax.numpy as jnp
 
+from svkc.integration.event_location import Found
 from svkc.integration.integrators import Motion
+from svkc.integration.replay import staged
+from svkc.integration.solution import EVENT, NON_FINITE, SUCCESSFUL, How, Path, Tally, World
 from svkc.integration.stabilization import projects
 from svkc.integration.vector_field import Field, settle
 
@@ -75,3 +79,54 @@ class Settled(diffrax.AbstractWrappedSolver):
         y1, _ = settle(self.field, args, raw)
         shift = jax.tree.map(lambda a, b: a - b, y1, raw)
         return y1, error, {"inner": dense, "shift": shift}, solver_state, result
+
+
+def solve_by_diffrax(
+    start: Motion,
+    times,
+    world: World,
+    how: How,
+    adjoint: diffrax.AbstractAdjoint,
+    found: Found | None,
+) -> Path:
+    """Integrate one phase by `diffrax.diffeqsolve` and return its path.
+
+    times: the start, the end and the save times. found: the event at the end, None: none.
+    """
+    t0, stop, at = times
+    # diffrax sets `scan_kind` for the adjoint, but not through a wrapper
+    kind = {diffrax.ForwardMode: "lax", diffrax.DirectAdjoint: "bounded"}.get(type(adjoint))
+    saveat = diffrax.SaveAt(subs=[diffrax.SubSaveAt(t1=True), diffrax.SubSaveAt(ts=at)])
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(world.field),
+        Settled(staged(how.solver, kind), world.field),
+        t0,
+        stop,
+        how.first_step,
+        start,
+        world.scene,
+        saveat=saveat,
+        stepsize_controller=how.controller,
+        adjoint=adjoint,
+        max_steps=how.max_steps,
+        throw=False,
+        progress_meter=how.progress_meter,
+    )
+    (end, saved), result = solution.ys, solution.result._value
+    result = jnp.where(result == diffrax.RESULTS.internal_error._value, NON_FINITE, result)
+    if found is not None:
+        result = jnp.where((result == SUCCESSFUL) & found.hit, EVENT, result)
+    accepted = jnp.asarray(solution.stats["num_accepted_steps"], jnp.int32)
+    rejected = jnp.asarray(solution.stats["num_rejected_steps"], jnp.int32)
+    return Path(
+        t=solution.ts[0][0],
+        end=jax.tree.map(lambda x: x[0], end),
+        saved=saved,
+        times=jnp.zeros(0, t0.dtype),
+        kept=saved,
+        accepted=accepted,
+        rejected=rejected,
+        result=result,
+        tally=Tally.unknown(t0.dtype, accepted + rejected),
+        found=found,
+    )

@@ -72,6 +72,12 @@ class Tally(eqx.Module):
             jnp.zeros(2, dtype),
         )
 
+    @classmethod
+    def unknown(cls, dtype, tries: Int[Array, ""]) -> "Tally":
+        """Return the tally of a loop that counts tries alone."""
+        no, one = jnp.asarray(-1, jnp.int32), jnp.ones((), dtype)
+        return cls(tries, jnp.inf * one, margin=one, swaps=no, loop=no, gap=jnp.zeros(2, dtype))
+
 
 class Path(eqx.Module):
     """Where a solve ended, the states at the times asked for, the times of its steps (inf: not

@@ -1,14 +1,15 @@
-"""One phase: a solve of one smooth field, up to the next scheduled time or the first guard that
-crosses zero."""
+"""One phase: the integration of one smooth vector field up to the next scheduled time, or to the
+first guard that crosses zero."""
+
+import dataclasses
 
 import diffrax
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.pytrees import frozen
-from svkc.integration.diffrax_adjoint import Settled
+from svkc.integration.diffrax_adjoint import solve_by_diffrax
 from svkc.integration.event_adjoint import arrived
 from svkc.integration.event_location import Reading, Watched
 from svkc.integration.integrate import march
@@ -22,7 +23,6 @@ from svkc.integration.solution import (
     SUCCESSFUL,
     How,
     Path,
-    Tally,
     World,
 )
 from svkc.integration.vector_field import Field
@@ -109,72 +109,46 @@ def _path(
     options: Options,
     reading: Reading | Field,
 ):
-    """The solve up to where it ends, the guard that ends it, and the time and motion there;
-    differentiated by replay, or by the diffrax adjoint asked for."""
-    ours, adjoint = isinstance(options.adjoint, Replay), options.adjoint
-    every = (
-        min(adjoint.every, options.max_steps) if isinstance(adjoint, Replay) else options.max_steps
-    )
-    meter = options.progress_meter if ours else diffrax.NoProgressMeter()
+    """Return the path up to its end, the guard that ends it, and the time and motion there.
+
+    The derivative is that of the replayed steps, or that of the diffrax adjoint asked for.
+    """
+    adjoint, replayed = options.adjoint, isinstance(options.adjoint, Replay)
     solver, looked_for, (controller, first_step) = frozen(
         (staged(options.solver, "lax"), watched, options.steps())
     )
     how = How(
-        solver, looked_for, controller, first_step, meter, options.gap, options.max_steps, every
+        solver=solver,
+        watched=looked_for,
+        controller=controller,
+        first_step=first_step,
+        progress_meter=options.progress_meter if replayed else diffrax.NoProgressMeter(),
+        gap=options.gap,
+        max_steps=options.max_steps,
+        every=min(adjoint.every, options.max_steps) if replayed else options.max_steps,
     )
-    if ours:
+    if replayed:
         path, t, motion = integrated(start, times, world, how, reading)
         return path, frozen(path.found), t, motion
     t0, stop, at = times
     found = None
     if watched is not None:
-        # where a guard is zero first, found once before
-        begin, fixed_times, still = frozen((start, times, world))
-        first = march(begin, fixed_times, still, how)
+        # an event is located once, before the differentiated solve, which then ends at its time
+        first = march(*frozen((start, times, world)), how)
         stop = jnp.where(first.found.hit, first.t, stop)
         at, found = jnp.where(at > stop, stop, at), first.found
     controller, first_step = options.steps(at)
-    # as diffrax would set it, did it see through the wrapper
-    kind = {diffrax.ForwardMode: "lax", diffrax.DirectAdjoint: "bounded"}.get(type(adjoint))
-    solver = Settled(staged(options.solver, kind), options.field)
-    saveat = diffrax.SaveAt(subs=[diffrax.SubSaveAt(t1=True), diffrax.SubSaveAt(ts=at)])
-    sol = diffrax.diffeqsolve(
-        diffrax.ODETerm(world.field), solver, t0, stop, first_step, start, world.scene,
-        saveat=saveat, stepsize_controller=controller, adjoint=adjoint,
-        max_steps=options.max_steps, throw=False, progress_meter=options.progress_meter,
-    )  # fmt: skip
-    (end, saved), t, result = sol.ys, sol.ts[0][0], sol.result._value
-    result = jnp.where(result == diffrax.RESULTS.internal_error._value, NON_FINITE, result)
-    if found is not None:
-        result = jnp.where((result == SUCCESSFUL) & found.hit, EVENT, result)
-    accepted, rejected = (
-        jnp.asarray(sol.stats[name], jnp.int32)
-        for name in ("num_accepted_steps", "num_rejected_steps")
+    how = dataclasses.replace(
+        how,
+        solver=options.solver,
+        controller=controller,
+        first_step=first_step,
+        progress_meter=options.progress_meter,
     )
-    # diffrax tells the number of tries alone
-    unknown = jnp.asarray(-1, jnp.int32)
-    tally = Tally(
-        accepted + rejected,
-        jnp.asarray(jnp.inf, t0.dtype),
-        jnp.ones((), t0.dtype),
-        unknown,
-        unknown,
-        jnp.zeros(2, t0.dtype),
-    )
-    path = Path(
-        t,
-        jax.tree.map(lambda x: x[0], end),
-        saved,
-        jnp.zeros(0, t0.dtype),
-        saved,
-        accepted,
-        rejected,
-        result,
-        tally,
-        found,
-    )
+    path = solve_by_diffrax(start, (t0, stop, at), world, how, adjoint, found)
     # the adjoint has seen to a scheduled end that moves
-    return path, found, *arrived(path.t, path.end, jnp.zeros_like(t), world.scene, reading, found)
+    late = jnp.zeros_like(path.t)
+    return path, found, *arrived(path.t, path.end, late, world.scene, reading, found)
 
 
 def _translate(result: Int[Array, ""], motion: Motion) -> RESULTS:
