@@ -80,53 +80,47 @@ def check_grad(
     gradients = {} if mode == "forward" else _gradients(f, free, rest, weights)
     for place, (path, leaf) in enumerate(named):
         for _ in range(directions if leaf.size else 0):
-            along = rng.normal(size=leaf.shape)
-            along = jnp.asarray(
-                along / np.linalg.norm(along) * (np.linalg.norm(leaf) or 1.0), leaf.dtype
-            )
-            direction = jax.tree.unflatten(
-                jax.tree.structure(free),
-                [along if i == place else jnp.zeros_like(x) for i, (_, x) in enumerate(named)],
-            )
+            direction = _direction(free, place, rng)
             difference, doubt = _differences(value, free, direction, step)
-            ahead = None if mode == "reverse" else _along(f, free, rest, direction)
+            forward = None if mode == "reverse" else _along(f, free, rest, direction)
             for name, weight in weights.items():
+                back = None if mode == "forward" else _inner(gradients[name], direction)
+                ahead = None if forward is None else np.asarray(forward[name])
                 pair = f"f(x){name}", f"x{jax.tree_util.keystr(path)}"
-                back = (
-                    None
-                    if mode == "forward"
-                    else sum(
-                        float(jnp.vdot(g, d))
-                        for g, d in zip(gradients[name], jax.tree.leaves(direction), strict=True)
-                    )
-                )
-                if ahead is None:
-                    # one number for the whole leaf: reverse mode has no more for one pass
-                    weighed = lambda x, weight=weight: np.asarray(np.sum(weight * x))
-                    found.append(
-                        _compare(
-                            np.asarray(back),
-                            weighed(difference[name]),
-                            weighed(doubt[name]),
-                            0.0,
-                            *pair,
-                        )
-                    )
-                    continue
-                size = np.linalg.norm(weight) * np.linalg.norm(ahead[name])
-                apart = (
-                    0.0
-                    if back is None
-                    else abs(back - np.sum(weight * np.asarray(ahead[name])))
-                    / (size if size > 1e-9 else 1.0)
-                )
-                found.append(
-                    _compare(
-                        np.asarray(ahead[name]), difference[name], doubt[name], float(apart), *pair
-                    )
-                )
+                found.append(_check(ahead, back, weight, difference[name], doubt[name], pair))
     worst = max(found, key=lambda c: c.error)
     return dataclasses.replace(worst, modes=max(c.modes for c in found), mode=mode)
+
+
+def _direction(free, place: int, rng: np.random.Generator):
+    """Return a random direction of one leaf, as long as the leaf (one, where it is zero)."""
+    leaves, shape = jax.tree.flatten(free)
+    leaf, along = leaves[place], rng.normal(size=leaves[place].shape)
+    along = along / np.linalg.norm(along) * (np.linalg.norm(leaf) or 1.0)
+    rest = [jnp.zeros_like(x) for x in leaves]
+    return shape.unflatten([*rest[:place], jnp.asarray(along, leaf.dtype), *rest[place + 1 :]])
+
+
+def _inner(gradient, direction) -> float:
+    """Return the derivative along a direction, from the leaves of a gradient."""
+    return sum(
+        float(jnp.vdot(g, d)) for g, d in zip(gradient, jax.tree.leaves(direction), strict=True)
+    )
+
+
+def _check(ahead, back: float | None, weight, difference, doubt, pair: tuple[str, str]) -> Check:
+    """Compare the derivatives of one output leaf along one direction with the difference.
+
+    ahead: the derivative in forward mode; back: the weighted sum of the derivative's entries in
+    reverse mode; None: not asked for.
+    """
+    if ahead is None:
+        # one number for the whole leaf: reverse mode has no more for one pass
+        weighed = lambda x: np.asarray(np.sum(weight * x))
+        return _compare(np.asarray(back), weighed(difference), weighed(doubt), 0.0, *pair)
+    size = np.linalg.norm(weight) * np.linalg.norm(ahead)
+    apart = 0.0 if back is None else abs(back - np.sum(weight * ahead))
+    return _compare(ahead, difference, doubt, float(apart / (size if size > 1e-9 else 1.0)), *pair)
 
 
 # (compiled once for a function, however many points it is checked at)
