@@ -1,10 +1,11 @@
 """Steps of the 40-freedom figure on a free base (46 freedoms), open and with two grips, and of the
 high bar's, beside MuJoCo, MJX, Pinocchio and JaxSim.
 
-`python benchmarks/speed.py [case ...] [--dtype ..] [--batch ..]` (extra `bench`) prints its rows,
-puts them into results/speed.csv and draws results/speed.png. One step is symplectic Euler of 2 ms
-with all that it needs; microseconds per step and lane, the median of rounds in which all that are
-compared take turns, and the least and most; `times svkc`: of svkc on as many cores.
+`python benchmarks/speed.py [case ...] [--dtype ..] [--batch ..]` prints its rows, puts them into
+results/speed.csv and draws results/speed.png (extra `viz`). Peers that are not installed (extra
+`bench`) are left out. One step is symplectic Euler of 2 ms with all that it needs; microseconds per
+step and lane, the median of rounds in which all that are compared take turns, and the least and
+most; `times svkc`: of svkc on as many cores.
 XLA is told to make one kernel of a loop (README). svkc on one core is `vmap` of `svkc.step` in one
 program, on all cores each device has its own lanes. Grips are hard in svkc, soft in MuJoCo and MJX.
 Compile seconds: trace, lower, XLA."""

@@ -64,7 +64,6 @@ from svkc.transitions.guards import leaves as leaves, overload as overload, touc
 from svkc.simulation.simulate import simulate as simulate
 from svkc.integration.replay import Replay as Replay
 from svkc.tools.rollout import rollout as rollout
-from svkc.tools.ahead import Program as Program, compile as compile
 from svkc.tools.accuracy import error_between as error_between, halved as halved, tune as tune
 from svkc.loops.projection import (
     dependent_change as dependent_change,

@@ -17,7 +17,6 @@ REFUSED = ("test_errors", "test_fuzz")
 MADE_BY = {
     "Chain": "load",
     "Check": "check_grad",
-    "Program": "compile",
     "Structure": "transition",
     "Trajectory": "simulate",
 }

@@ -78,8 +78,6 @@ def _parser() -> argparse.ArgumentParser:
     view = add("view", help="table, curves and page of a run that was saved")
     view.add_argument("file", type=pathlib.Path, help="an .npz of traj.save(path, chain)")
     view.add_argument("--no-open", action="store_true", help="write the page and do not open it")
-    bench = add("bench", help="time of a step, alone and in a batch, beside MuJoCo's")
-    bench.add_argument("--lanes", type=int, default=256, help="lanes of the batch (default: 256)")
     add("scenes", help="the scenes that ship")
     return parser
 
@@ -109,8 +107,4 @@ def main(argv=None) -> int:
         return inspect.info(options.model)
     if options.command == "view":
         return inspect.view(options.file, not options.no_open)
-    if options.command == "bench":
-        from svkc.cli.bench import bench
-
-        return bench(options.lanes)
     return run.scenes()

@@ -19,8 +19,8 @@ from svkc.model.virtual_link import VirtualLink
 from svkc.simulation.records import RESULTS, Events, Phases
 from svkc.simulation.trajectory import Trajectory
 
-# 2: with `derivative` and the phases' `margin`; 3: with the structures' `margin` and the rest of
-# the certificate; 4: with the phases' gaps
+# Raise it whenever a stored array is added, renamed or changes its meaning: files of every other
+# schema are refused.
 SCHEMA = 4
 _CODES = ("result", "derivative")
 _PARTS = {
@@ -97,40 +97,6 @@ def save(traj: Trajectory, path, chain=None, options=None) -> None:
         raise
 
 
-def _complete(arrays: dict[str, np.ndarray], schema: int) -> None:
-    """What was not kept before schema 4, as not known: inf, -1, or nothing let go."""
-    rows, dtype = arrays["phases.start"].shape, arrays["ts"].dtype
-    arrays |= {f"phases.{name}": np.full((*rows, 2), np.inf, dtype) for name in ("gap", "gap_rate")}
-    if schema >= 3:
-        return
-    unknown = {
-        "evaluations": np.full(rows, -1, np.int32),
-        "swaps": np.full(rows, -1, np.int32),
-        "loop": np.full(rows, -1, np.int32),
-        "error": np.full(rows, np.inf, dtype),
-    }
-    unknown |= {"free": np.zeros(rows, bool), "momentum_drift": np.zeros((*rows, 2), dtype)}
-    arrays |= {f"phases.{name}": value for name, value in unknown.items()} | {
-        "gap_rates": np.full_like(arrays["gaps"], np.inf)
-    }
-    arrays.setdefault("phases.margin", np.full(rows, np.inf, dtype))
-    for part in ("states", "final"):
-        arrays[f"{part}.structure.margin"] = np.zeros_like(arrays[f"{part}.structure.rank"], dtype)
-
-
-# what every file has had from the first
-_FIRST = {
-    "ts",
-    "gaps",
-    "states.q",
-    "states.structure.rank",
-    "final.q",
-    "final.structure.rank",
-    "events.time",
-    "phases.start",
-}
-
-
 def _named(cls, prefix: str = "") -> set[str]:
     """The names of all arrays that `_build` looks for, but for those that may be None."""
     out = set()
@@ -181,14 +147,10 @@ def load_chain(path) -> Chain:
 
 
 def load_trajectory(path) -> Trajectory:
-    """The trajectory that `Trajectory.save` wrote. ValueError: not such a file, cut short, or of a
-    newer schema. FileNotFoundError: no file."""
-    arrays, meta, codes = _read(path)
+    """The trajectory that `Trajectory.save` wrote. ValueError: not such a file, cut short, or of
+    another schema. FileNotFoundError: no file."""
+    arrays, _, codes = _read(path)
     arrays = {name: x for name, x in arrays.items() if not name.startswith("chain.")}
-    _check_whole(path, arrays, _FIRST)
-    schema = int(meta["schema"])
-    if schema < 4:
-        _complete(arrays, schema)
     _check_whole(path, arrays, _named(Trajectory))
     code = lambda value: eqx.tree_at(lambda item: item._value, RESULTS.successful, value)
     build = lambda arrays, codes: _build(
@@ -211,17 +173,18 @@ def _read(path) -> tuple[dict[str, np.ndarray], dict, dict[str, np.ndarray]]:
         with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         meta = json.loads(str(arrays.pop("metadata")))
-        schema, codes = (
-            int(meta["schema"]),
-            {name: np.asarray(meta.get(name, 0), np.int32) for name in _CODES},
+        schema = int(meta["schema"])
+        codes = (
+            {name: np.asarray(meta[name], np.int32) for name in _CODES} if schema == SCHEMA else {}
         )
     except FileNotFoundError:
         raise
     # whatever the readers of zip, npy and JSON say of what is none
     except Exception as error:
         raise ValueError(f"{path} is not a whole trajectory written by svkc: {error}") from error
-    if schema > SCHEMA:
+    if schema != SCHEMA:
         raise ValueError(
-            f"{path} has schema {schema}, this version reads up to {SCHEMA}; use a newer svkc"
+            f"{path} has schema {schema}, this version reads schema {SCHEMA}; load it with the"
+            " version of svkc that wrote it"
         )
     return arrays, meta, codes
