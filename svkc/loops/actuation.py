@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from svkc._jax.eager import eager_jit
 from svkc._jax.pytrees import concrete
 from svkc.loops.constrained_dynamics import with_links
-from svkc.loops.constraint import scales
+from svkc.loops.constraint import loop_kinematics, scales
 from svkc.loops.coordinates import constrained, open_coordinates
 from svkc.loops.forward_dynamics import constraint_forces
 from svkc.loops.pivoting import Selection, select, select_with_rank
@@ -104,11 +104,12 @@ def _per_dof(chain: Chain, name: str, value, default, state: State) -> Float[Arr
 
 @eager_jit
 def _coordinates(chain: Chain, state: State):
-    kin = kinematics(chain, state.q)
-    V = twists(chain, kin, state.v)
-    if not len(chain.link_names):
-        return open_coordinates(chain, state.structure), kin, V
-    return constrained(chain, state.structure, state.q, state.v, kin, V), kin, V
+    if not chain.link_names:
+        kin = kinematics(chain, state.q)
+        return open_coordinates(chain, state.structure), kin, twists(chain, kin, state.v)
+    loops = loop_kinematics(chain, state.structure, state.q)
+    V = twists(chain, loops.kin, state.v)
+    return constrained(chain, state.structure, state.v, loops, V), loops.kin, V
 
 
 def _basis(

@@ -2,8 +2,7 @@
 J_C (paper (9)-(11)).
 
 Rows of a loop: three angular, then three linear, the motion of the virtual link less that of its
-real link, in world axes at the real link's end
-of the joint.
+real link, in world axes at the real link's end of the joint.
 """
 
 import equinox as eqx
@@ -122,13 +121,9 @@ def _virtual_axes(chain: Chain, structure: Structure, end: Ends) -> Float[Array,
     """Motion of the virtual link for a unit of each of its six freedoms, at its own origin; zero
     for those it has not."""
     zero = jnp.zeros_like(end.axes[:, :3])
-    S = jnp.concatenate(
-        [
-            jnp.concatenate([end.axes[:, :3], zero], -1),
-            jnp.concatenate([zero, end.axes[:, 3:]], -1),
-        ],
-        1,
-    )
+    turns = jnp.concatenate([end.axes[:, :3], zero], -1)
+    slides = jnp.concatenate([zero, end.axes[:, 3:]], -1)
+    S = jnp.concatenate([turns, slides], 1)
     return jnp.where((structure.connected[:, None] & structure.freedoms)[:, :, None], S, 0)
 
 
@@ -151,9 +146,8 @@ def loop_jacobian(
     np.put_along_axis(source, top.links.dof, np.arange(6 * count).reshape(-1, 6), 1)
     virtual = take(own.reshape(-1, 6), source[:, top.nv : top.dofs])
     J = jnp.concatenate([tree, virtual], 1)
-    J = jnp.where(
-        structure.connected[:, None, None] & active_dofs(chain, structure)[None, :, None], J, 0
-    )
+    moving = structure.connected[:, None, None] & active_dofs(chain, structure)[None, :, None]
+    J = jnp.where(moving, J, 0)
     return jnp.swapaxes(J, 1, 2).reshape(-1, top.dofs)
 
 
@@ -177,9 +171,8 @@ def loop_bias(
     bias = motion_cross(V_parent, slide) + motion_cross(V_base, jnp.sum(parts[:, :3], 1))
     # turns in sequence carry one another; a ball's axes turn together and add nothing
     is_ball = np.array([sum(f[:3]) == 3 for f in top.link_freedoms], bool)[:, None]
-    carried = motion_cross(parts[:, 0], parts[:, 1] + parts[:, 2]) + motion_cross(
-        parts[:, 1], parts[:, 2]
-    )
+    x, y, z = parts[:, 0], parts[:, 1], parts[:, 2]
+    carried = motion_cross(x, y + z) + motion_cross(y, z)
     bias = bias + jnp.where(is_ball, 0, carried)
     A_virtual = shift_motion(A[structure.parent], end.from_parent_root) + bias
     A_real = shift_motion(A[structure.real], end.real)
@@ -200,27 +193,47 @@ def scales(chain: Chain) -> tuple[Float[Array, " rows"], Float[Array, " dofs"]]:
     return rows, jnp.where(linear, chain.length, 1)
 
 
-def scaled_jacobian(chain: Chain, structure: Structure, kin, end) -> Float[Array, "rows dofs"]:
-    """J_C without units: rows and columns multiplied by `scales`."""
+class LoopKinematics(eqx.Module):
+    """Kinematics of the tree and of its loops at one configuration.
+
+    kin: the tree's. frames: both ends of each virtual link. J: J_C without units, its rows and
+    columns multiplied by `scales`. row_scale: the factors of the rows.
+    """
+
+    kin: Kinematics
+    frames: Ends
+    J: Float[Array, "rows dofs"]
+    structure: Structure
+    row_scale: Float[Array, " rows"]
+
+    # a property, as most programs have no use for it: XLA would remove it, but only after it was
+    # traced and lowered
+    @property
+    def gap(self) -> Float[Array, " rows"]:
+        """Return `gap` of each link without units, row by row."""
+        return self.row_scale * gap(self.structure, self.frames).ravel()
+
+
+def loop_kinematics(chain: Chain, structure: Structure, q: Float[Array, " q"]) -> LoopKinematics:
+    """Return the kinematics of the tree and of its loops at q."""
+    kin = kinematics(chain, q)
+    end = ends(chain, structure, kin, q)
     row, column = scales(chain)
-    return row[:, None] * loop_jacobian(chain, structure, kin, end) * column[None]
+    J = row[:, None] * loop_jacobian(chain, structure, kin, end) * column[None]
+    return LoopKinematics(kin=kin, frames=end, J=J, structure=structure, row_scale=row)
 
 
 def loop_rates(
-    chain: Chain, structure: Structure, v, kin: Kinematics, V, end, J, baumgarte=None
+    chain: Chain, structure: Structure, v, loops: LoopKinematics, V, baumgarte=None
 ) -> Float[Array, " rows"]:
-    """Jdot_C v without units. baumgarte: rate (1/s) at which gaps are pulled back."""
+    """Return Jdot_C v without units. baumgarte: rate (1/s) at which gaps are pulled back."""
     row, column = scales(chain)
-    moving = jnp.where(active_dofs(chain, structure), v, 0)
-    bias = row * loop_bias(
-        chain, structure, kin, end, V, bias_accelerations(chain, kin, V, v), moving
-    )
+    kin, moving = loops.kin, jnp.where(active_dofs(chain, structure), v, 0)
+    A = bias_accelerations(chain, kin, V, v)
+    bias = row * loop_bias(chain, structure, kin, loops.frames, V, A, moving)
     if baumgarte is not None:
-        bias = (
-            bias
-            + 2 * baumgarte * (J @ (moving / column))
-            + baumgarte**2 * row * gap(structure, end).ravel()
-        )
+        gaps = gap(structure, loops.frames).ravel()
+        bias = bias + 2 * baumgarte * (loops.J @ (moving / column)) + baumgarte**2 * row * gaps
     return bias
 
 
@@ -230,9 +243,8 @@ def gaps_and_rates(
     """`loop_gaps` and `velocity_gaps` from one pass over the tree."""
     kin = kinematics(chain, state.q)
     end = ends(chain, state.structure, kin, state.q)
-    return gap(state.structure, end), (
-        loop_jacobian(chain, state.structure, kin, end) @ state.v
-    ).reshape(-1, 6)
+    rates = loop_jacobian(chain, state.structure, kin, end) @ state.v
+    return gap(state.structure, end), rates.reshape(-1, 6)
 
 
 def sizes(rows: Float[Array, " rows"]) -> Float[Array, "links 2"]:
@@ -268,12 +280,11 @@ def jacobian(
     chain: Chain, state: State
 ) -> tuple[Float[Array, "links 3 dofs"], Float[Array, "links 3 dofs"]]:
     """J_C (paper (11)): linear (m/s) and angular (rad/s) velocity of each connected virtual link
-    relative to its real link, for a unit rate of each
-    joint coordinate, at the joint, in world axes."""
+    relative to its real link, for a unit rate of each joint coordinate, at the joint, in world
+    axes."""
     kin = kinematics(chain, state.q)
-    J = loop_jacobian(
-        chain, state.structure, kin, ends(chain, state.structure, kin, state.q)
-    ).reshape(-1, 6, chain.dofs)
+    end = ends(chain, state.structure, kin, state.q)
+    J = loop_jacobian(chain, state.structure, kin, end).reshape(-1, 6, chain.dofs)
     return J[:, 3:], J[:, :3]
 
 

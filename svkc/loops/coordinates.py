@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from svkc.loops.constraint import ends, loop_rates, scaled_jacobian, scales
+from svkc.loops.constraint import LoopKinematics, loop_kinematics, loop_rates, scales
 from svkc.loops.pivoting import Selection, choose, solve_frozen, square
 from svkc.model.chain import Chain, State, Structure, active_dofs
 from svkc.model.checked_jit import check_state, verb
-from svkc.tree.kinematics import Kinematics, kinematics, twists
+from svkc.tree.kinematics import twists
 
 
 class Coordinates(eqx.Module):
@@ -82,12 +82,12 @@ def constrain(
     )
 
 
-def constrained(chain: Chain, structure: Structure, q, v, kin: Kinematics, V) -> Coordinates:
-    """`constrain` at one state, from its kinematics."""
-    end = ends(chain, structure, kin, q)
-    J = scaled_jacobian(chain, structure, kin, end)
-    bias = loop_rates(chain, structure, v, kin, V, end, J)
-    return constrain(chain, structure, choose(structure, J), J, bias)
+def constrained(
+    chain: Chain, structure: Structure, v: Float[Array, " dofs"], loops: LoopKinematics, V
+) -> Coordinates:
+    """Return `constrain` at one state. V: twists of the tree (`twists`)."""
+    bias = loop_rates(chain, structure, v, loops, V)
+    return constrain(chain, structure, choose(structure, loops.J), loops.J, bias)
 
 
 def open_coordinates(chain: Chain, structure: Structure) -> Coordinates:
@@ -116,8 +116,9 @@ def coordinates(chain: Chain, state: State) -> Coordinates:
     the paper names them (section II)."""
     if not len(chain.link_names):
         return open_coordinates(chain, state.structure)
-    kin = kinematics(chain, state.q)
-    return constrained(chain, state.structure, state.q, state.v, kin, twists(chain, kin, state.v))
+    loops = loop_kinematics(chain, state.structure, state.q)
+    V = twists(chain, loops.kin, state.v)
+    return constrained(chain, state.structure, state.v, loops, V)
 
 
 def prefer(chain: Chain, state: State, *names: str) -> State:

@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from svkc._jax.lanes_last import with_lanes_last
 from svkc.loops.constrained_dynamics import by_bodies, solve_free_motion, solve_motion, with_links
-from svkc.loops.constraint import ends, loop_rates, scaled_jacobian, scales
+from svkc.loops.constraint import loop_kinematics, loop_rates, scales
 from svkc.loops.coordinates import agreeing
 from svkc.loops.pivoting import (
     NEAR,
@@ -47,11 +47,9 @@ def moving(
     those of the independent ones, for there the stages of a step would make their errors grow.
     pivots: as `choose` takes them.
     """
-    kin = kinematics(chain, q)
-    loops = len(chain.topology.link_names)
-    if loops:
-        end = ends(chain, structure, kin, q)
-        J = scaled_jacobian(chain, structure, kin, end)
+    if chain.topology.link_names:
+        loops = loop_kinematics(chain, structure, q)
+        kin, J = loops.kin, loops.J
         selection = choose(structure, J, pivots) if agree or inertia is not by_bodies else None
         if agree:
             near = weakest(selection) < NEAR * structure.margin
@@ -60,6 +58,8 @@ def moving(
                 agreeing(chain, selection, J, jnp.where(active_dofs(chain, structure), v, 0)),
                 v,
             )
+    else:
+        kin, loops = kinematics(chain, q), None
     V = twists(chain, kin, v)
     bias = generalized_forces(chain, kin, V, v, jnp.zeros(chain.nv, v.dtype))
     force = (
@@ -67,9 +67,9 @@ def moving(
         + passive_forces(chain, q, v)
         - jnp.concatenate([bias, jnp.zeros(chain.dofs - chain.nv, v.dtype)])
     )
-    if not loops:
+    if loops is None:
         return v, solve_free_motion(chain, structure, kin, force, inertia)
-    rates = loop_rates(chain, structure, v, kin, V, end, J, baumgarte)
+    rates = loop_rates(chain, structure, v, loops, V, baumgarte)
     return v, solve_motion(chain, structure, kin, selection, J, force, rates, inertia)
 
 
@@ -150,11 +150,11 @@ def loop_forces(chain: Chain, state: State, tau: Float[Array, " torques"]) -> Lo
             jnp.zeros((0, 3), state.v.dtype), jnp.zeros((0, 3), state.v.dtype), jnp.zeros(0, bool)
         )
     q, v, s, nv = state.q, state.v, state.structure, chain.nv
-    kin = kinematics(chain, q)
+    loops = loop_kinematics(chain, s, q)
+    kin, J = loops.kin, loops.J
     V = twists(chain, kin, v)
     vdot = acceleration(chain, s, q, v, tau)
     needed = with_links(chain, generalized_forces(chain, kin, V, v, vdot[:nv]), vdot)
-    J = scaled_jacobian(chain, s, kin, ends(chain, s, kin, q))
     selection = choose(s, J)
     wrench = -constraint_forces(chain, selection, J, needed - passive_forces(chain, q, v) - tau)
     return LoopForces(wrench[:, 3:], wrench[:, :3], ~self_stressed(s, selection))

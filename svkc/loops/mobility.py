@@ -6,12 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from svkc.loops.constraint import ends, scaled_jacobian
+from svkc.loops.constraint import loop_kinematics
 from svkc.loops.coordinates import coordinates
 from svkc.loops.pivoting import count_rank, select, weakest
 from svkc.model.chain import Chain, State, active_dofs
 from svkc.model.checked_jit import verb
-from svkc.tree.kinematics import kinematics
 
 
 class Mobility(eqx.Module):
@@ -60,8 +59,7 @@ def mobility(chain: Chain, state: State) -> Mobility:
         return Mobility(
             joint_freedoms, joint_freedoms, zero, none, active, one, none > 0, (), chain.dof_names
         )
-    kin = kinematics(chain, state.q)
-    J = scaled_jacobian(chain, state.structure, kin, ends(chain, state.structure, kin, state.q))
+    J = loop_kinematics(chain, state.structure, state.q).J
     # of the first loop's rows, the first two loops', and so on
     upto = np.arange(6 * links)[None] < 6 * np.arange(1, links + 1)[:, None]
     ranks = jax.lax.map(

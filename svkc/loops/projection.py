@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from svkc._jax.lanes_last import with_lanes_last
 from svkc.loops.constrained_dynamics import by_bodies, solve_motion
-from svkc.loops.constraint import ends, gap, scaled_jacobian, scales, sizes
+from svkc.loops.constraint import loop_kinematics, scales, sizes
 from svkc.loops.pivoting import (
     Selection,
     held_part,
@@ -25,7 +25,7 @@ from svkc.loops.pivoting import (
 )
 from svkc.model.chain import Chain, Structure, active_dofs
 from svkc.tree.configuration import integrate, normalize
-from svkc.tree.kinematics import Kinematics, kinematics
+from svkc.tree.kinematics import Kinematics
 
 
 def least_change(
@@ -107,15 +107,14 @@ def settle_loops(
     |R_11|, and the pivots to go on with. pivots: those held so far (None: none are), which go on
     until their |R_mm| / |R_11| is below `hold` times that of new ones.
     """
-    row, column = scales(chain)
+    column = scales(chain)[1]
     active = active_dofs(chain, structure)
 
     @functools.partial(jax.checkpoint, prevent_cse=False)
     def turn(i, both):
         q, v = both[:2]
-        kin = kinematics(chain, q)
-        end = ends(chain, structure, kin, q)
-        J = scaled_jacobian(chain, structure, kin, end)
+        loops = loop_kinematics(chain, structure, q)
+        J = loops.J
         full = select(J, structure.rank, structure.independent)
         selection, chosen = _solvable(structure, full), full.P
         if pivots is not None:
@@ -127,10 +126,8 @@ def settle_loops(
             chosen = jax.lax.cond(
                 i == iterations, lambda: jnp.where(poor(), full.P, pivots), lambda: pivots
             )
-        open_ = jnp.stack(
-            [row * gap(structure, end).ravel(), J @ jnp.where(active, v / column, 0)], 1
-        )
-        step = -change(chain, structure, kin, selection, J, open_)
+        open_ = jnp.stack([loops.gap, J @ jnp.where(active, v / column, 0)], 1)
+        step = -change(chain, structure, loops.kin, selection, J, open_)
         last = i == iterations
         seen = jax.lax.stop_gradient((sizes(open_[:, 0]), weakest(full), chosen))
         return (
@@ -142,7 +139,7 @@ def settle_loops(
     none = (
         jnp.zeros((len(chain.link_names), 2), q.dtype),
         jnp.ones((), q.dtype),
-        jnp.zeros((min(row.shape[0], chain.dofs), chain.dofs), q.dtype),
+        jnp.zeros((min(6 * len(chain.link_names), chain.dofs), chain.dofs), q.dtype),
     )
     return jax.lax.fori_loop(0, iterations + 1, turn, (normalize(chain, q), v, *none))
 
@@ -179,12 +176,11 @@ def _turn_by_bodies(
 ) -> tuple[Float[Array, " dofs"], Float[Array, "links 2"]]:
     """The least change, in the metric of the inertia, of q that closes the loops or, in the last
     turn, of v that keeps them; and the gaps at q."""
-    row, column = scales(chain)
-    kin = kinematics(chain, q)
-    end = ends(chain, structure, kin, q)
-    J, open_ = scaled_jacobian(chain, structure, kin, end), row * gap(structure, end).ravel()
-    apart = jnp.where(last, J @ jnp.where(active_dofs(chain, structure), v / column, 0), open_)
+    column = scales(chain)[1]
+    loops = loop_kinematics(chain, structure, q)
+    J, open_, active = loops.J, loops.gap, active_dofs(chain, structure)
+    apart = jnp.where(last, J @ jnp.where(active, v / column, 0), open_)
     step = solve_motion(
-        chain, structure, kin, None, J, jnp.zeros(chain.dofs, q.dtype), apart, by_bodies
+        chain, structure, loops.kin, None, J, jnp.zeros(chain.dofs, q.dtype), apart, by_bodies
     )
     return step, jax.lax.stop_gradient(sizes(open_))

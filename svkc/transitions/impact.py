@@ -15,7 +15,7 @@ from svkc.loops.constrained_dynamics import (
     solve_motion,
     with_links,
 )
-from svkc.loops.constraint import ends, loop_jacobian, scales
+from svkc.loops.constraint import ends, loop_jacobian, loop_kinematics, scales
 from svkc.loops.coordinates import constrained
 from svkc.loops.forward_dynamics import constraint_forces
 from svkc.loops.pivoting import Selection
@@ -83,8 +83,9 @@ def velocity_by_impulse(
     State: not connected yet, bodies in place.
     """
     slot, nv = link_index(chain, name), chain.nv
-    kin = kinematics(chain, state.q)
-    before = constrained(chain, state.structure, state.q, state.v, kin, twists(chain, kin, state.v))
+    loops = loop_kinematics(chain, state.structure, state.q)
+    kin = loops.kin
+    before = constrained(chain, state.structure, state.v, loops, twists(chain, kin, state.v))
     after = eqx.tree_at(
         lambda s: s.connected, state.structure, state.structure.connected.at[slot].set(True)
     )

@@ -15,14 +15,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.primitive import operation
-from svkc.loops.constraint import ends, gap, scaled_jacobian, scales
+from svkc.loops.constraint import loop_kinematics, scales
 from svkc.loops.pivoting import count_rank, held_part, rank_tolerance, select, without_weak
 from svkc.loops.projection import least_change
 from svkc.model.chain import Chain, Structure, active_dofs
 from svkc.transitions.impact import velocity_after_impact
 from svkc.transitions.placement import joint_coordinates, with_coordinates
 from svkc.tree.configuration import integrate, normalize
-from svkc.tree.kinematics import kinematics
 
 # kinds of iterations
 READ = 0  # set the coordinates of virtual joints to what the poses of their bodies say
@@ -143,7 +142,7 @@ def _iterate(
 ) -> Newton:
     """Take the iterations of a schedule. unranked: how many of them take every row, whatever the
     rank of the structure."""
-    (row, column), kinds = scales(chain), schedule.kinds
+    column, kinds = scales(chain)[1], schedule.kinds
     active, every = active_dofs(chain, structure), min(6 * len(chain.link_names), chain.dofs)
     # a fixed direction without pattern, as q itself may be singular
     away = jnp.where(active, 0.05 * np.sin(1.0 + 2.3 * np.arange(chain.dofs)) * column, 0).astype(
@@ -154,9 +153,8 @@ def _iterate(
     def one(now: Newton, x) -> tuple[Newton, None]:
         kind, ranked = x
         at = jnp.where(_among(kind, RECLOSE, COUNT), now.probe, now.q) if COUNT in kinds else now.q
-        kin = kinematics(chain, at)
-        end = ends(chain, structure, kin, at)
-        J, gaps = scaled_jacobian(chain, structure, kin, end), row * gap(structure, end).ravel()
+        loops = loop_kinematics(chain, structure, at)
+        kin, J, gaps = loops.kin, loops.J, loops.gap
         free = J
         for which, mask in ((CLOSE_HELD, held.q), (VELOCITY_HELD, held.v)):
             free = (
