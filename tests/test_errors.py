@@ -378,7 +378,7 @@ def test_inside_compiled_programs(setting):
 
 
 def test_warnings_and_what_others_raise(setting, tmp_path):
-    warned, again, missing = said.OTHERS
+    warned, again, missing, unlike = said.OTHERS
     assert said.messages_of("warn", 0) == {warned, again}
     # it takes two compilations: tests/test_functions.py
     assert "a new function object" in again
@@ -392,3 +392,6 @@ def test_warnings_and_what_others_raise(setting, tmp_path):
     for read in (svkc.load_trajectory, svkc.load_chain):
         with pytest.raises(FileNotFoundError, match=said.pattern(missing)):
             read(tmp_path / "none.npz")
+    lighter = setting.load(models.MJCF.format(models.FOUR_BAR).replace("-9.81", "-1.62"))
+    with pytest.raises(ValueError, match=said.pattern(unlike)):
+        jax.tree.map(lambda *x: jnp.stack(x), setting.load(), lighter)

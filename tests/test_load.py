@@ -3,6 +3,8 @@
 import pathlib
 import re
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import models
 import mujoco
@@ -30,6 +32,76 @@ def test_four_ways_in(tmp_path):
         assert chain.body_names == ("world", "arm")
         assert chain.joint_names == ("arm",)
         assert (chain.nq, chain.nv, chain.dofs) == (1, 1, 1)
+
+
+def kept_as_is():
+    """A jitted function of a chain that gives it back, and the list of its traces."""
+    traces = []
+    return jax.jit(lambda chain: (traces.append(0), chain)[1]), traces
+
+
+def test_two_loads_of_one_model_are_one_program(tmp_path):
+    """However the model and the arguments come: equal, of equal hash, traced once."""
+    path = tmp_path / "model.xml"
+    path.write_text(PENDULUM)
+    hinge = {"name": "l", "parent": "world", "real": "arm", "connected": True}
+    written = [
+        {
+            "virtual_links": [svkc.VirtualLink(joint="hinge", axis=(0, 0, 1), **hinge)],
+            "ignore": ("limit", "damping"),
+        },
+        {
+            "virtual_links": svkc.VirtualLink(
+                joint=np.eye(6, dtype=bool)[2], axis=np.array([0.0, 0.0, 1.0]), **hinge
+            ),
+            "ignore": iter(["damping", "limit"]),
+        },
+        {
+            "virtual_links": (svkc.VirtualLink(joint="hinge", axis=jnp.array([0, 0, 1]), **hinge),),
+            "ignore": ["damping", "limit", "limit"],
+        },
+    ]
+    for sources, arguments in (
+        ([PENDULUM, path, str(path), mujoco.MjSpec.from_string(PENDULUM)], [{}]),
+        ([PENDULUM], written),
+        ([mujoco.MjModel.from_xml_string(PENDULUM) for _ in range(2)], [{}]),
+    ):
+        same, traces = kept_as_is()
+        chains = [svkc.load(source, **given) for source in sources for given in arguments]
+        assert len({jax.tree.structure(chain) for chain in chains}) == 1
+        for chain in chains:
+            same(chain)
+        assert len(traces) == 1
+
+
+def test_chains_of_other_models_keep_their_own():
+    """Equal in shape, but not in a number, a text or an argument: each comes back from jit with the
+    model that it was loaded from."""
+    link = lambda **where: svkc.VirtualLink("l", "world", "arm", "hinge", **where)
+    chains = [
+        svkc.load(PENDULUM),
+        svkc.load(PENDULUM.replace("-9.81", "-9.8")),
+        svkc.load(PENDULUM.replace("<mujoco>", "<mujoco><!-- this --><size nuser_body='1'/>")),
+        svkc.load(mujoco.MjModel.from_xml_string(PENDULUM)),
+        svkc.load(PENDULUM, ignore="limit"),
+        svkc.load(PENDULUM, virtual_links=link()),
+        svkc.load(PENDULUM, virtual_links=link(connected=True)),
+        svkc.load(PENDULUM, virtual_links=link(axis=(0, 1, 0))),
+    ]
+    assert len({jax.tree.structure(chain) for chain in chains}) == len(chains)
+    same, traces = kept_as_is()
+    for chain in chains:
+        assert same(chain).model.model is chain.model.model
+        assert same(chain).model.arguments == chain.model.arguments
+    assert len(traces) == len(chains)
+    # a MjModel that is changed later does not make its chain another one
+    before = hash(jax.tree.structure(chains[0]))
+    chains[0].model.model.opt.timestep *= 2
+    assert hash(jax.tree.structure(chains[0])) == before
+    # numbers of a chain are its leaves: one model, two masses
+    heavier = eqx.tree_at(lambda c: c.mass, chains[0], 2 * chains[0].mass)
+    both = jax.tree.map(lambda *x: jnp.stack(x), chains[0], heavier)
+    np.testing.assert_array_equal(both.mass[1], 2 * both.mass[0])
 
 
 def test_pointers():

@@ -392,6 +392,18 @@ def test_a_saved_run_goes_on(tmp_path, pendulum):
     assert "<mujoco" in told["model"]
 
 
+def test_a_chain_from_a_file_is_the_same_program(tmp_path, pendulum):
+    """With every argument that `load` takes, as numbers and arrays: equal, and traced once."""
+    hold = svkc.VirtualLink("hold", "world", "arm", "ball", axis=np.array([0, 1e-3, 1 / 3]))
+    text = pendulum.model.text
+    chain = svkc.load(text, virtual_links=hold, cuttable="arm", spare=np.int64(1), ignore="all")
+    svkc.simulate(pendulum, pendulum.state(), 0.1).save(tmp_path / "run.npz", chain)
+    again = svkc.load_chain(tmp_path / "run.npz")
+    assert bool(eqx.tree_equal(again, chain))
+    total = jax.jit(eqx.debug.assert_max_traces(lambda chain: chain.mass.sum(), max_traces=1))
+    assert total(again) == total(chain)
+
+
 @pytest.mark.slow
 def test_guards_that_jump(pendulum):
     """A guard that jumps in time happens where it jumps; one that a change of structure makes jump

@@ -1,6 +1,7 @@
 """A MuJoCo model -> Chain, on the host in numpy. mujoco is imported here and nowhere below."""
 
 import dataclasses
+import hashlib
 import os
 import pathlib
 import warnings
@@ -20,23 +21,18 @@ from svkc.model.validation import texts, whole
 from svkc.model.virtual_link import VirtualLink, joint_freedoms
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True)
 class Source:
-    """The MuJoCo model a chain was made of and its MJCF (None where only the compiled model was
-    given), for pictures, `chain.to_mjcf` and files; and the other arguments of `load`.
+    """The MuJoCo model a chain was made of, its MJCF (None where only the compiled model was
+    given) and the other arguments of `load`: for pictures, `chain.to_mjcf` and files.
 
-    Chains are told apart by their numbers and topology, not by it.
+    It is static data of the chain, so that jax compares it. Two are equal where their digests are.
     """
 
-    model: Any
-    text: str | None = None
-    arguments: dict[str, Any] | None = None
-
-    def __eq__(self, other):
-        return isinstance(other, Source)
-
-    def __hash__(self):
-        return 0
+    model: Any = dataclasses.field(compare=False, repr=False)
+    text: str | None = dataclasses.field(compare=False, repr=False)
+    arguments: dict[str, Any] = dataclasses.field(compare=False, repr=False)
+    digest: str
 
 
 def load(source, *, virtual_links=(), cuttable=(), spare=0, ignore=()) -> Chain:
@@ -49,14 +45,16 @@ def load(source, *, virtual_links=(), cuttable=(), spare=0, ignore=()) -> Chain:
     `ignore`: kinds of elements to leave out, by the names the error message uses, or "all";
     "equality" means those that are neither connect
     nor weld. "limit" leaves out joint ranges.
-    Collisions between geoms are never modelled. ValueError: the source does not parse, elements not
-    supported, unknown names.
+    Collisions between geoms are never modelled.
+    Functions are compiled once for all loads of one model with the same arguments, and again for
+    another model, even where only numbers differ. For other numbers and one program replace floats
+    of one chain (`eqx.tree_at`).
+    ValueError: the source does not parse, elements not supported, unknown names.
     """
     declared = tuple(virtual_links) if np.iterable(virtual_links) else (virtual_links,)
-    arguments = {"virtual_links": declared, "cuttable": cuttable, "spare": spare, "ignore": ignore}
-    kept = dataclasses.replace(_compiled(source), arguments=arguments)
-    model = kept.model
-    cuts = cuts_of(model, texts("cuttable", cuttable))
+    model, text = _compiled(source)
+    cuttable = texts("cuttable", cuttable)
+    cuts = cuts_of(model, cuttable)
     ignore, spare = texts("ignore", ignore), whole("spare", spare, 0, 1000)
     left_out = what_is_left_out(model, ignore)
     rows, topology = rows_of(model, {cut.body: cut.link.name for cut in cuts})
@@ -86,7 +84,35 @@ def load(source, *, virtual_links=(), cuttable=(), spare=0, ignore=()) -> Chain:
     )
     topology = placed_in(model, topology, cuts, first)
     structure = structure_of(model, topology, links)
+    arguments = {"virtual_links": declared, "cuttable": cuttable, "spare": spare, "ignore": ignore}
+    # here and not where it is compared: a MjModel may be changed after the chain is made
+    kept = Source(model, text, arguments, _digest(model, text, arguments))
     return _finite(_chain(kept, topology, rows, structure, ignore, left_out))
+
+
+def _digest(model, text: str | None, arguments: dict[str, Any]) -> str:
+    """Return SHA-256 of what a chain is made of: every byte of the compiled model, the text, and
+    the arguments of `load` in one form for all ways to write them.
+
+    Two compilations of one text give the same bytes.
+    """
+    import mujoco
+
+    image = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, image)
+    links = tuple(map(_written_out, arguments["virtual_links"]))
+    rest = arguments["cuttable"], arguments["spare"], sorted(set(arguments["ignore"]))
+    digest = hashlib.sha256(image)
+    digest.update(repr((text, links, rest)).encode())
+    return digest.hexdigest()
+
+
+def _written_out(link: VirtualLink) -> tuple:
+    """Return the fields of a virtual link as plain numbers, the joint by its freedoms."""
+    places = (link.pos, link.quat, link.real_pos, link.real_quat, link.axis)
+    numbers = (None if x is None else np.asarray(x, float).tolist() for x in places)
+    flags = bool(link.connected), bool(link.actuated)
+    return link.name, link.parent, link.real, joint_freedoms(link.joint), *numbers, *flags
 
 
 def _told_apart(what: str, names) -> None:
@@ -112,13 +138,13 @@ def _finite(chain: Chain) -> Chain:
     return chain
 
 
-def _compiled(source) -> Source:
-    """The mujoco.MjModel of any source and its text; ValueError with MuJoCo's own words where it
-    does not parse."""
+def _compiled(source) -> tuple[Any, str | None]:
+    """Return the mujoco.MjModel of any source and its text, None for a MjModel; ValueError with
+    MuJoCo's own words where it does not parse."""
     import mujoco
 
     if isinstance(source, mujoco.MjModel):
-        return Source(source)
+        return source, None
     if not isinstance(source, (mujoco.MjSpec, str, os.PathLike)):
         raise ValueError(
             "source: expected MJCF or URDF text, a path, MjSpec or MjModel, got"
@@ -131,7 +157,7 @@ def _compiled(source) -> Source:
         spec = source.copy() if isinstance(source, mujoco.MjSpec) else _read(text)
         model = spec.compile()
         with warnings.catch_warnings(action="ignore"):
-            return Source(model, text_of(spec))
+            return model, text_of(spec)
     except (ValueError, OSError, mujoco.FatalError) as error:
         raise ValueError(f"source: the model cannot be read: {error}") from error
 
