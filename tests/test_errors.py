@@ -91,6 +91,12 @@ def crowded(s):
         svkc.rollout(s.four, jax.tree.map(lambda x: x[None], s.state), 1.0)
 
 
+def too_large(s):
+    exhausted = jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory.")
+    with mock.patch("svkc.tools.rollout._piece", side_effect=exhausted):
+        svkc.rollout(s.four, jax.tree.map(lambda x: x[None], s.state), 1.0)
+
+
 def undrawn(s):
     traj = s.simulate(t1=1e-3, dt=1e-3)
     with mock.patch.dict(
@@ -196,6 +202,7 @@ CASES = {
     "check_grad: f(x) has": lambda s: svkc.check_grad(lambda x: 1, jnp.asarray(1.0)),
     "check_grad: f(x)...": lambda s: svkc.check_grad(lambda x: jnp.log(x), jnp.asarray(-1.0)),
     "check_grad: x has": lambda s: svkc.check_grad(lambda x: x, jnp.asarray(1)),
+    "chunk: ... lanes": too_large,
     "connect: the bodies": away,
     "connected: expected": lambda s: s.four.state(connected=np.ones(3)),
     "cost: got": lambda s: svkc.rollout(

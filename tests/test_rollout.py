@@ -132,17 +132,27 @@ def test_all_lanes_at_once(case, alone, capsys):
     assert capsys.readouterr().err == ""
 
 
-@pytest.mark.slow
-def test_chunks_fit_into_memory(case, alone, capsys, monkeypatch):
-    """Where little memory is free the default chunk is smaller, and never nothing."""
-    module, states = sys.modules["svkc.tools.rollout"], case[1]
-    lane = sum(x.nbytes // LANES for x in jax.tree.leaves(states))
-    # four times what four lanes with two times and the rest of a trajectory need
-    monkeypatch.setattr(module, "_free_memory", lambda device: 4.0 * 4 * lane * 66)
-    agrees(call(*case), alone)
-    assert "3 of 3 chunks (11 lanes)" in capsys.readouterr().err
-    monkeypatch.setattr(module, "_free_memory", lambda device: 0.0)
-    assert module._fitting(states, None, jax.local_devices()) == 1
+def test_out_of_memory_names_the_chunk(case, monkeypatch):
+    """The one that was given, or the default of a CPU; other errors of XLA are passed on."""
+    chain, states, data = case
+    many = jax.tree.map(lambda x: jnp.concatenate([x] * 8), (states, data))
+
+    def fails(words):
+        def piece(*args):
+            raise jax.errors.JaxRuntimeError(words)
+
+        monkeypatch.setattr(sys.modules["svkc.tools.rollout"], "_piece", piece)
+
+    fails("RESOURCE_EXHAUSTED: Out of memory allocating 1099511627776 bytes.")
+    for given, used in (({"chunk": 4}, 4), ({}, 64)):
+        with pytest.raises(
+            RuntimeError, match=rf"\(chunk={used}\) .* give a smaller chunk="
+        ) as seen:
+            call(chain, *many, devices=jax.local_devices()[:1], **given)
+        assert "RESOURCE_EXHAUSTED" in str(seen.value.__cause__)
+    fails("INTERNAL: something else")
+    with pytest.raises(jax.errors.JaxRuntimeError, match="INTERNAL"):
+        call(*case)
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ import svkc
 pytest_plugins = ["pytester"]
 
 FOLDER = pathlib.Path(__file__).parent
+FILES = {path.stem: path for path in FOLDER.rglob("*.py")}
 # calls that are there to be refused
 REFUSED = ("test_errors", "test_fuzz")
 # nouns that are made by a function, not by their name
@@ -24,7 +25,7 @@ MADE_BY = {
 
 @functools.cache
 def parsed(name: str) -> ast.Module:
-    return ast.parse((FOLDER / f"{name}.py").read_text())
+    return ast.parse(FILES[name].read_text())
 
 
 @functools.cache
@@ -96,7 +97,7 @@ class Names(ast.NodeVisitor):
         if isinstance(node.value, ast.Name):
             if node.value.id == "svkc":
                 self.public.add(node.attr)
-            elif (FOLDER / f"{node.value.id}.py").exists():
+            elif node.value.id in FILES:
                 self.come_upon(node.value.id, node.attr)
         self.generic_visit(node)
 

@@ -10,9 +10,10 @@ import models
 import mujoco
 import numpy as np
 import pytest
+from references import paper
 
 import svkc
-from svkc.loops.forward_dynamics import acceleration, forward_dynamics_by_unit_vectors
+from svkc.loops.forward_dynamics import acceleration
 from svkc.tree.configuration import rates
 from svkc.tree.kinematics import kinematics
 
@@ -89,7 +90,7 @@ def everything(chain, state, tau):
         "mass by unit vectors": svkc.inertia_by_unit_vectors(chain, kin),
         "bias": svkc.bias_force(chain, state),
         "acceleration": vdot,
-        "acceleration by unit vectors": forward_dynamics_by_unit_vectors(chain, state, tau),
+        "acceleration by unit vectors": paper.forward_dynamics_by_unit_vectors(chain, state, tau),
         "acceleration by composites": acceleration(
             chain, state.structure, state.q, state.v, tau, svkc.inertia_by_composites
         ),

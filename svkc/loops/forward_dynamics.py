@@ -24,7 +24,6 @@ from svkc.model.chain import Chain, State, Structure, active_dofs
 from svkc.model.checked_jit import joint_torques, verb
 from svkc.tree.inverse_dynamics import generalized_forces, passive_forces
 from svkc.tree.kinematics import kinematics, twists
-from svkc.tree.mass_matrix import inertia_by_unit_vectors
 
 
 @functools.partial(jax.jit, static_argnames=("inertia", "agree"))
@@ -99,17 +98,6 @@ def forward_dynamics(
     articulated bodies, or composites where there are loops.
     """
     return acceleration(chain, state.structure, state.q, state.v, joint_torques(chain, tau))
-
-
-@verb
-def forward_dynamics_by_unit_vectors(
-    chain: Chain, state: State, tau: Float[Array, " torques"]
-) -> Float[Array, " dofs"]:
-    """The same with the inertia matrix column by column from inverse dynamics: the paper's own
-    way."""
-    return acceleration(
-        chain, state.structure, state.q, state.v, joint_torques(chain, tau), inertia_by_unit_vectors
-    )
 
 
 def constraint_forces(

@@ -39,18 +39,18 @@ def rollout(
     Functions are compared as in `simulate`, `lane` too: it may be a lambda in the call itself.
     cost: [lanes], how long each may take (any unit): lanes alike go together, so that the short do
     not wait for the long.
-    chunk: lanes at once on one device (default: 64 on a CPU, 4096 otherwise, no more than there
-    are, nor than have trajectories that fit into a quarter
-    of the memory that is free). devices: default all of this process; each goes its own way through
-    its lanes. On a CPU there are as many as `jax.config.update("jax_num_cpu_devices", n)` asked for
-    before the first use of jax.
+    chunk: lanes at once on one device (default: 64 on a CPU, 4096 on another device, and no more
+    than there are). Memory of a chunk grows with its lanes.
+    devices: default all of this process; each goes its own way through its lanes. On a CPU there
+    are as many as `jax.config.update("jax_num_cpu_devices", n)` asked for before the first use of
+    jax.
     out: folder for finished chunks, chunk_00000.npz and so on, each a trajectory
     (`svkc.load_trajectory`); a run that was interrupted goes on from them. Under `jax.distributed`
     each process takes its share of the chunks, and all get the whole result.
     options: of `simulate`, for all lanes; `throw` is False by default: lanes that fail say so in
     `result`.
-    ValueError: leading axes that differ, or a folder of another rollout. RuntimeError: another
-    process is gone; the chunks that were finished are kept.
+    ValueError: leading axes that differ, or a folder of another rollout. RuntimeError: a chunk does
+    not fit into memory, or another process is gone; the chunks that were finished are kept.
     """
     check_chain(chain)
     lanes = _count(states, data, cost)
@@ -68,14 +68,8 @@ def rollout(
     if not devices or not all(isinstance(device, jax.Device) for device in devices):
         raise ValueError(f"devices: expected some of jax.local_devices(), got {devices!r}")
     most = max(1, lanes // (len(devices) * jax.process_count()))
-    size = min(
-        chunk
-        or min(
-            64 if devices[0].platform == "cpu" else 4096,
-            _fitting(states, options.get("ts"), devices),
-        ),
-        most,
-    ) * len(devices)
+    chunk = min(chunk or (64 if devices[0].platform == "cpu" else 4096), most)
+    size = chunk * len(devices)
     order = np.arange(lanes) if cost is None else np.argsort(np.asarray(cost), kind="stable")
     # a chunk that lacks lanes is filled up with its last one
     chunks = [
@@ -114,6 +108,7 @@ def rollout(
             jax.tree.map(lambda x, i=i: x[chunks[i]], (states, data)),
             folder and folder / f"chunk_{i:05d}.npz",
             chain,
+            chunk,
         )
         if progress:
             _say(count + 1, len(mine), lanes, time.perf_counter() - begun)
@@ -139,30 +134,6 @@ def _count(states, data, cost) -> int:
     if cost is not None and finite("cost", cost).ndim != 1:
         raise ValueError(f"cost: got shape {np.shape(cost)}, expected one number for each lane")
     return lanes
-
-
-def _fitting(states, ts, devices) -> int:
-    """How many lanes' trajectories go into a quarter of the memory that is free on each device; at
-    least one."""
-    lane = sum(x.nbytes // x.shape[0] for x in jax.tree.leaves(states))
-    # every phase keeps numbers of about a state's size, and a step as many again as its stages
-    need = lane * ((2 if ts is None else np.size(ts)) + 64)
-    # devices that are cores of one machine share its memory
-    sharing = len(devices) if devices[0].platform == "cpu" else 1
-    return max(
-        1, int(min(min(_free_memory(device) for device in devices) / sharing / 4 // need, 1 << 30))
-    )
-
-
-def _free_memory(device) -> float:
-    """Bytes: what the device says, the machine's for a CPU; inf where nobody says."""
-    stats = device.memory_stats() or {}
-    if "bytes_limit" in stats:
-        return float(stats["bytes_limit"] - stats.get("bytes_in_use", 0))
-    try:
-        return float(os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-    except (ValueError, OSError, AttributeError):
-        return np.inf
 
 
 @eqx.filter_jit
@@ -215,12 +186,21 @@ def _folder(folder: pathlib.Path, inputs, size: int) -> pathlib.Path:
     return folder
 
 
-def _chunk(run: Callable, lanes, path: pathlib.Path | None, chain: Chain) -> Trajectory:
+def _chunk(run: Callable, lanes, path: pathlib.Path | None, chain: Chain, chunk: int) -> Trajectory:
     """One chunk, read where it was finished before; on the host, so that the device is free for the
     next."""
     if path is not None and path.exists():
         return load_trajectory(path)
-    traj = jax.tree.map(np.asarray, run(lanes))
+    try:
+        # calls are asynchronous: some errors appear only when results are read
+        traj = jax.tree.map(np.asarray, run(lanes))
+    except jax.errors.JaxRuntimeError as error:
+        if "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        raise RuntimeError(
+            f"chunk: {chunk} lanes at once on one device (chunk={chunk}) need more memory than"
+            " there is; give a smaller chunk=, or fewer times ts="
+        ) from error
     if path is not None:
         traj.save(path, chain)
     return traj

@@ -1,0 +1,73 @@
+"""The paper's own forms of what svkc computes in other ways, to compare with."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.linalg import cho_factor, cho_solve
+from jaxtyping import Array, Float
+
+from svkc.loops.constrained_dynamics import reduced_inertia
+from svkc.loops.constraint import ends, loop_jacobian, loop_kinematics
+from svkc.loops.coordinates import constrained
+from svkc.loops.forward_dynamics import acceleration
+from svkc.model.chain import Chain, State
+from svkc.model.checked_jit import joint_torques
+from svkc.model.names import link_index
+from svkc.transitions.placement import joint_coordinates, with_coordinates
+from svkc.tree.kinematics import twists
+from svkc.tree.mass_matrix import inertia_by_composites, inertia_by_unit_vectors
+
+
+@jax.jit
+def forward_dynamics_by_unit_vectors(
+    chain: Chain, state: State, tau: Float[Array, " torques"]
+) -> Float[Array, " dofs"]:
+    """Return the accelerations of every joint coordinate with the inertia matrix column by column
+    from inverse dynamics: the paper's (23), (24)."""
+    return acceleration(
+        chain, state.structure, state.q, state.v, joint_torques(chain, tau), inertia_by_unit_vectors
+    )
+
+
+@functools.partial(jax.jit, static_argnames="name")
+def velocity_by_impulse(
+    chain: Chain, state: State, name: str
+) -> tuple[Float[Array, " dofs"], Float[Array, "6"]]:
+    """Return the velocity after connecting one link and the impulse F_1 on it, by the paper's
+    (34)-(38) in the coordinates theta_G of the old structure.
+
+    B must be regular. In `state` the link is not connected yet and its bodies are in place.
+    """
+    slot, nv = link_index(chain, name), chain.nv
+    loops = loop_kinematics(chain, state.structure, state.q)
+    kin = loops.kin
+    before = constrained(chain, state.structure, state.v, loops, twists(chain, kin, state.v))
+    after = eqx.tree_at(
+        lambda s: s.connected, state.structure, state.structure.connected.at[slot].set(True)
+    )
+    q = with_coordinates(
+        chain,
+        after.connected & ~state.structure.connected,
+        joint_coordinates(chain, after, kin, state.q),
+        state.q,
+    )
+    J = loop_jacobian(chain, after, kin, ends(chain, after, kin, q))[6 * slot : 6 * slot + 6]
+    own = np.array([d for d in chain.topology.links.dof[slot] if d < chain.dofs], int)
+    # J_1 - J_2 along theta_G, and the axes of the new joint, on the side where (27) has them
+    J_G, J_r = J[:, :nv] @ before.W[:nv], -J[:, own]
+    A = cho_factor(reduced_inertia(chain, before, inertia_by_composites(chain, kin)))
+    B_inverse = jnp.linalg.inv(J_G @ cho_solve(A, J_G.T))
+    C = (
+        J_r @ jnp.linalg.solve(J_r.T @ B_inverse @ J_r, J_r.T @ B_inverse)
+        if len(own)
+        else jnp.zeros_like(B_inverse)
+    )
+    u = J[:, :nv] @ state.v[:nv]
+    F = -B_inverse @ (jnp.eye(6, dtype=u.dtype) - C) @ u
+    v = state.v + before.W @ cho_solve(A, J_G.T @ F)
+    if len(own):
+        v = v.at[own].set(jnp.linalg.lstsq(J_r, J[:, :nv] @ v[:nv])[0])
+    return v, F
