@@ -14,7 +14,6 @@ from svkc.integration.vector_field import Field
 from svkc.model.chain import State
 from svkc.model.validation import one
 from svkc.transitions.events import Plan
-from svkc.transitions.guards import Sensor
 
 # how often a bracket may be narrowed
 NARROWINGS = 200
@@ -75,7 +74,7 @@ FLAT = 1e-5
 
 
 class Reading(eqx.Module):
-    """What every guard says of a moment; those that measure the mechanism are told its torques."""
+    """The values of all guards. Torques are evaluated where one of the guards needs them."""
 
     made: Plan
     field: Field
@@ -85,13 +84,10 @@ class Reading(eqx.Module):
         guards = self.made.guards
         tau = (
             self.field.torques(t, y, scene)[0]
-            if any(isinstance(g, Sensor) and g.loaded for g in guards)
+            if any(g.needs_torques for g in guards)
             else jnp.zeros_like(y.v)
         )
-        values = [
-            g.measure(scene.chain, state, tau) if isinstance(g, Sensor) else g(t, state, scene.args)
-            for g in guards
-        ]
+        values = [g.value(scene.chain, t, state, scene.args, tau) for g in guards]
         return jnp.stack([jnp.asarray(one("guard", x), y.q.dtype) for x in values])
 
 

@@ -12,18 +12,14 @@ from svkc.model.chain import Chain, State, Structure
 from svkc.simulation.phase import Run, Solved
 from svkc.simulation.records import RESULTS, Events
 from svkc.transitions.events import Plan
-from svkc.transitions.guards import Sensor
 from svkc.transitions.spare_links import emptied, grip
 from svkc.transitions.transition import change, connect_tolerance, release
 
 
 def reevaluated(made: Plan) -> np.ndarray:
     """Return which guards are re-evaluated after a change of structure, so that a guard is compared
-    within one phase.
-
-    Guards of loads are not: a link that is overloaded from the start of a phase breaks at once.
-    """
-    return np.array([not (isinstance(g, Sensor) and g.loaded) for g in made.guards], bool)
+    within one phase: all but those that need torques."""
+    return np.array([not g.needs_torques for g in made.guards], bool)
 
 
 def apply_events(

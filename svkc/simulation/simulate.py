@@ -30,7 +30,6 @@ from svkc.simulation.phase import Run, Solved, solve
 from svkc.simulation.records import RESULTS, no_events, no_records, recorded
 from svkc.simulation.trajectory import Trajectory
 from svkc.transitions.events import Plan
-from svkc.transitions.guards import Sensor
 
 
 def simulate(
@@ -151,11 +150,9 @@ def _converted(
     """Control and guards with all that they close over as their leaves, so that it can be
     differentiated."""
     state = _lockable(chain, state, made)
-
-    def converted(fn):
-        return fn if fn is None or isinstance(fn, Sensor) else Closed.over(fn, t0, state, args)
-
-    guards, control = tuple(converted(g) for g in made.guards), converted(options.control)
+    guards = tuple(g.closure_convert(t0, state, args) for g in made.guards)
+    control = options.control
+    control = None if control is None else Closed.over(control, t0, state, args)
     return _with(made, guards=guards), _with(options, control=control)
 
 
@@ -178,14 +175,14 @@ def _start(chain: Chain, state: State, t0, ts, made: Plan, options: Options, arg
     """Empty records, sized by capacity; unwritten entries show: inf, -1."""
     links, rows, dtype = len(chain.link_names), options.max_events, state.q.dtype
     state = _lockable(chain, state, made)
-    # an overload from the start is a crossing, so loads begin idle; other guards are evaluated at
-    # the start of the phase
-    idle = [g.idle if isinstance(g, Sensor) and g.loaded else 1 for g in made.guards]
+    # an overload from the start is a crossing; guards that need no torques are evaluated at the
+    # start of the phase
+    initial = [g.initial_value for g in made.guards]
     return Run(
         t=t0,
         state=state,
         work=jnp.zeros((), dtype) if options.has_work else None,
-        guards=jnp.asarray(idle, dtype) if made.guards else None,
+        guards=jnp.asarray(initial, dtype) if made.guards else None,
         stale=jnp.asarray(reevaluated(made)) if made.guards else None,
         pending=jnp.ones(len(made.timed), bool),
         events=no_events(rows, links, dtype),

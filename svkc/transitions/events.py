@@ -14,6 +14,7 @@ from svkc.model.chain import Chain, Structure
 from svkc.model.names import joint_slice, link_index, rows_of, spare_slot
 from svkc.model.topology import V_SIZE
 from svkc.model.validation import numbers, texts, yes_or_no
+from svkc.transitions.guards import AbstractGuard, UserGuard
 from svkc.transitions.spare_links import Grip, checked_freedoms, holding, placed, to_axis
 
 
@@ -128,7 +129,7 @@ class Plan(eqx.Module):
     """A list of events as tables: which are timed, and what each does."""
 
     times: Float[Array, " timed"]
-    guards: tuple[Callable, ...]
+    guards: tuple[AbstractGuard, ...]
     timed: tuple[int, ...] = eqx.field(static=True)
     guarded: tuple[int, ...] = eqx.field(static=True)
     directions: tuple[bool | None, ...] = eqx.field(static=True)
@@ -254,7 +255,7 @@ def plan(chain: Chain, events: tuple, dtype) -> Plan:
     )
     made = Plan(
         times=jnp.asarray(times, dtype),
-        guards=tuple(events[i].guard for i in guarded),
+        guards=tuple(_as_guard(events[i].guard) for i in guarded),
         timed=timed,
         guarded=guarded,
         directions=tuple(events[i].direction for i in guarded),
@@ -270,6 +271,11 @@ def plan(chain: Chain, events: tuple, dtype) -> Plan:
         for what in action.unbind:
             spare_slot(chain, what) if isinstance(what, str) else rows_of(chain, *what)
     return made
+
+
+def _as_guard(guard: Callable) -> AbstractGuard:
+    """Return a function of the user as a guard, and a guard as it is."""
+    return guard if isinstance(guard, AbstractGuard) else UserGuard(guard)
 
 
 def _checked_grip(chain: Chain, wish: Grip, dtype) -> Grip:

@@ -1,6 +1,8 @@
-"""Guards that measure the mechanism itself: bodies that touch, a support that would have to pull, a
-joint that carries too much."""
+"""Guards: a function of the user, and those that measure the mechanism itself: bodies that touch, a
+support that would have to pull, a joint that carries too much."""
 
+import abc
+from collections.abc import Callable
 from typing import ClassVar
 
 import equinox as eqx
@@ -8,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from svkc._jax.primitive import Closed
 from svkc.loops.constraint import ends
 from svkc.loops.forward_dynamics import loop_forces
 from svkc.model.chain import Chain, State
@@ -18,36 +21,65 @@ from svkc.tree.kinematics import kinematics
 from svkc.tree.spatial import quat_conjugate, quat_rotate
 
 
-class Sensor(eqx.Module):
-    """A guard that `simulate` gives its own chain and the joint torques of the moment; called by
-    hand it uses the chain it was made with, and none."""
+class AbstractGuard(eqx.Module):
+    """A number that changes with the motion; its zero is an event."""
+
+    # Whether `value` reads tau. Such a guard measures loads and is not re-evaluated after a change
+    # of structure: a link that is overloaded from the start of a phase breaks at once.
+    needs_torques: eqx.AbstractClassVar[bool]
+    # the value with which a run begins; a guard that needs no torques is evaluated there instead
+    initial_value: eqx.AbstractClassVar[float]
+
+    @abc.abstractmethod
+    def value(self, chain: Chain, t, state: State, args, tau: Float[Array, " dofs"]):
+        """Return the guard's value.
+
+        tau: joint torques of the moment (N m, N); zeros where no guard of the run needs them.
+        """
+
+    def closure_convert(self, t, state: State, args) -> "AbstractGuard":
+        """Return the guard with every array that it reads as a leaf, so that it can be
+        differentiated by them. t, state, args: examples."""
+        return self
+
+
+class UserGuard(AbstractGuard):
+    """A function (t, state, args) -> real."""
+
+    # the leaf is the function itself, by which two runs are compared
+    function: Callable
+    needs_torques: ClassVar[bool] = False
+    initial_value: ClassVar[float] = 1.0
+
+    def value(self, chain, t, state, args, tau):
+        return self.function(t, state, args)
+
+    def closure_convert(self, t, state, args):
+        return UserGuard(Closed.over(self.function, t, state, args))
+
+
+class LinkGuard(AbstractGuard):
+    """A guard that measures a virtual link. `simulate` evaluates it with its own chain; called as a
+    function it uses the chain it was made with."""
 
     chain: Chain
     link: int = eqx.field(static=True)
-    # it measures loads, for which it must be told the joint torques
-    loaded: ClassVar[bool] = True
-    # what it says of a link that carries nothing
-    idle: ClassVar[float] = 0.0
-
-    def measure(self, chain: Chain, state: State, tau: Float[Array, " dofs"]) -> Float[Array, ""]:
-        raise NotImplementedError
 
     def __call__(self, t, state: State, args=None, tau=None) -> Float[Array, ""]:
-        return self.measure(
-            self.chain,
-            state,
-            jnp.zeros_like(state.v) if tau is None else joint_torques(self.chain, tau),
-        )
+        """Return the value; tau None: no torques."""
+        tau = jnp.zeros_like(state.v) if tau is None else joint_torques(self.chain, tau)
+        return self.value(self.chain, t, state, args, tau)
 
 
-class Touch(Sensor):
+class Touch(LinkGuard):
     """See `touch`."""
 
-    loaded: ClassVar[bool] = False
+    needs_torques: ClassVar[bool] = False
+    initial_value: ClassVar[float] = 1.0
     distance: Float[Array, ""]
     axes: tuple[int, ...] = eqx.field(static=True)
 
-    def measure(self, chain, state, tau):
+    def value(self, chain, t, state, args, tau):
         s, kin, i = state.structure, kinematics(chain, state.q), self.link
         end = ends(chain, s, kin, state.q)
         p, r = s.parent[i], s.real[i]
@@ -63,30 +95,32 @@ class Touch(Sensor):
         )
 
 
-class Leaves(Sensor):
+class Leaves(LinkGuard):
     """See `leaves`."""
 
-    idle: ClassVar[float] = 1.0
+    needs_torques: ClassVar[bool] = True
+    initial_value: ClassVar[float] = 1.0
     axis: Float[Array, "3"]
 
-    def measure(self, chain, state, tau):
+    def value(self, chain, t, state, args, tau):
         s, i = state.structure, self.link
         kin = kinematics(chain, state.q)
         normal = quat_rotate(ends(chain, s, kin, state.q).base_quat[i], self.axis)
         push = jnp.sum(loop_forces(chain, state, tau).force[i] * normal)
         # a link that is not connected counts as pressed, so that one that would have to pull from
         # the first is seen to leave
-        return jnp.where(s.connected[i], push, self.idle)
+        return jnp.where(s.connected[i], push, self.initial_value)
 
 
-class Overload(Sensor):
+class Overload(LinkGuard):
     """See `overload`."""
 
-    idle: ClassVar[float] = -1.0
+    needs_torques: ClassVar[bool] = True
+    initial_value: ClassVar[float] = -1.0
     force: Float[Array, ""]
     torque: Float[Array, ""]
 
-    def measure(self, chain, state, tau):
+    def value(self, chain, t, state, args, tau):
         carried = loop_forces(chain, state, tau)
         size = lambda x: jnp.sqrt(jnp.maximum(jnp.sum(x[self.link] ** 2), jnp.finfo(x.dtype).tiny))
         return jnp.maximum(size(carried.force) / self.force, size(carried.torque) / self.torque) - 1
