@@ -23,9 +23,11 @@ import mujoco
 import numpy as np
 
 ROOT = pathlib.Path(__file__).parent.parent
-sys.path.insert(0, str(ROOT / "tests"))
+# the tests' reader of the reference problems, and the references themselves
+for folder in ("", "references", "problems"):
+    sys.path.insert(0, str(ROOT / "tests" / folder))
 
-import maximal  # the tests' reader of the reference problems
+import maximal
 import soft_loops
 import test_reference as reference
 from munthe_kaas import MuntheKaas

@@ -43,13 +43,13 @@ gc.set_threshold(100_000, 20, 50)
 
 # the longest first, so that no worker is left with one of them in the end
 LONGEST = (
-    "test_house",
+    "test_project",
     "test_transformations",
-    "test_gradients",
+    "test_derivatives",
     "test_simulate",
     "test_extremes",
     "test_reference",
-    "test_cuttable",
+    "test_cuttable_joints",
     "test_accuracy",
 )
 

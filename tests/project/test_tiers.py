@@ -10,10 +10,10 @@ import svkc
 
 pytest_plugins = ["pytester"]
 
-FOLDER = pathlib.Path(__file__).parent
-FILES = {path.stem: path for path in FOLDER.rglob("*.py")}
+TESTS = pathlib.Path(__file__).parents[1]
+FILES = {path.stem: path for path in TESTS.rglob("*.py")}
 # calls that are there to be refused
-REFUSED = ("test_errors", "test_fuzz")
+REFUSED = ("test_messages", "test_fuzz")
 # nouns that are made by a function, not by their name
 MADE_BY = {
     "Chain": "load",
@@ -106,7 +106,7 @@ def test_the_fast_tier_names_every_public_function():
     """That a test of it reaches the name in code that is to succeed; what the test looks at there,
     this does not say."""
     names = Names()
-    for path in sorted(FOLDER.glob("test_*.py")):
+    for path in sorted(TESTS.rglob("test_*.py")):
         if path.stem in (*REFUSED, "test_tiers"):
             continue
         for name, node in defined(path.stem).items():
@@ -131,7 +131,7 @@ def test_the_fast_tier_names_every_public_function():
 def test_which_tier_is_run(pytester, given, collected):
     """Without -m the fast one, by the project's own settings; -m on the command line comes last and
     holds."""
-    settings = (FOLDER.parent / "pyproject.toml").read_text()
+    settings = (TESTS.parent / "pyproject.toml").read_text()
     pytester.makepyprojecttoml(
         settings[settings.index("[tool.pytest.ini_options]") : settings.index("[tool.ruff]")]
     )

@@ -13,7 +13,8 @@ import pytest
 
 import svkc
 
-ROOT = pathlib.Path(__file__).parent.parent
+ROOT = pathlib.Path(__file__).parents[2]
+MINITAUR = pathlib.Path(__file__).parent / "robots" / "minitaur_v1.urdf"
 
 PENDULUM = models.MJCF.format(models.bar("arm", models.Y, "0 0 -1"))
 
@@ -401,7 +402,7 @@ def test_a_robot_of_others():
     angles = {"motor": -np.pi / 2, "knee": 2.1834}
     sign = lambda name: -1 if "right" in name else 1
     for slide, freedoms, least in ((False, 4, 1e-5), (True, 8, 0.1)):
-        chain = svkc.load(ROOT / "tests" / "robots" / "minitaur_v1.urdf", virtual_links=feet[slide])
+        chain = svkc.load(MINITAUR, virtual_links=feet[slide])
         assert (len(chain.body_names), chain.nv) == (28, 16)
         state = chain.state(
             {name: sign(name) * angles[name.split("_")[0]] for name in chain.joint_names}

@@ -206,7 +206,7 @@ def test_rodrigues_euler_keeps_quaternions_at_unit_length():
 def benchmark():
     """benchmarks/joints.py, which builds both figures."""
     spec = importlib.util.spec_from_file_location(
-        "joints", pathlib.Path(__file__).parent.parent / "benchmarks" / "joints.py"
+        "joints", pathlib.Path(__file__).parents[2] / "benchmarks" / "joints.py"
     )
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)

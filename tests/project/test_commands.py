@@ -1,8 +1,8 @@
 """The command line, in processes of its own."""
 
 import pytest
-import test_house
-from test_house import run
+import test_project
+from test_project import run
 
 import svkc
 
@@ -44,7 +44,7 @@ def test_a_model_of_ones_own(tmp_path):
     traj = svkc.load_trajectory(out / "rod.npz")
     assert traj.phases.freedoms[:3].tolist() == [0, 2, 0]
     for name in ("rod.png", "rod_curves.png"):
-        test_house._looks_drawn(out / name)
+        test_project._looks_drawn(out / name)
     assert ("libegl1" in done.stdout) or {"rod.gif", "rod.mp4"} <= {
         path.name for path in out.iterdir()
     }

@@ -20,11 +20,13 @@ import svkc
 from svkc._jax.primitive import operation
 from svkc.cli import run as commands
 
+TESTS = pathlib.Path(__file__).parents[1]
+
 # provoked in tests that need more than a call
 ELSEWHERE = {
-    "rollout: another process": ("test_rollout.py", "another process"),
-    "out: ... holds another": ("test_rollout.py", "holds another rollout"),
-    "expected NAME@TIME": ("test_commands.py", "expected NAME@TIME"),
+    "rollout: another process": ("tools/test_rollout.py", "another process"),
+    "out: ... holds another": ("tools/test_rollout.py", "holds another rollout"),
+    "expected NAME@TIME": ("project/test_commands.py", "expected NAME@TIME"),
 }
 
 
@@ -344,7 +346,7 @@ def test_the_page_has_every_message():
     assert sorted(ROWS) == sorted(said.messages())
     assert sorted(map(_row, [*CASES, *ELSEWHERE])) == sorted(ROWS)
     for file, words in ELSEWHERE.values():
-        assert words in (pathlib.Path(__file__).parent / file).read_text(), file
+        assert words in (TESTS / file).read_text(), file
     codes = [name for name in vars(svkc.RESULTS) if not name.startswith("_")]
     for name in codes:
         assert f"| `{name}` |" in PAGE, name
@@ -387,11 +389,9 @@ def test_inside_compiled_programs(setting):
 def test_warnings_and_what_others_raise(setting, tmp_path):
     warned, again, missing, unlike = said.OTHERS
     assert said.messages_of("warn", 0) == {warned, again}
-    # it takes two compilations: tests/test_functions.py
+    # it takes two compilations: tests/_jax/test_functions.py
     assert "a new function object" in again
-    assert (
-        "a new function object" in (pathlib.Path(__file__).parent / "test_functions.py").read_text()
-    )
+    assert "a new function object" in (TESTS / "_jax/test_functions.py").read_text()
     with jax.enable_x64(False):
         chain = models.four_bar()
         with pytest.warns(UserWarning, match=said.pattern(warned)):

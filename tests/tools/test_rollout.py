@@ -195,7 +195,8 @@ def start(count, out, dies=""):
     with socket.socket() as s:
         s.bind(("localhost", 0))
         port = s.getsockname()[1]
-    env = {**os.environ, "JAX_ENABLE_X64": "1", "PYTHONPATH": str(pathlib.Path(__file__).parent)}
+    paths = os.pathsep.join(map(str, pathlib.Path(__file__).parents[:2]))
+    env = {**os.environ, "JAX_ENABLE_X64": "1", "PYTHONPATH": paths}
     line = "import sys, test_rollout; test_rollout.main(*sys.argv[1:])"
     return [
         subprocess.Popen(

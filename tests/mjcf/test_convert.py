@@ -274,7 +274,7 @@ def test_a_compiled_model_has_no_text():
         svkc.load(mujoco.MjModel.from_xml_string(XML)).to_mjcf()
 
 
-VIEWER = pathlib.Path(__file__).parent.parent / "examples" / "08_mujoco_viewer.py"
+VIEWER = pathlib.Path(__file__).parents[2] / "examples" / "08_mujoco_viewer.py"
 
 
 @pytest.mark.slow

@@ -1,5 +1,5 @@
 """The tour: every cell runs headless, and prints what is stored with it. `python
-tests/test_notebook.py` stores what it prints and draws anew."""
+tests/project/test_notebook.py` stores what it prints and draws anew."""
 
 import base64
 import io
@@ -14,7 +14,7 @@ import nbformat
 import numpy as np
 import pytest
 
-ROOT = pathlib.Path(__file__).parent.parent
+ROOT = pathlib.Path(__file__).parents[2]
 TOUR = ROOT / "examples" / "tour.ipynb"
 NUMBER = re.compile(r"(?<![A-Za-z_])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?|\binf\b")
 # what another machine rounds otherwise: how good differences are, how many steps were tried; and

@@ -2,7 +2,7 @@
 docs/errors.md, or a NaN that can be seen.
 
 The suite makes a few hundred, the same every time; `SVKC_FUZZ=10000 python -m pytest
-tests/test_fuzz.py -n 0` makes that many, others each time.
+tests/project/test_fuzz.py -n 0` makes that many, others each time.
 What counts is what users see: annotations are not checked while these tests call
 (`said.as_users_see`), as they are in all other tests, and jax promotes types as it does by default.
 Programs are compiled for a handful of fixed scenes alone; where a call would compile another

@@ -7,7 +7,7 @@ import itertools
 import pathlib
 import re
 
-ROOT = pathlib.Path(__file__).parent.parent / "svkc"
+ROOT = pathlib.Path(__file__).parents[2] / "svkc"
 # a package may import from those to its left and from itself
 ORDER = "_jax model mjcf tree loops transitions integration simulation tools viz scenes cli".split()
 # methods that the contract puts on the nouns: they import upwards when they are called

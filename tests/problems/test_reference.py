@@ -16,7 +16,7 @@ import pytest
 
 import svkc
 
-FOLDER = pathlib.Path(__file__).parent / "reference"
+FOLDER = pathlib.Path(__file__).parents[1] / "references" / "data"
 ROTATION = (
     '<mujoco><compiler balanceinertia="false"/><option gravity="{}"/><worldbody><body'
     ' name="top"><joint name="top" type="ball"/>'
@@ -173,7 +173,9 @@ def forty_windows():
 def test_n_four_bar_of_forty_windows():
     """In a process of its own, whose programs are optimized: otherwise it takes eight minutes."""
     flags = os.environ["XLA_FLAGS"].replace("--xla_backend_optimization_level=0", "")
-    env = os.environ | {"XLA_FLAGS": flags, "JAX_ENABLE_X64": "1"}
+    tests = pathlib.Path(__file__).parents[1]
+    paths = os.pathsep.join(map(str, (tests, tests / "references")))
+    env = os.environ | {"XLA_FLAGS": flags, "JAX_ENABLE_X64": "1", "PYTHONPATH": paths}
     code = "import test_reference; test_reference.forty_windows()"
     done = subprocess.run(
         [sys.executable, "-c", code],

@@ -1,20 +1,15 @@
 """Derivatives through every change of structure: against differences, against closed forms, at the
 hard points."""
 
-import pathlib
-import sys
-
 import derivatives
 import jax
 import jax.numpy as jnp
 import models
 import numpy as np
 import pytest
+from compile import counted
 
 import svkc
-
-sys.path.append(str(pathlib.Path(__file__).parent.parent / "benchmarks"))
-from compile import counted
 
 TIGHT = derivatives.TIGHT
 BUDGET = 42500

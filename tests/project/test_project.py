@@ -11,7 +11,7 @@ import types
 import jax
 import pytest
 
-ROOT = pathlib.Path(__file__).parent.parent
+ROOT = pathlib.Path(__file__).parents[2]
 
 
 CACHE = tempfile.TemporaryDirectory()
