@@ -13,7 +13,6 @@ import csv
 import os
 import pathlib
 import platform
-import sys
 import time
 
 import diffrax
@@ -23,12 +22,12 @@ import mujoco
 import numpy as np
 
 ROOT = pathlib.Path(__file__).parent.parent
-# the tests' reader of the reference problems, and the references themselves
-for folder in ("", "references", "problems"):
-    sys.path.insert(0, str(ROOT / "tests" / folder))
 
-import maximal
+# (puts the tests' references on the path)
 import soft_loops
+
+# isort: split
+import maximal
 import test_reference as reference
 from munthe_kaas import MuntheKaas
 

@@ -1,9 +1,17 @@
 """MuJoCo's models of the accuracy problems, and its runs of them: loops are soft equality
 constraints as stiff as twice the time step lets them be."""
 
-import maximal
+import pathlib
+import sys
+
 import mujoco
 import numpy as np
+
+# the tests' reader of the reference problems, and the references themselves
+for folder in ("", "references", "problems"):
+    sys.path.insert(0, str(pathlib.Path(__file__).parents[1] / "tests" / folder))
+
+import maximal
 import test_reference as reference
 
 import svkc.scenes
