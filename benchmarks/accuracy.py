@@ -59,8 +59,6 @@ LEFT_OUT = {
 }
 # on what has loops: with every integrator, at some of its settings, and in float32 with Tsit5
 DRIFT = {
-    "least change": {"stabilization": svkc.Projection(change=svkc.least_change)},
-    "dependent change": {"stabilization": svkc.Projection(change=svkc.dependent_change)},
     "exact": {"stabilization": svkc.Exact()},
     "Baumgarte": {"stabilization": svkc.Baumgarte()},
     "drift": {"stabilization": svkc.Drift()},

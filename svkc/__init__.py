@@ -65,11 +65,6 @@ from svkc.simulation.simulate import simulate as simulate
 from svkc.integration.replay import Replay as Replay
 from svkc.tools.rollout import rollout as rollout
 from svkc.tools.accuracy import error_between as error_between, halved as halved, tune as tune
-from svkc.loops.projection import (
-    dependent_change as dependent_change,
-    inertia_change as inertia_change,
-    least_change as least_change,
-)
 from svkc.integration.stabilization import (
     Baumgarte as Baumgarte,
     Drift as Drift,

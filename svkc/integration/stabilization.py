@@ -1,40 +1,31 @@
 """What is done about the drift of the loops."""
 
-from collections.abc import Callable
-
 import equinox as eqx
 from jaxtyping import Array, Float
 
 from svkc.integration.integrators import Scene
-from svkc.loops.projection import dependent_change, inertia_change
-from svkc.model.validation import function, one, whole
+from svkc.model.validation import one, whole
 
 
 class Projection(eqx.Module):
-    """Loop drift is taken away after every step by the smallest change of q and v that closes the
-    loops.
+    """Loop drift is taken away after every step by the change of q and v that closes the loops and
+    is the least in the metric of the inertia: a velocity that is projected loses kinetic energy of
+    second order only.
 
     iterations: Newton steps on the position; one leaves a gap of the second order in the drift of a
-    step. change: what is smallest:
-    `svkc.inertia_change` (kinetic energy: a velocity that is projected loses energy of second order
-    only), `svkc.least_change` (scaled coordinates)
-    or `svkc.dependent_change` (no independent coordinate moves).
+    step.
     """
 
     iterations: int = eqx.field(static=True, default=2)
-    change: Callable = eqx.field(static=True, default=inertia_change)
 
     def __check_init__(self):
         whole("iterations", self.iterations, 0)
-        function("change", self.change, optional=False)
 
 
 class Exact(Projection):
     """Dependent coordinates are functions of the independent ones, solved for at every evaluation
     of the field as well as after every step: what is integrated is the paper's theta_G, and the
-    rest follows from it. `iterations` and `change` as in `Projection`."""
-
-    change: Callable = eqx.field(static=True, default=dependent_change)
+    rest follows from it. Only dependent coordinates are moved. `iterations` as in `Projection`."""
 
 
 class Baumgarte(eqx.Module):

@@ -10,7 +10,7 @@ from svkc.integration.integrators import Motion, Scene
 from svkc.integration.stabilization import Baumgarte, Drift, Exact, Projection, projects
 from svkc.loops.constrained_dynamics import Dynamics, by_bodies
 from svkc.loops.forward_dynamics import moving, moving_in_lanes
-from svkc.loops.projection import inertia_change, settle_by_bodies, settle_loops
+from svkc.loops.projection import settle_by_bodies, settle_loops
 from svkc.model.chain import Chain, State, active_dofs
 from svkc.model.checked_jit import joint_torques
 from svkc.model.validation import numbers
@@ -34,7 +34,7 @@ class Field(eqx.Module):
         return (
             self.dynamics.inertia is by_bodies
             and isinstance(self.stabilization, Projection)
-            and self.stabilization.change is inertia_change
+            and not isinstance(self.stabilization, Exact)
         )
 
     def __call__(self, t, y: Motion, scene: Scene) -> Motion:
@@ -129,7 +129,7 @@ def settle(field: Field, scene: Scene, y: Motion) -> tuple[Motion, Seen | None]:
             y.q,
             y.v,
             held.iterations,
-            held.change,
+            isinstance(held, Exact),
             scene.pivots,
             field.dynamics.hold or 0.0,
         )

@@ -1,7 +1,6 @@
 """Projection onto closed loops, by the smallest change."""
 
 import functools
-from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -29,30 +28,20 @@ from svkc.tree.kinematics import Kinematics
 
 
 def least_change(
-    chain: Chain,
-    structure: Structure,
-    kin: Kinematics,
-    selection: Selection,
-    J,
-    x: Float[Array, "rows n"],
+    chain: Chain, selection: Selection, J, x: Float[Array, "rows n"]
 ) -> Float[Array, "dofs n"]:
-    """The y (m, rad, or their rates) with J y = x whose sum of squares, in coordinates without
-    units, is least. For `svkc.Projection(change=...)`."""
+    """Return the y (m, rad, or their rates) with J y = x whose sum of squares, in coordinates
+    without units, is least."""
     Jm, _ = square(selection, J)
     gram = Jm @ Jm.T + jnp.diag(jnp.where(selection.used, 0, 1).astype(J.dtype))
     return scales(chain)[1][:, None] * (Jm.T @ solve_positive(gram, selection.Q @ x))
 
 
 def dependent_change(
-    chain: Chain,
-    structure: Structure,
-    kin: Kinematics,
-    selection: Selection,
-    J,
-    x: Float[Array, "rows n"],
+    chain: Chain, selection: Selection, J, x: Float[Array, "rows n"]
 ) -> Float[Array, "dofs n"]:
-    """The y (m, rad, or their rates) with J y = x that moves dependent coordinates only (16). For
-    `svkc.Projection(change=...)`."""
+    """Return the y (m, rad, or their rates) with J y = x that moves dependent coordinates only
+    (16)."""
     _, JS = square(selection, J)
     return scales(chain)[1][:, None] * (selection.P.T @ solve_frozen(JS, selection.Q @ x))
 
@@ -65,8 +54,8 @@ def inertia_change(
     J,
     x: Float[Array, "rows n"],
 ) -> Float[Array, "dofs n"]:
-    """The y (m, rad, or their rates) with J y = x whose y^T M y is least: that of an impulse of the
-    loops (29). For `svkc.Projection(change=...)`."""
+    """Return the y (m, rad, or their rates) with J y = x whose y^T M y is least: that of an impulse
+    of the loops (29)."""
     none = jnp.zeros(chain.dofs, J.dtype)
     return jax.vmap(lambda x: solve_motion(chain, structure, kin, selection, J, none, -x), 1, 1)(x)
 
@@ -83,14 +72,14 @@ def _solvable(structure: Structure, selection: Selection) -> Selection:
     )
 
 
-@functools.partial(jax.jit, static_argnames=("iterations", "change", "hold"))
+@functools.partial(jax.jit, static_argnames=("iterations", "dependent", "hold"))
 def settle_loops(
     chain: Chain,
     structure: Structure,
     q,
     v,
     iterations: int,
-    change: Callable = inertia_change,
+    dependent: bool = False,
     pivots=None,
     hold: float = 0.0,
 ) -> tuple[
@@ -101,7 +90,8 @@ def settle_loops(
     Float[Array, "steps dofs"],
 ]:
     """Close the loops by Newton's method, then project the velocity. The last turn of one loop is
-    the velocity's, so that the body is compiled once.
+    the velocity's, so that the body is compiled once. dependent: only dependent coordinates move;
+    otherwise the change is the least in the metric of the inertia.
 
     And what the loops show: the gaps (rad, `chain.length`s) that each loop is left with, |R_mm| /
     |R_11|, and the pivots to go on with. pivots: those held so far (None: none are), which go on
@@ -127,7 +117,11 @@ def settle_loops(
                 i == iterations, lambda: jnp.where(poor(), full.P, pivots), lambda: pivots
             )
         open_ = jnp.stack([loops.gap, J @ jnp.where(active, v / column, 0)], 1)
-        step = -change(chain, structure, loops.kin, selection, J, open_)
+        step = -(
+            dependent_change(chain, selection, J, open_)
+            if dependent
+            else inertia_change(chain, structure, loops.kin, selection, J, open_)
+        )
         last = i == iterations
         seen = jax.lax.stop_gradient((sizes(open_[:, 0]), weakest(full), chosen))
         return (
@@ -148,9 +142,9 @@ def settle_loops(
 def settle_by_bodies(
     chain: Chain, structure: Structure, q, v, iterations: int, differentiated: bool = True
 ) -> tuple[Float[Array, " q"], Float[Array, " dofs"], Float[Array, "links 2"]]:
-    """`settle_loops` with `inertia_change`, by articulated bodies and the forces of the loops: no
-    pivots are chosen. And the gaps (rad,
-    `chain.length`s) that each loop is left with. differentiated: as `Field`'s."""
+    """`settle_loops` in the metric of the inertia, by articulated bodies and the forces of the
+    loops: no pivots are chosen. And the gaps (rad, `chain.length`s) that each loop is left with.
+    differentiated: as `Field`'s."""
     one_turn = _turn_by_bodies if differentiated else with_lanes_last(_turn_by_bodies)
 
     @functools.partial(jax.checkpoint, prevent_cse=False)

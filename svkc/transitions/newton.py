@@ -178,7 +178,7 @@ def _iterate(
         )
         of_v = _among(kind, VELOCITY_HELD, VELOCITY)
         residual = jnp.where(of_v, J @ (now.v / column), gaps) if VELOCITY in kinds else gaps
-        step = -least_change(chain, structure, kin, selection, free, residual[:, None])[:, 0]
+        step = -least_change(chain, selection, free, residual[:, None])[:, 0]
         open_ = jnp.max(jnp.abs(gaps).reshape(-1, 6), 1)
         if COUNT in kinds:
             now = now.searched(kind, full.size, open_)

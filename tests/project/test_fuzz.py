@@ -794,7 +794,6 @@ simulations = dict(
         svkc.Baumgarte,
         lambda: svkc.Baumgarte("a"),
         lambda: svkc.Projection(-1),
-        lambda: svkc.Projection(1, "a"),
     ),
     dynamics=one_of_these(
         svkc.Dynamics,

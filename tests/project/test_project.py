@@ -74,12 +74,11 @@ def test_readme_example_runs():
 DOOR = """
 Baumgarte Chain Check Drift Dynamics Exact Grip Projection RESULTS Replay RodriguesEuler
 SemiImplicitEuler State Structure Trajectory VirtualLink actuation at bias_force bind by_bodies
-check_grad connect coordinates cut dependent_change difference energy error_between
-forward_dynamics from_mujoco halved inertia_by_composites inertia_by_unit_vectors inertia_change
-integrate inverse_dynamics jacobian kinetic_energy least_change leaves load load_chain
-load_trajectory lock loop_forces loop_gaps mass_matrix mobility momentum overload plot poses
-potential_energy prefer render rollout simulate step tangent to_mujoco touch transition tune
-unbind unlock velocities velocity_gaps when xyzw
+check_grad connect coordinates cut difference energy error_between forward_dynamics from_mujoco
+halved inertia_by_composites inertia_by_unit_vectors integrate inverse_dynamics jacobian
+kinetic_energy leaves load load_chain load_trajectory lock loop_forces loop_gaps mass_matrix
+mobility momentum overload plot poses potential_energy prefer render rollout simulate step tangent
+to_mujoco touch transition tune unbind unlock velocities velocity_gaps when xyzw
 """
 
 
