@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from svkc._jax.lanes_last import with_lanes_last
-from svkc.loops.constrained_dynamics import by_bodies, solve_motion
-from svkc.loops.constraint import loop_kinematics, scales, sizes
+from svkc.loops.constrained_dynamics import ArticulatedBodies, CompositeBodies
+from svkc.loops.constraint import LoopKinematics, loop_kinematics, scales, sizes
 from svkc.loops.pivoting import (
     Selection,
     held_part,
@@ -25,50 +25,47 @@ from svkc.loops.pivoting import (
 )
 from svkc.model.chain import Chain, Structure, active_dofs
 from svkc.tree.configuration import integrate, normalize
-from svkc.tree.kinematics import Kinematics
 
 
 def least_change(
     chain: Chain,
     structure: Structure,
-    kin: Kinematics,
+    loops: LoopKinematics,
     selection: Selection,
-    J,
     x: Float[Array, "rows n"],
 ) -> Float[Array, "dofs n"]:
     """The y (m, rad, or their rates) with J y = x whose sum of squares, in coordinates without
     units, is least. For `svkc.Projection(change=...)`."""
-    Jm, _ = square(selection, J)
-    gram = Jm @ Jm.T + jnp.diag(jnp.where(selection.used, 0, 1).astype(J.dtype))
+    Jm, _ = square(selection, loops.J)
+    gram = Jm @ Jm.T + jnp.diag(jnp.where(selection.used, 0, 1).astype(Jm.dtype))
     return scales(chain)[1][:, None] * (Jm.T @ solve_positive(gram, selection.Q @ x))
 
 
 def dependent_change(
     chain: Chain,
     structure: Structure,
-    kin: Kinematics,
+    loops: LoopKinematics,
     selection: Selection,
-    J,
     x: Float[Array, "rows n"],
 ) -> Float[Array, "dofs n"]:
     """The y (m, rad, or their rates) with J y = x that moves dependent coordinates only (16). For
     `svkc.Projection(change=...)`."""
-    _, JS = square(selection, J)
+    _, JS = square(selection, loops.J)
     return scales(chain)[1][:, None] * (selection.P.T @ solve_frozen(JS, selection.Q @ x))
 
 
 def inertia_change(
     chain: Chain,
     structure: Structure,
-    kin: Kinematics,
+    loops: LoopKinematics,
     selection: Selection,
-    J,
     x: Float[Array, "rows n"],
 ) -> Float[Array, "dofs n"]:
     """The y (m, rad, or their rates) with J y = x whose y^T M y is least: that of an impulse of the
     loops (29). For `svkc.Projection(change=...)`."""
-    none = jnp.zeros(chain.dofs, J.dtype)
-    return jax.vmap(lambda x: solve_motion(chain, structure, kin, selection, J, none, -x), 1, 1)(x)
+    none = jnp.zeros(chain.dofs, x.dtype)
+    solve = CompositeBodies().prepare(chain, structure, loops, selection)
+    return jax.vmap(lambda x: solve(none, -x), 1, 1)(x)
 
 
 def _solvable(structure: Structure, selection: Selection) -> Selection:
@@ -127,7 +124,7 @@ def settle_loops(
                 i == iterations, lambda: jnp.where(poor(), full.P, pivots), lambda: pivots
             )
         open_ = jnp.stack([loops.gap, J @ jnp.where(active, v / column, 0)], 1)
-        step = -change(chain, structure, loops.kin, selection, J, open_)
+        step = -change(chain, structure, loops, selection, open_)
         last = i == iterations
         seen = jax.lax.stop_gradient((sizes(open_[:, 0]), weakest(full), chosen))
         return (
@@ -180,7 +177,6 @@ def _turn_by_bodies(
     loops = loop_kinematics(chain, structure, q)
     J, open_, active = loops.J, loops.gap, active_dofs(chain, structure)
     apart = jnp.where(last, J @ jnp.where(active, v / column, 0), open_)
-    step = solve_motion(
-        chain, structure, loops.kin, None, J, jnp.zeros(chain.dofs, q.dtype), apart, by_bodies
-    )
+    solve = ArticulatedBodies().prepare(chain, structure, loops)
+    step = solve(jnp.zeros(chain.dofs, q.dtype), apart)
     return step, jax.lax.stop_gradient(sizes(open_))

@@ -178,7 +178,9 @@ def _iterate(
         )
         of_v = _among(kind, VELOCITY_HELD, VELOCITY)
         residual = jnp.where(of_v, J @ (now.v / column), gaps) if VELOCITY in kinds else gaps
-        step = -least_change(chain, structure, kin, selection, free, residual[:, None])[:, 0]
+        step = -least_change(
+            chain, structure, dataclasses.replace(loops, J=free), selection, residual[:, None]
+        )[:, 0]
         open_ = jnp.max(jnp.abs(gaps).reshape(-1, 6), 1)
         if COUNT in kinds:
             now = now.searched(kind, full.size, open_)
@@ -186,7 +188,7 @@ def _iterate(
         if IMPACT in kinds:
             new = jax.lax.cond(
                 kind == IMPACT,
-                lambda: velocity_after_impact(chain, structure, kin, selection, J, now.v),
+                lambda: velocity_after_impact(chain, structure, loops, selection, now.v),
                 lambda: new,
             )
         moved = integrate(
