@@ -38,7 +38,7 @@ EXACT = {
     "solver": diffrax.Dopri8(),
     "rtol": 1e-9,
     "atol": 1e-11,
-    "dynamics": svkc.Dynamics(inertia=svkc.by_bodies),
+    "dynamics": svkc.dynamics.ArticulatedBodies(),
 }
 
 

@@ -71,6 +71,7 @@ from svkc.integration.stabilization import (
     Exact as Exact,
     Projection as Projection,
 )
+from svkc import dynamics as dynamics
 from svkc.loops.constrained_dynamics import by_bodies as by_bodies
 from svkc.loops.constrained_dynamics import Dynamics as Dynamics
 from svkc.tree.mass_matrix import (

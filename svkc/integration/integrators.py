@@ -11,7 +11,7 @@ import optimistix
 from jaxtyping import Array, Bool, Float
 
 from svkc._jax.lanes_last import with_lanes_last
-from svkc.loops.constrained_dynamics import by_bodies
+from svkc.loops.constrained_dynamics import ArticulatedBodies
 from svkc.loops.forward_dynamics import moving
 from svkc.model.chain import Chain, State, Structure, active_dofs
 from svkc.model.checked_jit import joint_torques, verb
@@ -34,7 +34,7 @@ class Motion(eqx.Module):
 
 class Scene(eqx.Module):
     """The `args` of the vector field: all it depends on besides time and motion. pivots: of the
-    loops' rows, where they are held (`Dynamics.hold`)."""
+    loops' rows, where they are held (`AbstractDynamics.hold`)."""
 
     chain: Chain
     structure: Structure
@@ -177,7 +177,7 @@ def _step(chain: Chain, state: State, tau: Float[Array, " dofs"], dt: Float[Arra
         state.q,
         state.v,
         tau,
-        by_bodies,
+        ArticulatedBodies(),
         0.5 / dt if chain.link_names else None,
     )
     v = v + dt * vdot

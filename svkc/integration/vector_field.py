@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float
 
 from svkc.integration.integrators import Motion, Scene
 from svkc.integration.stabilization import Baumgarte, Drift, Exact, Projection, projects
-from svkc.loops.constrained_dynamics import Dynamics, by_bodies
+from svkc.loops.constrained_dynamics import AbstractDynamics, ArticulatedBodies
 from svkc.loops.forward_dynamics import moving, moving_in_lanes
 from svkc.loops.projection import settle_by_bodies, settle_loops
 from svkc.model.chain import Chain, State, active_dofs
@@ -25,14 +25,14 @@ class Field(eqx.Module):
 
     control: Callable | None
     stabilization: Projection | Baumgarte | Drift
-    dynamics: Dynamics
+    dynamics: AbstractDynamics
     differentiated: bool = eqx.field(static=True, default=True)
 
     @property
     def pivotless(self) -> bool:
         """Whether steps are put back onto the loops by the loops' forces, without pivots."""
         return (
-            self.dynamics.inertia is by_bodies
+            not self.dynamics.uses_pivots
             and isinstance(self.stabilization, Projection)
             and not isinstance(self.stabilization, Exact)
         )
@@ -50,7 +50,7 @@ class Field(eqx.Module):
             v, vdot = moving_in_lanes(chain, structure, y.q, y.v, tau, rate)
         else:
             v, vdot = moving(
-                chain, structure, y.q, y.v, tau, self.dynamics.inertia, rate, agree, scene.pivots
+                chain, structure, y.q, y.v, tau, self.dynamics, rate, agree, scene.pivots
             )
         return Motion(
             rates(chain, y.q, jnp.where(active_dofs(chain, structure), v, 0)), vdot, power
@@ -59,10 +59,9 @@ class Field(eqx.Module):
     def _in_lanes(self, chain: Chain) -> bool:
         """Whether it is for speed alone, and accelerations are had by articulated bodies, level by
         level."""
-        ways = (by_bodies,) if chain.topology.link_names else (by_bodies, None)
         return (
             not self.differentiated
-            and self.dynamics.inertia in ways
+            and isinstance(self.dynamics, ArticulatedBodies)
             and len(chain.topology.levels) <= LEVELS_UNROLLED
         )
 

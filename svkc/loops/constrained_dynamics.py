@@ -1,58 +1,26 @@
 """Accelerations and multipliers of a chain with loops, and the choice among the ways to compute
 them."""
 
+import abc
 from collections.abc import Callable
+from typing import ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from svkc._jax.batched_lapack import factor_positive, solve_triangle
-from svkc.loops.constraint import scales
+from svkc.loops.constraint import LoopKinematics, scales
 from svkc.loops.coordinates import Coordinates, constrain
 from svkc.loops.delassus import by_loop_forces
 from svkc.loops.pivoting import Selection, square
 from svkc.model.chain import Chain, Structure, active_dofs
-from svkc.model.validation import function, one
-from svkc.tree.articulated_body import Body, accelerations, articulate
+from svkc.model.validation import one
+from svkc.tree.articulated_body import accelerations, articulate
 from svkc.tree.inverse_dynamics import inertia_times
 from svkc.tree.kinematics import Kinematics
-from svkc.tree.mass_matrix import inertia_by_composites
-
-
-def by_bodies(chain: Chain, kin: Kinematics) -> list[Body] | Body:
-    """Names articulated bodies as the way to accelerations, for `svkc.Dynamics(inertia=...)`."""
-    return articulate(chain, kin)
-
-
-class Dynamics(eqx.Module):
-    """How `svkc.simulate` computes accelerations. All of these agree; they differ in what they
-    cost.
-
-    inertia: None (default), articulated bodies where the scene has no loops, else composite ones;
-    `svkc.inertia_by_composites` always; `svkc.inertia_by_unit_vectors`, the paper's columns by
-    inverse dynamics; or `svkc.by_bodies`, articulated bodies and the forces of the loops, which
-    square the loops' conditioning near singular configurations. With it `Projection()` too does
-    without pivots: the fastest, and the one for batches;
-    the certificate then has the margin of the phases' ends alone, and counts no swaps.
-    hold: dependent coordinates are chosen at every evaluation (None), or held until, at the end of
-    a step, the least |R_kk| / |R_11| of their columns is below this part of what a new choice has
-    (default 0.3); 0 holds them until the structure changes. Held only where steps are projected;
-    near a
-    singular configuration, and in what is differentiated, they are chosen at every evaluation, as
-    the motion does not depend on the choice.
-    """
-
-    inertia: Callable | None = eqx.field(static=True, default=None)
-    hold: float | None = eqx.field(static=True, default=0.3)
-
-    def __check_init__(self):
-        function("dynamics.inertia", self.inertia)
-        if self.hold is not None and not 0 <= one("dynamics.hold", self.hold) <= 1:
-            raise ValueError(
-                f"dynamics.hold: got {self.hold}, expected None or a part between 0 and 1"
-            )
+from svkc.tree.mass_matrix import inertia_by_composites, inertia_by_unit_vectors
 
 
 def reduced_inertia(
@@ -77,43 +45,197 @@ def with_links(
     return jnp.concatenate([tree, chain.link_armature * own[chain.nv :]])
 
 
-def solve_motion(
-    chain: Chain, structure: Structure, kin: Kinematics, selection: Selection | None,
-    J: Float[Array, "rows dofs"], force: Float[Array, " dofs"], bias: Float[Array, " rows"],
-    inertia=None,
-) -> Float[Array, " dofs"]:  # fmt: skip
-    """The x with M x = force + J_C^T lambda and J_C x + bias = 0 (paper, section III-B).
+class AbstractDynamics(eqx.Module):
+    """How accelerations are computed. All ways agree; they differ in what they cost.
 
-    Its derivatives are those of these equations, M x by Newton-Euler: one more solve with the same
-    factors, nothing through recursions for M or pivots.
+    uses_pivots: whether dependent coordinates are chosen. Where they are not, `svkc.Projection()`
+    puts steps back onto the loops without pivots too.
+    hold: dependent coordinates are chosen at every evaluation (None), or held until, at the end of
+    a step, the least |R_kk| / |R_11| of their columns is below this part of what a new choice has
+    (default 0.3); 0 holds them until the structure changes. Held only where steps are projected by
+    pivots; near a singular configuration, and in what is differentiated, they are chosen at every
+    evaluation, as the motion does not depend on the choice.
     """
-    nv, (_, column) = chain.nv, scales(chain)
-    chosen, rows, frozen, static = jax.lax.stop_gradient((selection, J, (chain, kin), structure))
-    active = active_dofs(chain, structure)
-    if inertia is by_bodies:
-        # every row as it is, whether or not it repeats others
-        pick, used = (lambda x: x), jnp.ones(J.shape[0], bool)
+
+    uses_pivots: eqx.AbstractClassVar[bool]
+    hold: float | None = eqx.field(static=True, default=0.3)
+
+    def __check_init__(self):
+        _check_hold(self.hold)
+
+    @abc.abstractmethod
+    def prepare(
+        self,
+        chain: Chain,
+        structure: Structure,
+        loops: LoopKinematics,
+        selection: Selection | None = None,
+    ) -> Callable:
+        """Return solve: (force [dofs], bias [rows]) -> the x with M x = force + J_C^T lambda and
+        J_C x + bias = 0 (paper, section III-B).
+
+        selection: the pivots of `loops.J`; None where `uses_pivots` is False.
+        """
+
+    @abc.abstractmethod
+    def prepare_open(self, chain: Chain, structure: Structure, kin: Kinematics) -> Callable:
+        """Return solve: force [nv] -> the x with M x = force, zero for locked joints, on a chain
+        without virtual links."""
+
+
+class ArticulatedBodies(AbstractDynamics):
+    """Articulated bodies and the forces of the loops, without pivots.
+
+    The fastest way, and the one for batches. The forces square the loops' conditioning near
+    singular configurations. With `Projection()` the certificate has the margin of the phases' ends
+    alone, and counts no swaps. hold: for the stabilizations that choose pivots all the same.
+    """
+
+    uses_pivots: ClassVar[bool] = False
+
+    def prepare(self, chain, structure, loops, selection=None):
+        column, active = scales(chain)[1], active_dofs(chain, structure)
+        rows, frozen, static = jax.lax.stop_gradient((loops.J, (chain, loops.kin), structure))
         solve = by_loop_forces(
             *frozen,
             jnp.where(active[None], rows / column[None], 0),
-            None if static.locked is None else active[:nv],
+            None if static.locked is None else active[: chain.nv],
         )
-    else:
-        pick, used = (lambda x: chosen.Q @ x), chosen.used
-        solve = _by_independent(*frozen, static, chosen, rows, inertia or inertia_by_composites)
+        # every row as it is, whether or not it repeats others
+        used = jnp.ones(loops.J.shape[0], bool)
+        return _implicit_solve(chain, structure, loops, solve, lambda x: x, used)
+
+    def prepare_open(self, chain, structure, kin):
+        free = None if structure.locked is None else ~structure.locked
+        bodies = articulate(*jax.lax.stop_gradient((chain, kin)), free)
+        solve = lambda force: accelerations(chain.topology, bodies, force)
+        return _implicit_open_solve(chain, structure, kin, solve)
+
+
+class AbstractInertiaMatrix(AbstractDynamics):
+    """The tree's inertia matrix, reduced to the independent coordinates, as the paper has it."""
+
+    @abc.abstractmethod
+    def inertia(self, chain: Chain, kin: Kinematics) -> Float[Array, "nv nv"]:
+        """Return the inertia matrix of the tree."""
+
+    def prepare(self, chain, structure, loops, selection=None):
+        chosen, rows, frozen, static = jax.lax.stop_gradient(
+            (selection, loops.J, (chain, loops.kin), structure)
+        )
+        solve = _by_independent(*frozen, static, chosen, rows, self.inertia)
+        return _implicit_solve(chain, structure, loops, solve, lambda x: chosen.Q @ x, chosen.used)
+
+    def prepare_open(self, chain, structure, kin):
+        M = self.inertia(*jax.lax.stop_gradient((chain, kin)))
+        if structure.locked is not None:
+            free = ~structure.locked
+            M = jnp.where(free[:, None] & free[None], M, jnp.eye(chain.nv, dtype=M.dtype))
+        return _implicit_open_solve(chain, structure, kin, factor_positive(M))
+
+
+class CompositeBodies(AbstractInertiaMatrix):
+    """The inertia matrix by composite bodies (Featherstone section 6.2)."""
+
+    uses_pivots: ClassVar[bool] = True
+
+    def inertia(self, chain, kin):
+        return inertia_by_composites(chain, kin)
+
+
+class UnitVectors(AbstractInertiaMatrix):
+    """The inertia matrix column by column from inverse dynamics: the paper's own way."""
+
+    uses_pivots: ClassVar[bool] = True
+
+    def inertia(self, chain, kin):
+        return inertia_by_unit_vectors(chain, kin)
+
+
+def default_dynamics(chain: Chain) -> AbstractDynamics:
+    """Return articulated bodies for a chain without virtual links, else composite ones."""
+    return CompositeBodies() if chain.topology.link_names else ArticulatedBodies()
+
+
+def by_bodies(chain: Chain, kin: Kinematics):
+    """Names articulated bodies in the older spelling, `svkc.Dynamics(inertia=svkc.by_bodies)`."""
+    return articulate(chain, kin)
+
+
+OLDER = (
+    (by_bodies, ArticulatedBodies),
+    (inertia_by_composites, CompositeBodies),
+    (inertia_by_unit_vectors, UnitVectors),
+)
+
+
+class Dynamics(eqx.Module):
+    """The older spelling of the classes in `svkc.dynamics`.
+
+    inertia: `svkc.by_bodies`, `svkc.inertia_by_composites`, `svkc.inertia_by_unit_vectors`; None
+    (default): articulated bodies where the scene has no loops, else composite ones. hold: as in
+    `svkc.dynamics.CompositeBodies`.
+    """
+
+    inertia: Callable | None = eqx.field(static=True, default=None)
+    hold: float | None = eqx.field(static=True, default=0.3)
+
+    def __check_init__(self):
+        if self.inertia is not None and not any(self.inertia is old for old, _ in OLDER):
+            raise ValueError(
+                f"dynamics.inertia: got {self.inertia!r}, expected None, svkc.by_bodies,"
+                " svkc.inertia_by_composites or svkc.inertia_by_unit_vectors"
+            )
+        _check_hold(self.hold)
+
+    def resolved(self, chain: Chain) -> AbstractDynamics:
+        """Return the object of `svkc.dynamics` that this one stands for."""
+        if self.inertia is None:
+            return type(default_dynamics(chain))(hold=self.hold)
+        return next(new for old, new in OLDER if old is self.inertia)(hold=self.hold)
+
+
+def _check_hold(hold) -> None:
+    if hold is not None and not 0 <= one("dynamics.hold", hold) <= 1:
+        raise ValueError(f"dynamics.hold: got {hold}, expected None or a part between 0 and 1")
+
+
+def _implicit_solve(
+    chain: Chain,
+    structure: Structure,
+    loops: LoopKinematics,
+    factored: Callable,
+    pick: Callable,
+    used: Bool[Array, " picked"],
+) -> Callable:
+    """Return (force, bias) -> x by `factored`, whose derivatives are those of the equations that
+    x solves, with M x by Newton-Euler.
+
+    A derivative is one more solve with the same factors: recursions for M and the search for pivots
+    have no part in it. pick: the rows that are solved for, of all. used: which of them count.
+    """
+    nv, column = chain.nv, scales(chain)[1]
+    active = active_dofs(chain, structure)
 
     def equations(unknown):
         x, mu = unknown
-        held = pick(J) / column[None]
+        held = pick(loops.J) / column[None]
         moving = jnp.where(active, x, 0)
-        force = with_links(chain, inertia_times(chain, kin, moving[:nv]), moving) + held.T @ mu
+        tree = inertia_times(chain, loops.kin, moving[:nv])
+        force = with_links(chain, tree, moving) + held.T @ mu
         return jnp.where(active, force, x), held @ x + jnp.where(used, 0, mu)
 
-    # jax transposes the solve only where both sides take part in the derivative
-    right = (jnp.where(active, force, 0) + 0 * jnp.sum(bias), -pick(bias) + 0 * jnp.sum(force))
-    return jax.lax.custom_linear_solve(
-        equations, right, solve=lambda _, right: solve(*right), symmetric=True
-    )[0]
+    def solve(force: Float[Array, " dofs"], bias: Float[Array, " rows"]) -> Float[Array, " dofs"]:
+        # jax transposes the solve only where both sides take part in the derivative
+        right = (
+            jnp.where(active, force, 0) + 0 * jnp.sum(bias),
+            -pick(bias) + 0 * jnp.sum(force),
+        )
+        return jax.lax.custom_linear_solve(
+            equations, right, solve=lambda _, right: factored(*right), symmetric=True
+        )[0]
+
+    return solve
 
 
 def _by_independent(
@@ -135,25 +257,22 @@ def _by_independent(
     return solve
 
 
-def solve_free_motion(
-    chain: Chain, structure: Structure, kin: Kinematics, force: Float[Array, " dofs"], inertia=None
-) -> Float[Array, " dofs"]:
-    """The same on an open chain: M x = force, zero for locked joints."""
-    locked, frozen = structure.locked, jax.lax.stop_gradient((chain, kin))
+def _implicit_open_solve(
+    chain: Chain, structure: Structure, kin: Kinematics, factored: Callable
+) -> Callable:
+    """Return force -> x by `factored`, with derivatives as in `_implicit_solve`."""
+    locked = structure.locked
     free = jnp.ones(chain.nv, bool) if locked is None else ~locked
-    if inertia in (None, by_bodies):
-        bodies = articulate(*frozen, None if locked is None else free)
-        solve = lambda _, x: accelerations(chain.topology, bodies, x)
-    else:
-        M = (inertia or inertia_by_composites)(*frozen)
-        if locked is not None:
-            M = jnp.where(free[:, None] & free[None], M, jnp.eye(chain.nv, dtype=M.dtype))
-        inverse = factor_positive(M)
-        solve = lambda _, x: inverse(x)
 
     def equations(x):
         return jnp.where(free, inertia_times(chain, kin, jnp.where(free, x, 0)), x)
 
-    return jax.lax.custom_linear_solve(
-        equations, jnp.where(free, force, 0), solve=solve, symmetric=True
-    )
+    def solve(force: Float[Array, " nv"]) -> Float[Array, " nv"]:
+        return jax.lax.custom_linear_solve(
+            equations,
+            jnp.where(free, force, 0),
+            solve=lambda _, x: factored(x),
+            symmetric=True,
+        )
+
+    return solve

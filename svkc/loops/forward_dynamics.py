@@ -8,7 +8,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from svkc._jax.lanes_last import with_lanes_last
-from svkc.loops.constrained_dynamics import by_bodies, solve_free_motion, solve_motion, with_links
+from svkc.loops.constrained_dynamics import (
+    AbstractDynamics,
+    ArticulatedBodies,
+    default_dynamics,
+    with_links,
+)
 from svkc.loops.constraint import loop_kinematics, loop_rates, scales
 from svkc.loops.coordinates import agreeing
 from svkc.loops.pivoting import (
@@ -26,14 +31,14 @@ from svkc.tree.inverse_dynamics import generalized_forces, passive_forces
 from svkc.tree.kinematics import kinematics, twists
 
 
-@functools.partial(jax.jit, static_argnames=("inertia", "agree"))
+@functools.partial(jax.jit, static_argnames="agree")
 def moving(
     chain: Chain,
     structure: Structure,
     q,
     v,
     tau: Float[Array, " dofs"],
-    inertia=None,
+    dynamics: AbstractDynamics,
     baumgarte=None,
     agree: bool = False,
     pivots=None,
@@ -49,7 +54,7 @@ def moving(
     if chain.topology.link_names:
         loops = loop_kinematics(chain, structure, q)
         kin, J = loops.kin, loops.J
-        selection = choose(structure, J, pivots) if agree or inertia is not by_bodies else None
+        selection = choose(structure, J, pivots) if agree or dynamics.uses_pivots else None
         if agree:
             near = weakest(selection) < NEAR * structure.margin
             v = jnp.where(
@@ -67,9 +72,9 @@ def moving(
         - jnp.concatenate([bias, jnp.zeros(chain.dofs - chain.nv, v.dtype)])
     )
     if loops is None:
-        return v, solve_free_motion(chain, structure, kin, force, inertia)
+        return v, dynamics.prepare_open(chain, structure, kin)(force)
     rates = loop_rates(chain, structure, v, loops, V, baumgarte)
-    return v, solve_motion(chain, structure, kin, selection, J, force, rates, inertia)
+    return v, dynamics.prepare(chain, structure, loops, selection)(force, rates)
 
 
 @with_lanes_last
@@ -77,14 +82,14 @@ def moving_in_lanes(
     chain: Chain, structure: Structure, q, v, tau, baumgarte
 ) -> tuple[Float[Array, " dofs"], Float[Array, " dofs"]]:
     """`moving` by articulated bodies, without pivots, under a `vmap` that keeps its lanes last."""
-    return moving(chain, structure, q, v, tau, by_bodies, baumgarte)
+    return moving(chain, structure, q, v, tau, ArticulatedBodies(), baumgarte)
 
 
 def acceleration(
-    chain: Chain, structure: Structure, q, v, tau: Float[Array, " dofs"], inertia=None
+    chain: Chain, structure: Structure, q, v, tau: Float[Array, " dofs"], dynamics: AbstractDynamics
 ) -> Float[Array, " dofs"]:
     """The acceleration alone, for the velocity as it is."""
-    return moving(chain, structure, q, v, tau, inertia)[1]
+    return moving(chain, structure, q, v, tau, dynamics)[1]
 
 
 @verb
@@ -97,7 +102,8 @@ def forward_dynamics(
     Springs and dampers of the joints act too. tau: over every coordinate, or the tree's alone. By
     articulated bodies, or composites where there are loops.
     """
-    return acceleration(chain, state.structure, state.q, state.v, joint_torques(chain, tau))
+    tau = joint_torques(chain, tau)
+    return acceleration(chain, state.structure, state.q, state.v, tau, default_dynamics(chain))
 
 
 def constraint_forces(
@@ -141,7 +147,7 @@ def loop_forces(chain: Chain, state: State, tau: Float[Array, " torques"]) -> Lo
     loops = loop_kinematics(chain, s, q)
     kin, J = loops.kin, loops.J
     V = twists(chain, kin, v)
-    vdot = acceleration(chain, s, q, v, tau)
+    vdot = acceleration(chain, s, q, v, tau, default_dynamics(chain))
     needed = with_links(chain, generalized_forces(chain, kin, V, v, vdot[:nv]), vdot)
     selection = choose(s, J)
     wrench = -constraint_forces(chain, selection, J, needed - passive_forces(chain, q, v) - tau)

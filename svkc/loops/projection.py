@@ -7,8 +7,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from svkc._jax.lanes_last import with_lanes_last
-from svkc.loops.constrained_dynamics import by_bodies, solve_motion
-from svkc.loops.constraint import loop_kinematics, scales, sizes
+from svkc.loops.constrained_dynamics import ArticulatedBodies, CompositeBodies
+from svkc.loops.constraint import LoopKinematics, loop_kinematics, scales, sizes
 from svkc.loops.pivoting import (
     Selection,
     held_part,
@@ -24,7 +24,6 @@ from svkc.loops.pivoting import (
 )
 from svkc.model.chain import Chain, Structure, active_dofs
 from svkc.tree.configuration import integrate, normalize
-from svkc.tree.kinematics import Kinematics
 
 
 def least_change(
@@ -49,15 +48,15 @@ def dependent_change(
 def inertia_change(
     chain: Chain,
     structure: Structure,
-    kin: Kinematics,
+    loops: LoopKinematics,
     selection: Selection,
-    J,
     x: Float[Array, "rows n"],
 ) -> Float[Array, "dofs n"]:
     """Return the y (m, rad, or their rates) with J y = x whose y^T M y is least: that of an impulse
     of the loops (29)."""
-    none = jnp.zeros(chain.dofs, J.dtype)
-    return jax.vmap(lambda x: solve_motion(chain, structure, kin, selection, J, none, -x), 1, 1)(x)
+    none = jnp.zeros(chain.dofs, x.dtype)
+    solve = CompositeBodies().prepare(chain, structure, loops, selection)
+    return jax.vmap(lambda x: solve(none, -x), 1, 1)(x)
 
 
 def _solvable(structure: Structure, selection: Selection) -> Selection:
@@ -120,7 +119,7 @@ def settle_loops(
         step = -(
             dependent_change(chain, selection, J, open_)
             if dependent
-            else inertia_change(chain, structure, loops.kin, selection, J, open_)
+            else inertia_change(chain, structure, loops, selection, open_)
         )
         last = i == iterations
         seen = jax.lax.stop_gradient((sizes(open_[:, 0]), weakest(full), chosen))
@@ -174,7 +173,6 @@ def _turn_by_bodies(
     loops = loop_kinematics(chain, structure, q)
     J, open_, active = loops.J, loops.gap, active_dofs(chain, structure)
     apart = jnp.where(last, J @ jnp.where(active, v / column, 0), open_)
-    step = solve_motion(
-        chain, structure, loops.kin, None, J, jnp.zeros(chain.dofs, q.dtype), apart, by_bodies
-    )
+    solve = ArticulatedBodies().prepare(chain, structure, loops)
+    step = solve(jnp.zeros(chain.dofs, q.dtype), apart)
     return step, jax.lax.stop_gradient(sizes(open_))

@@ -16,7 +16,7 @@ from svkc.integration.integrators import FixedSteps, SimplifiedNewton, motion_no
 from svkc.integration.replay import Replay
 from svkc.integration.stabilization import Baumgarte, Drift, Projection
 from svkc.integration.vector_field import Field
-from svkc.loops.constrained_dynamics import Dynamics
+from svkc.loops.constrained_dynamics import AbstractDynamics, Dynamics, default_dynamics
 from svkc.loops.constraint import gap_tolerance
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import check_state
@@ -30,7 +30,7 @@ class Options(eqx.Module):
     control: Callable | None
     solver: diffrax.AbstractSolver
     stabilization: Projection | Baumgarte | Drift
-    dynamics: Dynamics
+    dynamics: AbstractDynamics
     controller: Any
     adjoint: diffrax.AbstractAdjoint | Replay
     progress_meter: diffrax.AbstractProgressMeter
@@ -98,8 +98,6 @@ def checked(
             "stabilization: expected svkc.Projection, svkc.Baumgarte or svkc.Drift, got"
             f" {stabilization!r}"
         )
-    if dynamics is not None and not isinstance(dynamics, Dynamics):
-        raise ValueError(f"dynamics: expected svkc.Dynamics, got {dynamics!r}")
     if stepsize_controller is not None and not isinstance(
         stepsize_controller, diffrax.AbstractStepSizeController
     ):
@@ -126,7 +124,7 @@ def checked(
         control=control,
         solver=_solving(solver, None if dt is not None else controller, dtype),
         stabilization=Projection() if stabilization is None else stabilization,
-        dynamics=Dynamics() if dynamics is None else dynamics,
+        dynamics=_dynamics(chain, dynamics),
         controller=controller,
         adjoint=_adjoint(adjoint, controller if dt is None else None),
         progress_meter=diffrax.NoProgressMeter() if progress_meter is None else progress_meter,
@@ -139,6 +137,20 @@ def checked(
     )
     save_at = host.stack([of(t0), of(t1)]) if ts is None else ts
     return options, jnp.asarray(save_at, dtype), made
+
+
+def _dynamics(chain: Chain, dynamics) -> AbstractDynamics:
+    """Return the way to compute accelerations, or the default one of the chain."""
+    if dynamics is None:
+        return default_dynamics(chain)
+    if isinstance(dynamics, Dynamics):
+        return dynamics.resolved(chain)
+    if not isinstance(dynamics, AbstractDynamics):
+        raise ValueError(
+            "dynamics: expected an object of svkc.dynamics, such as"
+            f" svkc.dynamics.CompositeBodies(), got {dynamics!r}"
+        )
+    return dynamics
 
 
 def _solving(solver, controller, dtype) -> diffrax.AbstractSolver:

@@ -134,7 +134,8 @@ def _path(
     found = None
     if watched is not None:
         # an event is located once, before the differentiated solve, which then ends at its time
-        first = march(*frozen((start, times, world)), how)
+        begin, fixed_times, still = frozen((start, times, world))
+        first = march(begin, fixed_times, still, how)
         stop = jnp.where(first.found.hit, first.t, stop)
         at, found = jnp.where(at > stop, stop, at), first.found
     controller, first_step = options.steps(at)

@@ -49,7 +49,7 @@ def simulate(
     solver, stepsize_controller, adjoint, progress_meter: diffrax objects, passed through; by
     default Dopri8 with rtol, Tsit5 with dt or in float32. stabilization: `svkc.Projection()`
     (default), `svkc.Exact()`, `svkc.Baumgarte(rate)` or `svkc.Drift()`. dynamics:
-    `svkc.Dynamics(inertia, hold)`. Functions are compared by their code and by the values that they
+    an object of `svkc.dynamics`. Functions are compared by their code and by the values that they
     read: defaults, closures and globals. An equal function is not compiled again. Floating-point
     arrays among these values are data. Numbers and integer arrays are static, as are arrays that
     Python has to read. A function that reads other kinds of objects is compared by identity; if

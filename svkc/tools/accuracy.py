@@ -14,7 +14,7 @@ import numpy as np
 
 from svkc.integration.integrators import RodriguesEuler, SemiImplicitEuler
 from svkc.integration.stabilization import Drift, Projection
-from svkc.loops.constrained_dynamics import Dynamics, by_bodies
+from svkc.loops.constrained_dynamics import ArticulatedBodies
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import check_state
 from svkc.model.validation import one, positive, whole
@@ -91,9 +91,7 @@ def candidates(dtype, span: float) -> list[Candidate]:
             )
             found.append(Candidate(name, how | {"stabilization": Projection()}))
             found.append(Candidate(f"{name}, drift", how | {"stabilization": Drift()}))
-            found.append(
-                Candidate(f"{name}, by bodies", how | {"dynamics": Dynamics(inertia=by_bodies)})
-            )
+            found.append(Candidate(f"{name}, by bodies", how | {"dynamics": ArticulatedBodies()}))
         if rtol >= 1e-8:
             found.append(
                 Candidate(

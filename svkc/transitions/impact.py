@@ -4,17 +4,21 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from svkc.loops.constrained_dynamics import solve_free_motion, solve_motion, with_links
-from svkc.loops.constraint import scales
+from svkc.loops.constrained_dynamics import (
+    ArticulatedBodies,
+    CompositeBodies,
+    with_links,
+)
+from svkc.loops.constraint import LoopKinematics, scales
 from svkc.loops.forward_dynamics import constraint_forces
 from svkc.loops.pivoting import Selection
 from svkc.model.chain import Chain, State, Structure
 from svkc.tree.inverse_dynamics import inertia_times
-from svkc.tree.kinematics import Kinematics, kinematics
+from svkc.tree.kinematics import kinematics
 
 
 def velocity_after_impact(
-    chain: Chain, structure: Structure, kin: Kinematics, selection: Selection, J, v
+    chain: Chain, structure: Structure, loops: LoopKinematics, selection: Selection, v
 ):
     """Return v+ = W (W^T M W)^-1 W^T M v-, the impulse of each loop on its real link, and the
     energy lost: the paper's (29)-(38) in one formula.
@@ -22,13 +26,12 @@ def velocity_after_impact(
     v+ is the projection of v-, orthogonal in the metric of the inertia, on the velocities that the
     structure allows. Redundant loops need no special case.
     """
-    jump = solve_motion(
-        chain, structure, kin, selection, J, jnp.zeros_like(v), J @ (v / scales(chain)[1])
-    )
-    impulse = with_links(chain, inertia_times(chain, kin, jump[: chain.nv]), jump)
+    solve = CompositeBodies().prepare(chain, structure, loops, selection)
+    jump = solve(jnp.zeros_like(v), loops.J @ (v / scales(chain)[1]))
+    impulse = with_links(chain, inertia_times(chain, loops.kin, jump[: chain.nv]), jump)
     # v- and v+ differ by a vector orthogonal to v+, so that the loss is a square and cannot be
     # negative
-    return v + jump, -constraint_forces(chain, selection, J, impulse), jump @ impulse / 2
+    return v + jump, -constraint_forces(chain, selection, loops.J, impulse), jump @ impulse / 2
 
 
 class Change(eqx.Module):
@@ -53,6 +56,6 @@ def lock_projection(chain: Chain, structure: Structure, q, v):
     if structure.locked is None:
         return v, jnp.zeros((), v.dtype)
     kin = kinematics(chain, q)
-    after = solve_free_motion(chain, structure, kin, inertia_times(chain, kin, v))
+    after = ArticulatedBodies().prepare_open(chain, structure, kin)(inertia_times(chain, kin, v))
     jump = after - v
     return after, jump @ inertia_times(chain, kin, jump) / 2

@@ -186,7 +186,7 @@ def _iterate(
         if IMPACT in kinds:
             new = jax.lax.cond(
                 kind == IMPACT,
-                lambda: velocity_after_impact(chain, structure, kin, selection, J, now.v),
+                lambda: velocity_after_impact(chain, structure, loops, selection, now.v),
                 lambda: new,
             )
         moved = integrate(

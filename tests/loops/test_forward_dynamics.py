@@ -53,7 +53,9 @@ def test_acceleration_is_that_of_the_multipliers(case):
     scale = np.abs(expected).max()
     fast = svkc.forward_dynamics(chain, state, tau)
     columns = paper.forward_dynamics_by_unit_vectors(chain, state, tau)
-    bodies = accelerated(chain, state.structure, state.q, state.v, tau, svkc.by_bodies)
+    bodies = accelerated(
+        chain, state.structure, state.q, state.v, tau, svkc.dynamics.ArticulatedBodies()
+    )
     assert np.abs(fast[: chain.nv] - expected).max() < 1e-9 * scale
     assert np.abs(columns - fast).max() < 1e-10 * np.abs(fast).max()
     assert np.abs(bodies - fast).max() < 1e-10 * np.abs(fast).max()
@@ -80,7 +82,7 @@ def test_articulated_bodies_carry_what_acts_on_virtual_joints(case):
         q = svkc.integrate(chain, locked.q, scale * along)
         return [
             accelerated(c, locked.structure, q, locked.v, tau, way)
-            for way in (None, svkc.by_bodies)
+            for way in (svkc.dynamics.CompositeBodies(), svkc.dynamics.ArticulatedBodies())
         ]
 
     for usual, bodies in (both(0.0), jax.jvp(both, (0.0,), (1.0,))[1]):

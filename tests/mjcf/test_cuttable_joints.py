@@ -197,7 +197,8 @@ def test_springs_ranges_armature_and_motors_go_with_the_joint():
     u = jnp.array([0.7])
     tau = jnp.linspace(-1.0, 2.0, chain.dofs)
     usual, bodies = (
-        acceleration(chain, b.structure, b.q, b.v, tau, way) for way in (None, svkc.by_bodies)
+        acceleration(chain, b.structure, b.q, b.v, tau, way)
+        for way in (svkc.dynamics.CompositeBodies(), svkc.dynamics.ArticulatedBodies())
     )
     np.testing.assert_allclose(bodies, usual, atol=1e-10 * float(jnp.abs(usual).max()))
     motors = {c.dofs: lambda t, s, args, c=c: c.motors(u) for c in (plain, chain)}

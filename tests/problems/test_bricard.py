@@ -103,12 +103,14 @@ def by_hand(ends):
     ).y[0]
 
 
-@pytest.mark.parametrize("inertia", [None, svkc.by_bodies], ids=["pivots", "by_bodies"])
-def test_bricards_mechanism(inertia):
+@pytest.mark.parametrize(
+    "dynamics",
+    [svkc.dynamics.CompositeBodies(), svkc.dynamics.ArticulatedBodies()],
+    ids=["pivots", "bodies"],
+)
+def test_bricards_mechanism(dynamics):
     chain, times = mechanism(), jnp.linspace(0, 10, 101)
-    traj = svkc.simulate(
-        chain, chain.state(), 10.0, ts=times, rtol=1e-11, dynamics=svkc.Dynamics(inertia=inertia)
-    )
+    traj = svkc.simulate(chain, chain.state(), 10.0, ts=times, rtol=1e-11, dynamics=dynamics)
     np.testing.assert_allclose(
         traj.states.q[:, :5], jax.vmap(angles)(jnp.array(by_hand(times))), atol=1e-8
     )

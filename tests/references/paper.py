@@ -9,7 +9,7 @@ import numpy as np
 from jax.scipy.linalg import cho_factor, cho_solve
 from jaxtyping import Array, Float
 
-from svkc.loops.constrained_dynamics import reduced_inertia
+from svkc.loops.constrained_dynamics import UnitVectors, reduced_inertia
 from svkc.loops.constraint import ends, loop_jacobian, loop_kinematics
 from svkc.loops.coordinates import constrained
 from svkc.loops.forward_dynamics import acceleration
@@ -18,7 +18,7 @@ from svkc.model.checked_jit import joint_torques
 from svkc.model.names import link_index
 from svkc.transitions.placement import joint_coordinates, with_coordinates
 from svkc.tree.kinematics import twists
-from svkc.tree.mass_matrix import inertia_by_composites, inertia_by_unit_vectors
+from svkc.tree.mass_matrix import inertia_by_composites
 
 
 @jax.jit
@@ -28,7 +28,7 @@ def forward_dynamics_by_unit_vectors(
     """Return the accelerations of every joint coordinate with the inertia matrix column by column
     from inverse dynamics: the paper's (23), (24)."""
     return acceleration(
-        chain, state.structure, state.q, state.v, joint_torques(chain, tau), inertia_by_unit_vectors
+        chain, state.structure, state.q, state.v, joint_torques(chain, tau), UnitVectors()
     )
 
 

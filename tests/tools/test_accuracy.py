@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import svkc
+from svkc.loops.constrained_dynamics import default_dynamics
 from svkc.loops.projection import settle_loops
 from svkc.tools.accuracy import Candidate, candidates
 
@@ -135,10 +136,10 @@ def test_only_dependent_coordinates_move():
 
 WAYS = {
     "exact": {"stabilization": svkc.Exact()},
-    "unit vectors": {"dynamics": svkc.Dynamics(inertia=svkc.inertia_by_unit_vectors)},
-    "bodies": {"dynamics": svkc.Dynamics(inertia=svkc.by_bodies)},
-    "chosen at every evaluation": {"dynamics": svkc.Dynamics(hold=None)},
-    "held": {"dynamics": svkc.Dynamics(hold=0.0)},
+    "unit vectors": {"dynamics": svkc.dynamics.UnitVectors()},
+    "bodies": {"dynamics": svkc.dynamics.ArticulatedBodies()},
+    "chosen at every evaluation": {"dynamics": svkc.dynamics.CompositeBodies(hold=None)},
+    "held": {"dynamics": svkc.dynamics.CompositeBodies(hold=0.0)},
 }
 
 
@@ -208,11 +209,33 @@ def test_how_loops_are_kept_leaves_derivatives_as_they_are(swinging, way):
 def test_bad_dynamics():
     chain = models.four_bar()
     for given, said in (
-        (svkc.Projection, "dynamics: expected svkc.Dynamics"),
+        (svkc.Projection, "dynamics: expected an object of svkc.dynamics"),
+        (lambda: svkc.dynamics.UnitVectors, "dynamics: expected an object of svkc.dynamics"),
+        (lambda: svkc.dynamics.ArticulatedBodies(hold=2.0), r"dynamics.hold: got 2.0"),
         (lambda: svkc.Dynamics(hold=2.0), r"dynamics.hold: got 2.0"),
+        (lambda: svkc.Dynamics(inertia=svkc.mass_matrix), r"dynamics.inertia: got"),
     ):
         with pytest.raises(ValueError, match=said):
             svkc.simulate(chain, chain.state(), 1.0, dynamics=given())
+
+
+def test_the_older_spelling_of_dynamics():
+    closed, tree = (
+        models.four_bar(),
+        svkc.load(models.MJCF.format(models.bar("a", models.Y, "0 0 1"))),
+    )
+    new = svkc.dynamics
+    for chain, usual in ((closed, new.CompositeBodies), (tree, new.ArticulatedBodies)):
+        assert default_dynamics(chain) == usual()
+        for inertia, kind in (
+            (None, usual),
+            (svkc.by_bodies, new.ArticulatedBodies),
+            (svkc.inertia_by_composites, new.CompositeBodies),
+            (svkc.inertia_by_unit_vectors, new.UnitVectors),
+        ):
+            for hold in (None, 0.0, 0.3):
+                assert svkc.Dynamics(inertia, hold).resolved(chain) == kind(hold)
+        assert type(svkc.Dynamics().resolved(chain)) is usual
 
 
 def test_the_certificate(tmp_path):

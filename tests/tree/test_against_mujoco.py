@@ -92,7 +92,7 @@ def everything(chain, state, tau):
         "acceleration": vdot,
         "acceleration by unit vectors": paper.forward_dynamics_by_unit_vectors(chain, state, tau),
         "acceleration by composites": acceleration(
-            chain, state.structure, state.q, state.v, tau, svkc.inertia_by_composites
+            chain, state.structure, state.q, state.v, tau, svkc.dynamics.CompositeBodies()
         ),
         "inverse": svkc.inverse_dynamics(chain, state, vdot),
         "kinetic": svkc.kinetic_energy(chain, state),
@@ -221,7 +221,12 @@ def test_deep_chain_agrees_with_mujoco(twigs):
     vdot = svkc.forward_dynamics(chain, state, jnp.zeros(model.nv))
     np.testing.assert_allclose(vdot, data.qacc, rtol=1e-8, atol=1e-8 * np.abs(data.qacc).max())
     by_composites = acceleration(
-        chain, state.structure, state.q, state.v, jnp.zeros(model.nv), svkc.inertia_by_composites
+        chain,
+        state.structure,
+        state.q,
+        state.v,
+        jnp.zeros(model.nv),
+        svkc.dynamics.CompositeBodies(),
     )
     np.testing.assert_allclose(vdot, by_composites, rtol=1e-9, atol=1e-10 * np.abs(data.qacc).max())
 
