@@ -2,9 +2,8 @@
 against drift, float64 and float32, MuJoCo beside them.
 
 `python benchmarks/accuracy.py [problem ...] [--only TEXT]` prints results/accuracy.csv and draws
-results/accuracy_PROBLEM.png. Errors are
-those at the end, root mean square over coordinates (rad, m), against closed forms, published
-digits, or, where the reference says so, Dopri8 at
+results/accuracy_PROBLEM.png. Errors are those at the end, root mean square over coordinates (rad,
+m), against closed forms, published digits, or, where the reference says so, Dopri8 at
 rtol 1e-12. Seconds are per simulated second, the median of five runs of a compiled program, one run
 at a time."""
 

@@ -5,9 +5,9 @@ process of its own.
 for each program and writes results/compile.csv. FOLDER is another checkout; the two take turns.
 Columns: `instructions`, of the HLO module before XLA's passes, with every call inlined; `kernels`,
 the fusions that are left after them; CPU seconds of tracing, lowering and XLA; `first`, CPU and
-wall seconds of the first call as a user makes
-it, from after the imports and the models' loading to its result; `again`, the wall milliseconds of
-a second call. Medians where there are several rounds. Options of XLA are the default ones.
+wall seconds of the first call as a user makes it, from after the imports and the models' loading to
+its result; `again`, the wall milliseconds of a second call. Medians where there are several rounds.
+Options of XLA are the default ones.
 """
 
 import argparse

@@ -2,12 +2,12 @@
 derivative, and the compilation of each.
 
 High bar: 1.8 s with both releases, 198 parameters (masses, centres of mass, velocity, release
-times, torques). Open chain: the same figure in free
-fall, alone and 64 by `vmap`, 200 steps of the classical Runge-Kutta method of 2 ms, 198 parameters
-(velocity, torques), beside MJX's gradient of the same steps and central differences with MuJoCo,
-both of which hold the torque of a step's middle; all three gradients are compared. `python
-benchmarks/gradients.py` prints and writes results/gradients.csv; needs the extra `bench`. float64.
-Medians; runs that are compared take turns."""
+times, torques). Open chain: the same figure in free fall, alone and 64 by `vmap`, 200 steps of the
+classical Runge-Kutta method of 2 ms, 198 parameters (velocity, torques), beside MJX's gradient of
+the same steps and central differences with MuJoCo, both of which hold the torque of a step's
+middle; all three gradients are compared. `python benchmarks/gradients.py` prints and writes
+results/gradients.csv; needs the extra `bench`. float64. Medians; runs that are compared take
+turns."""
 
 import csv
 import os

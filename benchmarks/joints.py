@@ -2,8 +2,8 @@
 measured on the 40-freedom figure of its Fig. 16.
 
 As 12 balls and 4 hinges, and as 40 hinges. `python benchmarks/joints.py` prints and writes
-results/joints.csv. The figures take turns, so that
-a busy machine slows both. Times of a batch are those of all its lanes together."""
+results/joints.csv. The figures take turns, so that a busy machine slows both. Times of a batch are
+those of all its lanes together."""
 
 import csv
 import functools

@@ -118,8 +118,8 @@ class RodriguesEuler(diffrax.AbstractSolver):
 
 class SemiImplicitEuler(RodriguesEuler):
     """Symplectic Euler: the velocity first, v(t + dt) = v(t) + vdot dt, then q moved by the new one
-    along the exponential map. First order; on
-    conservative open chains the energy's error stays bounded. For `svkc.simulate` alone, with dt.
+    along the exponential map. First order; on conservative open chains the energy's error stays
+    bounded. For `svkc.simulate` alone, with dt.
     """
 
     def _moving(self, before, after):

@@ -232,8 +232,8 @@ def step_alone(
     solver: diffrax.AbstractSolver, field: Field, t0, t1, y: Motion, scene: Scene
 ) -> Motion:
     """One settled step of a solver that remembers nothing of the step before, to be differentiated:
-    of each evaluation of the field, and
-    of each turn of the loop that settles the step, only the arguments are kept on the way back."""
+    of each evaluation of the field, and of each turn of the loop that settles the step, only the
+    arguments are kept on the way back."""
     rate = eqx.filter_checkpoint(field)
     if isinstance(solver, diffrax.AbstractERK) and isinstance(
         solver.tableau, diffrax.ButcherTableau

@@ -49,8 +49,7 @@ class Tally(eqx.Module):
     """What a run has cost and shown: tries, and of the steps that were kept the sum of their
     estimated errors (root mean square over q and v; inf: the solver gives none), the least |R_mm| /
     |R_11| of the loops, how often the dependent coordinates changed (-1: not looked at), the loop
-    that could
-    not be closed (-1: none), and the largest of the loops' gaps (rad, m)."""
+    that could not be closed (-1: none), and the largest of the loops' gaps (rad, m)."""
 
     tries: Int[Array, ""]
     error: Float[Array, ""]
@@ -97,8 +96,7 @@ class Path(eqx.Module):
 
 class Step(eqx.Module):
     """What goes from step to step. length: what the controller asks for, before a time to be met
-    shortens it; times, kept, saved: as in `Path`, but
-    buffers within the loop."""
+    shortens it; times, kept, saved: as in `Path`, but buffers within the loop."""
 
     t: Float[Array, ""]
     y: Motion

@@ -84,8 +84,7 @@ class Field(eqx.Module):
 
 class Seen(eqx.Module):
     """What the loops show as a step is put back onto them: how far each loop is open yet (rad,
-    `chain.length`s) and, where pivots are chosen,
-    |R_mm| / |R_11| and those to go on with."""
+    `chain.length`s) and, where pivots are chosen, |R_mm| / |R_11| and those to go on with."""
 
     gap: Float[Array, "links 2"]
     margin: Float[Array, ""] | None = None

@@ -34,9 +34,9 @@ LARGE = 36
 
 class Joints(eqx.Module):
     """The virtual joints' own coordinates, link by link, as many as the freest has: motion [links,
-    row, freedom] of those without inertia, and
-    (S^T S)^-1 of it; of those with armature (N m s^2, N s^2/m), and that (None: no joint has any);
-    where each stands among the coordinates of virtual joints (`count`: nowhere)."""
+    row, freedom] of those without inertia, and (S^T S)^-1 of it; of those with armature (N m s^2, N
+    s^2/m), and that (None: no joint has any); where each stands among the coordinates of virtual
+    joints (`count`: nowhere)."""
 
     light: Float[Array, "links 6 d"]
     inverse: Float[Array, "links d d"]

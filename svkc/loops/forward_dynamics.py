@@ -47,9 +47,8 @@ def moving(
     and nothing of the closure is computed.
 
     baumgarte: rate (1/s) at which open loops are pulled back; None: not at all. agree: near a
-    singular configuration dependent velocities are
-    those of the independent ones, for there the stages of a step would make their errors grow.
-    pivots: as `choose` takes them.
+    singular configuration dependent velocities are those of the independent ones, for there the
+    stages of a step would make their errors grow. pivots: as `choose` takes them.
     """
     if chain.topology.link_names:
         loops = loop_kinematics(chain, structure, q)
@@ -136,8 +135,8 @@ class LoopForces(eqx.Module):
 @verb(eager=True)
 def loop_forces(chain: Chain, state: State, tau: Float[Array, " torques"]) -> LoopForces:
     """Force (N) and torque (N m) that each connected virtual link carries for the joint torques
-    tau: on `real` from `parent`, at the joint, in
-    world axes, and whether the motion alone decides it."""
+    tau: on `real` from `parent`, at the joint, in world axes, and whether the motion alone decides
+    it."""
     tau = joint_torques(chain, tau)
     if not len(chain.link_names):
         return LoopForces(

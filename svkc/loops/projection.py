@@ -61,8 +61,7 @@ def inertia_change(
 
 def _solvable(structure: Structure, selection: Selection) -> Selection:
     """Steps below the rank's tolerance dropped, for a gap along them is of second order and
-    dividing by them would only amplify round-off; and rows
-    that are let go just now."""
+    dividing by them would only amplify round-off; and rows that are let go just now."""
     return without_weak(
         selection,
         jnp.maximum(

@@ -43,8 +43,7 @@ def load(source, *, virtual_links=(), cuttable=(), spare=0, ignore=()) -> Chain:
     `cuttable`: names of joints of the tree that may be cut, each a virtual link of its name,
     connected at first (paper, Fig. 15);
     `ignore`: kinds of elements to leave out, by the names the error message uses, or "all";
-    "equality" means those that are neither connect
-    nor weld. "limit" leaves out joint ranges.
+    "equality" means those that are neither connect nor weld. "limit" leaves out joint ranges.
     Collisions between geoms are never modelled.
     Functions are compiled once for all loads of one model with the same arguments, and again for
     another model, even where only numbers differ. For other numbers and one program replace floats

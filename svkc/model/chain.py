@@ -17,9 +17,8 @@ class Structure(eqx.Module):
     two bodies (m, wxyz), its axis along z.
 
     `connected` [links]; `parent`, `real`: rows of the two bodies; `freedoms`: of each virtual
-    joint; `locked`: joint coordinates held still, None
-    where nothing can be locked; `independent`: coordinates asked to be independent where they can
-    be; `rank`: m, decided once for the phase,
+    joint; `locked`: joint coordinates held still, None where nothing can be locked; `independent`:
+    coordinates asked to be independent where they can be; `rank`: m, decided once for the phase,
     with `margin`: |R_mm| / |R_11| where that was, in a generic configuration.
     """
 
@@ -182,8 +181,8 @@ class Chain(eqx.Module):
         q, v: arrays over the tree (or over every coordinate), or dicts by joint name, whose entries
         are kept where the loops allow it.
         connected: names of the virtual links, or a mask; None: as the model says. ValueError:
-        unknown names, wrong sizes, quaternions that are
-        not unit, loops that cannot be closed (says which, and by how much).
+        unknown names, wrong sizes, quaternions that are not unit, loops that cannot be closed (says
+        which, and by how much).
         """
         # the one import that goes up the house: a state needs the loops closed, and the contract
         # puts the verb on the noun

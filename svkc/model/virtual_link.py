@@ -46,8 +46,7 @@ class VirtualLink:
     `parent`, `real`: names of bodies ("world" is the ground) or of sites. `pos` (m), `quat`: the
     joint's frame in the parent; `real_pos`, `real_quat`: the same frame in the real link, None:
     from the load pose. Of a site: in the site's frame; `real_pos` None: at the site. `axis`: of the
-    joint, in the
-    frame `pos`, `quat` makes in the parent.
+    joint, in the frame `pos`, `quat` makes in the parent.
     `joint`: weld, hinge, slide, cylinder, universal, planar, ball, free, or six Booleans (three
     rotations, three translations).
     `actuated`: a motor drives the joint's own coordinates (paper, Fig. 6).

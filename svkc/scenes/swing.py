@@ -20,9 +20,8 @@ def swing(angle: float = 0.6, **options) -> tuple[Chain, State]:
     along the plate at each thigh.
 
     30 joint freedoms and the swing's own one; the seat gives way where a slide is cut, as when a
-    thigh has passed the plate's edge: two fewer after
-    both have. State: at rest, the swing turned by `angle` (rad) about its pivot. `options` go to
-    `svkc.load`.
+    thigh has passed the plate's edge: two fewer after both have. State: at rest, the swing turned
+    by `angle` (rad) about its pivot. `options` go to `svkc.load`.
     """
     spec, links = parts()
     chain = load(spec, virtual_links=links, **options)

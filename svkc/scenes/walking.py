@@ -19,9 +19,8 @@ def walking(**options) -> tuple[Chain, State]:
     standing at rest, the right foot a stride behind.
 
     22 joint freedoms; mobility 11 with both feet on the ground (legs that move in parallel planes
-    make one row redundant), 16 with one, 22 with
-    none. A weld also carries moments and friction: the ground of this scene is one that feet do not
-    slide or tilt on. `options` go to `svkc.load`.
+    make one row redundant), 16 with one, 22 with none. A weld also carries moments and friction:
+    the ground of this scene is one that feet do not slide or tilt on. `options` go to `svkc.load`.
     """
     spec = mujoco.MjSpec.from_file(str(FOLDER / "figure16.xml"))
     floor = {"pos": [1.55, 0, -0.02], "size": [2.35, 0.6, 0.02], "rgba": [0.75, 0.75, 0.78, 1]}

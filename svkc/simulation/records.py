@@ -31,9 +31,8 @@ class Events(eqx.Module):
     """What happened, in the order of time; rows past `count` are unused (time inf, which -1).
 
     `which`: the event's place in the list given; `impulse` (N s), `angular_impulse` (N m s): on
-    each real link from its parent, at the joint, in
-    world axes, for the links this event connected; `energy_lost` (J): of events at one instant, in
-    the first one's row.
+    each real link from its parent, at the joint, in world axes, for the links this event connected;
+    `energy_lost` (J): of events at one instant, in the first one's row.
     """
 
     time: Float[Array, " events"]
@@ -144,17 +143,15 @@ class Phases(eqx.Module):
     """The stretches between changes of structure; rows past `count` are unused.
 
     `energy`: mechanical energy (J) at start and end; `work`: done in between by control, limits and
-    dampers (J); `margin`: the least |R_mm| / |R_11| of
-    the phase (of its two ends where steps are not projected), how far the weakest row that counts
-    is from being redundant; `swaps`: how often the
-    choice of dependent coordinates changed from step to step (-1: not looked at); `loop`: the one
-    that could not be closed (-1: none);
+    dampers (J); `margin`: the least |R_mm| / |R_11| of the phase (of its two ends where steps are
+    not projected), how far the weakest row that counts is from being redundant; `swaps`: how often
+    the choice of dependent coordinates changed from step to step (-1: not looked at); `loop`: the
+    one that could not be closed (-1: none);
     `evaluations`: of the vector field, in steps alone; `error`: the estimated errors of the steps
-    added up (root mean square over q and v; inf: the
-    solver estimates none); `gap`: the largest of the loops' gaps (rad, m) at the ends of steps (of
-    the phase, with a diffrax adjoint); `gap_rate`: of
-    their rates (rad/s, m/s) at the phase's two ends, before the event that ends it; `free`: nothing
-    holds the bodies to the ground; `momentum_drift`:
+    added up (root mean square over q and v; inf: the solver estimates none); `gap`: the largest of
+    the loops' gaps (rad, m) at the ends of steps (of the phase, with a diffrax adjoint);
+    `gap_rate`: of their rates (rad/s, m/s) at the phase's two ends, before the event that ends it;
+    `free`: nothing holds the bodies to the ground; `momentum_drift`:
     then, the change of linear momentum (N s) that gravity does not explain and that of the angular
     momentum about the centre of mass (N m s).
     """

@@ -2,9 +2,8 @@
 structure between them.
 
 A phase ends at the next scheduled time or at the end of the first step in which a guard crosses
-zero; the crossing is then located by steps of the
-solver back from there, so that its time and state have the solver's own order and not that of an
-interpolation. Lanes of a batch
+zero; the crossing is then located by steps of the solver back from there, so that its time and
+state have the solver's own order and not that of an interpolation. Lanes of a batch
 that are done go on with phases of no length.
 """
 
@@ -41,8 +40,7 @@ def simulate(
     `svkc.when`).
 
     ts: times to save, stepped to exactly; None: t0 and t1. A state saved at an event's time is the
-    one after it; times past the end of a run that
-    stopped early hold its last state.
+    one after it; times past the end of a run that stopped early hold its last state.
     control(t, state, args): joint torques (N m, N) over every coordinate, or the tree's.
     dt: fixed steps (s). rtol, atol: adaptive steps, by default 1e-7 (float32: 1e-4) and a hundredth
     of rtol.

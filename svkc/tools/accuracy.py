@@ -42,8 +42,7 @@ class Candidate:
 @dataclasses.dataclass(frozen=True)
 class Tuning:
     """`best`: options to give to `simulate` (None: no candidate holds the target); `table`: every
-    candidate, the fastest that hold it first. Printed, it
-    is that table."""
+    candidate, the fastest that hold it first. Printed, it is that table."""
 
     target: float
     best: dict[str, Any] | None
@@ -138,15 +137,14 @@ def tune(
     **call,
 ) -> Tuning:
     """Runs candidates on this scene and tells the fastest whose configuration stays within `target`
-    (rad, m; root mean square over the coordinates,
-    largest over the save times) of a run with much smaller tolerances.
+    (rad, m; root mean square over the coordinates, largest over the save times) of a run with much
+    smaller tolerances.
 
     options: the candidates (None: fixed and adaptive steps of several orders, `candidates`). show:
     print each as it is found, and the table in the end. call: ts, events, control, args and
     whatever else of `simulate` all runs share. Seconds are those of computing alone, the least of
-    `repeats`
-    runs; what takes ten times the best so far is not repeated. ValueError: a target that is not
-    positive, or no reference that holds.
+    `repeats` runs; what takes ten times the best so far is not repeated. ValueError: a target that
+    is not positive, or no reference that holds.
     """
     check_state(chain, state)
     target, t1, repeats = positive("target", target), one("t1", t1), whole("repeats", repeats, 1)

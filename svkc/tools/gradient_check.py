@@ -46,11 +46,10 @@ def check_grad(
     along random directions; says which entry is worst.
 
     f: of one argument; x and f(x): any pytrees, of which floats count. For every float leaf of x by
-    itself, `directions` random directions, as long as
-    the leaf (one, where it is zero). mode: "forward", "reverse", or "both", which compares the two.
-    step: the first step of the differences, as
-    a part of the direction; it is halved seven times and the best estimate taken. float64, or the
-    differences are worth little.
+    itself, `directions` random directions, as long as the leaf (one, where it is zero). mode:
+    "forward", "reverse", or "both", which compares the two. step: the first step of the
+    differences, as a part of the direction; it is halved seven times and the best estimate taken.
+    float64, or the differences are worth little.
     ValueError: no floats in x, an unknown mode, or f not finite.
     """
     function("f", f, optional=False)

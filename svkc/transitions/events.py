@@ -20,8 +20,8 @@ from svkc.transitions.spare_links import Grip, checked_freedoms, holding, placed
 
 class Action(eqx.Module):
     """What an event does: names of virtual links to connect (those in `here`: where they are) and
-    cut, of joints to lock and unlock, grips to
-    make with spare slots and, by slot or by pair of bodies, to give up."""
+    cut, of joints to lock and unlock, grips to make with spare slots and, by slot or by pair of
+    bodies, to give up."""
 
     connect: tuple[str, ...] = eqx.field(static=True, default=())
     cut: tuple[str, ...] = eqx.field(static=True, default=())
@@ -109,9 +109,8 @@ def when(
     time; the actions are those of `at`.
 
     direction: True for upwards only, False for downwards only. A guard is watched while its action
-    would change something, or always if it has
-    none, so name the links it is about where several act alike; one that is exactly zero at the
-    start has not crossed, nor has one that rests at zero
+    would change something, or always if it has none, so name the links it is about where several
+    act alike; one that is exactly zero at the start has not crossed, nor has one that rests at zero
     (to eps^(3/4)) after it fired. Crossings are seen between the ends of steps of one phase: two
     within one step go unseen, so bound the step (`stepsize_controller`, `dt`) where that can
     happen. A guard that jumps over zero happens where it jumps; only a smooth one has a time to

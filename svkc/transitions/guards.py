@@ -161,9 +161,8 @@ def touch(chain: Chain, link: str, distance=0.01, axes: str | None = None) -> To
 
 def leaves(chain: Chain, link: str, axis=(0.0, 0.0, 1.0)) -> Leaves:
     """A guard: the force (N) with which a virtual link's parent pushes its real link along `axis`
-    (in the joint's frame in the parent). It falls
-    through zero where the parent would have to pull: with direction=False and cut=link the link
-    holds in one direction only."""
+    (in the joint's frame in the parent). It falls through zero where the parent would have to pull:
+    with direction=False and cut=link the link holds in one direction only."""
     check_chain(chain)
     axis = np.asarray(finite("leaves: axis", axis), float)
     size = float(np.linalg.norm(axis))
@@ -174,9 +173,8 @@ def leaves(chain: Chain, link: str, axis=(0.0, 0.0, 1.0)) -> Leaves:
 
 def overload(chain: Chain, link: str, force=None, torque=None) -> Overload:
     """A guard: what a virtual link carries, over the most it can (force N, torque N m), less one.
-    It rises through zero where the joint breaks; use
-    with direction=True and cut=link. Where loops are redundant the load is the least one
-    (`loop_forces`)."""
+    It rises through zero where the joint breaks; use with direction=True and cut=link. Where loops
+    are redundant the load is the least one (`loop_forces`)."""
     if force is None and torque is None:
         raise ValueError("overload: give the largest force (N), the largest torque (N m), or both")
     check_chain(chain)

@@ -64,8 +64,8 @@ def change(
     """The state under another set of connected links and locked joints.
 
     Where links are only cut or joints only unlocked, q and v are kept bit for bit; where something
-    new holds, coordinates of the new joints
-    are read off, the remaining gap is closed by the least change, and the velocity is projected.
+    new holds, coordinates of the new joints are read off, the remaining gap is closed by the least
+    change, and the velocity is projected.
     """
     structure, new_links, holds = _restructured(chain, state.structure, connected, locked)
     q, v, nothing = state.q, state.v, jnp.zeros((len(chain.link_names), 3), state.v.dtype)
@@ -133,8 +133,8 @@ def connect(chain: Chain, state: State, *names: str, here: bool = False) -> Stat
     (paper, section V-C).
 
     At their declared placement, where the bodies must already be; here=True: the joint is made
-    where the real link is. ValueError: unknown
-    names, or bodies that are not at the placement (says by how much).
+    where the real link is. ValueError: unknown names, or bodies that are not at the placement (says
+    by how much).
     """
     check_state(chain, state)
     chosen = np.isin(np.arange(len(chain.link_names)), [link_index(chain, n) for n in names])

@@ -81,8 +81,8 @@ def limit_forces(
     damper that act outside of it only.
 
     With x the distance outside and a = 0.02 rad or m: -(k x + c v) exp(-a / x); zero inside. All
-    derivatives are continuous where it sets in: a kink
-    there would cost adaptive steps of high order more than the motion itself.
+    derivatives are continuous where it sets in: a kink there would cost adaptive steps of high
+    order more than the motion itself.
     """
     tau = jnp.zeros_like(v)
     if chain.limit is None:

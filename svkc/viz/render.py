@@ -28,10 +28,9 @@ def render(
     elevation: float = -8,
 ) -> pathlib.Path:  # fmt: skip
     """Writes a picture of the run by the ending of `path`: .png a strobe of `frames` poses seen
-    from the side; .gif and .mp4 an animation of `fps` frames
-    a second of size (width, height) in pixels, with a strip below that names the time, what holds
-    and the events; .html a page of its own to turn, play
-    and go through (`svkc.page.show` in a notebook).
+    from the side; .gif and .mp4 an animation of `fps` frames a second of size (width, height) in
+    pixels, with a strip below that names the time, what holds and the events; .html a page of its
+    own to turn, play and go through (`svkc.page.show` in a notebook).
 
     Of animations: trails: names of bodies whose paths are drawn; camera: the model's own of that
     name, else lookat (m), distance (m), azimuth and elevation (deg) place one. ValueError: another

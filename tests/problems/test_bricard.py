@@ -1,6 +1,6 @@
 """Bricard's rectangular mechanism, IFToMM's A04: five rods along the edges of a cube, six hinges,
-one row of the loop redundant wherever it is. Ten
-seconds against Lagrange's equation of its one freedom."""
+one row of the loop redundant wherever it is. Ten seconds against Lagrange's equation of its one
+freedom."""
 
 import jax
 import jax.numpy as jnp

@@ -116,9 +116,8 @@ def four_bar_on_a_bar(small):
 
 def test_lengths_from_a_millimetre_to_a_kilometre():
     """A four-bar of a kilometre at the end of a millimetre's bar; one of a millimetre at the end of
-    a kilometre's, where its inertia about the far
-    root is 1e12 times its own and round-off of it shows: energy drifts by 9e-3 of the kinetic
-    energy."""
+    a kilometre's, where its inertia about the far root is 1e12 times its own and round-off of it
+    shows: energy drifts by 9e-3 of the kinetic energy."""
     chain = four_bar_on_a_bar(1e3)
     traj = svkc.simulate(chain, chain.state(v={"crank": 4.0}), 1.0, ts=TIMES, **FINE)
     assert drift(chain, traj) < 1e-8

@@ -121,8 +121,7 @@ def test_a_loop_of_no_length():
 @pytest.mark.slow
 def test_a_loop_that_locks():
     """A crank longer than its rod reaches no further than a dead centre, where the coordinate that
-    drove it stands still: it turns back there, with all
-    its energy, on other coordinates."""
+    drove it stands still: it turns back there, with all its energy, on other coordinates."""
     slider = (
         '<body name="slider"><joint name="slider" type="slide" axis="1 0 0"/><geom size="0.05"'
         ' mass="1" contype="0"/></body>'
