@@ -8,6 +8,7 @@ import pathlib
 import re
 
 ROOT = pathlib.Path(__file__).parents[2] / "svkc"
+TESTS = pathlib.Path(__file__).parents[1]
 # a package may import from those to its left and from itself
 ORDER = "_jax model mjcf tree loops transitions integration simulation tools viz scenes cli".split()
 # methods that the contract puts on the nouns: they import upwards when they are called
@@ -147,3 +148,12 @@ def test_the_page_on_the_architecture_names_what_there_is():
         path for path in re.findall(r"`(svkc/[\w/.]+)`", page) if not (ROOT.parent / path).exists()
     ]
     assert not [name for name in ORDER if not re.search(rf"\b{name}\b", page)]
+
+
+def test_the_table_of_the_paper_names_what_there_is():
+    readme = (ROOT.parent / "README.md").read_text()
+    table = readme[readme.index("| paper | where | test |") :].split("\n\n")[0]
+    for file in re.findall(r"`((?:\w+/)+\w+\.\w+)", table):
+        assert any((folder / file).exists() for folder in (ROOT, ROOT.parent, TESTS)), file
+    for file, test in re.findall(r"`([\w/]+\.py)::(\w+)`", table):
+        assert f"def {test}(" in (TESTS / file).read_text(), test

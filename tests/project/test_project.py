@@ -120,7 +120,7 @@ EXAMPLES = {
 
 
 def test_examples_are_all_here():
-    # the viewer's draws no picture: test_interop.py
+    # the viewer's draws no picture: tests/mjcf/test_convert.py
     assert {path.stem for path in (ROOT / "examples").glob("*.py")} == {
         *EXAMPLES,
         "08_mujoco_viewer",
