@@ -91,15 +91,9 @@ def at(
     """
     numbers("time", time)
     action = _action(
-        connect=connect,
-        cut=cut,
-        lock=lock,
-        unlock=unlock,
-        here=here,
-        stop=stop,
-        bind=bind,
+        connect=connect, cut=cut, lock=lock, unlock=unlock, here=here, stop=stop, bind=bind,
         unbind=unbind,
-    )
+    )  # fmt: skip
     return At(time, action)
 
 
@@ -133,15 +127,9 @@ def when(
         raise ValueError(f"when: direction must be True, False or None, got {direction!r}")
     direction = None if direction is None else bool(direction)
     action = _action(
-        connect=connect,
-        cut=cut,
-        lock=lock,
-        unlock=unlock,
-        here=here,
-        stop=stop,
-        bind=bind,
+        connect=connect, cut=cut, lock=lock, unlock=unlock, here=here, stop=stop, bind=bind,
         unbind=unbind,
-    )
+    )  # fmt: skip
     return When(guard, action, direction)
 
 
