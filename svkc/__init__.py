@@ -67,11 +67,9 @@ from svkc.tools.rollout import rollout as rollout
 from svkc.tools.accuracy import error_between as error_between, halved as halved, tune as tune
 from svkc.integration.stabilization import (
     Baumgarte as Baumgarte,
-    Drift as Drift,
-    Exact as Exact,
     Projection as Projection,
 )
-from svkc import dynamics as dynamics
+from svkc import dynamics as dynamics, stabilization as stabilization
 from svkc.loops.constrained_dynamics import by_bodies as by_bodies
 from svkc.loops.constrained_dynamics import Dynamics as Dynamics
 from svkc.tree.mass_matrix import (
@@ -87,6 +85,9 @@ from svkc.integration.integrators import (
 # derivatives
 from svkc.tools.gradient_check import Check as Check, check_grad as check_grad
 from svkc.tree.configuration import tangent as tangent
+
+# old names
+Exact, Drift = stabilization.CoordinatePartitioning, stabilization.NoStabilization
 
 try:
     __version__ = _version("svkc")

@@ -36,7 +36,7 @@ class _Interpolation(diffrax.AbstractLocalInterpolation):
 
 
 def _interpolation(cls, *, t0, t1, inner, shift):
-    return _Interpolation(t0, t1, cls(t0=t0, t1=t1, **inner), shift)
+    return _Interpolation(t0=t0, t1=t1, inner=cls(t0=t0, t1=t1, **inner), shift=shift)
 
 
 class Settled(diffrax.AbstractWrappedSolver):
@@ -74,7 +74,7 @@ class Settled(diffrax.AbstractWrappedSolver):
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         fresh = True if projects(self.field.stabilization, args) else made_jump
         raw, error, dense, solver_state, result = self.solver.step(
-            terms, t0, t1, y0, args, solver_state, fresh
+            terms, t0, t1, y0, args, solver_state, made_jump=fresh
         )
         y1, _ = settle(self.field, args, raw)
         shift = jax.tree.map(lambda a, b: a - b, y1, raw)
@@ -100,11 +100,11 @@ def solve_by_diffrax(
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(world.field),
         Settled(staged(how.solver, kind), world.field),
-        t0,
-        stop,
-        how.first_step,
-        start,
-        world.scene,
+        t0=t0,
+        t1=stop,
+        dt0=how.first_step,
+        y0=start,
+        args=world.scene,
         saveat=saveat,
         stepsize_controller=how.controller,
         adjoint=adjoint,

@@ -30,7 +30,8 @@ def arrival_tangent(primals, tangents, end, at: Motion, rate: Motion):
         (guards, d_guards) if isinstance(guards, Field) else (guards.field, d_guards.field)
     )
     d_t = filled(t, d_t)
-    dy = carried((filled(y, dy), d_scene, d_field), rate, end - t, end, at, scene, field)
+    changes = filled(y, dy), d_scene, d_field
+    dy = carried(changes, rate, delay=end - t, t=end, at=at, scene=scene, field=field)
     dt = filled(late, d_late)
     if found is not None:
         guard = lambda t, y, scene, guards: guards(t, y, scene)[found.first]
@@ -83,12 +84,12 @@ def _carried_transpose(inputs, cotangent: Motion):
 _carried = operation("carried", lambda changes, *_: changes[0], _carried_jvp, _carried_transpose)
 
 
-def carried(changes, rate: Motion, none, t, at: Motion, scene: Scene, field: Field) -> Motion:
-    """Of changes = (dy, d_scene, d_field), dy carried along for a time that is zero but may itself
-    change, which second derivatives see."""
+def carried(changes, rate: Motion, *, delay, t, at: Motion, scene: Scene, field: Field) -> Motion:
+    """Of changes = (dy, d_scene, d_field), dy carried along for a time `delay` that is zero but may
+    itself change, which second derivatives see."""
     # a number for each lane of its own, as the operation's transpose would not sum over lanes
     one = 1 + 0 * jnp.sum(rate.v)
-    return _carried(jax.tree.map(lambda d: d * one, changes), none, t, at, scene, field)
+    return _carried(jax.tree.map(lambda d: d * one, changes), delay, t, at, scene, field)
 
 
 def _back(cotangent: Motion, asked, *_):

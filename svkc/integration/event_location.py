@@ -13,7 +13,7 @@ from svkc.integration.integrators import Motion, Scene
 from svkc.integration.vector_field import Field
 from svkc.model.chain import State
 from svkc.model.validation import one
-from svkc.transitions.events import Plan
+from svkc.transitions.plan import Plan
 
 # how often a bracket may be narrowed
 NARROWINGS = 200
@@ -37,7 +37,8 @@ class Bracket(eqx.Module):
         """From the two times and the function there."""
         eps = jnp.finfo(fb.dtype).eps
         fine = 2 * eps * jnp.maximum(jnp.abs(a), jnp.abs(b)) + eps * (b - a)
-        return Bracket(a, b, fa, fb, fine, *(jnp.zeros((), jnp.int32) for _ in range(2)))
+        zero = jnp.zeros((), jnp.int32)
+        return Bracket(a=a, b=b, fa=fa, fb=fb, fine=fine, last=zero, count=zero)
 
     def wide(self) -> Bool[Array, ""]:
         """Whether to go on."""
@@ -53,18 +54,16 @@ class Bracket(eqx.Module):
     def narrowed(self, c, fc) -> "Bracket":
         """With what the function is at c."""
         right = fc >= 0
-        fa, fb = (
-            jnp.where(right & (self.last == 1), self.fa / 2, self.fa),
-            jnp.where(~right & (self.last == -1), self.fb / 2, self.fb),
-        )
-        a, fa, b, fb = (
-            jnp.where(right, self.a, c),
-            jnp.where(right, fa, fc),
-            jnp.where(right, c, self.b),
-            jnp.where(right, fc, fb),
-        )
+        fa = jnp.where(right & (self.last == 1), self.fa / 2, self.fa)
+        fb = jnp.where(~right & (self.last == -1), self.fb / 2, self.fb)
         return Bracket(
-            a, b, fa, fb, self.fine, jnp.where(right, 1, -1).astype(jnp.int32), self.count + 1
+            a=jnp.where(right, self.a, c),
+            b=jnp.where(right, c, self.b),
+            fa=jnp.where(right, fa, fc),
+            fb=jnp.where(right, fc, fb),
+            fine=self.fine,
+            last=jnp.where(right, 1, -1).astype(jnp.int32),
+            count=self.count + 1,
         )
 
 
@@ -148,6 +147,7 @@ class Search(eqx.Module):
 def watch(
     old: Search,
     before: Float[Array, " guards"],
+    *,
     t0,
     t1,
     y: Motion,
@@ -211,4 +211,5 @@ def found(search: Search, guards: Float[Array, " guards"], t) -> Found:
     flat = search.done & ~jumps & (grown / event_tolerance(t) * search.span < large)
     fired = fired & search.done
     # zero: not armed, until it has left zero
-    return Found(fired, jnp.where(fired, 0, guards), first, search.done, jumps, flat)
+    values = jnp.where(fired, 0, guards)
+    return Found(fired=fired, values=values, first=first, hit=search.done, jumps=jumps, flat=flat)

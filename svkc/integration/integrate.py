@@ -62,16 +62,16 @@ def march(start: Motion, times, world: World, how: How) -> Path:
         short = jnp.where(fired.hit, EVENT, short)
     result = jnp.where(end.result == SUCCESSFUL, short, end.result)
     return Path(
-        end.t,
-        end.y,
-        saved,
-        end.times,
-        end.kept,
-        end.accepted,
-        end.rejected,
-        result.astype(jnp.int32),
-        end.tally,
-        fired,
+        t=end.t,
+        end=end.y,
+        saved=saved,
+        times=end.times,
+        kept=end.kept,
+        accepted=end.accepted,
+        rejected=end.rejected,
+        result=result.astype(jnp.int32),
+        tally=end.tally,
+        found=fired,
     )
 
 
@@ -85,24 +85,24 @@ def _begin(start: Motion, times, world: World, how: How) -> Step:
         start,
         how.first_step,
         world.scene,
-        how.solver.func,
-        how.solver.error_order(term),
+        func=how.solver.func,
+        error_order=how.solver.error_order(term),
     )
     rows = lambda n: jax.tree.map(lambda x: jnp.broadcast_to(x[None], (n, *x.shape)), start)
     values, search, seen = None, None, Seen.first(world.field, world.scene, start.q)
     if how.watched is not None:
         values = how.watched.values
         search = Search(
-            t0,
-            jnp.zeros_like(values),
-            values,
-            Bracket.around(t0, t0, t0, t0),
-            start,
-            values,
-            values,
-            no,
-            no,
-            no,
+            span=t0,
+            side=jnp.zeros_like(values),
+            size=values,
+            bracket=Bracket.around(t0, t0, t0, t0),
+            motion=start,
+            values=values,
+            ahead=values,
+            on=no,
+            narrow=no,
+            done=no,
         )
     return Step(
         t=t0,
@@ -139,7 +139,9 @@ def _try(s: Step, t1, world: World, how: How) -> Tried:
     # a step begins with the rate where the one before was settled to, not with one remembered from
     # where it was before that
     fresh = True if projects(stabilization, world.scene) else s.jumped
-    y, error, _, solver, solved = how.solver.step(term, s.t, t1, s.y, world.scene, s.solver, fresh)
+    y, error, _, solver, solved = how.solver.step(
+        term, s.t, t1, s.y, world.scene, s.solver, made_jump=fresh
+    )
     raw, (y, seen) = y, settle(world.field, world.scene, y)
     if error is not None and world.field.pivotless:
         # without pivots nothing else shows that loops lose rank
@@ -152,7 +154,7 @@ def _try(s: Step, t1, world: World, how: How) -> Tried:
         whole = whole & (jnp.max(seen.gap) <= how.gap)
     error = jax.tree.map(lambda x: jnp.where(whole & jnp.isfinite(x), x, jnp.inf), error)
     keep, t, ahead, jumped, controller, said = how.controller.adapt_step_size(
-        s.t, t1, s.y, y, world.scene, error, order, s.controller
+        s.t, t1, s.y, y, world.scene, error, error_order=order, controller_state=s.controller
     )
     keep, length = jnp.asarray(keep), ahead - t
     if isinstance(how.controller, diffrax.PIDController):
@@ -167,8 +169,57 @@ def _try(s: Step, t1, world: World, how: How) -> Tried:
     result = jnp.where(~whole & (keep | (result != SUCCESSFUL)), why, result).astype(jnp.int32)
     estimate = jnp.asarray(jnp.inf, t.dtype) if error is None else motion_norm(error)
     return Tried(
-        t, y, keep & whole, length, jnp.asarray(jumped), solver, controller, result, estimate, seen
+        t=t,
+        y=y,
+        keep=keep & whole,
+        length=length,
+        jumped=jnp.asarray(jumped),
+        solver=solver,
+        controller=controller,
+        result=result,
+        error=estimate,
+        seen=seen,
     )
+
+
+def _located(s: Step, world: World, how: How) -> tuple[Tried, Array, Search, Array]:
+    """Take a try of a step and look at the guards there. Return it, the values of the guards, the
+    search for the zero of one, and whether that search goes on or has just ended."""
+    t1 = jnp.where(s.search.on, s.search.asked(), s.next)
+    tried = _try(s, t1, world, how)
+    guards, search = watch(
+        s.search,
+        s.guards,
+        t0=s.t,
+        t1=t1,
+        y=tried.y,
+        keep=tried.keep,
+        scene=world.scene,
+        watched=how.watched,
+    )
+    still = s.search.on | search.on
+    blind = tried.keep & jnp.any(jnp.isnan(guards))
+    t, y = chosen(search.done, (search.bracket.b, search.motion), (tried.t, tried.y))
+    tried = dataclasses.replace(
+        tried,
+        t=t,
+        y=y,
+        keep=(tried.keep & ~blind & ~still) | search.done,
+        result=jnp.where(blind, NON_FINITE, tried.result),
+    )
+    return tried, guards, search, still
+
+
+def _saved(s: Step, tried: Tried, t, at, accepted, every: int) -> tuple[Motion, Motion]:
+    """Return the saved states and the kept ones, with the state after a try written in where it is
+    one of them. t, accepted: the time and the number of steps after it."""
+    saved, kept = s.saved, s.kept
+    if at.shape[0]:
+        place = jnp.minimum(jnp.sum(at < t, dtype=jnp.int32), at.shape[0] - 1)
+        saved = _written(saved, place, tried.y, tried.keep & (at[place] == t))
+    if kept.q.shape[0]:
+        kept = _written(kept, accepted // every - 1, tried.y, tried.keep & (accepted % every == 0))
+    return saved, kept
 
 
 def _step(s: Step, times, world: World, how: How) -> Step:
@@ -183,34 +234,13 @@ def _step(s: Step, times, world: World, how: How) -> Step:
         tried = _try(s, s.next, world, how)
         guards, search, still = None, None, jnp.zeros((), bool)
     else:
-        t1 = jnp.where(s.search.on, s.search.asked(), s.next)
-        tried = _try(s, t1, world, how)
-        guards, search = watch(
-            s.search, s.guards, s.t, t1, tried.y, tried.keep, world.scene, how.watched
-        )
-        still = s.search.on | search.on
-        blind = tried.keep & jnp.any(jnp.isnan(guards))
-        tried = eqx.tree_at(
-            lambda x: (x.keep, x.result),
-            tried,
-            (tried.keep & ~blind, jnp.where(blind, NON_FINITE, tried.result)),
-        )
-        landed = chosen(search.done, (search.bracket.b, search.motion), (tried.t, tried.y))
-        tried = eqx.tree_at(
-            lambda x: (x.t, x.y, x.keep), tried, (*landed, (tried.keep & ~still) | search.done)
-        )
+        tried, guards, search, still = _located(s, world, how)
     moved = lambda new, old: chosen(tried.keep, new, old)
     # while a zero is looked for, nothing else goes on
     next_ = lambda new, old: chosen(still, old, new)
     t, accepted = moved(tried.t, s.t), s.accepted + tried.keep.astype(jnp.int32)
-    saved, kept = s.saved, s.kept
-    if at.shape[0]:
-        place = jnp.minimum(jnp.sum(at < t, dtype=jnp.int32), at.shape[0] - 1)
-        saved = _written(saved, place, tried.y, tried.keep & (at[place] == t))
-    if kept.q.shape[0]:
-        kept = _written(
-            kept, accepted // how.every - 1, tried.y, tried.keep & (accepted % how.every == 0)
-        )
+    saved, kept = _saved(s, tried, t, at, accepted, how.every)
+    result = next_(tried.result, s.result)
     return Step(
         t=t,
         y=moved(tried.y, s.y),
@@ -227,8 +257,8 @@ def _step(s: Step, times, world: World, how: How) -> Step:
         saved=saved,
         accepted=accepted,
         rejected=s.rejected + (~tried.keep & ~still).astype(jnp.int32),
-        result=next_(tried.result, s.result),
-        tally=_counted(s, tried, next_(tried.result, s.result), world.scene),
+        result=result,
+        tally=_counted(s, tried, result, world.scene),
         seen=moved(tried.seen, s.seen),
     )
 

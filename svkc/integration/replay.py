@@ -93,10 +93,14 @@ def _integrated_jvp(primals, tangents):
     )
     at_start, at_end = (jax.tree.map(lambda x, i=i: x[i], rates) for i in range(2))
     grid, place = _grid(*frozen((t0, at, path)))
-    start, d_start = _from_fixed(start, filled(start, d_start), at_start, t0, d_t0, world, d_world)
-    d_end, d_saved, d_kept = _through(start, d_start, grid, place, world, d_world, path, how)
+    d_start = filled(start, d_start)
+    if d_t0 is not None:
+        start, d_start = _from_fixed(start, d_start, at_start, (t0, d_t0), (world, d_world))
+    d_end, d_saved, d_kept = _through(
+        (start, d_start), (world, d_world), grid, place, path=path, how=how
+    )
     if d_at is not None:
-        d_saved = jax.vmap(lambda y, dy, t, dt: _moved_on(y, dy, t, dt, world, d_world))(
+        d_saved = jax.vmap(lambda y, dy, *times: _moved_on(y, dy, times, (world, d_world)))(
             path.saved, d_saved, at, d_at
         )
     none = jax.tree.map(lambda x: None, path)
@@ -115,24 +119,31 @@ def _integrated_jvp(primals, tangents):
     )
 
 
-def _from_fixed(
-    y: Motion, dy: Motion, rate: Motion, t0, d_t0, world: World, d_world
-) -> tuple[Motion, Motion]:
-    """The start of a run and its tangent, as of a start at a time that stays: one that comes later
-    has less time to move. rate: of the motion there."""
-    if d_t0 is None:
-        return y, dy
-    none = jax.lax.stop_gradient(t0) - t0
+def _from_fixed(y: Motion, dy: Motion, rate: Motion, time, world) -> tuple[Motion, Motion]:
+    """Return the start of a run and its tangent, as of a start at a time that stays: one that comes
+    later has less time to move. rate: of the motion there; time, world: with their tangents."""
+    t0, d_t0 = time
+    delay = jax.lax.stop_gradient(t0) - t0
     dy = jax.tree.map(lambda d, r: d - r * d_t0, dy, rate)
-    dy = carried((dy, d_world.scene, d_world.field), rate, none, t0, y, world.scene, world.field)
-    return jax.tree.map(lambda y, r: y + none * r, y, rate), dy
+    dy = _carried(y, dy, rate, (t0, delay), world)
+    return jax.tree.map(lambda y, r: y + delay * r, y, rate), dy
 
 
-def _moved_on(y: Motion, dy: Motion, t, dt, world: World, d_world) -> Motion:
-    """The tangent of a state saved at a time that changes, from that at a time that stays."""
-    none, rate = t - jax.lax.stop_gradient(t), world.field(t, y, world.scene)
-    dy = carried((dy, d_world.scene, d_world.field), rate, none, t, y, world.scene, world.field)
+def _moved_on(y: Motion, dy: Motion, time, world) -> Motion:
+    """Return the tangent of a state saved at a time that changes, from that at a time that stays.
+    time, world: with their tangents."""
+    t, dt = time
+    rate = world[0].field(t, y, world[0].scene)
+    dy = _carried(y, dy, rate, (t, t - jax.lax.stop_gradient(t)), world)
     return jax.tree.map(lambda d, r: d + r * dt, dy, rate)
+
+
+def _carried(y: Motion, dy: Motion, rate: Motion, time, world) -> Motion:
+    """Return dy carried along for a time that is zero but may itself change. time: t and that
+    delay; world: with its tangent."""
+    (t, delay), (world, d_world) = time, world
+    changes = dy, d_world.scene, d_world.field
+    return carried(changes, rate, delay=delay, t=t, at=y, scene=world.scene, field=world.field)
 
 
 def _blocks(start: Motion, grid, path: Path, every: int):
@@ -158,35 +169,22 @@ def _blocks(start: Motion, grid, path: Path, every: int):
 
 
 @eqx.filter_jit
-def _through(
-    start: Motion, d_start: Motion, grid, place, world: World, d_world, path: Path, how: How
-):
-    """The tangents at the end, at the save times and at the kept states: block after block of
-    steps, each from its kept state."""
-    every, blocks = how.every, path.kept.q.shape[0]
+def _through(start, world, grid, place, *, path: Path, how: How):
+    """Return the tangents at the end, at the save times and at the kept states: block after block
+    of steps, each from its kept state. start, world: with their tangents."""
+    (start, d_start), every, blocks = start, how.every, path.kept.q.shape[0]
     index, *rest = _blocks(start, grid, path, every)
-
-    @eqx.filter_checkpoint
-    def block(d_y, y, times):
-        _, (d_y, d_every) = eqx.filter_jvp(
-            lambda y, world: _block(y, times, world, how.solver), (y, world), (d_y, d_world)
-        )
-        return d_y, d_every
 
     def one(carry, x):
         d_y, d_saved = carry
         i, going, y, times = x
 
         def taken():
-            after, d_every = block(d_y, y, times)
+            after, d_every = _block_tangent(d_y, y, times, world, how.solver)
             here = (place > i * every) & (place <= jnp.minimum((i + 1) * every, path.accepted))
             local = jnp.clip(place - i * every - 1, 0, every - 1)
-            spread = lambda old, new: jnp.where(
-                here.reshape(-1, *(1,) * (old.ndim - 1)) & going, new[local], old
-            )
-            return jax.tree.map(
-                lambda new, old: jnp.where(going, new, old), after, d_y
-            ), jax.tree.map(spread, d_saved, d_every)
+            spread = lambda old, new: jnp.where(_rows(here, old) & going, new[local], old)
+            return _where(going, after, d_y), jax.tree.map(spread, d_saved, d_every)
 
         carry = jax.lax.cond(unvmap_any(going), taken, lambda: (d_y, d_saved))
         return carry, carry[0]
@@ -201,17 +199,29 @@ def _through(
 
         return jax.lax.cond(unvmap_any(jnp.any(x[1])), some, none, carry)
 
-    d_saved = jax.tree.map(
-        lambda d: jnp.where((place == 0).reshape(-1, *(1,) * d.ndim), d[None], 0), d_start
-    )
+    d_saved = jax.tree.map(lambda d: jnp.where(_rows(place == 0, d[None]), d[None], 0), d_start)
     xs = jax.tree.map(lambda x: x.reshape(-1, GROUP, *x.shape[1:]), (index, *rest))
     (d_end, d_saved), after = jax.lax.scan(group, (d_start, d_saved), xs)
     written = (index[:blocks] + 1) * every <= path.accepted
     flat = jax.tree.map(lambda d: d.reshape(-1, *d.shape[2:])[:blocks], after)
-    d_kept = jax.tree.map(
-        lambda d: jnp.where(written.reshape(-1, *(1,) * (d.ndim - 1)), d, 0), flat
-    )
-    return d_end, d_saved, d_kept
+    return d_end, d_saved, jax.tree.map(lambda d: jnp.where(_rows(written, d), d, 0), flat)
+
+
+@eqx.filter_checkpoint
+def _block_tangent(d_y: Motion, y: Motion, times, world, solver):
+    """Return the tangents after a block of steps and after each of its steps."""
+    world, d_world = world
+    step = lambda y, world: _block(y, times, world, solver)
+    return eqx.filter_jvp(step, (y, world), (d_y, d_world))[1]
+
+
+def _rows(mask, like):
+    """Return a mask of rows with the axes of an array of such rows."""
+    return mask.reshape(-1, *(1,) * (like.ndim - 1))
+
+
+def _where(pred, new, old):
+    return jax.tree.map(lambda new, old: jnp.where(pred, new, old), new, old)
 
 
 # integrated(start, times, world, how, guards or field) -> Path, t, Motion: where the run went, with
@@ -242,7 +252,8 @@ def step_alone(
     else:
         solver = staged(solver, "bounded")
         term = diffrax.ODETerm(rate)
-        raw = solver.step(term, t0, t1, y, scene, solver.init(term, t0, t1, y, scene), False)[0]
+        begun = solver.init(term, t0, t1, y, scene)
+        raw = solver.step(term, t0, t1, y, scene, begun, made_jump=False)[0]
     return settle(field, scene, raw)[0]
 
 

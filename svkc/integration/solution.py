@@ -63,19 +63,20 @@ class Tally(eqx.Module):
         """Before the first step."""
         zero = jnp.zeros((), jnp.int32)
         return cls(
-            zero,
-            jnp.zeros((), dtype),
-            jnp.ones((), dtype),
-            zero if looked else zero - 1,
-            zero - 1,
-            jnp.zeros(2, dtype),
+            tries=zero,
+            error=jnp.zeros((), dtype),
+            margin=jnp.ones((), dtype),
+            swaps=zero if looked else zero - 1,
+            loop=zero - 1,
+            gap=jnp.zeros(2, dtype),
         )
 
     @classmethod
     def unknown(cls, dtype, tries: Int[Array, ""]) -> "Tally":
         """Return the tally of a loop that counts tries alone."""
         no, one = jnp.asarray(-1, jnp.int32), jnp.ones((), dtype)
-        return cls(tries, jnp.inf * one, margin=one, swaps=no, loop=no, gap=jnp.zeros(2, dtype))
+        gap = jnp.zeros(2, dtype)
+        return cls(tries=tries, error=jnp.inf * one, margin=one, swaps=no, loop=no, gap=gap)
 
 
 class Path(eqx.Module):
@@ -142,18 +143,14 @@ def _counted(s: Step, tried: Tried, result: Int[Array, ""], scene: Scene) -> Tal
         # the first choice of a phase is no change
         swapped = jnp.any(s.seen.dependent) & jnp.any(s.seen.dependent != tried.seen.dependent)
         swaps = swaps + (kept & swapped).astype(jnp.int32)
-    loop = (
-        old.loop
-        if tried.seen is None
-        else jnp.where(
-            result == OPEN, jnp.argmax(jnp.max(tried.seen.gap, 1)).astype(jnp.int32), old.loop
-        )
-    )
+    loop = old.loop
+    if tried.seen is not None:
+        widest = jnp.argmax(jnp.max(tried.seen.gap, 1)).astype(jnp.int32)
+        loop = jnp.where(result == OPEN, widest, loop)
     if len(scene.chain.link_names):
         gap = jnp.where(kept, jnp.maximum(gap, _open(tried, scene)), gap)
-    return Tally(
-        old.tries + 1, old.error + jnp.where(kept, tried.error, 0), margin, swaps, loop, gap
-    )
+    error = old.error + jnp.where(kept, tried.error, 0)
+    return Tally(tries=old.tries + 1, error=error, margin=margin, swaps=swaps, loop=loop, gap=gap)
 
 
 def _open(tried: Tried, scene: Scene) -> Float[Array, "2"]:

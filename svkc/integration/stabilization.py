@@ -7,7 +7,11 @@ from svkc.integration.integrators import Scene
 from svkc.model.validation import one, whole
 
 
-class Projection(eqx.Module):
+class AbstractStabilization(eqx.Module):
+    """What is done about the drift of the loops."""
+
+
+class Projection(AbstractStabilization):
     """Loop drift is taken away after every step by the change of q and v that closes the loops and
     is the least in the metric of the inertia: a velocity that is projected loses kinetic energy of
     second order only.
@@ -22,13 +26,13 @@ class Projection(eqx.Module):
         whole("iterations", self.iterations, 0)
 
 
-class Exact(Projection):
+class CoordinatePartitioning(Projection):
     """Dependent coordinates are functions of the independent ones, solved for at every evaluation
     of the field as well as after every step: what is integrated is the paper's theta_G, and the
     rest follows from it. Only dependent coordinates are moved. `iterations` as in `Projection`."""
 
 
-class Baumgarte(eqx.Module):
+class Baumgarte(AbstractStabilization):
     """Loop drift is pulled back while integrating, as by a critically damped spring of this rate
     (1/s); nothing is projected."""
 
@@ -38,7 +42,7 @@ class Baumgarte(eqx.Module):
         one("rate", self.rate)
 
 
-class Drift(eqx.Module):
+class NoStabilization(AbstractStabilization):
     """Nothing is done about loop drift."""
 
 

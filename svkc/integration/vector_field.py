@@ -7,7 +7,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from svkc.integration.integrators import Motion, Scene
-from svkc.integration.stabilization import Baumgarte, Drift, Exact, Projection, projects
+from svkc.integration.stabilization import (
+    AbstractStabilization,
+    Baumgarte,
+    CoordinatePartitioning,
+    Projection,
+    projects,
+)
 from svkc.loops.constrained_dynamics import AbstractDynamics, ArticulatedBodies
 from svkc.loops.forward_dynamics import moving, moving_in_lanes
 from svkc.loops.projection import settle_by_bodies, settle_loops
@@ -24,7 +30,7 @@ class Field(eqx.Module):
     differentiates, where a `vmap` keeps lanes last."""
 
     control: Callable | None
-    stabilization: Projection | Baumgarte | Drift
+    stabilization: AbstractStabilization
     dynamics: AbstractDynamics
     differentiated: bool = eqx.field(static=True, default=True)
 
@@ -34,12 +40,12 @@ class Field(eqx.Module):
         return (
             not self.dynamics.uses_pivots
             and isinstance(self.stabilization, Projection)
-            and not isinstance(self.stabilization, Exact)
+            and not isinstance(self.stabilization, CoordinatePartitioning)
         )
 
     def __call__(self, t, y: Motion, scene: Scene) -> Motion:
         chain, structure, held = scene.chain, scene.structure, self.stabilization
-        if isinstance(held, Exact):
+        if isinstance(held, CoordinatePartitioning):
             y, _ = settle(self, scene, y)
         tau, power = self.torques(t, y, scene)
         rate, agree = (
@@ -127,7 +133,7 @@ def settle(field: Field, scene: Scene, y: Motion) -> tuple[Motion, Seen | None]:
             y.q,
             y.v,
             held.iterations,
-            isinstance(held, Exact),
+            isinstance(held, CoordinatePartitioning),
             scene.pivots,
             field.dynamics.hold or 0.0,
         )

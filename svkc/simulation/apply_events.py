@@ -11,7 +11,8 @@ from svkc.integration.integrators import Motion, finite
 from svkc.model.chain import Chain, State, Structure
 from svkc.simulation.phase import Run, Solved
 from svkc.simulation.records import RESULTS, Events
-from svkc.transitions.events import Plan
+from svkc.transitions.impact import Change
+from svkc.transitions.plan import Plan
 from svkc.transitions.spare_links import emptied, grip
 from svkc.transitions.transition import change, connect_tolerance, release
 
@@ -27,29 +28,20 @@ def apply_events(
 ):
     """The change of structure that all events of this instant make together; one record row for
     each of them."""
-    any_of = lambda what: jnp.any(fired[:, None] & made.table(chain, what), 0)
-    connected = (ended.structure.connected | any_of("connect")) & ~any_of("cut")
-    locked = (ended.structure.locked | any_of("lock")) & ~any_of("unlock") if made.locks else None
-    here = any_of("here") if made.table(chain, "here").any() or made.binds else None
     happened, full, emptying = jnp.any(fired), jnp.zeros((), bool), None
+    masks = _masks(chain, ended.structure, fired, made)
     if made.binds:
         structure, gripped, full, emptying = _bound(chain, ended.structure, fired, made)
         ended = State(ended.q, ended.v, structure)
-        connected, here = (connected | gripped) & ~emptying, here | gripped
+        masks["connected"] = (masks["connected"] | gripped) & ~emptying
+        masks["here"] = masks["here"] | gripped
 
     def changed():
-        done = (
-            change(chain, ended, connected, locked, here)
-            if made.joins(chain)
-            else release(chain, ended, connected, locked)
-        )
-        return (
-            done
-            if emptying is None
-            else eqx.tree_at(
-                lambda d: d.state.structure, done, emptied(done.state.structure, emptying)
-            )
-        )
+        done = _change(chain, ended, masks, made)
+        if emptying is None:
+            return done
+        structure = emptied(done.state.structure, emptying)
+        return eqx.tree_at(lambda d: d.state.structure, done, structure)
 
     def same():
         return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), eqx.filter_eval_shape(changed))
@@ -58,30 +50,61 @@ def apply_events(
     # what a change makes of numbers that are not is not taken
     sound = finite(Motion(done.state.q, done.state.v)) & ~jnp.isnan(done.gap)
     after = jax.tree.map(lambda new, old: jnp.where(happened & sound, new, old), done.state, ended)
-    r, count = run.events, jnp.sum(fired, dtype=jnp.int32)
-    place = r.count + jnp.cumsum(fired, dtype=jnp.int32) - 1
-    rows = jnp.arange(r.time.shape[0], dtype=jnp.int32)
-    hit = (rows[:, None] == place[None]) & fired[None]
-    written = jnp.any(hit, 1)
-    first = written & (rows == r.count)
-    mine = jnp.any(
-        hit[:, :, None] & (made.table(chain, "connect") | made.table_of_grips(chain))[None], 1
-    )[:, :, None]
-    events = Events(
-        jnp.where(written, solved.t, r.time),
-        jnp.where(written, jnp.argmax(hit, 1).astype(jnp.int32), r.which),
-        jnp.where(mine, done.impulse[None], r.impulse),
-        jnp.where(mine, done.angular_impulse[None], r.angular_impulse),
-        jnp.where(first, done.energy_lost, r.energy_lost),
-        jnp.minimum(r.count + count, r.time.shape[0]),
-    )
+    mine = made.table(chain, "connect") | made.table_of_grips(chain)
+    events, overflow = _recorded(run.events, solved.t, fired, mine, done)
     stops = jnp.any(fired & np.array([a.stop for a in made.actions], bool))
     result = RESULTS.where(stops, RESULTS.stopped, solved.result)
     result = RESULTS.where(happened & (done.gap > connect_tolerance), RESULTS.not_in_place, result)
     result = RESULTS.where(sound, result, RESULTS.non_finite)
     result = RESULTS.where(full, RESULTS.no_slot, result)
-    result = RESULTS.where(r.count + count > r.time.shape[0], RESULTS.max_events, result)
+    result = RESULTS.where(overflow, RESULTS.max_events, result)
     return after, events, result
+
+
+def _masks(chain: Chain, structure: Structure, fired: Bool[Array, " events"], made: Plan) -> dict:
+    """Return the connected links, the locked joints, and the new links whose joint is made where
+    the bodies are, after the events of this instant. None: no event has to do with that."""
+    any_of = lambda what: jnp.any(fired[:, None] & made.table(chain, what), 0)
+    return {
+        "connected": (structure.connected | any_of("connect")) & ~any_of("cut"),
+        "locked": (structure.locked | any_of("lock")) & ~any_of("unlock") if made.locks else None,
+        "here": any_of("here") if made.table(chain, "here").any() or made.binds else None,
+    }
+
+
+def _change(chain: Chain, ended: State, masks: dict, made: Plan) -> Change:
+    """Change the structure: with an impact, where an event of the plan can make one."""
+    if made.joins(chain):
+        return change(chain, ended, masks["connected"], masks["locked"], masks["here"])
+    return release(chain, ended, masks["connected"], masks["locked"])
+
+
+def _recorded(
+    events: Events,
+    t,
+    fired: Bool[Array, " events"],
+    mine: Bool[np.ndarray, "events links"],
+    done: Change,
+) -> tuple[Events, Bool[Array, ""]]:
+    """Return the records with a row for each event that fired, and whether there were too few rows.
+
+    mine: the links that each event connects, whose impulses are written in its row.
+    """
+    r, count, capacity = events, jnp.sum(fired, dtype=jnp.int32), events.time.shape[0]
+    place = r.count + jnp.cumsum(fired, dtype=jnp.int32) - 1
+    rows = jnp.arange(capacity, dtype=jnp.int32)
+    hit = (rows[:, None] == place[None]) & fired[None]
+    written = jnp.any(hit, 1)
+    first = written & (rows == r.count)
+    mine = jnp.any(hit[:, :, None] & mine[None], 1)[:, :, None]
+    return Events(
+        time=jnp.where(written, t, r.time),
+        which=jnp.where(written, jnp.argmax(hit, 1).astype(jnp.int32), r.which),
+        impulse=jnp.where(mine, done.impulse[None], r.impulse),
+        angular_impulse=jnp.where(mine, done.angular_impulse[None], r.angular_impulse),
+        energy_lost=jnp.where(first, done.energy_lost, r.energy_lost),
+        count=jnp.minimum(r.count + count, capacity),
+    ), r.count + count > capacity
 
 
 def _bound(chain: Chain, structure: Structure, fired: Bool[Array, " events"], made: Plan):

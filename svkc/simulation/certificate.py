@@ -36,9 +36,21 @@ def certificate(
     """Return the phases of a run, the checks of its saved states, and the index of the first phase
     whose loops lose rank at an end (past the last: none).
 
-    stages: evaluations of the vector field in one try of a step. One loop checks every state, so
-    that kinematics and energy are compiled once.
+    stages: evaluations of the vector field in one try of a step.
     """
+    rows = records.start.shape[0]
+    first, last, saved_checks = _check_states(chain, records, saved)
+    written = jnp.arange(rows, dtype=jnp.int32) < count
+    margin = frozen(jnp.minimum(first.margin, last.margin))
+    lost = written & (margin < rank_tolerance(margin.dtype))
+    lost_at = jnp.where(jnp.any(lost), jnp.argmax(lost).astype(jnp.int32), rows)
+    phases = _phases(chain, records, count, (first, last), stages)
+    return phases, saved_checks, lost_at
+
+
+def _check_states(chain: Chain, records: Records, saved: State) -> tuple[Checked, Checked, Checked]:
+    """Return the checks of the states at the starts of phases, at their ends, and of the saved
+    ones. One loop checks them all, so that kinematics and energy are compiled once."""
     r, rows, join = records, records.start.shape[0], lambda *x: jnp.concatenate(x)
     states = State(
         join(r.q[:, 0], r.q[:, 1], saved.q),
@@ -49,25 +61,36 @@ def certificate(
     checks = jax.lax.map(
         jax.checkpoint(lambda x: _check_state(chain, *x)), (states, jnp.asarray(at_end))
     )
-    first, last, saved_checks = (
-        jax.tree.map(lambda x, part=p: x[part], checks)
-        for p in (slice(rows), slice(rows, 2 * rows), slice(2 * rows, None))
-    )
-    written = jnp.arange(rows, dtype=jnp.int32) < count
+    parts = slice(rows), slice(rows, 2 * rows), slice(2 * rows, None)
+    return tuple(jax.tree.map(lambda x, part=part: x[part], checks) for part in parts)
+
+
+def _phases(
+    chain: Chain,
+    records: Records,
+    count: Int[Array, ""],
+    both: tuple[Checked, Checked],
+    stages: int,
+) -> Phases:
+    """Return the phases of a run. both: the checks at their starts and at their ends."""
+    r, (first, last) = records, both
+    written = jnp.arange(r.start.shape[0], dtype=jnp.int32) < count
     fill = lambda value, none: jnp.where(
         written.reshape(-1, *(1,) * (jnp.ndim(value) - 1)), value, none
     )
     free, joint_freedoms = jax.vmap(
         lambda s: (_free(chain, s), jnp.sum(active_dofs(chain, s), dtype=jnp.int32))
     )(r.structure)
-    margin, gaps, rates = frozen(
+    # no derivative is promised of the certificate's worst values
+    margin, gap, gap_rate, drift = frozen(
         (
             jnp.minimum(first.margin, last.margin),
             jnp.maximum(first.gap, last.gap),
             jnp.maximum(first.gap_rate, last.gap_rate),
+            _momentum_drift(chain, first, last, fill(r.stop - r.start, 0)),
         )
     )
-    phases = Phases(
+    return Phases(
         start=r.start,
         stop=r.stop,
         connected=fill(r.structure.connected, False),
@@ -82,18 +105,12 @@ def certificate(
         swaps=r.tally.swaps,
         loop=r.tally.loop,
         error=r.tally.error,
-        gap=fill(jnp.maximum(gaps, r.tally.gap), 0),
-        gap_rate=fill(rates, 0),
+        gap=fill(jnp.maximum(gap, r.tally.gap), 0),
+        gap_rate=fill(gap_rate, 0),
         free=fill(free, False),
-        momentum_drift=jnp.where(
-            (written & free)[:, None],
-            frozen(_momentum_drift(chain, first, last, fill(r.stop - r.start, 0))),
-            0,
-        ),
+        momentum_drift=jnp.where((written & free)[:, None], drift, 0),
         count=count,
     )
-    lost = written & (margin < rank_tolerance(margin.dtype))
-    return phases, saved_checks, jnp.where(jnp.any(lost), jnp.argmax(lost).astype(jnp.int32), rows)
 
 
 def _check_state(chain: Chain, state: State, at_end: Bool[Array, ""]) -> Checked:
@@ -118,7 +135,10 @@ def _check_state(chain: Chain, state: State, at_end: Bool[Array, ""]) -> Checked
         return energy, *frozen(tuple(momenta)), margin
 
     none = jnp.zeros((), dtype), jnp.zeros(3, dtype), jnp.zeros(3, dtype), jnp.ones((), dtype)
-    return Checked(gaps, rates, *jax.lax.cond(at_end, whole, lambda: none))
+    energy, linear, angular, margin = jax.lax.cond(at_end, whole, lambda: none)
+    return Checked(
+        gap=gaps, gap_rate=rates, energy=energy, linear=linear, angular=angular, margin=margin
+    )
 
 
 def _free(chain: Chain, s: Structure) -> Bool[Array, ""]:

@@ -14,14 +14,15 @@ from jaxtyping import Array, Float
 from svkc._jax.pytrees import concrete
 from svkc.integration.integrators import FixedSteps, SimplifiedNewton, motion_norm
 from svkc.integration.replay import Replay
-from svkc.integration.stabilization import Baumgarte, Drift, Projection
+from svkc.integration.stabilization import AbstractStabilization, Projection
 from svkc.integration.vector_field import Field
 from svkc.loops.constrained_dynamics import AbstractDynamics, Dynamics, default_dynamics
 from svkc.loops.constraint import gap_tolerance
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import check_state
 from svkc.model.validation import finite, function, one, positive, whole
-from svkc.transitions.events import At, Plan, listed, plan
+from svkc.transitions.events import At, listed
+from svkc.transitions.plan import Plan, plan
 
 
 class Options(eqx.Module):
@@ -29,7 +30,7 @@ class Options(eqx.Module):
 
     control: Callable | None
     solver: diffrax.AbstractSolver
-    stabilization: Projection | Baumgarte | Drift
+    stabilization: AbstractStabilization
     dynamics: AbstractDynamics
     controller: Any
     adjoint: diffrax.AbstractAdjoint | Replay
@@ -75,37 +76,17 @@ def tolerances(dtype, rtol=None, atol=None) -> tuple[Float[Array, ""], Float[Arr
 
 
 def checked(
-    chain: Chain, state: State, t0, t1, ts, events, control, dt, rtol, atol, solver,
+    chain: Chain, state: State, t0, t1, *, ts, events, control, dt, rtol, atol, solver,
     stepsize_controller, stabilization, dynamics, adjoint, max_events, max_steps, progress_meter,
 ) -> tuple[Options, Float[Array, " times"], Plan]:  # fmt: skip
     """The call's options, save times and plan of events; ValueError for what cannot be right."""
     _check_state(chain, state)
     dtype, events = state.q.dtype, listed(events)
     _check_times(t0, t1, ts, events)
-    for name, value in (("dt", dt), ("rtol", rtol), ("atol", atol)):
-        if value is not None:
-            positive(name, value)
-    if dt is not None and (rtol is not None or atol is not None or stepsize_controller is not None):
-        raise ValueError(
-            "dt asks for fixed steps, rtol, atol and stepsize_controller for others; give one of"
-            " them"
-        )
-    if stepsize_controller is not None and (rtol is not None or atol is not None):
-        raise ValueError("rtol and atol belong inside the stepsize_controller that is given")
+    _check_steps(dt, rtol, atol, stepsize_controller)
     function("control", control)
-    if stabilization is not None and not isinstance(stabilization, Projection | Baumgarte | Drift):
-        raise ValueError(
-            "stabilization: expected svkc.Projection, svkc.Baumgarte or svkc.Drift, got"
-            f" {stabilization!r}"
-        )
-    if stepsize_controller is not None and not isinstance(
-        stepsize_controller, diffrax.AbstractStepSizeController
-    ):
-        raise ValueError(
-            f"stepsize_controller: expected a diffrax one, got {stepsize_controller!r}"
-        )
-    if progress_meter is not None and not isinstance(progress_meter, diffrax.AbstractProgressMeter):
-        raise ValueError(f"progress_meter: expected a diffrax one, got {progress_meter!r}")
+    _check_kind("stepsize_controller", stepsize_controller, diffrax.AbstractStepSizeController)
+    _check_kind("progress_meter", progress_meter, diffrax.AbstractProgressMeter)
     made = plan(chain, events, dtype)
     # on the host where nothing is traced: each operation that jax is given eagerly is a program of
     # its own
@@ -114,16 +95,12 @@ def checked(
     span = of(t1) - of(t0)
     controller = stepsize_controller
     if controller is None:
-        # as arrays: another tolerance is the same program
-        rtol, atol = tolerances(dtype, rtol, atol)
         smallest = np.finfo(dtype).eps * host.maximum(host.abs(span), host.abs(of(t1)))
-        controller = diffrax.PIDController(
-            rtol, atol, norm=motion_norm, dtmin=jnp.asarray(smallest, dtype), force_dtmin=False
-        )
+        controller = _controller(rtol, atol, smallest, dtype)
     options = Options(
         control=control,
         solver=_solving(solver, None if dt is not None else controller, dtype),
-        stabilization=Projection() if stabilization is None else stabilization,
+        stabilization=_stabilization(stabilization),
         dynamics=_dynamics(chain, dynamics),
         controller=controller,
         adjoint=_adjoint(adjoint, controller if dt is None else None),
@@ -137,6 +114,48 @@ def checked(
     )
     save_at = host.stack([of(t0), of(t1)]) if ts is None else ts
     return options, jnp.asarray(save_at, dtype), made
+
+
+def _controller(rtol, atol, smallest, dtype) -> diffrax.PIDController:
+    """Return the default control of adaptive steps. smallest: step (s)."""
+    # as arrays: another tolerance is the same program
+    rtol, atol = tolerances(dtype, rtol, atol)
+    return diffrax.PIDController(
+        rtol, atol, norm=motion_norm, dtmin=jnp.asarray(smallest, dtype), force_dtmin=False
+    )
+
+
+def _check_steps(dt, rtol, atol, stepsize_controller) -> None:
+    """Check that steps are asked for in one way."""
+    for name, value in (("dt", dt), ("rtol", rtol), ("atol", atol)):
+        if value is not None:
+            positive(name, value)
+    tolerance = rtol is not None or atol is not None
+    if dt is not None and (tolerance or stepsize_controller is not None):
+        raise ValueError(
+            "dt asks for fixed steps, rtol, atol and stepsize_controller for others; give one of"
+            " them"
+        )
+    if stepsize_controller is not None and tolerance:
+        raise ValueError("rtol and atol belong inside the stepsize_controller that is given")
+
+
+def _check_kind(name: str, value, kind: type) -> None:
+    """Check that an option is of a class of diffrax's."""
+    if value is not None and not isinstance(value, kind):
+        raise ValueError(f"{name}: expected a diffrax one, got {value!r}")
+
+
+def _stabilization(stabilization) -> AbstractStabilization:
+    """Return what is done about the drift of the loops, or the default."""
+    if stabilization is None:
+        return Projection()
+    if not isinstance(stabilization, AbstractStabilization):
+        raise ValueError(
+            "stabilization: expected an object of svkc.stabilization, such as"
+            f" svkc.stabilization.Projection(), got {stabilization!r}"
+        )
+    return stabilization
 
 
 def _dynamics(chain: Chain, dynamics) -> AbstractDynamics:

@@ -29,7 +29,7 @@ from svkc.integration.vector_field import Field
 from svkc.model.chain import State
 from svkc.simulation.options import Options
 from svkc.simulation.records import RESULTS, Events, Records
-from svkc.transitions.events import Plan
+from svkc.transitions.plan import Plan
 
 
 class Run(eqx.Module):
@@ -84,21 +84,22 @@ def solve(run: Run, stop, ts, made: Plan, options: Options, scene: Scene) -> Sol
         start, (run.t, stop, at), World(scene, options.field), watched, options, reading
     )
     result = _translate(path.result, path.end)
+    solved = Solved(
+        t=t,
+        motion=motion,
+        fired=jnp.zeros(0, bool),
+        guards=None,
+        saved=path.saved,
+        path=frozen(path),
+        result=result,
+        derivative=RESULTS.successful,
+    )
     if found is None:
-        return Solved(
-            t,
-            motion,
-            jnp.zeros(0, bool),
-            None,
-            path.saved,
-            frozen(path),
-            result,
-            RESULTS.successful,
-        )
+        return solved
     code = RESULTS.where(found.jumps, RESULTS.jump, RESULTS.successful)
     code = RESULTS.where(jnp.sum(found.fired) > 1, RESULTS.together, code)
     code = RESULTS.where(found.flat, RESULTS.grazing, code)
-    return Solved(t, motion, found.fired, found.values, path.saved, frozen(path), result, code)
+    return dataclasses.replace(solved, fired=found.fired, guards=found.values, derivative=code)
 
 
 def _path(

@@ -47,12 +47,12 @@ def no_events(rows: int, links: int, dtype) -> Events:
     """Return empty rows for events. Their times are inf, their indices -1."""
     impulse = jnp.zeros((rows, links, 3), dtype)
     return Events(
-        jnp.full(rows, jnp.inf, dtype),
-        jnp.full(rows, -1, jnp.int32),
-        impulse,
-        impulse,
-        jnp.zeros(rows, dtype),
-        jnp.asarray(0, jnp.int32),
+        time=jnp.full(rows, jnp.inf, dtype),
+        which=jnp.full(rows, -1, jnp.int32),
+        impulse=impulse,
+        angular_impulse=impulse,
+        energy_lost=jnp.zeros(rows, dtype),
+        count=jnp.asarray(0, jnp.int32),
     )
 
 
@@ -82,15 +82,15 @@ def recorded(
     phase; began, ended: time and state."""
     (start, first), (stop, last) = began, ended
     new = Records(
-        start,
-        stop,
-        jnp.stack([first.q, last.q]),
-        jnp.stack([first.v, last.v]),
-        first.structure,
-        work,
-        path.accepted,
-        path.rejected,
-        path.tally,
+        start=start,
+        stop=stop,
+        q=jnp.stack([first.q, last.q]),
+        v=jnp.stack([first.v, last.v]),
+        structure=first.structure,
+        work=work,
+        accepted=path.accepted,
+        rejected=path.rejected,
+        tally=path.tally,
     )
     write = lambda old, new: jnp.where(
         row.reshape(-1, *(1,) * jnp.ndim(new)), jnp.asarray(new)[None], old

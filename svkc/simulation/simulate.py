@@ -28,7 +28,7 @@ from svkc.simulation.options import Options, checked
 from svkc.simulation.phase import Run, Solved, solve
 from svkc.simulation.records import RESULTS, no_events, no_records, recorded
 from svkc.simulation.trajectory import Trajectory
-from svkc.transitions.events import Plan
+from svkc.transitions.plan import Plan
 
 
 def simulate(
@@ -45,10 +45,10 @@ def simulate(
     dt: fixed steps (s). rtol, atol: adaptive steps, by default 1e-7 (float32: 1e-4) and a hundredth
     of rtol.
     solver, stepsize_controller, adjoint, progress_meter: diffrax objects, passed through; by
-    default Dopri8 with rtol, Tsit5 with dt or in float32. stabilization: `svkc.Projection()`
-    (default), `svkc.Exact()`, `svkc.Baumgarte(rate)` or `svkc.Drift()`. dynamics:
-    an object of `svkc.dynamics`. Functions are compared by their code and by the values that they
-    read: defaults, closures and globals. An equal function is not compiled again. Floating-point
+    default Dopri8 with rtol, Tsit5 with dt or in float32.
+    stabilization: an object of `svkc.stabilization`, by default `Projection()`. dynamics: one of
+    `svkc.dynamics`. Functions are compared by their code and by the values that they read:
+    defaults, closures and globals. An equal function is not compiled again. Floating-point
     arrays among these values are data. Numbers and integer arrays are static, as are arrays that
     Python has to read. A function that reads other kinds of objects is compared by identity; if
     that compiles it again, a `UserWarning` names the argument.
@@ -58,8 +58,10 @@ def simulate(
     raised when throw=True.
     """
     options, save_at, made = checked(
-        chain, state, t0, t1, ts, events, control, dt, rtol, atol, solver, stepsize_controller,
-        stabilization, dynamics, adjoint, max_events, max_steps, progress_meter,
+        chain, state, t0, t1, ts=ts, events=events, control=control, dt=dt, rtol=rtol, atol=atol,
+        solver=solver, stepsize_controller=stepsize_controller, stabilization=stabilization,
+        dynamics=dynamics, adjoint=adjoint, max_events=max_events, max_steps=max_steps,
+        progress_meter=progress_meter,
     )  # fmt: skip
     dtype = state.q.dtype
     given = chain, state, jnp.asarray(t0, dtype), jnp.asarray(t1, dtype), save_at
@@ -67,36 +69,33 @@ def simulate(
         *given, _with(made, guards=events), _with(options, control=control), args
     )
     run = shared(run, control=options.control, events=made.guards)
-    traj = (_certified_once if len(save_at) <= FEW_STATES else _certified)(
-        chain, run, save_at, given[3], options.gap, stages(options.solver)
-    )
-    if not throw:
-        return traj
+    certified = _certified_once if len(save_at) <= FEW_STATES else _certified
+    traj = certified(chain, run, save_at, given[3], options.gap, stages(options.solver))
+    return _raised(chain, traj) if throw else traj
+
+
+def _raised(chain: Chain, traj: Trajectory) -> Trajectory:
+    """Return the trajectory. Raise RuntimeError, or an error at run time under jit, where the run
+    went wrong."""
+    good = RESULTS.successful, RESULTS.stopped
     if isinstance(traj.result._value, jax.core.Tracer):
-        return traj.result.error_if(
-            traj, (traj.result != RESULTS.successful) & (traj.result != RESULTS.stopped)
-        )
-    if np.any(
-        ~np.isin(
-            np.asarray(traj.result._value), [RESULTS.successful._value, RESULTS.stopped._value]
-        )
-    ):
-        phase, loop = int(traj.phases.count), int(traj.report().loop)
-        where = f"phase {phase}" if loop < 0 else f"phase {phase}, loop {chain.link_names[loop]!r}"
-        raise RuntimeError(
-            f"simulate stopped at t = {float(traj.t_final):.9g} s, in {where}:"
-            f" {RESULTS[traj.result]}"
-        )
-    return traj
+        return traj.result.error_if(traj, (traj.result != good[0]) & (traj.result != good[1]))
+    if np.all(np.isin(np.asarray(traj.result._value), [code._value for code in good])):
+        return traj
+    phase, loop = int(traj.phases.count), int(traj.report().loop)
+    where = f"phase {phase}" if loop < 0 else f"phase {phase}, loop {chain.link_names[loop]!r}"
+    raise RuntimeError(
+        f"simulate stopped at t = {float(traj.t_final):.9g} s, in {where}: {RESULTS[traj.result]}"
+    )
 
 
 @eqx.filter_jit
 def _run(chain: Chain, state: State, t0, t1, ts, made: Plan, options: Options, args) -> Run:
     made, options = _converted(chain, state, t0, made, options, args)
-    run = _start(chain, state, t0, ts, made, options, args)
+    run = _start(chain, state, t0, ts, made, options)
 
     def phase(run: Run, index):
-        return _phase(chain, run, index, t1, ts, made, options, args), None
+        return _phase(chain, run, index, (t1, ts), made=made, options=options, args=args), None
 
     if options.max_events == 0:
         run, _ = phase(run, jnp.asarray(0))
@@ -121,16 +120,16 @@ def _with_certificate(chain: Chain, run: Run, ts, t1, most: float, evaluations: 
         run.derivative,
     )
     return Trajectory(
-        ts,
-        run.saved,
-        saved.gap,
-        saved.gap_rate,
-        run.events,
-        phases,
-        run.state,
-        run.t,
-        result,
-        derivative,
+        ts=ts,
+        states=run.saved,
+        gaps=saved.gap,
+        gap_rates=saved.gap_rate,
+        events=run.events,
+        phases=phases,
+        final=run.state,
+        t_final=run.t,
+        result=result,
+        derivative=derivative,
     )
 
 
@@ -169,7 +168,7 @@ def _lockable(chain: Chain, state: State, made: Plan) -> State:
     )
 
 
-def _start(chain: Chain, state: State, t0, ts, made: Plan, options: Options, args) -> Run:
+def _start(chain: Chain, state: State, t0, ts, made: Plan, options: Options) -> Run:
     """Empty records, sized by capacity; unwritten entries show: inf, -1."""
     links, rows, dtype = len(chain.link_names), options.max_events, state.q.dtype
     state = _lockable(chain, state, made)
@@ -193,16 +192,25 @@ def _start(chain: Chain, state: State, t0, ts, made: Plan, options: Options, arg
     )  # fmt: skip
 
 
-def _phase(chain: Chain, run: Run, index, t1, ts, made: Plan, options: Options, args) -> Run:
-    """One solve, the events at its end, and the records of both."""
+def _next_stop(run: Run, t1, made: Plan):
+    """Return the time at which the next phase ends at the latest: that of the next event, or t1.
+
+    Of two equal times the one taken is differentiated: the event's where it is t1, and t1 where the
+    run is there already.
+    """
+    next_time = jnp.min(jnp.where(run.pending, made.times, jnp.inf), initial=jnp.inf)
+    stop = jnp.where(next_time <= t1, next_time, t1)
+    return jnp.where((stop < run.t) | (run.result != RESULTS.successful), run.t, stop)
+
+
+def _phase(chain: Chain, run: Run, index, times, *, made: Plan, options: Options, args) -> Run:
+    """One solve, the events at its end, and the records of both. times: the end and the save
+    times."""
+    t1, ts = times
     run = _with_guards(chain, run, made, options, args)
     going = (run.t < t1) | jnp.any(run.pending & (made.times <= t1))
     going = going & (run.result == RESULTS.successful)
-    next_time = jnp.min(jnp.where(run.pending, made.times, jnp.inf), initial=jnp.inf)
-    # (the event's own time where it is that of the end, and the end's own where the run is there
-    # already: each is to be differentiated by)
-    ahead = jnp.where(next_time <= t1, next_time, t1)
-    stop = jnp.where((ahead < run.t) | (run.result != RESULTS.successful), run.t, ahead)
+    stop = _next_stop(run, t1, made)
     solved = solve(run, stop, ts, made, options, Scene(chain, run.state.structure, args))
     reached = going & (solved.result == RESULTS.successful)
     timed = run.pending & (made.times <= solved.t + event_tolerance(solved.t)) & reached

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from svkc.integration.integrators import RodriguesEuler, SemiImplicitEuler
-from svkc.integration.stabilization import Drift, Projection
+from svkc.integration.stabilization import NoStabilization, Projection
 from svkc.loops.constrained_dynamics import ArticulatedBodies
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import check_state
@@ -89,7 +89,7 @@ def candidates(dtype, span: float) -> list[Candidate]:
                 {"solver": solver, "rtol": rtol, "atol": rtol / 100},
             )
             found.append(Candidate(name, how | {"stabilization": Projection()}))
-            found.append(Candidate(f"{name}, drift", how | {"stabilization": Drift()}))
+            found.append(Candidate(f"{name}, drift", how | {"stabilization": NoStabilization()}))
             found.append(Candidate(f"{name}, by bodies", how | {"dynamics": ArticulatedBodies()}))
         if rtol >= 1e-8:
             found.append(

@@ -156,7 +156,8 @@ def touch(chain: Chain, link: str, distance=0.01, axes: str | None = None) -> To
     distance = jnp.asarray(
         one("touch: distance", finite("touch: distance", distance)), chain.q_load.dtype
     )
-    return Touch(chain, slot, distance, tuple("xyz".index(a) for a in axes))
+    kept = tuple("xyz".index(a) for a in axes)
+    return Touch(chain=chain, link=slot, distance=distance, axes=kept)
 
 
 def leaves(chain: Chain, link: str, axis=(0.0, 0.0, 1.0)) -> Leaves:

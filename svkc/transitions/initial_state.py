@@ -1,6 +1,7 @@
 """A consistent state from what the user knows of it: names to numbers, loops closed, velocities
 made to agree."""
 
+import dataclasses
 import functools
 import warnings
 
@@ -48,8 +49,15 @@ def _put(array, at, values):
     return out
 
 
-def _filled(chain: Chain, what: str, value, default, tree: int, sizes, start):
-    """The full vector of a user's array or dict, and which coordinates the dict named."""
+def _filled(chain: Chain, what: str, value, default):
+    """Return the full vector of a user's array or dict for `what`, q or v, and which coordinates
+    the dict named."""
+    top = chain.topology
+    tree, sizes, start, of_model = (
+        (top.nq, Q_SIZE, top.q_start, top.model_q)
+        if what == "q"
+        else (top.nv, V_SIZE, top.v_start, top.model_v)
+    )
     named = np.zeros(len(default), bool)
     if value is None:
         return default, named
@@ -68,10 +76,9 @@ def _filled(chain: Chain, what: str, value, default, tree: int, sizes, start):
                 named[at] = True
         return out, named
     value = finite(what, value, default.dtype)
-    of_model = np.array(chain.topology.model_q if what == "q" else chain.topology.model_v, int)
-    if chain.topology.cut_joints and value.shape == of_model.shape:
+    if top.cut_joints and value.shape == (len(of_model),):
         # as for the plain tree
-        return _put(default, of_model, value), named
+        return _put(default, np.array(of_model, int), value), named
     if value.shape == (tree,):
         return _put(default, slice(tree), value), named
     if value.shape != default.shape:
@@ -116,7 +123,7 @@ def _carried(chain: Chain, structure: Structure, q, v, placed):
 
 @functools.partial(eager_jit, jit=eqx.filter_jit)
 def _close_and_agree(
-    chain: Chain, structure: Structure, q, v, held_q, held_v, whole: bool
+    chain: Chain, structure: Structure, q, v, held: Held, whole: bool
 ) -> tuple[State, Float[Array, " links"]]:
     """Return the state with its loops closed, and how far each loop is still open (rad, or
     `chain.length`s).
@@ -129,7 +136,7 @@ def _close_and_agree(
     placed = (np.array(chain.topology.link_child, int) >= 0) & (not whole)
     if placed.any():
         q, v = _carried(chain, structure, q, v, placed)
-    held = Held(held_q, held_v, jnp.asarray(~placed) | ~structure.connected)
+    held = dataclasses.replace(held, read=jnp.asarray(~placed) | ~structure.connected)
     found = solve_structure(chain, structure, q, v, held, _ASSEMBLE)
     return (
         State(
@@ -159,10 +166,8 @@ def assemble(chain: Chain, q, v, connected) -> State:
             " the chain was loaded",
             stacklevel=3,
         )
-    q, held_q = _filled(chain, "q", q, chain.q_load, top.nq, Q_SIZE, top.q_start)
-    v, held_v = _filled(
-        chain, "v", v, np.zeros(top.dofs, chain.q_load.dtype), top.nv, V_SIZE, top.v_start
-    )
+    q, held_q = _filled(chain, "q", q, chain.q_load)
+    v, held_v = _filled(chain, "v", v, np.zeros(top.dofs, chain.q_load.dtype))
     q, v = jnp.asarray(q), jnp.asarray(v)
     _check_quaternions(chain, q)
     if not len(top.link_names):
@@ -171,12 +176,8 @@ def assemble(chain: Chain, q, v, connected) -> State:
     whole = max(top.link_child, default=-1) < 0 or (
         given is not None and not isinstance(given, dict) and np.shape(given) != (len(top.model_q),)
     )
-    return check_closed(
-        chain,
-        *_close_and_agree(
-            chain, structure, q, v, jnp.asarray(_as_dofs(chain, held_q)), jnp.asarray(held_v), whole
-        ),
-    )
+    held = Held(jnp.asarray(_as_dofs(chain, held_q)), jnp.asarray(held_v))
+    return check_closed(chain, *_close_and_agree(chain, structure, q, v, held, whole))
 
 
 def _as_dofs(chain: Chain, held_q: np.ndarray) -> np.ndarray:

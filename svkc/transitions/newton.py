@@ -15,8 +15,15 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.primitive import operation
-from svkc.loops.constraint import loop_kinematics, scales
-from svkc.loops.pivoting import count_rank, held_part, rank_tolerance, select, without_weak
+from svkc.loops.constraint import LoopKinematics, loop_kinematics, scales
+from svkc.loops.pivoting import (
+    Selection,
+    count_rank,
+    held_part,
+    rank_tolerance,
+    select,
+    without_weak,
+)
 from svkc.loops.projection import least_change
 from svkc.model.chain import Chain, Structure, active_dofs
 from svkc.transitions.impact import velocity_after_impact
@@ -87,16 +94,16 @@ class Newton(eqx.Module):
         gaps, zero = jnp.zeros((2, links), dtype), jnp.zeros((), dtype)
         size = jnp.zeros((2, min(6 * links, chain.dofs)), dtype)
         return cls(
-            q,
-            v,
-            structure.rank,
-            structure.margin,
-            q,
-            size,
-            gaps,
-            gaps[0],
-            jnp.zeros((links, 6), dtype),
-            zero,
+            q=q,
+            v=v,
+            rank=structure.rank,
+            margin=structure.margin,
+            probe=q,
+            size=size,
+            open=gaps,
+            left=gaps[0],
+            wrench=jnp.zeros((links, 6), dtype),
+            lost=zero,
         )
 
     def searched(self, kind, size, gaps) -> "Newton":
@@ -131,85 +138,96 @@ def _among(kind, *kinds: int) -> Bool[Array, ""]:
     return functools.reduce(jnp.logical_or, [kind == k for k in kinds])
 
 
+class _Iteration(eqx.Module):
+    """One iteration of any kind among `kinds`; what no kind among them needs is not compiled.
+
+    `away`: the change of q to a configuration nearby, from which the rank is searched for.
+    """
+
+    chain: Chain
+    structure: Structure
+    held: Held
+    away: Float[Array, " dofs"]
+    kinds: tuple[int, ...] = eqx.field(static=True)
+
+    def __call__(self, now: Newton, kind, ranked) -> Newton:
+        """Return the state after one more iteration. ranked: whether only as many rows count as the
+        rank of `now`."""
+        chain, structure = self.chain, self.structure
+        at = now.q
+        if COUNT in self.kinds:
+            at = jnp.where(_among(kind, RECLOSE, COUNT), now.probe, now.q)
+        loops = loop_kinematics(chain, structure, at)
+        J = self._without_held(loops.J, kind)
+        full, selection = self._select(J, now, kind, ranked)
+        of_v, residual = _among(kind, VELOCITY_HELD, VELOCITY), loops.gap
+        if VELOCITY in self.kinds:
+            residual = jnp.where(of_v, loops.J @ (now.v / scales(chain)[1]), residual)
+        step = -least_change(chain, selection, J, residual[:, None])[:, 0]
+        left = jnp.max(jnp.abs(loops.gap).reshape(-1, 6), 1)
+        if COUNT in self.kinds:
+            now = now.searched(kind, full.size, left)
+        v, wrench, lost = now.v + jnp.where(of_v, step, 0), now.wrench, now.lost
+        if IMPACT in self.kinds:
+            v, wrench, lost = jax.lax.cond(
+                kind == IMPACT,
+                lambda: velocity_after_impact(chain, structure, loops, selection, now.v),
+                lambda: (v, wrench, lost),
+            )
+        q, probe = self._moved(loops, at, kind, step), now.probe
+        if COUNT in self.kinds:
+            searching = _among(kind, *RANK)
+            q, probe = jnp.where(searching, now.q, q), jnp.where(searching, q, probe)
+        return dataclasses.replace(now, q=q, v=v, probe=probe, wrench=wrench, lost=lost, left=left)
+
+    def _without_held(self, J, kind) -> Float[Array, "rows dofs"]:
+        """Return J with the columns of coordinates zero that this iteration holds."""
+        for which, mask in ((CLOSE_HELD, self.held.q), (VELOCITY_HELD, self.held.v)):
+            if mask is not None and which in self.kinds:
+                J = jnp.where(mask[None] & (kind == which), 0, J)
+        return J
+
+    def _select(self, J, now: Newton, kind, ranked) -> tuple[Selection, Selection]:
+        """Return the pivots of J, and those among them that are large enough to divide by."""
+        wanted, every, dtype = None, min(J.shape), J.dtype
+        if self.structure.independent is not None and IMPACT in self.kinds:
+            wanted = self.structure.independent & (kind == IMPACT)
+        full = select(J, jnp.where(ranked, now.rank, every), wanted)
+        weak = jnp.where(ranked, held_part(dtype) * now.margin, 0)
+        # along weaker steps a gap is of second order, and dividing by them would only amplify
+        # round-off
+        least = jnp.where(kind == IMPACT, weak, jnp.maximum(rank_tolerance(dtype), weak))
+        return full, without_weak(full, least)
+
+    def _moved(self, loops: LoopKinematics, at, kind, step) -> Float[Array, " q"]:
+        """Return the configuration after this iteration, moved from the one at which it was."""
+        chain = self.chain
+        closing = jnp.where(_among(kind, CLOSE_HELD, CLOSE, RECLOSE), step, 0)
+        moved = integrate(chain, at, jnp.where(kind == PERTURB, self.away, closing))
+        if READ not in self.kinds:
+            return moved
+
+        def read():
+            coordinates = joint_coordinates(chain, self.structure, loops.kin, at)
+            return with_coordinates(chain, self.held.read, coordinates, at)
+
+        return jax.lax.cond(kind == READ, read, lambda: moved)
+
+
 def _iterate(
-    chain: Chain,
-    structure: Structure,
-    q: Float[Array, " q"],
-    v: Float[Array, " dofs"],
-    held: Held,
-    schedule: Schedule,
-    unranked: int,
+    chain: Chain, structure: Structure, q, v, held: Held, schedule: Schedule, *, unranked: int
 ) -> Newton:
     """Take the iterations of a schedule. unranked: how many of them take every row, whatever the
     rank of the structure."""
-    column, kinds = scales(chain)[1], schedule.kinds
-    active, every = active_dofs(chain, structure), min(6 * len(chain.link_names), chain.dofs)
+    kinds, active = schedule.kinds, active_dofs(chain, structure)
     # a fixed direction without pattern, as q itself may be singular
-    away = jnp.where(active, 0.05 * np.sin(1.0 + 2.3 * np.arange(chain.dofs)) * column, 0).astype(
-        q.dtype
-    )
+    away = 0.05 * np.sin(1.0 + 2.3 * np.arange(chain.dofs)) * scales(chain)[1]
+    away = jnp.where(active, away, 0).astype(q.dtype)
+    iteration = _Iteration(chain, structure, held=held, away=away, kinds=kinds)
 
     @functools.partial(jax.checkpoint, prevent_cse=False)
     def one(now: Newton, x) -> tuple[Newton, None]:
-        kind, ranked = x
-        at = jnp.where(_among(kind, RECLOSE, COUNT), now.probe, now.q) if COUNT in kinds else now.q
-        loops = loop_kinematics(chain, structure, at)
-        kin, J, gaps = loops.kin, loops.J, loops.gap
-        free = J
-        for which, mask in ((CLOSE_HELD, held.q), (VELOCITY_HELD, held.v)):
-            free = (
-                free
-                if mask is None or which not in kinds
-                else jnp.where(mask[None] & (kind == which), 0, free)
-            )
-        wanted = (
-            None
-            if structure.independent is None or IMPACT not in kinds
-            else structure.independent & (kind == IMPACT)
-        )
-        full, weak = (
-            select(free, jnp.where(ranked, now.rank, every), wanted),
-            jnp.where(ranked, held_part(q.dtype) * now.margin, 0),
-        )
-        # along weaker steps a gap is of second order, and dividing by them would only amplify
-        # round-off
-        selection = without_weak(
-            full, jnp.where(kind == IMPACT, weak, jnp.maximum(rank_tolerance(q.dtype), weak))
-        )
-        of_v = _among(kind, VELOCITY_HELD, VELOCITY)
-        residual = jnp.where(of_v, J @ (now.v / column), gaps) if VELOCITY in kinds else gaps
-        step = -least_change(chain, selection, free, residual[:, None])[:, 0]
-        open_ = jnp.max(jnp.abs(gaps).reshape(-1, 6), 1)
-        if COUNT in kinds:
-            now = now.searched(kind, full.size, open_)
-        new = now.v + jnp.where(of_v, step, 0), now.wrench, now.lost
-        if IMPACT in kinds:
-            new = jax.lax.cond(
-                kind == IMPACT,
-                lambda: velocity_after_impact(chain, structure, loops, selection, now.v),
-                lambda: new,
-            )
-        moved = integrate(
-            chain,
-            at,
-            jnp.where(
-                kind == PERTURB, away, jnp.where(_among(kind, CLOSE_HELD, CLOSE, RECLOSE), step, 0)
-            ),
-        )
-        if READ in kinds:
-            read = lambda: with_coordinates(
-                chain, held.read, joint_coordinates(chain, structure, kin, at), at
-            )
-            moved = jax.lax.cond(kind == READ, read, lambda: moved)
-        if COUNT in kinds:
-            searching = _among(kind, *RANK)
-            now, moved = (
-                dataclasses.replace(now, probe=jnp.where(searching, moved, now.probe)),
-                jnp.where(searching, now.q, moved),
-            )
-        return dataclasses.replace(
-            now, q=moved, v=new[0], wrench=new[1], lost=new[2], left=open_
-        ), None
+        return iteration(now, *x), None
 
     xs = jnp.asarray(np.array(kinds, np.int32)), jnp.asarray(np.arange(len(kinds)) >= unranked)
     return jax.lax.scan(one, Newton.init(chain, structure, q, jnp.where(active, v, 0)), xs)[0]
@@ -218,7 +236,7 @@ def _iterate(
 def _solve(chain: Chain, structure: Structure, q, v, held: Held, schedule: Schedule) -> Newton:
     # until the search has ended every row counts, in the search too
     unranked = schedule.unranked + len(RANK) if COUNT in schedule.kinds else 0
-    return _iterate(chain, structure, q, v, held, schedule, unranked)
+    return _iterate(chain, structure, q, v, held, schedule, unranked=unranked)
 
 
 def _solve_jvp(primals, tangents):
@@ -233,7 +251,7 @@ def _solve_jvp(primals, tangents):
 
     @eqx.filter_checkpoint
     def moved(chain, structure, q, v):
-        there = _iterate(chain, structure, q, v, held, moving, schedule.unranked)
+        there = _iterate(chain, structure, q, v, held, moving, unranked=schedule.unranked)
         return there.q, there.v, there.wrench, there.lost
 
     along = eqx.filter_jvp(moved, (chain, ranked, q, v), tangents[:4])[1]

@@ -64,7 +64,7 @@ def placed(name: str, value, dtype):
 
 
 def put(
-    structure: Structure, at: Bool[Array, " links"], rows, freedoms, quat, pos, real_pos
+    structure: Structure, at: Bool[Array, " links"], *, rows, freedoms, quat, pos, real_pos
 ) -> Structure:
     """The structure with the links in the mask `at` between two rows, by such a joint, at such a
     place."""
@@ -112,19 +112,27 @@ def grip(
     bound = put(
         structure,
         slot,
-        rows,
-        checked_freedoms(wish.joint),
-        to_axis(wish.axis),
-        jnp.zeros(3, structure.pos.dtype),
-        wish.real_pos,
+        rows=rows,
+        freedoms=checked_freedoms(wish.joint),
+        quat=to_axis(wish.axis),
+        pos=jnp.zeros(3, structure.pos.dtype),
+        real_pos=wish.real_pos,
     )
     return bound, slot, ~held & ~jnp.any(slot)
 
 
 def emptied(structure: Structure, slots: Bool[Array, " links"]) -> Structure:
     """The structure with these slots bound to nothing."""
-    empty = jnp.zeros(3, structure.pos.dtype)
-    return put(structure, slots, (0, 0), (True,) * 6, np.array([1.0, 0, 0, 0]), empty, empty)
+    zero = jnp.zeros(3, structure.pos.dtype)
+    return put(
+        structure,
+        slots,
+        rows=(0, 0),
+        freedoms=(True,) * 6,
+        quat=np.array([1.0, 0, 0, 0]),
+        pos=zero,
+        real_pos=zero,
+    )
 
 
 def bind(
@@ -151,16 +159,13 @@ def bind(
     pos, real_pos = (
         placed(what, x, state.q.dtype) for what, x in (("pos", pos), ("real_pos", real_pos))
     )
-    return State(
-        state.q,
-        state.v,
-        put(
-            state.structure,
-            at,
-            rows_of(chain, parent, real),
-            checked_freedoms(joint),
-            to_axis(axis),
-            pos,
-            real_pos,
-        ),
+    structure = put(
+        state.structure,
+        at,
+        rows=rows_of(chain, parent, real),
+        freedoms=checked_freedoms(joint),
+        quat=to_axis(axis),
+        pos=pos,
+        real_pos=real_pos,
     )
+    return State(state.q, state.v, structure)

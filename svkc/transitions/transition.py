@@ -73,12 +73,12 @@ def change(
         after, lost = lock_projection(chain, structure, q, v)
         v = jnp.where(holds, after, v)
         return Change(
-            State(q, v, structure),
-            nothing,
-            nothing,
-            jnp.where(holds, lost, 0),
-            jnp.zeros((), v.dtype),
-            nothing[:, 0],
+            state=State(q, v, structure),
+            impulse=nothing,
+            angular_impulse=nothing,
+            energy_lost=jnp.where(holds, lost, 0),
+            gap=jnp.zeros((), v.dtype),
+            left=nothing[:, 0],
         )
     structure, new_q = _placed(chain, structure, new_links, here, q)
     # the armature of a joint that is made anew is at rest before
@@ -88,12 +88,15 @@ def change(
     joined = solve_structure(chain, structure, new_q, before, Held(), Schedule(RANK + CONNECT))
     structure = eqx.tree_at(lambda s: (s.rank, s.margin), structure, (joined.rank, joined.margin))
     q, v = jnp.where(holds, joined.q, q), jnp.where(holds, joined.v, v)
-    wrench, lost = jnp.where(holds, joined.wrench, 0), jnp.where(holds, joined.lost, 0)
-    found, left = (
-        jnp.where(holds, jnp.max(joined.open[0]), 0),
-        jnp.where(holds, joined.left, joined.open[0]),
+    wrench = jnp.where(holds, joined.wrench, 0)
+    return Change(
+        state=State(q, v, structure),
+        impulse=wrench[:, 3:],
+        angular_impulse=wrench[:, :3],
+        energy_lost=jnp.where(holds, joined.lost, 0),
+        gap=jnp.where(holds, jnp.max(joined.open[0]), 0),
+        left=jnp.where(holds, joined.left, joined.open[0]),
     )
-    return Change(State(q, v, structure), wrench[:, 3:], wrench[:, :3], lost, found, left)
 
 
 @functools.partial(eager_jit, jit=eqx.filter_jit)
@@ -106,17 +109,15 @@ def release(
     """`change` where links are only cut and joints only unlocked: q and v stay, the rank is decided
     anew."""
     structure, _, _ = _restructured(chain, state.structure, connected, locked)
-    nothing, zero = (
-        jnp.zeros((len(chain.link_names), 3), state.v.dtype),
-        jnp.zeros((), state.v.dtype),
-    )
+    nothing = jnp.zeros((len(chain.link_names), 3), state.v.dtype)
+    zero = jnp.zeros((), state.v.dtype)
     return Change(
-        State(state.q, state.v, decide_rank(chain, structure, state.q)),
-        nothing,
-        nothing,
-        zero,
-        zero,
-        nothing[:, 0],
+        state=State(state.q, state.v, decide_rank(chain, structure, state.q)),
+        impulse=nothing,
+        angular_impulse=nothing,
+        energy_lost=zero,
+        gap=zero,
+        left=nothing[:, 0],
     )
 
 

@@ -267,8 +267,7 @@ CASES = {
     ),
     "source: the model has no joints": lambda s: svkc.load("<mujoco/>"),
     "source: the model has numbers": lambda s: svkc.load(endless()),
-    "stepsize_controller": lambda s: s.simulate(stepsize_controller=3),
-    "progress_meter": lambda s: s.simulate(progress_meter=3),
+    "...: expected a diffrax one": lambda s: s.simulate(stepsize_controller=3),
     "source: the model cannot": lambda s: s.load("<mujoco><nonsense/></mujoco>"),
     "stabilization": lambda s: s.simulate(stabilization=3),
     "state....: got": lambda s: s.simulate(

@@ -789,8 +789,8 @@ simulations = dict(
     ),
     stabilization=one_of_these(
         svkc.Projection,
-        svkc.Exact,
-        svkc.Drift,
+        svkc.stabilization.CoordinatePartitioning,
+        svkc.stabilization.NoStabilization,
         svkc.Baumgarte,
         lambda: svkc.Baumgarte("a"),
         lambda: svkc.Projection(-1),

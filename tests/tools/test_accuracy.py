@@ -88,14 +88,18 @@ def test_symplectic_euler_keeps_energy():
 
 
 @pytest.mark.parametrize(
-    "stabilization", [svkc.Projection(), pytest.param(svkc.Exact(), marks=pytest.mark.slow)]
+    "stabilization",
+    [
+        svkc.Projection(),
+        pytest.param(svkc.stabilization.CoordinatePartitioning(), marks=pytest.mark.slow),
+    ],
 )
 def test_each_way_back_onto_the_loops(stabilization):
     """One motion, loops closed to round-off. By short steps, and by one that is too long."""
     chain = models.four_bar()
     state = chain.state(v={"crank": 4.0})
     free = lambda t1, dt: svkc.simulate(
-        chain, state, t1, dt=dt, stabilization=svkc.Drift(), throw=False
+        chain, state, t1, dt=dt, stabilization=svkc.stabilization.NoStabilization(), throw=False
     )
     held = lambda t1, dt: svkc.simulate(chain, state, t1, dt=dt, stabilization=stabilization)
     fine = held(0.5, 1e-3)
@@ -116,7 +120,7 @@ def test_only_dependent_coordinates_move():
         chain.state(v={"crank": 4.0}),
         0.1,
         dt=0.1,
-        stabilization=svkc.Drift(),
+        stabilization=svkc.stabilization.NoStabilization(),
         throw=False,
     ).final
     moved = lambda dependent: settle_loops(
@@ -135,7 +139,7 @@ def test_only_dependent_coordinates_move():
 
 
 WAYS = {
-    "exact": {"stabilization": svkc.Exact()},
+    "exact": {"stabilization": svkc.stabilization.CoordinatePartitioning()},
     "unit vectors": {"dynamics": svkc.dynamics.UnitVectors()},
     "bodies": {"dynamics": svkc.dynamics.ArticulatedBodies()},
     "chosen at every evaluation": {"dynamics": svkc.dynamics.CompositeBodies(hold=None)},
@@ -308,7 +312,12 @@ def test_gaps_are_seen_between_saved_times():
     """A loop that drifts open and is cut: no saved state shows it, the certificate does, and the
     run's code."""
     chain = models.four_bar()
-    rough = {"dt": 0.02, "solver": diffrax.Heun(), "stabilization": svkc.Drift(), "throw": False}
+    rough = {
+        "dt": 0.02,
+        "solver": diffrax.Heun(),
+        "stabilization": svkc.stabilization.NoStabilization(),
+        "throw": False,
+    }
     cut = svkc.simulate(
         chain, chain.state(v={"crank": 6.0}), 0.4, events=[svkc.at(0.2, cut="pin")], **rough
     )
@@ -406,7 +415,14 @@ def test_tune(capsys):
     given = [
         Candidate("rough", {"dt": 0.02, "solver": svkc.SemiImplicitEuler()}),
         Candidate("fine", {"rtol": 1e-8, "atol": 1e-10}),
-        Candidate("loose", {"rtol": 1e-3, "atol": 1e-5, "stabilization": svkc.Exact()}),
+        Candidate(
+            "loose",
+            {
+                "rtol": 1e-3,
+                "atol": 1e-5,
+                "stabilization": svkc.stabilization.CoordinatePartitioning(),
+            },
+        ),
     ]
     found = svkc.tune(chain, state, 0.5, target=1e-6, options=given, repeats=1)
     assert str(found) in capsys.readouterr().out
