@@ -272,7 +272,9 @@ def in_mujoco(problem: Problem, name: str):
     """MuJoCo's integrators on the same model; links are let go when they were in the reference."""
     for integrator in soft_loops.INTEGRATORS:
         for dt in FIXED:
-            run = soft_loops.Run(problem, name, integrator, dt * min(1.0, problem.end))
+            run = soft_loops.Run(
+                problem, name, integrator=integrator, dt=dt * min(1.0, problem.end)
+            )
             q, seconds = timed(run)
             failed = "" if np.isfinite(q).all() else "not finite"
             yield [

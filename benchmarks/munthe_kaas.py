@@ -60,7 +60,9 @@ class MuntheKaas(diffrax.AbstractAdaptiveSolver):
 
         term, start = diffrax.ODETerm(field), eqx.tree_at(lambda y: y.q, y0, jnp.zeros_like(y0.v))
         inner = self.solver.init(term, t0, t1, start, args)
-        end, error, *_ = self.solver.step(term, t0, t1, start, args, inner, True)
+        end, error, *_ = self.solver.step(
+            term, t0, t1, start, args, solver_state=inner, made_jump=True
+        )
         y1 = eqx.tree_at(lambda y: y.q, end, integrate(chain, q0, end.q))
         error = eqx.tree_at(lambda y: y.q, error, rates(chain, y1.q, error.q))
         return y1, error, {"y0": y0, "y1": y1}, None, diffrax.RESULTS.successful

@@ -80,10 +80,9 @@ def by_pinocchio(name: str, chain, state, batch: int, steps: int):
     else:
         pinocchio.initConstraintDynamics(model, data, held, given)
         proximal = pinocchio.ProximalSettings(1e-10, 1e-8, 10)
-        who, run = (
-            "Pinocchio, constraintDynamics alone",
-            lambda: pinocchio.constraintDynamics(model, data, q, v, force, held, given, proximal),
-        )
+        who = "Pinocchio, constraintDynamics alone"
+        grips = {"contact_models": held, "contact_datas": given, "prox_settings": proximal}
+        run = lambda: pinocchio.constraintDynamics(model, data, q, v, force, **grips)
     ours = np.asarray(svkc.forward_dynamics(chain, still, jnp.zeros(chain.nv)))[6 : chain.nv]
     # (the base's own are in other axes)
     assert np.max(np.abs(ours - run()[6:])) < (1e-8 if ours.dtype == np.float64 else 0.1), (

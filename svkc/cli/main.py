@@ -28,6 +28,7 @@ def _event(kind: str):
 
 
 def _parser() -> argparse.ArgumentParser:
+    """Return the parser of all commands."""
     parser = argparse.ArgumentParser(
         "svkc",
         description=(
@@ -35,22 +36,33 @@ def _parser() -> argparse.ArgumentParser:
         ),
     )
     add = parser.add_subparsers(dest="command", metavar="COMMAND", required=True).add_parser
-    job = add(
-        "run", help="a scene, or a model from where it was loaded: table, npz, pictures, page"
+    _add_run_options(
+        add("run", help="a scene, or a model from where it was loaded: table, npz, pictures, page")
     )
-    job.add_argument(
+    add("info", help="what a model is to svkc").add_argument("model", help="MJCF or URDF file")
+    view = add("view", help="table, curves and page of a run that was saved")
+    view.add_argument("file", type=pathlib.Path, help="an .npz of traj.save(path, chain)")
+    view.add_argument("--no-open", action="store_true", help="write the page and do not open it")
+    add("scenes", help="the scenes that ship")
+    return parser
+
+
+def _add_run_options(parser: argparse.ArgumentParser):
+    """Add the arguments of `svkc run` to its parser."""
+    add = parser.add_argument
+    add(
         "what",
         nargs="?",
         default="high_bar",
         metavar="SCENE|MODEL",
         help="a name that `svkc scenes` lists (default: high_bar), or an MJCF or URDF file",
     )
-    job.add_argument("--t1", type=float, help="until when, s")
+    add("--t1", type=float, help="until when, s")
     for kind, what in (
         ("release", "let a virtual link go"),
         ("catch", "connect one where its bodies are then"),
     ):
-        job.add_argument(
+        add(
             f"--{kind}",
             dest="events",
             action="append",
@@ -59,27 +71,12 @@ def _parser() -> argparse.ArgumentParser:
             metavar="NAME@TIME",
             help=f"{what} at a time, s; again for more, instead of the scene's own events",
         )
-    job.add_argument(
-        "--ignore",
-        nargs="*",
-        default=[],
-        metavar="KIND",
-        help="kinds of elements of a model to leave out, or all",
-    )
-    job.add_argument(
-        "--out",
-        type=pathlib.Path,
-        default=pathlib.Path("out"),
-        help="folder for results (default: out)",
-    )
-    job.add_argument("--mp4", action="store_true", help="an mp4 too (needs the extra svkc[video])")
-    job.add_argument("--quiet", action="store_true", help="no progress")
-    add("info", help="what a model is to svkc").add_argument("model", help="MJCF or URDF file")
-    view = add("view", help="table, curves and page of a run that was saved")
-    view.add_argument("file", type=pathlib.Path, help="an .npz of traj.save(path, chain)")
-    view.add_argument("--no-open", action="store_true", help="write the page and do not open it")
-    add("scenes", help="the scenes that ship")
-    return parser
+    leave_out = "kinds of elements of a model to leave out, or all"
+    add("--ignore", nargs="*", default=[], metavar="KIND", help=leave_out)
+    folder = pathlib.Path("out")
+    add("--out", type=pathlib.Path, default=folder, help="folder for results (default: out)")
+    add("--mp4", action="store_true", help="an mp4 too (needs the extra svkc[video])")
+    add("--quiet", action="store_true", help="no progress")
 
 
 def main(argv=None) -> int:
@@ -96,12 +93,12 @@ def main(argv=None) -> int:
     if options.command == "run":
         return run.run(
             options.what,
-            options.t1,
-            options.events,
-            tuple(options.ignore),
-            options.out,
-            options.mp4,
-            options.quiet,
+            t1=options.t1,
+            events=options.events,
+            ignore=tuple(options.ignore),
+            out=options.out,
+            video=options.mp4,
+            quiet=options.quiet,
         )
     if options.command == "info":
         return inspect.info(options.model)

@@ -2,6 +2,7 @@
 help is quick."""
 
 import gc
+import itertools
 import pathlib
 import time
 
@@ -68,16 +69,49 @@ def scenes() -> int:
 
 
 def run(
-    name: str, t1: float | None, events, ignore, out: pathlib.Path, video: bool, quiet: bool
+    name: str, *, t1: float | None, events, ignore, out: pathlib.Path, video: bool, quiet: bool
 ) -> int:
-    """One scene or model: the table of its phases, the run, the pictures. events: (kind, link,
-    time) besides the scene's own."""
-    import jax
-    from tqdm import tqdm
+    """Run one scene or model; print the table of its phases and write its pictures.
 
-    # the process is the command's own, so the setting is too
-    jax.config.update("jax_enable_x64", True)
+    events: (kind, link, time), instead of the scene's own.
+    """
+    kept = _configure_process()
     import svkc
+
+    times = [time.perf_counter()]
+    stages = _stages(quiet)
+    try:
+        chain, state, events, end = _wanted(name, t1, events, ignore)
+        out.mkdir(parents=True, exist_ok=True)
+        times.append(time.perf_counter())
+        _next(stages, "compiling, and the first run")
+        _simulated(chain, state, events, end, stages.disable)
+    except (ValueError, OSError) as error:
+        stages.close()
+        print(error)
+        return 1
+    times.append(time.perf_counter())
+    _next(stages, "a run")
+    traj = _simulated(chain, state, events, end, stages.disable)
+    times.append(time.perf_counter())
+    _next(stages, "pictures")
+    options = {**TOLERANCES, "t1": end, "what": name}
+    written, missing = _write(chain, traj, out, pathlib.Path(name).stem, video, options)
+    _next(stages, "done")
+    stages.close()
+    print_phases(chain, traj)
+    _print_times(times, kept)
+    _print_files(written, missing)
+    # what ended early is kept and said, and the shell is told
+    return 0 if traj.result in (svkc.RESULTS.successful, svkc.RESULTS.stopped) else 1
+
+
+def _configure_process() -> pathlib.Path | None:
+    """Set up jax and the garbage collector of the command's own process; return the folder of
+    compiled programs."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
     from svkc._jax.compilation_cache import use_cache
 
     kept = use_cache()
@@ -85,47 +119,40 @@ def run(
     # again and again
     gc.freeze()
     gc.set_threshold(100_000, 20, 50)
-    begin = time.perf_counter()
-    stages = tqdm(
+    return kept
+
+
+def _stages(quiet: bool):
+    """Return the progress bar of the command's four stages."""
+    from tqdm import tqdm
+
+    return tqdm(
         total=4,
         desc="loading",
         bar_format="{l_bar}{bar:20}| {elapsed}",
         disable=True if quiet else None,
         leave=False,
     )
-    try:
-        chain, state, events, end = _wanted(name, t1, events, ignore)
-        out.mkdir(parents=True, exist_ok=True)
-        loaded = time.perf_counter()
-        _next(stages, "compiling, and the first run")
-        _simulated(chain, state, events, end, stages.disable)
-    except (ValueError, OSError) as error:
-        stages.close()
-        print(error)
-        return 1
-    compiled = time.perf_counter()
-    _next(stages, "a run")
-    traj = _simulated(chain, state, events, end, stages.disable)
-    done = time.perf_counter()
-    _next(stages, "pictures")
-    written, missing = _write(
-        chain, traj, out, pathlib.Path(name).stem, video, {**TOLERANCES, "t1": end, "what": name}
-    )
-    _next(stages, "done")
-    stages.close()
-    print_phases(chain, traj)
+
+
+def _print_times(times: list[float], kept: pathlib.Path | None):
+    """Print the seconds between the four times, and where compiled programs are kept."""
+    load, first, second = (b - a for a, b in itertools.pairwise(times))
     print(
-        f"load and close the loops {loaded - begin:.1f} s, first run with compilation"
-        f" {compiled - loaded:.1f} s, a run {done - compiled:.3f} s"
+        f"load and close the loops {load:.1f} s, first run with compilation"
+        f" {first:.1f} s, a run {second:.3f} s"
     )
-    print(f"compiled programs are kept in {kept}\n" * (kept is not None), end="")
+    if kept is not None:
+        print(f"compiled programs are kept in {kept}")
+
+
+def _print_files(written: list[pathlib.Path], missing: list[str]):
+    """Print what could not be drawn, what was written, and how to look at it."""
     print("\n".join(missing) + "\n" * bool(missing) + "wrote " + ", ".join(map(str, written)))
     print(
         f"look: open {written[-1]}"
         + f", or  svkc view {written[0]}" * (written[-1].suffix == ".html")
     )
-    # what ended early is kept and said, and the shell is told
-    return 0 if traj.result in (svkc.RESULTS.successful, svkc.RESULTS.stopped) else 1
 
 
 def _simulated(chain, state, events, end: float, quiet: bool):

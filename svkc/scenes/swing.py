@@ -6,6 +6,7 @@ import numpy as np
 from svkc.mjcf.load import load
 from svkc.model.chain import Chain, State
 from svkc.model.virtual_link import VirtualLink
+from svkc.scenes.figure import PALM, figure16
 from svkc.transitions.events import When, when
 from svkc.transitions.guards import touch
 
@@ -32,9 +33,7 @@ def parts():
     """The model, an `mujoco.MjSpec`, and its virtual links."""
     import mujoco
 
-    from svkc.scenes import FOLDER, PALM
-
-    spec = mujoco.MjSpec.from_file(str(FOLDER / "figure16.xml"))
+    spec = figure16()
     look = {"contype": 0, "conaffinity": 0, "rgba": [0.55, 0.4, 0.3, 1]}
     capsule, box = mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOX
     body = spec.worldbody.add_body(name="swing", pos=[0, 0, TOP])

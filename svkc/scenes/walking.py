@@ -6,7 +6,7 @@ import mujoco
 from svkc.mjcf.load import load
 from svkc.model.chain import Chain, State
 from svkc.model.virtual_link import VirtualLink
-from svkc.scenes import FOLDER
+from svkc.scenes.figure import figure16
 
 STRIDE, HIP = 0.33, 0.906  # m: from foot to foot where both stand; the hips above the ground
 HIPS = 0.085  # m: half the distance between the hips, and between the feet
@@ -22,7 +22,7 @@ def walking(**options) -> tuple[Chain, State]:
     make one row redundant), 16 with one, 22 with none. A weld also carries moments and friction:
     the ground of this scene is one that feet do not slide or tilt on. `options` go to `svkc.load`.
     """
-    spec = mujoco.MjSpec.from_file(str(FOLDER / "figure16.xml"))
+    spec = figure16()
     floor = {"pos": [1.55, 0, -0.02], "size": [2.35, 0.6, 0.02], "rgba": [0.75, 0.75, 0.78, 1]}
     spec.worldbody.add_geom(
         name="floor", type=mujoco.mjtGeom.mjGEOM_BOX, contype=0, conaffinity=0, **floor

@@ -4,7 +4,7 @@ fastest that holds an error."""
 import dataclasses
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import diffrax
@@ -151,17 +151,17 @@ def tune(
     dtype, span = state.q.dtype, float(t1) - float(call.get("t0", 0.0))
     tight = float(max(target * 1e-3, 50 * np.finfo(dtype).eps))
     call = {"ts": jnp.linspace(call.get("t0", 0.0), t1, 11, dtype=dtype), **call, "throw": False}
-    reference = simulate(
-        chain, state, t1, **call, solver=diffrax.Dopri8(), rtol=tight, atol=tight / 100
-    )
+    run = lambda **options: simulate(chain, state, t1, **call, **options)
+    reference = run(solver=diffrax.Dopri8(), rtol=tight, atol=tight / 100)
     if reference.result != RESULTS.successful:
         raise ValueError(
             f"target: {target} cannot be judged, a run at rtol {tight:.1e} ends with:"
             f" {RESULTS[reference.result]}"
         )
+    error = lambda traj: error_between(chain, traj, reference)
     tried, best = [], np.inf
     for candidate in candidates(dtype, span) if options is None else options:
-        tried.append(_tried(chain, state, t1, candidate, call, reference, repeats, 10 * best))
+        tried.append(_measure(run, candidate, error=error, repeats=repeats, limit=10 * best))
         if tried[-1].error <= target:
             best = min(best, tried[-1].seconds)
         if show:
@@ -177,21 +177,16 @@ def tune(
     return found
 
 
-def _tried(
-    chain: Chain,
-    state: State,
-    t1,
-    candidate: Candidate,
-    call,
-    reference: Trajectory,
-    repeats: int,
-    limit: float,
+def _measure(
+    run: Callable, candidate: Candidate, *, error: Callable, repeats: int, limit: float
 ) -> Candidate:
-    run = lambda: jax.block_until_ready(simulate(chain, state, t1, **call, **candidate.options))
-    traj, seconds = run(), np.inf
+    """Return a candidate with what it costs and gives. limit (s): what takes longer is not
+    repeated."""
+    once = lambda: jax.block_until_ready(run(**candidate.options))
+    traj, seconds = once(), np.inf
     for _ in range(repeats):
         begun = time.perf_counter()
-        run()
+        once()
         seconds = min(seconds, time.perf_counter() - begun)
         if seconds > limit:
             break
@@ -200,7 +195,7 @@ def _tried(
     return dataclasses.replace(
         candidate,
         seconds=seconds,
-        error=error_between(chain, traj, reference) if good else np.inf,
+        error=error(traj) if good else np.inf,
         gap=float(jnp.maximum(report.gap, report.angular_gap)),
         energy_drift=float(report.energy_drift),
         steps=int(report.accepted + report.rejected),

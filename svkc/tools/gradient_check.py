@@ -190,7 +190,7 @@ def _differences(value, free, direction, step):
 
 
 def _compare(derivative, difference, doubt, modes: float, output: str, input: str) -> Check:
-    """The worst entry of one leaf."""
+    """Return the worst entry of one leaf."""
     size = max(
         np.abs(x[np.isfinite(x)]).max(initial=0) for x in map(np.asarray, (derivative, difference))
     )
@@ -200,16 +200,16 @@ def _compare(derivative, difference, doubt, modes: float, output: str, input: st
     off = np.where(np.isfinite(off), off, np.inf).ravel()
     modes = modes if np.isfinite(modes) else np.inf
     if not off.size:
-        return Check(0.0, output, input, 0.0, 0.0, 0.0, modes)
+        nothing = {"derivative": 0.0, "difference": 0.0, "uncertainty": 0.0}
+        return Check(error=0.0, output=output, input=input, **nothing, modes=modes)
     at = int(np.argmax(off))
-    entry = f"{output}[{at}]" if off.size > 1 else output
     pick = lambda x: float(np.ravel(x)[at])
     return Check(
-        float(off[at] / size),
-        entry,
-        input,
-        pick(derivative),
-        pick(difference),
-        pick(doubt) / float(size),
-        modes,
+        error=float(off[at] / size),
+        output=f"{output}[{at}]" if off.size > 1 else output,
+        input=input,
+        derivative=pick(derivative),
+        difference=pick(difference),
+        uncertainty=pick(doubt) / float(size),
+        modes=modes,
     )

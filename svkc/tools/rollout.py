@@ -56,67 +56,63 @@ def rollout(
     lanes = _count(states, data, cost)
     one("t1", t1)
     function("lane", lane)
+    devices, chunk = _checked_devices(devices, chunk, lanes)
+    size = chunk * len(devices)
+    order = np.arange(lanes) if cost is None else np.argsort(np.asarray(cost), kind="stable")
+    chunks = _chunks(order, size)
+    run = _program(chain, jnp.asarray(t1, states.q.dtype), lane, options, devices)
+    inputs = (chain, states, t1, data, order, options)
+    folder = None if out is None else _folder(pathlib.Path(out), inputs, size)
+    mine = range(jax.process_index(), len(chunks), jax.process_count())
+    done, begun = {}, time.perf_counter()
+    for count, i in enumerate(mine, 1):
+        own = jax.tree.map(lambda x, i=i: x[chunks[i]], (states, data))
+        done[i] = _chunk(run, own, folder and folder / f"chunk_{i:05d}.npz", chain, chunk)
+        if progress:
+            _say(count, len(mine), lanes, time.perf_counter() - begun)
+    back = np.argsort(order)
+    return jax.tree.map(lambda *x: np.concatenate(x)[back], *_gathered(done, len(chunks)))
+
+
+def _checked_devices(devices, chunk: int | None, lanes: int) -> tuple[list[jax.Device], int]:
+    """Return the devices and how many lanes each takes at once. ValueError: no device or no count
+    of lanes."""
     if chunk is not None:
         chunk = whole("chunk", chunk, 1)
-    devices = (
-        jax.local_devices()
-        if devices is None
-        else list(devices)
-        if np.iterable(devices)
-        else [devices]
-    )
+    if devices is None:
+        devices = jax.local_devices()
+    devices = list(devices) if np.iterable(devices) else [devices]
     if not devices or not all(isinstance(device, jax.Device) for device in devices):
         raise ValueError(f"devices: expected some of jax.local_devices(), got {devices!r}")
     most = max(1, lanes // (len(devices) * jax.process_count()))
-    chunk = min(chunk or (64 if devices[0].platform == "cpu" else 4096), most)
-    size = chunk * len(devices)
-    order = np.arange(lanes) if cost is None else np.argsort(np.asarray(cost), kind="stable")
-    # a chunk that lacks lanes is filled up with its last one
-    chunks = [
-        np.pad(order[i : i + size], (0, max(0, i + size - lanes)), mode="edge")
-        for i in range(0, lanes, size)
-    ]
+    default = 64 if devices[0].platform == "cpu" else 4096
+    return devices, min(chunk or default, most)
+
+
+def _chunks(order: np.ndarray, size: int) -> np.ndarray:
+    """Return the lanes of each chunk, [chunks size]; the last one is filled up with its last lane.
+    ValueError: fewer chunks than processes."""
+    chunks = np.pad(order, (0, -len(order) % size), mode="edge").reshape(-1, size)
     if len(chunks) < jax.process_count():
         raise ValueError(
-            f"states: {lanes} lanes are {len(chunks)} chunks, too few for {jax.process_count()}"
-            " processes; start fewer, or give fewer devices"
+            f"states: {len(order)} lanes are {len(chunks)} chunks, too few for"
+            f" {jax.process_count()} processes; start fewer, or give fewer devices"
         )
-    common, mesh = (
-        {"throw": False, "adjoint": Replay(every=1 << 30), **options},
-        Mesh(np.array(devices), ("lanes",)),
-    )
-    watched = {
-        name: options.get(name, default) for name, default in (("control", None), ("events", ()))
-    }
+    return chunks
 
-    def run(given):
-        piece = lambda lane, **own: _piece(
-            (chain, jnp.asarray(t1, states.q.dtype), common | own, lane), given, mesh
-        )
-        return shared(piece, lane=lane, **watched)
 
-    folder = (
-        None
-        if out is None
-        else _folder(pathlib.Path(out), (chain, states, t1, data, order, options), size)
-    )
-    mine = range(jax.process_index(), len(chunks), jax.process_count())
-    done, begun = {}, time.perf_counter()
-    for count, i in enumerate(mine):
-        done[i] = _chunk(
-            run,
-            jax.tree.map(lambda x, i=i: x[chunks[i]], (states, data)),
-            folder and folder / f"chunk_{i:05d}.npz",
-            chain,
-            chunk,
-        )
-        if progress:
-            _say(count + 1, len(mine), lanes, time.perf_counter() - begun)
-    found = _gathered(done, len(chunks))
-    back = np.argsort(
-        np.concatenate([c[: lanes - n * size] for n, c in enumerate(chunks)]), kind="stable"
-    )
-    return jax.tree.map(lambda *x: np.concatenate(x)[back], *found)
+def _program(chain: Chain, t1, lane: Callable | None, options: dict, devices) -> Callable:
+    """Return the function that runs a chunk, (states, data) of its lanes, on the devices. Equal
+    functions share a compiled program."""
+    common = {"throw": False, "adjoint": Replay(every=1 << 30), **options}
+    mesh = Mesh(np.array(devices), ("lanes",))
+    functions = {"control": options.get("control"), "events": options.get("events", ())}
+
+    def run(lanes):
+        piece = lambda lane, **own: _piece((chain, t1, common | own, lane), lanes, mesh)
+        return shared(piece, lane=lane, **functions)
+
+    return run
 
 
 def _count(states, data, cost) -> int:
@@ -198,8 +194,8 @@ def _chunk(run: Callable, lanes, path: pathlib.Path | None, chain: Chain, chunk:
         if "RESOURCE_EXHAUSTED" not in str(error):
             raise
         raise RuntimeError(
-            f"chunk: {chunk} lanes at once on one device (chunk={chunk}) need more memory than"
-            " there is; give a smaller chunk=, or fewer times ts="
+            f"chunk={chunk} lanes at once on one device need more memory than there is; give a"
+            " smaller chunk=, or fewer times ts="
         ) from error
     if path is not None:
         traj.save(path, chain)

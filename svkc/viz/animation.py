@@ -15,16 +15,18 @@ GL_PACKAGES = "libegl1 libgl1"
 FLASH = 0.3  # s: for how long the links that an event changed are drawn large
 
 
-def _gl_context():
-    """A class of offscreen GL context whose library is on this machine; RuntimeError naming the
-    packages otherwise."""
+def _use_offscreen_context():
+    """Give MuJoCo's renderer an offscreen GL context whose library is on this machine;
+    RuntimeError naming the packages otherwise."""
     import importlib
 
     for module in ("mujoco.egl", "mujoco.osmesa"):
         try:
-            return importlib.import_module(module).GLContext
+            context = importlib.import_module(module).GLContext
         except (ImportError, AttributeError, RuntimeError, OSError, TypeError):
             continue
+        importlib.import_module("mujoco.rendering.classic.gl_context").GLContext = context
+        return
     raise RuntimeError(
         f"no library to draw with: install the packages {GL_PACKAGES} (apt-get install"
         f" --no-install-recommends {GL_PACKAGES})"
@@ -62,23 +64,11 @@ def mp4(path: pathlib.Path, images: Iterator, fps: float):
         writer.close()
 
 
-def frames(
-    chain: Chain,
-    traj: Trajectory,
-    *,
-    fps: float,
-    size,
-    trails,
-    camera,
-    lookat,
-    distance,
-    azimuth,
-    elevation,
-) -> Iterator:
-    """PIL images `1/fps` s apart, the nearest saved state to each: links that hold as spheres,
-    paths of the bodies in `trails`, a strip below.
+def frames(chain: Chain, traj: Trajectory, *, fps: float, size, trails, **view) -> Iterator:
+    """Yield PIL images `1/fps` s apart, the nearest saved state to each: links that hold as
+    spheres, paths of the bodies in `trails`, a strip below.
 
-    ValueError: no such body or camera. RuntimeError: no GL library.
+    view: arguments of `_camera`. ValueError: no such body or camera. RuntimeError: no GL library.
     """
     import mujoco
     from PIL import Image
@@ -87,50 +77,49 @@ def frames(
     unknown = [name for name in trails if name not in chain.body_names]
     if unknown:
         raise ValueError(f"trails: no body {unknown[0]!r}; bodies: {', '.join(chain.body_names)}")
-    model.vis.quality.shadowsize = model.vis.quality.offsamples = 0
-    model.vis.global_.offwidth, model.vis.global_.offheight = np.maximum(
-        size, (model.vis.global_.offwidth, model.vis.global_.offheight)
-    )
+    _set_buffer(model, size)
     data = mujoco.MjData(model)
     ts, (positions, R) = np.asarray(traj.ts), world_poses(chain, traj.states)
     holding, events = held(chain, traj.states, positions, R), happened(traj, chain)
-    eye = _camera(model, positions, camera, lookat, distance, azimuth, elevation)
-    shapes = [matrix(quat) for quat in model.geom_quat]
-    context = _gl_context()
-    import mujoco.rendering.classic.gl_context as gl
-
-    gl.GLContext = context
+    eye = _camera(model, positions, **view)
+    _use_offscreen_context()
     mujoco.mj_forward(model, data)
     with mujoco.Renderer(model, height=size[1], width=size[0]) as renderer:
         for t in np.arange(ts[0], ts[-1] + 0.5 / fps, 1 / fps):
             i = int(np.argmin(np.abs(ts - t)))
-            # bodies where svkc has them: the tree may be another one where joints can be cut
-            for g, body in enumerate(model.geom_bodyid):
-                data.geom_xpos[g] = positions[i, body] + R[i, body] @ model.geom_pos[g]
-                data.geom_xmat[g] = (R[i, body] @ shapes[g]).ravel()
-            for c, body in enumerate(model.cam_bodyid):
-                data.cam_xpos[c] = positions[i, body] + R[i, body] @ model.cam_pos[c]
-                data.cam_xmat[c] = (R[i, body] @ matrix(model.cam_quat[c])).ravel()
+            _place_bodies(model, data, positions[i], R[i])
             renderer.update_scene(data, eye)
-            _draw_links(
-                renderer.scene, holding[i], any(0 <= t - when < FLASH for when, _ in events)
-            )
+            recent = any(0 <= t - when < FLASH for when, _ in events)
+            _draw_links(renderer.scene, holding[i], large=recent)
             for k, name in enumerate(trails):
-                _draw_trail(
-                    renderer.scene, positions[: i + 1, chain.body_names.index(name)], color(k)
-                )
-            yield _captioned(
-                Image.fromarray(renderer.render()),
-                ts[i],
-                ts[0],
-                ts[-1],
-                [chain.link_names[k] for k in holding[i]],
-                events,
-            )
+                path = positions[: i + 1, chain.body_names.index(name)]
+                _draw_trail(renderer.scene, path, color(k))
+            image = Image.fromarray(renderer.render())
+            links = [chain.link_names[k] for k in holding[i]]
+            yield _captioned(image, ts[i], ts[0], ts[-1], links, events)
 
 
-def _camera(model, positions, camera, lookat, distance, azimuth, elevation):
-    """The model's camera of that name, or one that sees all places where bodies are."""
+def _set_buffer(model, size):
+    """Make the offscreen buffer at least `size` (width, height), without shadows' and samples'
+    cost."""
+    model.vis.quality.shadowsize = model.vis.quality.offsamples = 0
+    buffer = model.vis.global_
+    buffer.offwidth, buffer.offheight = np.maximum(size, (buffer.offwidth, buffer.offheight))
+
+
+def _place_bodies(model, data, positions: np.ndarray, R: np.ndarray):
+    """Write the places of geoms and cameras, from those of the bodies in svkc: MuJoCo's tree may be
+    another one where joints can be cut."""
+    geoms = model.geom_bodyid, model.geom_pos, model.geom_quat, data.geom_xpos, data.geom_xmat
+    cameras = model.cam_bodyid, model.cam_pos, model.cam_quat, data.cam_xpos, data.cam_xmat
+    for bodies, pos, quat, xpos, xmat in (geoms, cameras):
+        for k, body in enumerate(bodies):
+            xpos[k] = positions[body] + R[body] @ pos[k]
+            xmat[k] = (R[body] @ matrix(quat[k])).ravel()
+
+
+def _camera(model, positions, *, camera, lookat, distance, azimuth, elevation):
+    """Return the model's camera of that name, or one that sees all places where bodies are."""
     import mujoco
 
     if camera is not None:
@@ -144,7 +133,7 @@ def _camera(model, positions, camera, lookat, distance, azimuth, elevation):
     low, high = moving.min(0), moving.max(0)
     eye = mujoco.MjvCamera()
     eye.lookat[:] = (low + high) / 2 if lookat is None else lookat
-    eye.distance = 1.0 * float(np.linalg.norm(high - low)) + 1 if distance is None else distance
+    eye.distance = float(np.linalg.norm(high - low)) + 1 if distance is None else distance
     eye.azimuth, eye.elevation = azimuth, elevation
     return eye
 

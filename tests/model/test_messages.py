@@ -204,7 +204,7 @@ CASES = {
     "check_grad: f(x) has": lambda s: svkc.check_grad(lambda x: 1, jnp.asarray(1.0)),
     "check_grad: f(x)...": lambda s: svkc.check_grad(lambda x: jnp.log(x), jnp.asarray(-1.0)),
     "check_grad: x has": lambda s: svkc.check_grad(lambda x: x, jnp.asarray(1)),
-    "chunk: ... lanes": too_large,
+    "chunk=... lanes": too_large,
     "connect: the bodies": away,
     "connected: expected": lambda s: s.four.state(connected=np.ones(3)),
     "cost: got": lambda s: svkc.rollout(

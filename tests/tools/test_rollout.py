@@ -146,7 +146,7 @@ def test_out_of_memory_names_the_chunk(case, monkeypatch):
     fails("RESOURCE_EXHAUSTED: Out of memory allocating 1099511627776 bytes.")
     for given, used in (({"chunk": 4}, 4), ({}, 64)):
         with pytest.raises(
-            RuntimeError, match=rf"\(chunk={used}\) .* give a smaller chunk="
+            RuntimeError, match=rf"^chunk={used} lanes .* give a smaller chunk="
         ) as seen:
             call(chain, *many, devices=jax.local_devices()[:1], **given)
         assert "RESOURCE_EXHAUSTED" in str(seen.value.__cause__)

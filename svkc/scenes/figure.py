@@ -1,0 +1,62 @@
+"""What several scenes share: the 16-joint figure, bars, and how the figure hangs from a bar."""
+
+import pathlib
+
+import numpy as np
+
+from svkc.model.virtual_link import VirtualLink
+
+FOLDER = pathlib.Path(__file__).parent
+BAR_HEIGHT = 2.6  # m: bars above the ground
+SHOULDER = 0.5155  # m: the shoulders above the hips
+ARM = 0.2817 + 0.2689  # m: from the shoulder to the wrist
+PALM = 0.0681  # m: from the wrist to the palm's centre
+
+
+def figure16():
+    """Return the model of the 16-joint figure, a `mujoco.MjSpec`."""
+    import mujoco
+
+    return mujoco.MjSpec.from_file(str(FOLDER / "figure16.xml"))
+
+
+def add_rod(spec, start, end, radius: float, name: str = ""):
+    """Add a steel rod between two points (m) of the ground; nothing collides with it."""
+    import mujoco
+
+    spec.worldbody.add_geom(
+        name=name,
+        type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+        fromto=[*start, *end],
+        size=[radius, 0, 0],
+        contype=0,
+        conaffinity=0,
+        rgba=[0.6, 0.6, 0.65, 1],
+    )
+
+
+def hand_on_bar(name: str, side: str, *, x: float, y: float, connected: bool) -> VirtualLink:
+    """Return a virtual link that holds a palm at a bar along y: a hinge about the bar."""
+    return VirtualLink(
+        name,
+        "world",
+        f"{side}_hand",
+        joint="hinge",
+        axis=(0, 1, 0),
+        pos=(x, y, BAR_HEIGHT),
+        real_pos=(0, 0, -PALM),
+        real_quat=(1, 0, 0, 0),
+        connected=connected,
+    )
+
+
+def hanging(arm: float, angle: float) -> list[float]:
+    """Return the base's pose, (x, y, z) in m and a quaternion, of the figure that hangs from the
+    bar above the origin.
+
+    arm: how far the shoulders are below the wrists (m). angle: of the whole figure about the bar,
+    backwards (rad).
+    """
+    below = arm + PALM + SHOULDER
+    turn = [np.cos(angle / 2), 0, np.sin(angle / 2), 0]
+    return [-below * np.sin(angle), 0, BAR_HEIGHT - below * np.cos(angle), *turn]

@@ -1,0 +1,46 @@
+"""The high bar of the paper's Fig. 20."""
+
+import numpy as np
+
+from svkc.mjcf.load import load
+from svkc.model.chain import Chain, State
+from svkc.scenes.figure import ARM, BAR_HEIGHT, add_rod, figure16, hand_on_bar, hanging
+
+GRIP = 0.30  # m: half the distance between the hands
+
+
+def high_bar(**options) -> tuple[Chain, State]:
+    """The high bar of the paper's Fig. 20: the 16-joint figure, a hinge about the bar at each hand,
+    and a swing to start with.
+
+    24 joint freedoms with both hands on the bar, 23 with one, 22 in flight. `options` go to
+    `svkc.load`.
+    """
+    spec = figure16()
+    add_rod(spec, (0, -1.2, BAR_HEIGHT), (0, 1.2, BAR_HEIGHT), radius=0.014, name="bar")
+    for y in (-1.2, 1.2):
+        add_rod(spec, (0, y, 0), (0, y, BAR_HEIGHT), radius=0.03)
+    hands = [
+        hand_on_bar(f"{side}_hand_grip", side, x=0, y=y, connected=True)
+        for side, y in (("right", -GRIP), ("left", GRIP))
+    ]
+    chain = load(spec, virtual_links=hands, **options)
+    return chain, swinging(chain, angle=1.7)
+
+
+def swinging(chain: Chain, angle: float) -> State:
+    """Hanging from the bar by both hands, the whole figure turned by `angle` (rad) about the bar,
+    at rest."""
+    spread = np.arcsin((GRIP - 0.18) / ARM)
+    q = {"base": hanging(ARM * np.cos(spread), angle)}
+    for side in ("right", "left"):
+        q |= {
+            f"{side}_shoulder_flexion": np.pi - 0.1,
+            f"{side}_shoulder_abduction": spread,
+            f"{side}_wrist": -spread,
+            f"{side}_elbow": 0.1,
+            f"{side}_knee": 0.1,
+            f"{side}_hip_flexion": 0.1,
+            f"{side}_ankle": -0.5,
+        }
+    return chain.state(q)
