@@ -177,8 +177,8 @@ def _step(chain: Chain, state: State, tau: Float[Array, " dofs"], dt: Float[Arra
         state.q,
         state.v,
         tau,
-        ArticulatedBodies(),
-        0.5 / dt if chain.link_names else None,
+        dynamics=ArticulatedBodies(),
+        baumgarte=0.5 / dt if chain.link_names else None,
     )
     v = v + dt * vdot
     return State(

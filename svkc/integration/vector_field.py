@@ -56,7 +56,15 @@ class Field(eqx.Module):
             v, vdot = moving_in_lanes(chain, structure, y.q, y.v, tau, rate)
         else:
             v, vdot = moving(
-                chain, structure, y.q, y.v, tau, self.dynamics, rate, agree, scene.pivots
+                chain,
+                structure,
+                y.q,
+                y.v,
+                tau,
+                dynamics=self.dynamics,
+                baumgarte=rate,
+                agree=agree,
+                pivots=scene.pivots,
             )
         return Motion(
             rates(chain, y.q, jnp.where(active_dofs(chain, structure), v, 0)), vdot, power
@@ -124,7 +132,12 @@ def settle(field: Field, scene: Scene, y: Motion) -> tuple[Motion, Seen | None]:
         return eqx.tree_at(lambda y: y.q, y, normalize(chain, y.q)), None
     if field.pivotless:
         q, v, *seen = settle_by_bodies(
-            chain, structure, y.q, y.v, held.iterations, field.differentiated
+            chain,
+            structure,
+            y.q,
+            y.v,
+            iterations=held.iterations,
+            differentiated=field.differentiated,
         )
     else:
         q, v, *seen = settle_loops(
@@ -132,9 +145,9 @@ def settle(field: Field, scene: Scene, y: Motion) -> tuple[Motion, Seen | None]:
             structure,
             y.q,
             y.v,
-            held.iterations,
-            isinstance(held, CoordinatePartitioning),
-            scene.pivots,
-            field.dynamics.hold or 0.0,
+            iterations=held.iterations,
+            dependent=isinstance(held, CoordinatePartitioning),
+            pivots=scene.pivots,
+            hold=field.dynamics.hold or 0.0,
         )
     return eqx.tree_at(lambda y: (y.q, y.v), y, (q, v)), Seen(*seen)

@@ -154,14 +154,14 @@ def loop_jacobian(
 def loop_bias(
     chain: Chain,
     structure: Structure,
-    kin: Kinematics,
     end: Ends,
+    v: Float[Array, " dofs"],
+    *,
     V: Float[Array, "rows 6"],
     A: Float[Array, "rows 6"],
-    v: Float[Array, " dofs"],
 ) -> Float[Array, " loop_rows"]:
-    """Jdot_C v (paper (21)): the difference of the two ends' velocity-product accelerations; A: the
-    tree's, with vdot = 0."""
+    """Jdot_C v (paper (21)): the difference of the two ends' velocity-product accelerations. V,
+    A: twists and, with vdot = 0, accelerations of the tree."""
     top = chain.topology
     rate = jnp.where(structure.connected[:, None] & structure.freedoms, take(v, top.links.dof), 0)
     parts = _virtual_axes(chain, structure, end) * rate[:, :, None]
@@ -228,9 +228,9 @@ def loop_rates(
 ) -> Float[Array, " rows"]:
     """Return Jdot_C v without units. baumgarte: rate (1/s) at which gaps are pulled back."""
     row, column = scales(chain)
-    kin, moving = loops.kin, jnp.where(active_dofs(chain, structure), v, 0)
-    A = bias_accelerations(chain, kin, V, v)
-    bias = row * loop_bias(chain, structure, kin, loops.frames, V, A, moving)
+    moving = jnp.where(active_dofs(chain, structure), v, 0)
+    A = bias_accelerations(chain, loops.kin, V, v)
+    bias = row * loop_bias(chain, structure, loops.frames, moving, V=V, A=A)
     if baumgarte is not None:
         gaps = gap(structure, loops.frames).ravel()
         bias = bias + 2 * baumgarte * (loops.J @ (moving / column)) + baumgarte**2 * row * gaps

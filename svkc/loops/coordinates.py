@@ -78,7 +78,13 @@ def constrain(
     W = jnp.where(independent[None], jnp.eye(len(column), dtype=J.dtype) - from_pivots[:, :-1], 0)
     W = column[:, None] * W / column[None]
     return Coordinates(
-        W, -column * from_pivots[:, -1], independent, dependent, chain.actuated, selection, J
+        W=W,
+        bias=-column * from_pivots[:, -1],
+        independent=independent,
+        dependent=dependent,
+        actuated=chain.actuated,
+        selection=selection,
+        J=J,
     )
 
 
@@ -93,20 +99,19 @@ def constrained(
 def open_coordinates(chain: Chain, structure: Structure) -> Coordinates:
     """The coordinates of a chain without virtual links: every joint that is not locked is
     independent."""
-    n, none, dtype = chain.dofs, jnp.zeros(0, bool), chain.q_load.dtype
+    n, dtype = chain.dofs, chain.q_load.dtype
     free = jnp.ones(n, bool) if structure.locked is None else ~structure.locked
-    selection = Selection(
-        jnp.zeros((0, 0), dtype), jnp.zeros((0, n), dtype), jnp.zeros(0, dtype), none
-    )
-    W = jnp.diag(jnp.where(free, 1, 0).astype(dtype))
+    none = jnp.zeros((0, n), dtype)
     return Coordinates(
-        W,
-        jnp.zeros(n, dtype),
-        free,
-        jnp.zeros(n, bool),
-        chain.actuated,
-        selection,
-        jnp.zeros((0, n), dtype),
+        W=jnp.diag(jnp.where(free, 1, 0).astype(dtype)),
+        bias=jnp.zeros(n, dtype),
+        independent=free,
+        dependent=jnp.zeros(n, bool),
+        actuated=chain.actuated,
+        selection=Selection(
+            Q=jnp.zeros((0, 0), dtype), P=none, size=none[:, 0], used=jnp.zeros(0, bool)
+        ),
+        J=none,
     )
 
 

@@ -38,6 +38,7 @@ def moving(
     q,
     v,
     tau: Float[Array, " dofs"],
+    *,
     dynamics: AbstractDynamics,
     baumgarte=None,
     agree: bool = False,
@@ -81,14 +82,15 @@ def moving_in_lanes(
     chain: Chain, structure: Structure, q, v, tau, baumgarte
 ) -> tuple[Float[Array, " dofs"], Float[Array, " dofs"]]:
     """`moving` by articulated bodies, without pivots, under a `vmap` that keeps its lanes last."""
-    return moving(chain, structure, q, v, tau, ArticulatedBodies(), baumgarte)
+    way = ArticulatedBodies()
+    return moving(chain, structure, q, v, tau, dynamics=way, baumgarte=baumgarte)
 
 
 def acceleration(
     chain: Chain, structure: Structure, q, v, tau: Float[Array, " dofs"], dynamics: AbstractDynamics
 ) -> Float[Array, " dofs"]:
     """The acceleration alone, for the velocity as it is."""
-    return moving(chain, structure, q, v, tau, dynamics)[1]
+    return moving(chain, structure, q, v, tau, dynamics=dynamics)[1]
 
 
 @verb

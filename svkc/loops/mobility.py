@@ -57,7 +57,15 @@ def mobility(chain: Chain, state: State) -> Mobility:
         zero = jnp.zeros((), jnp.int32)
         one, none = jnp.ones((), state.q.dtype), jnp.zeros(0, jnp.int32)
         return Mobility(
-            joint_freedoms, joint_freedoms, zero, none, active, one, none > 0, (), chain.dof_names
+            freedoms=joint_freedoms,
+            joint_freedoms=joint_freedoms,
+            rank=zero,
+            redundant=none,
+            independent=active,
+            margin=one,
+            connected=none > 0,
+            link_names=(),
+            dof_names=chain.dof_names,
         )
     J = loop_kinematics(chain, state.structure, state.q).J
     # of the first loop's rows, the first two loops', and so on
@@ -68,17 +76,15 @@ def mobility(chain: Chain, state: State) -> Mobility:
     )
     rows = jnp.where(state.structure.connected, 6, 0).astype(jnp.int32)
     redundant = rows - jnp.diff(ranks, prepend=jnp.zeros(1, jnp.int32))
-    co = coordinates(chain, state)
-    rank, margin = state.structure.rank, weakest(select(J, state.structure.rank))
-    on = state.structure.connected
+    rank = state.structure.rank
     return Mobility(
-        joint_freedoms - rank,
-        joint_freedoms,
-        rank,
-        redundant,
-        co.independent,
-        margin,
-        on,
-        chain.link_names,
-        chain.dof_names,
+        freedoms=joint_freedoms - rank,
+        joint_freedoms=joint_freedoms,
+        rank=rank,
+        redundant=redundant,
+        independent=coordinates(chain, state).independent,
+        margin=weakest(select(J, rank)),
+        connected=state.structure.connected,
+        link_names=chain.link_names,
+        dof_names=chain.dof_names,
     )

@@ -46,10 +46,10 @@ def held_part(dtype) -> float:
 
 def _kept(selection: Selection, keep: Bool[Array, " steps"]) -> Selection:
     return Selection(
-        jnp.where(keep[:, None], selection.Q, 0),
-        jnp.where(keep[:, None], selection.P, 0),
-        selection.size,
-        keep,
+        Q=jnp.where(keep[:, None], selection.Q, 0),
+        P=jnp.where(keep[:, None], selection.P, 0),
+        size=selection.size,
+        used=keep,
     )
 
 
@@ -104,7 +104,7 @@ def select(
     )
     _, Q, P, size = jax.lax.fori_loop(0, steps, step, start)
     Q, size = _following(J, Q, P, size)
-    return Selection(Q, P, size, jnp.any(P > 0, 1))
+    return Selection(Q=Q, P=P, size=size, used=jnp.any(P > 0, 1))
 
 
 def select_again(J: Float[Array, "rows dofs"], P: Float[Array, "steps dofs"]) -> Selection:
@@ -127,7 +127,7 @@ def select_again(J: Float[Array, "rows dofs"], P: Float[Array, "steps dofs"]) ->
     none = jnp.zeros((used.shape[0], J.shape[0]), J.dtype), jnp.zeros(used.shape[0], J.dtype)
     Q, size = jax.lax.fori_loop(0, used.shape[0], step, none)
     Q, size = _following(J, Q, P, size)
-    return Selection(Q, P, size, used & (size > 0))
+    return Selection(Q=Q, P=P, size=size, used=used & (size > 0))
 
 
 def _following_jvp(primals, tangents):
@@ -170,7 +170,7 @@ def select_with_rank(J: Float[Array, "rows dofs"]) -> tuple[Selection, Int[Array
     # later steps do not change earlier ones, and are round-off, which must not be differentiated
     first = _kept(full, full.used & (jnp.arange(full.used.shape[0], dtype=jnp.int32) < rank))
     Q, size = _following(J, first.Q, first.P, first.size)
-    return Selection(Q, first.P, size, first.used), rank
+    return Selection(Q=Q, P=first.P, size=size, used=first.used), rank
 
 
 def too_few(P: Float[Array, "steps dofs"], rank: Int[Array, ""]) -> Bool[Array, ""]:

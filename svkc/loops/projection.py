@@ -76,6 +76,7 @@ def settle_loops(
     structure: Structure,
     q,
     v,
+    *,
     iterations: int,
     dependent: bool = False,
     pivots=None,
@@ -95,50 +96,54 @@ def settle_loops(
     |R_11|, and the pivots to go on with. pivots: those held so far (None: none are), which go on
     until their |R_mm| / |R_11| is below `hold` times that of new ones.
     """
-    column = scales(chain)[1]
-    active = active_dofs(chain, structure)
 
     @functools.partial(jax.checkpoint, prevent_cse=False)
     def turn(i, both):
         q, v = both[:2]
-        loops = loop_kinematics(chain, structure, q)
-        J = loops.J
-        full = select(J, structure.rank, structure.independent)
-        selection, chosen = _solvable(structure, full), full.P
-        if pivots is not None:
-            # (asked of the last turn alone)
-            poor = lambda: (
-                (weakest(select_again(J, pivots)) < hold * weakest(full))
-                | too_few(pivots, structure.rank)
-            )
-            chosen = jax.lax.cond(
-                i == iterations, lambda: jnp.where(poor(), full.P, pivots), lambda: pivots
-            )
-        open_ = jnp.stack([loops.gap, J @ jnp.where(active, v / column, 0)], 1)
-        step = -(
-            dependent_change(chain, selection, J, open_)
-            if dependent
-            else inertia_change(chain, structure, loops, selection, open_)
-        )
         last = i == iterations
-        seen = jax.lax.stop_gradient((sizes(open_[:, 0]), weakest(full), chosen))
-        return (
-            integrate(chain, q, jnp.where(last, 0, step[:, 0])),
-            jnp.where(last, v + step[:, 1], v),
-            *seen,
-        )
+        loops = loop_kinematics(chain, structure, q)
+        full = select(loops.J, structure.rank, structure.independent)
+        held = full.P if pivots is None else _held(structure, loops.J, full, pivots, hold, last)
+        step, open_ = _turn_by_pivots(chain, structure, loops, v, full, dependent)
+        seen = jax.lax.stop_gradient((sizes(open_), weakest(full), held))
+        q = integrate(chain, q, jnp.where(last, 0, step[:, 0]))
+        return q, jnp.where(last, v + step[:, 1], v), *seen
 
+    links = len(chain.link_names)
     none = (
-        jnp.zeros((len(chain.link_names), 2), q.dtype),
+        jnp.zeros((links, 2), q.dtype),
         jnp.ones((), q.dtype),
-        jnp.zeros((min(6 * len(chain.link_names), chain.dofs), chain.dofs), q.dtype),
+        jnp.zeros((min(6 * links, chain.dofs), chain.dofs), q.dtype),
     )
     return jax.lax.fori_loop(0, iterations + 1, turn, (normalize(chain, q), v, *none))
 
 
+def _held(
+    structure: Structure, J, full: Selection, pivots, hold: float, last: Bool[Array, ""]
+) -> Float[Array, "steps dofs"]:
+    """Return the pivots or, where they are poor in the last turn, those of the new selection
+    `full`."""
+    poor = lambda: (
+        (weakest(select_again(J, pivots)) < hold * weakest(full)) | too_few(pivots, structure.rank)
+    )
+    return jax.lax.cond(last, lambda: jnp.where(poor(), full.P, pivots), lambda: pivots)
+
+
+def _turn_by_pivots(
+    chain: Chain, structure: Structure, loops: LoopKinematics, v, full: Selection, dependent: bool
+) -> tuple[Float[Array, "dofs 2"], Float[Array, " rows"]]:
+    """Return the changes of q, that close the loops, and of v, that keep them; and the gaps."""
+    moving = jnp.where(active_dofs(chain, structure), v / scales(chain)[1], 0)
+    gap, J, selection = loops.gap, loops.J, _solvable(structure, full)
+    open_ = jnp.stack([gap, J @ moving], 1)
+    if dependent:
+        return -dependent_change(chain, selection, J, open_), gap
+    return -inertia_change(chain, structure, loops, selection, open_), gap
+
+
 @functools.partial(jax.jit, static_argnames=("iterations", "differentiated"))
 def settle_by_bodies(
-    chain: Chain, structure: Structure, q, v, iterations: int, differentiated: bool = True
+    chain: Chain, structure: Structure, q, v, *, iterations: int, differentiated: bool = True
 ) -> tuple[Float[Array, " q"], Float[Array, " dofs"], Float[Array, "links 2"]]:
     """`settle_loops` in the metric of the inertia, by articulated bodies and the forces of the
     loops: no pivots are chosen. And the gaps (rad, `chain.length`s) that each loop is left with.

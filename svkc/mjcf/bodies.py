@@ -55,7 +55,7 @@ def joints_of(model, cut_bodies) -> list[Joint]:
         if body in cut_bodies:
             seen.add(body)
             kind, name, joint = FREE, f"{cut_bodies[body]}_free", -1
-        out.append(Joint(name, kind, body, joint, q, v))
+        out.append(Joint(name=name, kind=kind, body=body, joint=joint, q=q, v=v))
         q, v = q + Q_SIZE[kind], v + V_SIZE[kind]
     return out
 

@@ -12,9 +12,9 @@ import numpy as np
 
 from svkc.mjcf.bodies import bodies_of, by_dof, joint_forces_of, motors_of, name_of, rows_of
 from svkc.mjcf.convert import text_of
-from svkc.mjcf.cuttable_joints import cuts_of, placed_in
+from svkc.mjcf.cuttable_joints import Cut, cuts_of, placed_in
 from svkc.mjcf.unsupported import what_is_left_out
-from svkc.mjcf.virtual_links import equalities, floats, structure_of
+from svkc.mjcf.virtual_links import floats, links_of, structure_of
 from svkc.model.chain import Chain
 from svkc.model.topology import Topology
 from svkc.model.validation import texts, whole
@@ -56,37 +56,39 @@ def load(source, *, virtual_links=(), cuttable=(), spare=0, ignore=()) -> Chain:
     cuts = cuts_of(model, cuttable)
     ignore, spare = texts("ignore", ignore), whole("spare", spare, 0, 1000)
     left_out = what_is_left_out(model, ignore)
+    rows, topology = _tree_of(model, cuts)
+    links = links_of(model, declared, [cut.link for cut in cuts], spare)
+    topology = _with_links(topology, links, spare)
+    topology = placed_in(model, topology, cuts, first=len(links) - spare - len(cuts))
+    structure = structure_of(model, topology, links)
+    arguments = {"virtual_links": declared, "cuttable": cuttable, "spare": spare, "ignore": ignore}
+    # here and not where it is compared: a MjModel may be changed after the chain is made
+    digest = _digest(model, text, arguments)
+    kept = Source(model=model, text=text, arguments=arguments, digest=digest)
+    return _finite(_chain(kept, topology, rows, structure, set(ignore), left_out))
+
+
+def _tree_of(model, cuts: list[Cut]) -> tuple[list[tuple[int, int]], Topology]:
+    """Return `rows_of` the tree that is left when the cuts are made; ValueError where nothing can
+    move, or names of bodies or joints do not differ."""
     rows, topology = rows_of(model, {cut.body: cut.link.name for cut in cuts})
     if not topology.joint_names:
         raise ValueError("source: the model has no joints, so that nothing in it can move")
     _told_apart("bodies", topology.body_names)
-    _told_apart(
-        "joints",
-        [*topology.joint_names, *(name_of(model, "joint", j) for cut in cuts for j in cut.joints)],
-    )
-    links = [*equalities(model), *declared]
-    first = len(links)
-    for link in links:
-        if not isinstance(link, VirtualLink):
-            raise ValueError(f"virtual_links: expected svkc.VirtualLink objects, got {link!r}")
-    links += [cut.link for cut in cuts]
-    links += [VirtualLink(f"spare_{i}", "world", "world", "free") for i in range(spare)]
-    names = [link.name for link in links]
-    if len(set(names)) < len(names):
-        raise ValueError(f"virtual_links: names must differ, got {names}")
-    topology = dataclasses.replace(
+    cut_joints = [name_of(model, "joint", j) for cut in cuts for j in cut.joints]
+    _told_apart("joints", [*topology.joint_names, *cut_joints])
+    return rows, topology
+
+
+def _with_links(topology: Topology, links: list[VirtualLink], spare: int) -> Topology:
+    """Return the topology with these virtual links, the last of them spare."""
+    return dataclasses.replace(
         topology,
-        link_names=tuple(names),
+        link_names=tuple(link.name for link in links),
         link_freedoms=tuple(joint_freedoms(link.joint) for link in links),
         link_spare=tuple(i >= len(links) - spare for i in range(len(links))),
         link_actuated=tuple(bool(link.actuated) for link in links),
     )
-    topology = placed_in(model, topology, cuts, first)
-    structure = structure_of(model, topology, links)
-    arguments = {"virtual_links": declared, "cuttable": cuttable, "spare": spare, "ignore": ignore}
-    # here and not where it is compared: a MjModel may be changed after the chain is made
-    kept = Source(model, text, arguments, _digest(model, text, arguments))
-    return _finite(_chain(kept, topology, rows, structure, ignore, left_out))
 
 
 def _digest(model, text: str | None, arguments: dict[str, Any]) -> str:
@@ -206,54 +208,65 @@ def _load_pose(model, topology: Topology) -> np.ndarray:
     return q
 
 
-def _chain(source: Source, topology, rows, structure, ignore, left_out) -> Chain:
+def _gravity(model) -> np.ndarray:
+    """Return gravity (m/s^2), zero where the model turns it off."""
     import mujoco
 
-    model = source.model
-    ignored, bodies = set(ignore), bodies_of(model, topology, rows)
-    stiffness, limit, spring = joint_forces_of(model, ignored, topology)
-    damping = by_dof(topology, 0 * model.dof_damping if "damping" in ignored else model.dof_damping)
-    armature = by_dof(
-        topology, 0 * model.dof_armature if "armature" in ignored else model.dof_armature
-    )
-    gravity = (
-        np.zeros(3)
-        if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
-        else model.opt.gravity
-    )
-    gear, control, force = motors_of(model, ignored, topology)
-    offsets = np.linalg.norm(
-        np.concatenate([bodies["pos"][np.array(topology.parent) > 0], bodies["com"]]), axis=1
-    )
+    off = model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
+    return np.zeros(3) if off else model.opt.gravity
+
+
+def _length(bodies: dict[str, np.ndarray], topology: Topology) -> float:
+    """Return the root mean square offset (m) of joints and centres of mass, 1 where all are
+    zero."""
+    below_roots = bodies["pos"][np.array(topology.parent) > 0]
+    offsets = np.linalg.norm(np.concatenate([below_roots, bodies["com"]]), axis=1)
     offsets = offsets[offsets > 1e-12]
-    q_load = _load_pose(model, topology)
+    return np.sqrt(np.mean(offsets**2)) if len(offsets) else 1.0
+
+
+def _passive(model, ignored: set[str], topology: Topology, q_load) -> dict[str, Any]:
+    """Return the chain's fields on rotors, dampers, springs and ranges; None for those that act on
+    no joint."""
+    stiffness, limit, spring = joint_forces_of(model, ignored, topology)
+    damping, armature = (
+        by_dof(topology, 0 * values if name in ignored else values)
+        for name, values in (("damping", model.dof_damping), ("armature", model.dof_armature))
+    )
     q_spring = np.array(q_load)
     q_spring[np.array(topology.model_q, int)] = model.qpos_spring
-    nv = topology.nv
+    sprung, limited = stiffness.any(), np.isfinite(limit).any()
+    own, others = np.split(armature, [topology.nv])
+    return {
+        "armature": floats(own) if own.any() else None,
+        "link_armature": floats(others) if others.any() else None,
+        "damping": floats(damping) if damping.any() else None,
+        "stiffness": floats(stiffness) if sprung else None,
+        "q_spring": floats(q_spring) if sprung else None,
+        "limit": floats(limit) if limited else None,
+        "limit_spring": floats(spring) if limited else None,
+    }
 
-    def unless(empty, value):
-        return None if empty else floats(value)
 
+def _chain(source: Source, topology, rows, structure, ignored: set[str], left_out) -> Chain:
+    """Return the chain with the numbers of the model."""
+    model = source.model
+    bodies = bodies_of(model, topology, rows)
+    gear, control, force = motors_of(model, ignored, topology)
+    q_load = _load_pose(model, topology)
+    own = ("pos", "quat", "axis", "mass", "com", "inertia")
     return Chain(
         topology=topology,
-        **{
-            name: floats(bodies[name]) for name in ("pos", "quat", "axis", "mass", "com", "inertia")
-        },
-        gravity=floats(gravity),
+        **{name: floats(bodies[name]) for name in own},
+        gravity=floats(_gravity(model)),
         q_load=floats(q_load),
-        length=floats(np.sqrt(np.mean(offsets**2)) if len(offsets) else 1.0),
+        length=floats(_length(bodies, topology)),
         gear=floats(gear),
         control_range=floats(control),
         force_range=floats(force),
         structure=structure,
-        anchor=unless(not bodies["anchor"].any(), bodies["anchor"]),
-        armature=unless(not np.any(armature[:nv]), armature[:nv]),
-        link_armature=unless(not np.any(armature[nv:]), armature[nv:]),
-        damping=unless(not np.any(damping), damping),
-        stiffness=unless(not stiffness.any(), stiffness),
-        q_spring=unless(not stiffness.any(), q_spring),
-        limit=unless(not np.isfinite(limit).any(), limit),
-        limit_spring=unless(not np.isfinite(limit).any(), spring),
+        anchor=floats(bodies["anchor"]) if bodies["anchor"].any() else None,
+        **_passive(model, ignored, topology, q_load),
         model=source,
         left_out=left_out,
     )

@@ -21,97 +21,104 @@ def plain_motors(model) -> np.ndarray:
     return plain & (model.actuator_biastype == int(mujoco.mjtBias.mjBIAS_NONE))
 
 
-KINDS = frozenset(
+# in the order in which they are reported
+KINDS = (
     "tendon actuator equality friction contact gravcomp fluid polynomial plastic actuatorforce"
     " actuatorgravcomp actuatordamping balllimit flex mocap plugin".split()
 )
 
 
-def _findings(model) -> list[tuple[str, str]]:
-    """(kind, what was found) for everything that would change the motion and is not simulated."""
+def _any(model, *names: str) -> bool:
+    """Return whether one of these arrays of the model, as far as MuJoCo has them, is not zero."""
+    return any(np.any(getattr(model, name, 0)) for name in names)
+
+
+def _in_actuators(model) -> dict[str, tuple]:
+    """Look at tendons and actuators: kind -> (what was found, how to say it)."""
     import mujoco
 
-    def any_of(name) -> bool:
-        return bool(np.any(getattr(model, name, 0)))
+    tendon = [
+        n
+        for n in ("stiffness", "damping", "limited", "frictionloss", "armature")
+        if _any(model, f"tendon_{n}")
+    ]
+    pulled = np.any(model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_TENDON))
+    complex_motors = np.sum(~plain_motors(model))
+    return {
+        "tendon": (
+            tendon or pulled,
+            f"{model.ntendon} tendons with {', '.join(tendon) or 'actuators'}",
+        ),
+        "actuator": (
+            complex_motors,
+            f"{complex_motors} actuators that are not a torque on a joint (motor with gear)",
+        ),
+        "actuatordamping": (
+            _any(model, "actuator_damping", "actuator_armature"),
+            "damping or armature of actuators",
+        ),
+    }
+
+
+def _in_joints(model) -> dict[str, tuple]:
+    """Look at joints, as `_in_actuators` at actuators."""
+    import mujoco
+
+    ball = model.jnt_type == int(mujoco.mjtJoint.mjJNT_BALL)
+    balls = np.sum(ball & (model.jnt_limited != 0))
+    return {
+        "friction": (_any(model, "dof_frictionloss"), "joint friction loss"),
+        "polynomial": (
+            _any(model, "jnt_stiffnesspoly", "dof_dampingpoly"),
+            "polynomial stiffness or damping of joints",
+        ),
+        "plastic": (_any(model, "nplastic"), "plastic joint springs"),
+        "actuatorforce": (
+            model.nu and _any(model, "jnt_actfrclimited"),
+            "joint limits on actuator force",
+        ),
+        "actuatorgravcomp": (_any(model, "jnt_actgravcomp"), "gravity compensation by actuators"),
+        "balllimit": (balls, f"{balls} ball joints with a range"),
+    }
+
+
+def _in_bodies(model) -> dict[str, tuple]:
+    """Look at bodies, what is between them and what is around them, as `_in_actuators` at
+    actuators."""
+    import mujoco
 
     supported = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
     other = [
         mujoco.mjtEq(int(t)).name[5:].lower() for t in model.eq_type if int(t) not in supported
     ]
-    tendon = [
-        n
-        for n in ("stiffness", "damping", "limited", "frictionloss", "armature")
-        if any_of(f"tendon_{n}")
-    ]
-    pulled = [
-        i
-        for i in range(model.nu)
-        if int(model.actuator_trntype[i]) == int(mujoco.mjtTrn.mjTRN_TENDON)
-    ]
-    complex_motors = np.flatnonzero(~plain_motors(model))
-    fluid = model.opt.density != 0 or model.opt.viscosity != 0
-    balls = [
-        j
-        for j in range(model.njnt)
-        if model.jnt_limited[j] and int(model.jnt_type[j]) == int(mujoco.mjtJoint.mjJNT_BALL)
-    ]
-    checks = [
-        (
-            "tendon",
-            tendon or pulled,
-            f"{model.ntendon} tendons with {', '.join(tendon) or 'actuators'}",
-        ),
-        (
-            "actuator",
-            len(complex_motors),
-            f"{len(complex_motors)} actuators that are not a torque on a joint (motor with gear)",
-        ),
-        (
-            "equality",
+    density, viscosity, flexes = model.opt.density, model.opt.viscosity, getattr(model, "nflex", 0)
+    return {
+        "equality": (
             other,
             f"equality constraints: {', '.join(other)} (connect and weld are supported)",
         ),
-        ("friction", any_of("dof_frictionloss"), "joint friction loss"),
-        ("contact", model.npair, f"{model.npair} explicit contact pairs"),
-        ("gravcomp", any_of("body_gravcomp"), "gravity compensation"),
-        (
-            "fluid",
-            fluid,
-            f"fluid forces (density {model.opt.density:g}, viscosity {model.opt.viscosity:g})",
+        "contact": (model.npair, f"{model.npair} explicit contact pairs"),
+        "gravcomp": (_any(model, "body_gravcomp"), "gravity compensation"),
+        "fluid": (
+            density != 0 or viscosity != 0,
+            f"fluid forces (density {density:g}, viscosity {viscosity:g})",
         ),
-        (
-            "polynomial",
-            any_of("jnt_stiffnesspoly") or any_of("dof_dampingpoly"),
-            "polynomial stiffness or damping of joints",
-        ),
-        ("plastic", any_of("nplastic"), "plastic joint springs"),
-        (
-            "actuatorforce",
-            model.nu and any_of("jnt_actfrclimited"),
-            "joint limits on actuator force",
-        ),
-        ("actuatorgravcomp", any_of("jnt_actgravcomp"), "gravity compensation by actuators"),
-        (
-            "actuatordamping",
-            any_of("actuator_damping") or any_of("actuator_armature"),
-            "damping or armature of actuators",
-        ),
-        ("balllimit", balls, f"{len(balls)} ball joints with a range"),
-        (
-            "flex",
-            getattr(model, "nflex", 0),
-            f"{getattr(model, 'nflex', 0)} deformable (flex) bodies",
-        ),
-        ("mocap", model.nmocap, f"{model.nmocap} mocap bodies"),
-        ("plugin", model.nplugin, f"{model.nplugin} plugins"),
-    ]
-    return [(kind, text) for kind, found, text in checks if found]
+        "flex": (flexes, f"{flexes} deformable (flex) bodies"),
+        "mocap": (model.nmocap, f"{model.nmocap} mocap bodies"),
+        "plugin": (model.nplugin, f"{model.nplugin} plugins"),
+    }
+
+
+def _findings(model) -> list[tuple[str, str]]:
+    """(kind, what was found) for everything that would change the motion and is not simulated."""
+    seen = _in_actuators(model) | _in_joints(model) | _in_bodies(model)
+    return [(kind, seen[kind][1]) for kind in KINDS if seen[kind][0]]
 
 
 def what_is_left_out(model, ignore) -> tuple[str, ...]:
     """What the chain will lack, by name; ValueError listing every element that is neither simulated
     nor ignored."""
-    known = {"all", "limit", "spring", "damping", "armature", "collision"} | KINDS
+    known = {"all", "limit", "spring", "damping", "armature", "collision", *KINDS}
     unknown = [name for name in ignore if name not in known]
     if unknown:
         raise ValueError(f"ignore: got {unknown}, expected some of {', '.join(sorted(known))}")

@@ -48,15 +48,46 @@ def equalities(model) -> list[VirtualLink]:
     return links
 
 
-def _unit(quat):
+def links_of(model, declared, cuttable: list[VirtualLink], spare: int) -> list[VirtualLink]:
+    """Return the virtual links in the order of their slots: <equality>, declared, cuttable joints,
+    spare; ValueError for what is no link, and for names that do not differ."""
+    links = [*equalities(model), *declared]
+    for link in links:
+        if not isinstance(link, VirtualLink):
+            raise ValueError(f"virtual_links: expected svkc.VirtualLink objects, got {link!r}")
+    links += cuttable
+    links += [VirtualLink(f"spare_{i}", "world", "world", "free") for i in range(spare)]
+    names = [link.name for link in links]
+    if len(set(names)) < len(names):
+        raise ValueError(f"virtual_links: names must differ, got {names}")
+    return links
+
+
+def _unit(quat) -> tuple[float, ...]:
     return tuple(np.asarray(quat, float) / np.linalg.norm(quat))
+
+
+def _multiply(a, b) -> np.ndarray:
+    """Return the product of two quaternions."""
+    import mujoco
+
+    out = np.zeros(4)
+    mujoco.mju_mulQuat(out, np.asarray(a, float), np.asarray(b, float))
+    return out
+
+
+def _rotate(quat, x) -> np.ndarray:
+    """Return the vector x turned by a quaternion."""
+    import mujoco
+
+    out = np.zeros(3)
+    mujoco.mju_rotVecQuat(out, np.asarray(x, float), np.asarray(quat, float))
+    return out
 
 
 def _on_bodies(model, link: VirtualLink, ids: dict[str, int]) -> VirtualLink:
     """The link from body to body: an end that names a site is the site's body, its placement is in
     the site's frame, at the site where none is given."""
-    import mujoco
-
     sites = {name_of(model, "site", i): i for i in range(model.nsite)}
     for side, pos, quat in (("parent", "pos", "quat"), ("real", "real_pos", "real_quat")):
         name = getattr(link, side)
@@ -69,75 +100,63 @@ def _on_bodies(model, link: VirtualLink, ids: dict[str, int]) -> VirtualLink:
                 f" bodies: {', '.join(ids)}"
             )
         frame, body = model.site_quat[site], name_of(model, "body", int(model.site_bodyid[site]))
-        place, turn = np.zeros(3), np.zeros(4)
-        mujoco.mju_rotVecQuat(
-            place,
-            np.asarray((0, 0, 0) if getattr(link, pos) is None else getattr(link, pos), float),
-            frame,
-        )
+        place = _rotate(frame, (0, 0, 0) if getattr(link, pos) is None else getattr(link, pos))
         changed = {side: body, pos: tuple(model.site_pos[site] + place)}
         if getattr(link, quat) is not None:
-            mujoco.mju_mulQuat(turn, frame, np.asarray(getattr(link, quat), float))
-            changed[quat] = _unit(turn)
+            changed[quat] = _unit(_multiply(frame, getattr(link, quat)))
         link = dataclasses.replace(link, **changed)
     return link
 
 
+def _joint_frames(data, link: VirtualLink, parent: int, real: int) -> dict[str, np.ndarray]:
+    """Return the joint's frame in the two bodies, its axis turned to z; what the link does not say
+    is taken from the load pose."""
+    import mujoco
+
+    to_z = np.zeros(4)
+    mujoco.mju_quatZ2Vec(to_z, np.asarray(link.axis, float) / np.linalg.norm(link.axis))
+    quat = _unit(_multiply(_unit(link.quat), to_z))
+    back = data.xquat[real] * np.array([1, -1, -1, -1])
+    world = data.xpos[parent] + _rotate(data.xquat[parent], link.pos)
+    frames = {
+        "pos": link.pos,
+        "quat": quat,
+        "real_pos": _rotate(back, world - data.xpos[real])
+        if link.real_pos is None
+        else link.real_pos,
+        "real_quat": _unit(
+            _multiply(back, _multiply(data.xquat[parent], quat))
+            if link.real_quat is None
+            else _multiply(_unit(link.real_quat), to_z)
+        ),
+    }
+    return {name: np.asarray(value, float) for name, value in frames.items()}
+
+
 def structure_of(model, topology: Topology, links: list[VirtualLink]) -> Structure:
-    """The links' declared placements, their axis turned to z of the joint's frame; what is not
-    given is taken from the load pose."""
+    """Return the structure of the load pose, with the links where they are declared."""
     import mujoco
 
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     ids = {name: i for i, name in enumerate(topology.body_names)}
     links = [_on_bodies(model, link, ids) for link in links]
-
-    def multiply(a, b):
-        out = np.zeros(4)
-        mujoco.mju_mulQuat(out, np.asarray(a, float), np.asarray(b, float))
-        return out
-
-    def turn(quat, x):
-        out = np.zeros(3)
-        mujoco.mju_rotVecQuat(out, np.asarray(x, float), np.asarray(quat, float))
-        return out
-
-    frames = {"pos": [], "quat": [], "real_pos": [], "real_quat": []}
-    ends = []
-    for link in links:
-        p, r = ids[link.parent], ids[link.real]
-        to_z = np.zeros(4)
-        mujoco.mju_quatZ2Vec(to_z, np.asarray(link.axis, float) / np.linalg.norm(link.axis))
-        quat = _unit(multiply(_unit(link.quat), to_z))
-        world = data.xpos[p] + turn(data.xquat[p], link.pos)
-        back = data.xquat[r] * np.array([1, -1, -1, -1])
-        real_pos = turn(back, world - data.xpos[r]) if link.real_pos is None else link.real_pos
-        real_quat = (
-            multiply(back, multiply(data.xquat[p], quat))
-            if link.real_quat is None
-            else multiply(_unit(link.real_quat), to_z)
-        )
-        ends.append((topology.body_row[p], topology.body_row[r]))
-        for name, value in (
-            ("pos", link.pos),
-            ("quat", quat),
-            ("real_pos", real_pos),
-            ("real_quat", _unit(real_quat)),
-        ):
-            frames[name].append(np.asarray(value, float))
-    count = len(links)
+    ends = [(ids[link.parent], ids[link.real]) for link in links]
+    frames = [_joint_frames(data, link, *both) for link, both in zip(links, ends, strict=True)]
+    stacked = lambda name, size: floats(
+        np.array([frame[name] for frame in frames]).reshape(len(links), size)
+    )
+    rows = lambda end: jnp.asarray(np.array([topology.body_row[e[end]] for e in ends], np.int32))
+    freedoms = np.array([joint_freedoms(link.joint) for link in links], bool)
     return Structure(
         connected=jnp.asarray(np.array([link.connected for link in links], bool)),
-        parent=jnp.asarray(np.array([e[0] for e in ends], np.int32)),
-        real=jnp.asarray(np.array([e[1] for e in ends], np.int32)),
-        **{
-            name: floats(np.array(value).reshape(count, 4 if "quat" in name else 3))
-            for name, value in frames.items()
-        },
-        freedoms=jnp.asarray(
-            np.array([joint_freedoms(link.joint) for link in links], bool).reshape(count, 6)
-        ),
+        parent=rows(0),
+        real=rows(1),
+        pos=stacked("pos", 3),
+        quat=stacked("quat", 4),
+        real_pos=stacked("real_pos", 3),
+        real_quat=stacked("real_quat", 4),
+        freedoms=jnp.asarray(freedoms.reshape(len(links), 6)),
         rank=jnp.asarray(np.int32(0)),
         margin=jnp.zeros((), jnp.result_type(float)),
     )

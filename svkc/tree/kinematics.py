@@ -107,7 +107,7 @@ def kinematics(chain: Chain, q: Float[Array, " q"]) -> Kinematics:
         step = put(step, free, take(q, np.array(top.q_start)[free][:, None] + np.arange(3)))
     roots = np.array(top.parent) <= 0
     r = down(top, jnp.where(roots[:, None], 0, step))
-    return Kinematics(R, quat, r, take(step, top.root), _axes(chain, R, r))
+    return Kinematics(R=R, quat=quat, r=r, root=take(step, top.root), S=_axes(chain, R, r))
 
 
 def _axes(chain: Chain, R, r) -> Float[Array, "nv 6"]:

@@ -143,10 +143,10 @@ def levels(top: Topology) -> list[Level] | Level:
         filled = lambda shape, value: np.full(shape, value, np.int32)
         children = most if deep else max(map(len, families[level]))
         of = Level(
-            filled(n, len(parents)),
-            filled((n, d), top.nv),
-            filled((n, children), below),
-            filled(n, 0),
+            rows=filled(n, len(parents)),
+            dofs=filled((n, d), top.nv),
+            children=filled((n, children), below),
+            parent=filled(n, 0),
         )
         of.rows[: last - first] = np.arange(first, last)
         of.parent[: last - first] = parents[first:last] - top.levels[level][0]
