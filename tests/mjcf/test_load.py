@@ -138,7 +138,7 @@ def test_ends_of_virtual_links_by_sites():
     # 0.5 along the z of a frame turned about x by the angle of cosine 0.28
     place, turned = (0.1, 0.2 - 0.48, -0.3 - 0.14), (0.6, 0.8, 0, 0)
     links = [
-        svkc.VirtualLink("x", "a", "b", "hinge", place, turned, (0, 0.1, 0)),
+        svkc.VirtualLink("x", "a", "b", "hinge", place, turned, real_pos=(0, 0.1, 0)),
         svkc.VirtualLink("y", "a", "b", "weld", (0.1, 0.2, -0.3), turned),
     ]
     by_bodies = svkc.load(model, virtual_links=links).structure

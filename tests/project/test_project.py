@@ -311,5 +311,5 @@ def test_cameras(tmp_path):
 
 
 def test_ruff_is_content():
-    done = run("-m", "ruff", "check", "svkc", "tests", "examples", "benchmarks")
+    done = run(*"-m ruff check svkc tests examples benchmarks".split())
     assert done.returncode == 0, done.stdout
