@@ -1,4 +1,5 @@
-"""Mechanisms for the tests, as MJCF and virtual links."""
+"""How mechanisms of the tests are built, as MJCF and virtual links; which of them laws are tested
+on, and in what state, is the table in `cases.py`."""
 
 import numpy as np
 
@@ -72,20 +73,16 @@ FOUR_BAR = bar(
 )
 
 
-def four_bar() -> svkc.Chain:
+def pin(**changed) -> svkc.VirtualLink:
+    """The hinge that closes the four-bar, or one that differs from it."""
+    at = {"pos": (1.2, 0, 0), "axis": (0, 1, 0), "real_pos": (0.2, 0, -0.6), "connected": True}
+    return svkc.VirtualLink("pin", "world", "rocker", "hinge", **at | changed)
+
+
+def four_bar(**options) -> svkc.Chain:
     """Crank, coupler, rocker on hinges about y; closed by a hinge. In space: 3 of the 6 rows are
     redundant."""
-    link = svkc.VirtualLink(
-        "pin",
-        "world",
-        "rocker",
-        "hinge",
-        pos=(1.2, 0, 0),
-        axis=(0, 1, 0),
-        real_pos=(0.2, 0, -0.6),
-        connected=True,
-    )
-    return svkc.load(MJCF.format(FOUR_BAR), virtual_links=[link])
+    return svkc.load(MJCF.format(FOUR_BAR), virtual_links=[pin()], **options)
 
 
 def parallelogram(middle: bool = True) -> svkc.Chain:

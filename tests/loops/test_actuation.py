@@ -117,18 +117,7 @@ def test_missing(five_bar):
 def test_actuated_virtual_joint():
     """A four-bar driven at its closing hinge (Fig. 6), with a spring and damper in the tree."""
     xml = models.MJCF.format(models.FOUR_BAR).replace('damping="0"', 'damping="0.2" stiffness="3"')
-    link = svkc.VirtualLink(
-        "pin",
-        "world",
-        "rocker",
-        "hinge",
-        pos=(1.2, 0, 0),
-        axis=(0, 1, 0),
-        real_pos=(0.2, 0, -0.6),
-        connected=True,
-        actuated=True,
-    )
-    chain = svkc.load(xml, virtual_links=[link])
+    chain = svkc.load(xml, virtual_links=[models.pin(actuated=True)])
     state, vdot = moving(chain)
     assert bool(chain.actuated[-1])
     found = svkc.actuation(chain, state, vdot, actuated=mask(chain, "pin"))

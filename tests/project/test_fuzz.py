@@ -419,18 +419,12 @@ TREE = models.MJCF.format(
 def scenes() -> dict:
     """Names to (chain, state): a closed loop; a tree that has none, nor slots; a loop and an empty
     slot."""
-    pin = dict(pos=(1.2, 0, 0), axis=(0, 1, 0), real_pos=(0.2, 0, -0.6), connected=True)
-    spare = svkc.load(
-        models.MJCF.format(models.FOUR_BAR),
-        virtual_links=[svkc.VirtualLink("pin", "world", "rocker", "hinge", **pin)],
-        spare=1,
-    )
     return {
         name: (chain, chain.state())
         for name, chain in (
             ("four", models.four_bar()),
             ("tree", svkc.load(TREE)),
-            ("spare", spare),
+            ("spare", models.four_bar(spare=1)),
         )
     }
 
