@@ -226,19 +226,6 @@ def test_a_joint_that_breaks():
     assert abs(float(jnp.linalg.norm(carried.force[0])) - limit) < 1e-6
 
 
-@pytest.mark.parametrize(
-    ("cut", "message"),
-    [
-        ("nose", "no joint 'nose'; joints: base"),
-        ("base", "'base' belongs to body 'torso'"),
-        (["left_knee", "chin"], "chin"),
-    ],
-)
-def test_what_cannot_be_cut(cut, message):
-    with pytest.raises(ValueError, match=message):
-        cases.CASES["arm"].build(cuttable=cut)
-
-
 SPARE = models.MJCF.format(
     models.bar("arm", models.Y, "0 0 -1")
     + '<body name="ball" pos="0.8 0 -0.6"><freejoint name="ball"/><geom size="0.1"'
@@ -317,24 +304,3 @@ def test_no_slot_left(gripped):
     assert traj.final.structure.connected.tolist() == [True]
     with pytest.raises(RuntimeError, match="every spare slot was taken"):
         run(times)
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: svkc.at(0.1, bind=svkc.Grip("arm", "nose")), "no body 'nose'"),
-        (
-            lambda: svkc.at(0.1, bind=svkc.Grip("arm", "ball", joint="universal")),
-            "no coordinates for 'universal'",
-        ),
-        (lambda: svkc.at(0.1, bind=svkc.Grip("arm", "ball", axis=(0, 0, 0))), "axis"),
-        (lambda: svkc.at(0.1, bind=svkc.Grip("arm", "ball", real_pos=(0, 0))), "real_pos"),
-        (lambda: svkc.at(0.1, bind=svkc.Grip("arm", "ball", slot="x")), "no virtual link 'x'"),
-        (lambda: svkc.at(0.1, bind="spare_0"), "svkc.Grip"),
-        (lambda: svkc.at(0.1, unbind=3), "unbind"),
-    ],
-)
-def test_wrong_grips(make, message):
-    chain = svkc.load(SPARE, spare=1)
-    with pytest.raises((ValueError, TypeError), match=message if message != "unbind" else None):
-        svkc.simulate(chain, chain.state(), 0.5, events=[make()])

@@ -4,7 +4,7 @@ docs/errors.md, or a NaN that can be seen.
 The suite makes a few hundred, the same every time; `SVKC_FUZZ=10000 python -m pytest
 tests/project/test_fuzz.py -n 0` makes that many, others each time.
 What counts is what users see: annotations are not checked while these tests call
-(`said.as_users_see`), as they are in all other tests, and jax promotes types as it does by default.
+(`error_page.as_users_see`), and jax promotes types as it does by default.
 Programs are compiled for a handful of fixed scenes alone; where a call would compile another
 (`simulate`, `rollout`, `tune`), it is only traced.
 """
@@ -20,13 +20,13 @@ import warnings
 
 import diffrax
 import equinox as eqx
+import error_page
 import hypothesis
 import jax
 import jax.numpy as jnp
 import models
 import numpy as np
 import pytest
-import said
 from hypothesis import strategies as st
 
 import svkc
@@ -34,7 +34,7 @@ import svkc
 pytestmark = pytest.mark.slow
 
 LONG = int(os.environ.get("SVKC_FUZZ", "0"))
-DOCUMENTED = [re.compile(said.pattern(row)) for row in said.ROWS]
+DOCUMENTED = [re.compile(error_page.pattern(row)) for row in error_page.ROWS]
 CALLS = {"count": 0, "raised": 0}
 
 
@@ -433,7 +433,7 @@ def scenes() -> dict:
 def ready():
     """The scenes are made before anything is drawn, and annotations are not checked."""
     scenes()
-    with said.as_users_see():
+    with error_page.as_users_see():
         yield
     if LONG:
         print(

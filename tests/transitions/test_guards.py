@@ -295,17 +295,3 @@ def test_a_support_that_can_only_push():
     early = run(0.55, 0.6, 0.55)
     assert early.events.which[: int(early.events.count)].tolist() == [0, 1]
     assert abs(float(early.events.time[1]) - 0.55) < 1e-9
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda c: svkc.touch(c, "welds"), "no virtual link 'welds'"),
-        (lambda c: svkc.touch(c, "weld", axes="xx"), "axes"),
-        (lambda c: svkc.leaves(c, "weld", axis=(0, 0, 0)), "axis"),
-        (lambda c: svkc.overload(c, "weld"), "largest force"),
-    ],
-)
-def test_wrong_guards(pair, call, message):
-    with pytest.raises(ValueError, match=message):
-        call(pair)
