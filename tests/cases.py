@@ -1,7 +1,10 @@
 """The table of mechanisms on which laws and comparisons are tested: how each is built, in what
 state, and what is known of it. `models.py` has what is built here and in other tests.
 
-`params(tag)` gives the names of those with a tag, those that are not in the fast tier marked slow.
+Tags: "loops", closed by hinges and balls; "forces", of which the loop forces are known to be unique
+or not; "overconstrained", that move although counting says that they cannot; "tree"; "cuttable",
+trees with joints that may be cut; "afloat", joined to the world by virtual links alone; "fast", in
+the fast tier. `params(tag)` gives the names of those with a tag; all but "fast" ones marked slow.
 """
 
 import dataclasses
@@ -44,6 +47,15 @@ FIGURE = str(svkc.scenes.FOLDER / "figure16.xml")
 def high_bar() -> tuple[svkc.Chain, svkc.State]:
     """Chain and state of the main job, without joint ranges: nothing that takes or gives energy."""
     return svkc.scenes.high_bar(ignore=("limit",))
+
+
+@functools.cache
+def flight() -> tuple[svkc.Chain, svkc.State]:
+    """The same figure in flight beside the bar, spinning, its hands still where the grips are."""
+    (chain, state), rng = high_bar(), np.random.default_rng(2)
+    free = svkc.cut(chain, state, "right_hand_grip", "left_hand_grip")
+    moving = free.v.at[: chain.nv].set(jnp.asarray(rng.normal(size=chain.nv)))
+    return chain, svkc.State(free.q, moving, free.structure)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -100,11 +112,11 @@ CASES = {
         build=models.rod_on_balls, tags="loops forces", freedoms=2, unique=(True,)
     ),
     "stewart": Case(build=models.stewart, tags="loops forces", freedoms=6, unique=(True,) * 5),
-    "figure40": Case(build=models.figure40, tags="loops", freedoms=40),
+    "figure40": Case(build=models.figure40, tags="loops afloat", freedoms=40),
     "two_hands": Case(
         build=lambda: high_bar()[0],
         pose=lambda: high_bar()[1].q[: high_bar()[0].nq],
-        tags="loops",
+        tags="loops afloat",
         freedoms=12,
     ),
     "bennett": Case(
@@ -136,6 +148,7 @@ CASES = {
         for n in (2, 7, 25, 60)
     },
     "urdf": tree(URDF, "tree fast"),
+    "free_tree": Case(build=models.free_tree, tags="afloat fast"),
     "figure40_tree": tree(str(svkc.scenes.FOLDER / "figure40.xml")),
     # trees with joints that may be cut
     "arm": tree(

@@ -1,6 +1,7 @@
-"""Structure changes: the velocity after, two ways; momentum, energy; cuts, locks, grips where the
+"""Structure changes: the velocity after, two ways; cuts, locks, grips where the
 hand is."""
 
+import cases
 import jax
 import jax.numpy as jnp
 import models
@@ -9,23 +10,10 @@ import pytest
 from references import paper
 
 import svkc
-from svkc.transitions.transition import change
 
 
-@pytest.fixture(scope="module")
-def flight(high_bar):
-    """The figure in flight beside the bar, spinning, its hands still where the grips are; with
-    gravity off."""
-    chain, state = high_bar
-    rng = np.random.default_rng(2)
-    free = svkc.cut(chain, state, "right_hand_grip", "left_hand_grip")
-    return chain, svkc.State(
-        free.q, free.v.at[: chain.nv].set(jnp.asarray(rng.normal(size=chain.nv))), free.structure
-    )
-
-
-def test_both_forms_of_the_impact_agree(flight):
-    chain, state = flight
+def test_both_forms_of_the_impact_agree():
+    chain, state = cases.flight()
     for name in ("left_hand_grip", "right_hand_grip"):
         v, F = paper.velocity_by_impulse(chain, state, name)
         after = svkc.connect(chain, state, name)
@@ -39,25 +27,9 @@ def test_both_forms_of_the_impact_agree(flight):
         state = after
 
 
-def test_impulse_energy_and_rank(flight):
-    chain, state = flight
-    mask = jnp.array([True, True])
-    done = change(chain, state, mask)
-    lost = svkc.kinetic_energy(chain, state) - svkc.kinetic_energy(chain, done.state)
-    assert float(done.energy_lost) > 0
-    np.testing.assert_allclose(done.energy_lost, lost, rtol=1e-10)
-    # the impulses of the two hands are all that changes the figure's momentum
-    before, after = svkc.momentum(chain, state), svkc.momentum(chain, done.state)
-    np.testing.assert_allclose(done.impulse.sum(0), after[0] - before[0], atol=1e-9)
-    points = np.array([[0, -0.3, 2.6], [0, 0.3, 2.6]])
-    moment = np.cross(points, done.impulse).sum(0) + np.asarray(done.angular_impulse).sum(0)
-    np.testing.assert_allclose(moment, after[1] - before[1], atol=1e-9)
-    assert np.abs(np.asarray(done.angular_impulse)[:, 1]).max() < 1e-10
-
-
-def test_one_by_one_or_together_is_the_same(flight):
+def test_one_by_one_or_together_is_the_same():
     """Plastic latches are projections; their order does not matter."""
-    chain, state = flight
+    chain, state = cases.flight()
     together = svkc.connect(chain, state, "left_hand_grip", "right_hand_grip")
     left_first = svkc.connect(
         chain, svkc.connect(chain, state, "left_hand_grip"), "right_hand_grip"
@@ -87,38 +59,12 @@ def test_a_cut_keeps_every_bit(high_bar):
         )
 
 
-TWO = models.MJCF.format(
-    '<body name="a"><freejoint name="a"/><geom type="box" size="0.1 0.2 0.3"'
-    ' contype="0"/></body><body name="b" pos="1 0 0"><freejoint name="b"/><geom type="box"'
-    ' size="0.3 0.1 0.2" contype="0"/></body>'
-)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("joint", ["hinge", "weld", "ball", "slide"])
-def test_momentum_across_a_connect(joint):
-    """Two free bodies caught together: momentum stays to 1e-12, energy never grows, the joint's
-    freedoms take nothing."""
-    chain = svkc.load(
-        TWO,
-        virtual_links=[
-            svkc.VirtualLink(
-                "grip",
-                "a",
-                "b",
-                joint,
-                pos=(0.4, 0.1, 0),
-                real_pos=(-0.6, 0.1, 0),
-                axis=(0.2, 0.5, 1),
-            )
-        ],
-    )
-    rng = np.random.default_rng(1)
+def test_both_forms_of_it_agree_between_free_bodies(joint):
+    chain, rng = models.two_boxes(joint), np.random.default_rng(1)
     state = chain.state(v=rng.normal(size=12))
     after = svkc.connect(chain, state, "grip")
-    for a, b in zip(svkc.momentum(chain, state), svkc.momentum(chain, after), strict=True):
-        np.testing.assert_allclose(a, b, atol=1e-12 * float(jnp.abs(a).max()))
-    assert float(svkc.kinetic_energy(chain, after)) < float(svkc.kinetic_energy(chain, state))
     assert float(jnp.abs(svkc.velocity_gaps(chain, after)).max()) < 1e-12
     v, _ = paper.velocity_by_impulse(chain, state, "grip")
     np.testing.assert_allclose(after.v, v, atol=1e-10)
@@ -127,7 +73,7 @@ def test_momentum_across_a_connect(joint):
 def test_grip_where_it_is():
     """Bodies away from the declared placement: here=True makes the joint where the real link is."""
     chain = svkc.load(
-        TWO,
+        models.TWO_BOXES,
         virtual_links=[
             svkc.VirtualLink("grip", "a", "b", "hinge", pos=(0, 0, 0), real_pos=(-0.6, 0.1, 0))
         ],

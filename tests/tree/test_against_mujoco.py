@@ -109,32 +109,6 @@ def test_every_intermediate(run):
             assert np.abs(np.asarray(got[name]) - value).max() <= 1e-10 * scale, name
 
 
-def test_momentum_of_a_free_system():
-    """No gravity, no ground: forces inside change neither linear nor angular momentum."""
-    text = models.random_tree(8, seed=4, kinds=("free", "ball", "hinge")).replace(
-        'gravity="0.3 -0.2 -9.81"', 'gravity="0 0 0"'
-    )
-    import re
-
-    text = re.sub(
-        r'<body name="b1"([^>]*)>(<joint[^>]*/>)*', r'<body name="b1"\1><freejoint/>', text, count=1
-    )
-    chain = svkc.load(text)
-    if np.sum(np.array(chain.parent) == 0) > 1 or chain.topology.kind[1] != 4:
-        pytest.fail("the model should be one free tree")
-    rng = np.random.default_rng(0)
-    state = chain.state(v=rng.normal(size=chain.nv))
-    vdot = svkc.forward_dynamics(
-        chain, state, jnp.concatenate([jnp.zeros(6), jnp.asarray(rng.normal(size=chain.nv - 6))])
-    )
-
-    def both(q, v):
-        return jnp.concatenate(svkc.momentum(chain, svkc.State(q, v, state.structure)))
-
-    value, change = jax.jvp(both, (state.q, state.v), (rates(chain, state.q, state.v), vdot))
-    assert float(jnp.max(jnp.abs(change))) < 1e-10 * float(jnp.max(jnp.abs(value)))
-
-
 def test_integrate_and_difference_are_inverse():
     chain = cases.CASES["random_7"].build()
     rng = np.random.default_rng(0)
