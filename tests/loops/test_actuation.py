@@ -117,18 +117,7 @@ def test_missing(five_bar):
 def test_actuated_virtual_joint():
     """A four-bar driven at its closing hinge (Fig. 6), with a spring and damper in the tree."""
     xml = models.MJCF.format(models.FOUR_BAR).replace('damping="0"', 'damping="0.2" stiffness="3"')
-    link = svkc.VirtualLink(
-        "pin",
-        "world",
-        "rocker",
-        "hinge",
-        pos=(1.2, 0, 0),
-        axis=(0, 1, 0),
-        real_pos=(0.2, 0, -0.6),
-        connected=True,
-        actuated=True,
-    )
-    chain = svkc.load(xml, virtual_links=[link])
+    chain = svkc.load(xml, virtual_links=[models.pin(actuated=True)])
     state, vdot = moving(chain)
     assert bool(chain.actuated[-1])
     found = svkc.actuation(chain, state, vdot, actuated=mask(chain, "pin"))
@@ -237,25 +226,3 @@ def test_open_chain_and_derivative(five_bar):
         np.testing.assert_allclose(jax.jacrev(f)(0.0), forward, rtol=1e-9, atol=1e-9)
         h = 1e-5
         np.testing.assert_allclose(forward, (f(h) - f(-h)) / (2 * h), rtol=1e-6, atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("kw", "message"),
-    [
-        ({"vdot_G": np.zeros(3)}, "vdot_G.*theta_G"),
-        ({"weight": np.zeros(5)}, "weight.*positive"),
-        ({"weight": np.ones(2)}, "weight.*shape"),
-        ({"actuated": np.ones(2, bool)}, "actuated"),
-        ({"bounds": (1.0, -1.0)}, "lower at or below upper"),
-    ],
-)
-def test_wrong_calls(five_bar, kw, message):
-    chain, state, vdot, _ = five_bar
-    with pytest.raises(ValueError, match=message):
-        svkc.actuation(chain, state, **({"vdot_G": vdot} | kw))
-
-
-def test_bounds_are_for_the_host(five_bar):
-    chain, state, vdot, _ = five_bar
-    with pytest.raises(ValueError, match="host"):
-        jax.jit(lambda a: svkc.actuation(chain, state, a, bounds=(-1.0, 1.0)).tau)(vdot)

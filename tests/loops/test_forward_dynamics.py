@@ -1,6 +1,7 @@
 """Closed chains: accelerations against multipliers, whatever coordinates are chosen; redundant
 loops; the loop forces."""
 
+import cases
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -13,37 +14,11 @@ from references import paper
 import svkc
 from svkc.loops.forward_dynamics import acceleration as accelerated
 
-CASES = {
-    "four_bar": models.four_bar,
-    "parallelogram": models.parallelogram,
-    "rod_on_balls": models.rod_on_balls,
-    "stewart": models.stewart,
-}
-CASES |= {"figure40": models.figure40}
-MOBILITY = {"four_bar": 1, "parallelogram": 1, "rod_on_balls": 2, "stewart": 6, "figure40": 40}
 
-
-FAST = ("four_bar",)
-
-
-@pytest.fixture(
-    params=[
-        name if name in FAST else pytest.param(name, marks=pytest.mark.slow)
-        for name in (*CASES, "two_hands")
-    ],
-    scope="module",
-)
-def case(request, high_bar):
-    """Chain, and a state in motion: velocities at random, projected on what the loops allow."""
-    rng = np.random.default_rng(3)
-    chain = high_bar[0] if request.param == "two_hands" else CASES[request.param]()
-    q = high_bar[1].q[: chain.nq] if request.param == "two_hands" else None
-    return (
-        request.param,
-        chain,
-        chain.state(q, rng.normal(size=chain.nv)),
-        jnp.asarray(rng.normal(size=chain.dofs)),
-    )
+@pytest.fixture(params=cases.params("loops"), scope="module")
+def case(request):
+    """Name, chain, and a state in motion with torques."""
+    return request.param, *cases.CASES[request.param].moving()
 
 
 def test_acceleration_is_that_of_the_multipliers(case):
@@ -122,8 +97,7 @@ def test_velocities_and_accelerations_keep_the_loops(case):
 
     _, change = jax.jvp(relative, (state.q, state.v), (rates(chain, state.q, state.v), vdot))
     assert float(jnp.max(jnp.abs(change))) < 1e-9 * max(1, float(jnp.max(jnp.abs(vdot))))
-    if name in MOBILITY:
-        assert int(svkc.mobility(chain, state).freedoms) == MOBILITY[name]
+    assert int(svkc.mobility(chain, state).freedoms) == cases.CASES[name].freedoms
 
 
 def test_loop_forces_and_torques_explain_the_acceleration(case):
@@ -231,20 +205,7 @@ def test_every_kind_of_virtual_joint(joint):
 def test_spare_slots_change_nothing():
     numbers = []
     for spare in (0, 1, 4):
-        links = [
-            svkc.VirtualLink(
-                "pin",
-                "world",
-                "rocker",
-                "hinge",
-                pos=(1.2, 0, 0),
-                axis=(0, 1, 0),
-                real_pos=(0.2, 0, -0.6),
-                connected=True,
-            )
-        ]
-        xml = models.FOUR_BAR
-        chain = svkc.load(models.MJCF.format(xml), virtual_links=links, spare=spare)
+        chain = models.four_bar(spare=spare)
         state = chain.state(v={"crank": 1.0})
         vdot = svkc.forward_dynamics(chain, state, jnp.zeros(chain.nv))
         m = svkc.mobility(chain, state)

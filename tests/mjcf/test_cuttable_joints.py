@@ -1,6 +1,7 @@
 """Joints of the tree that may be cut (Fig. 15): before the cut the plain tree, after it two free
 systems; joints that break; slots bound in a run."""
 
+import cases
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,43 +11,21 @@ import pytest
 
 import svkc
 from svkc.loops.forward_dynamics import acceleration
-from svkc.scenes import FOLDER
-
-FIGURE = str(FOLDER / "figure16.xml")
-PENDULUM = models.MJCF.format(
-    models.bar(
-        "arm", models.Y, "0 0 -1", inside=models.bar("tip", 'type="ball"', "0 0 -0.5", "0 0 -1")
-    )
-)
-# name: model, what may be cut (the first is), state by joint name
-CASES = {
-    "arm": (
-        FIGURE,
-        ["right_shoulder_flexion"],
-        {
-            "base": [0, 0, 2, 0.8, 0.6, 0, 0],
-            "right_shoulder_flexion": 0.6,
-            "right_shoulder_abduction": 0.3,
-        },
-    ),
-    "pivot": (PENDULUM, ["arm", "tip"], {"arm": 0.7, "tip": [0.9, 0.1, 0.3, 0.3]}),
-}
 
 
-def state_of(chain, q, seed=1):
-    rng = np.random.default_rng(seed)
-    q = {k: np.asarray(x) / (np.linalg.norm(x) if k == "tip" else 1) for k, x in q.items()}
+def state_of(chain, q):
+    rng = np.random.default_rng(1)
     v = {k: rng.normal(size=6 if k == "base" else 3 if k == "tip" else 1) for k in q}
     return chain.state(q, v)
 
 
-@pytest.fixture(params=CASES, scope="module")
+@pytest.fixture(params=cases.params("cuttable"), scope="module")
 def case(request):
     """The plain tree and the one with a joint that may be cut, in the same state, springs, ranges
     and motors included."""
-    xml, cut, q = CASES[request.param]
-    plain, chain = svkc.load(xml), svkc.load(xml, cuttable=cut)
-    return plain, chain, cut[0], state_of(plain, q), state_of(chain, q)
+    case = cases.CASES[request.param]
+    plain, chain = case.build(), case.build(cuttable=case.cuttable)
+    return plain, chain, case.cuttable[0], state_of(plain, case.pose), state_of(chain, case.pose)
 
 
 @pytest.mark.slow
@@ -145,17 +124,7 @@ def part_momentum(chain, state, part):
 def test_a_link_in_the_middle_of_a_loop():
     """A four-bar whose coupler joint is cut: the loop at the rocker still holds, the crank swings
     alone; then the joint is made again."""
-    link = svkc.VirtualLink(
-        "pin",
-        "world",
-        "rocker",
-        "hinge",
-        pos=(1.2, 0, 0),
-        axis=(0, 1, 0),
-        real_pos=(0.2, 0, -0.6),
-        connected=True,
-    )
-    chain = svkc.load(models.MJCF.format(models.FOUR_BAR), virtual_links=[link], cuttable="coupler")
+    chain = models.four_bar(cuttable="coupler")
     state = chain.state(v={"crank": 2.0})
     plain = models.four_bar()
     np.testing.assert_allclose(
@@ -257,19 +226,6 @@ def test_a_joint_that_breaks():
     assert abs(float(jnp.linalg.norm(carried.force[0])) - limit) < 1e-6
 
 
-@pytest.mark.parametrize(
-    ("cut", "message"),
-    [
-        ("nose", "no joint 'nose'; joints: base"),
-        ("base", "'base' belongs to body 'torso'"),
-        (["left_knee", "chin"], "chin"),
-    ],
-)
-def test_what_cannot_be_cut(cut, message):
-    with pytest.raises(ValueError, match=message):
-        svkc.load(FIGURE, cuttable=cut)
-
-
 SPARE = models.MJCF.format(
     models.bar("arm", models.Y, "0 0 -1")
     + '<body name="ball" pos="0.8 0 -0.6"><freejoint name="ball"/><geom size="0.1"'
@@ -348,24 +304,3 @@ def test_no_slot_left(gripped):
     assert traj.final.structure.connected.tolist() == [True]
     with pytest.raises(RuntimeError, match="every spare slot was taken"):
         run(times)
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: svkc.at(0.1, bind=svkc.Grip("arm", "nose")), "no body 'nose'"),
-        (
-            lambda: svkc.at(0.1, bind=svkc.Grip("arm", "ball", joint="universal")),
-            "no coordinates for 'universal'",
-        ),
-        (lambda: svkc.at(0.1, bind=svkc.Grip("arm", "ball", axis=(0, 0, 0))), "axis"),
-        (lambda: svkc.at(0.1, bind=svkc.Grip("arm", "ball", real_pos=(0, 0))), "real_pos"),
-        (lambda: svkc.at(0.1, bind=svkc.Grip("arm", "ball", slot="x")), "no virtual link 'x'"),
-        (lambda: svkc.at(0.1, bind="spare_0"), "svkc.Grip"),
-        (lambda: svkc.at(0.1, unbind=3), "unbind"),
-    ],
-)
-def test_wrong_grips(make, message):
-    chain = svkc.load(SPARE, spare=1)
-    with pytest.raises((ValueError, TypeError), match=message if message != "unbind" else None):
-        svkc.simulate(chain, chain.state(), 0.5, events=[make()])

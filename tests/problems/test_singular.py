@@ -17,16 +17,7 @@ FINE = {"rtol": 1e-9, "atol": 1e-11}
 
 def tilted(angle):
     """The four-bar with the axis of its last pin out of the others' direction by a small angle."""
-    pin = svkc.VirtualLink(
-        "pin",
-        "world",
-        "rocker",
-        "hinge",
-        pos=(1.2, 0, 0),
-        axis=(np.sin(angle), np.cos(angle), 0),
-        real_pos=(0.2, 0, -0.6),
-        connected=True,
-    )
+    pin = models.pin(axis=(np.sin(angle), np.cos(angle), 0))
     return svkc.load(models.MJCF.format(models.FOUR_BAR), virtual_links=[pin])
 
 

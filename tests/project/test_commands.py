@@ -17,8 +17,9 @@ ROD = """<mujoco><worldbody>
 </mujoco>"""
 
 
-def command(*args):
-    return run("-m", "svkc", *args, optimized=False)
+def command(line, *args):
+    """Runs svkc with the words of the line, then the arguments."""
+    return run("-m", "svkc", *line.split(), *args, optimized=False)
 
 
 def test_a_model_of_ones_own(tmp_path):
@@ -26,17 +27,7 @@ def test_a_model_of_ones_own(tmp_path):
     (tmp_path / "rod.xml").write_text(ROD)
     out = tmp_path / "out"
     done = command(
-        "run",
-        tmp_path / "rod.xml",
-        "--t1",
-        "0.3",
-        "--release",
-        "pin@0.1",
-        "--catch",
-        "pin@0.2",
-        "--out",
-        out,
-        "--mp4",
+        "run --t1 0.3 --release pin@0.1 --catch pin@0.2 --mp4 --out", out, tmp_path / "rod.xml"
     )
     assert done.returncode == 0, done.stderr
     assert "events at 0.100000 s, 0.200000 s" in done.stdout, done.stdout
@@ -49,7 +40,7 @@ def test_a_model_of_ones_own(tmp_path):
         path.name for path in out.iterdir()
     }
     assert "libegl1" in done.stdout or (out / "rod.mp4").read_bytes()[4:8] == b"ftyp"
-    seen = command("view", out / "rod.npz", "--no-open")
+    seen = command("view --no-open", out / "rod.npz")
     assert seen.returncode == 0, seen.stdout + seen.stderr
     assert "largest loop gap" in seen.stdout
     assert "rod.html" in seen.stdout
@@ -60,11 +51,11 @@ def test_what_is_wrong_is_said(tmp_path):
     (tmp_path / "rod.xml").write_text(ROD)
     (tmp_path / "no.npz").write_text("nothing")
     wrong = {
-        "no scene and no file 'nowhere'": ("run", "nowhere"),
-        "no virtual link 'pen'": ("run", tmp_path / "rod.xml", "--release", "pen@0.1"),
-        "expected NAME@TIME": ("run", "--release", "pin"),
-        "--t1: got -1.0, expected a positive number": ("run", tmp_path / "rod.xml", "--t1", "-1"),
-        "no.npz": ("run", tmp_path / "rod.xml", "--out", tmp_path / "no.npz"),
+        "no scene and no file 'nowhere'": ("run nowhere",),
+        "no virtual link 'pen'": ("run --release pen@0.1", tmp_path / "rod.xml"),
+        "expected NAME@TIME": ("run --release pin",),
+        "--t1: got -1.0, expected a positive number": ("run --t1 -1", tmp_path / "rod.xml"),
+        "no.npz": ("run --out", tmp_path / "no.npz", tmp_path / "rod.xml"),
         "is not a whole trajectory": ("view", tmp_path / "no.npz"),
         "No such file": ("view", tmp_path / "nothing.npz"),
         "invalid choice": ("dance",),

@@ -4,7 +4,7 @@ docs/errors.md, or a NaN that can be seen.
 The suite makes a few hundred, the same every time; `SVKC_FUZZ=10000 python -m pytest
 tests/project/test_fuzz.py -n 0` makes that many, others each time.
 What counts is what users see: annotations are not checked while these tests call
-(`said.as_users_see`), as they are in all other tests, and jax promotes types as it does by default.
+(`error_page.as_users_see`), and jax promotes types as it does by default.
 Programs are compiled for a handful of fixed scenes alone; where a call would compile another
 (`simulate`, `rollout`, `tune`), it is only traced.
 """
@@ -20,13 +20,13 @@ import warnings
 
 import diffrax
 import equinox as eqx
+import error_page
 import hypothesis
 import jax
 import jax.numpy as jnp
 import models
 import numpy as np
 import pytest
-import said
 from hypothesis import strategies as st
 
 import svkc
@@ -34,7 +34,7 @@ import svkc
 pytestmark = pytest.mark.slow
 
 LONG = int(os.environ.get("SVKC_FUZZ", "0"))
-DOCUMENTED = [re.compile(said.pattern(row)) for row in said.ROWS]
+DOCUMENTED = [re.compile(error_page.pattern(row)) for row in error_page.ROWS]
 CALLS = {"count": 0, "raised": 0}
 
 
@@ -419,18 +419,12 @@ TREE = models.MJCF.format(
 def scenes() -> dict:
     """Names to (chain, state): a closed loop; a tree that has none, nor slots; a loop and an empty
     slot."""
-    pin = dict(pos=(1.2, 0, 0), axis=(0, 1, 0), real_pos=(0.2, 0, -0.6), connected=True)
-    spare = svkc.load(
-        models.MJCF.format(models.FOUR_BAR),
-        virtual_links=[svkc.VirtualLink("pin", "world", "rocker", "hinge", **pin)],
-        spare=1,
-    )
     return {
         name: (chain, chain.state())
         for name, chain in (
             ("four", models.four_bar()),
             ("tree", svkc.load(TREE)),
-            ("spare", spare),
+            ("spare", models.four_bar(spare=1)),
         )
     }
 
@@ -439,7 +433,7 @@ def scenes() -> dict:
 def ready():
     """The scenes are made before anything is drawn, and annotations are not checked."""
     scenes()
-    with said.as_users_see():
+    with error_page.as_users_see():
         yield
     if LONG:
         print(

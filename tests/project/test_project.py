@@ -257,29 +257,6 @@ ROD = """<mujoco><worldbody><light pos="0 0 5"/>{}
   </body></worldbody></mujoco>"""
 
 
-def test_pictures_say_what_they_cannot_draw(tmp_path, monkeypatch):
-    """Another ending; a machine without GL, as Python would see it."""
-    import importlib
-
-    import svkc
-
-    plain = importlib.import_module
-
-    def missing(name, *where):
-        if name.startswith("mujoco."):
-            raise ImportError(name)
-        return plain(name, *where)
-
-    chain = svkc.load(ROD.format(""))
-    traj = svkc.simulate(chain, chain.state(), 0.1, ts=[0.0, 0.05, 0.1])
-    with monkeypatch.context() as patch:
-        patch.setattr(importlib, "import_module", missing)
-        with pytest.raises(RuntimeError, match="libegl1 libgl1"):
-            svkc.render(chain, traj, tmp_path / "x.gif")
-    with pytest.raises(ValueError, match=r"\.png, \.gif, \.mp4 or \.html"):
-        svkc.render(chain, traj, tmp_path / "x.bmp")
-
-
 def test_cameras(tmp_path):
     """The model's own by its name, and those that are placed, each see something else."""
     from PIL import Image
@@ -301,7 +278,7 @@ def test_cameras(tmp_path):
                 chain, traj, tmp_path / f"{i}.gif", size=(96, 64), trails=("rod",), **way
             )
         except RuntimeError:
-            # without an offscreen OpenGL there is no picture: that this is said is tested above
+            # without an offscreen OpenGL there is no picture: test_messages has what is said then
             return
         with Image.open(path) as image:
             assert image.width == 96
@@ -311,5 +288,5 @@ def test_cameras(tmp_path):
 
 
 def test_ruff_is_content():
-    done = run("-m", "ruff", "check", "svkc", "tests", "examples", "benchmarks")
+    done = run(*"-m ruff check svkc tests examples benchmarks".split())
     assert done.returncode == 0, done.stdout

@@ -318,49 +318,6 @@ def test_results_tell_what_went_wrong(pendulum):
     assert away.result == svkc.RESULTS.not_in_place
 
 
-@pytest.mark.parametrize(
-    ("kw", "message"),
-    [
-        ({"t1": -1.0}, "t1"),
-        ({"ts": [0.0, 2.0]}, "ts"),
-        ({"ts": [0.5, 0.2]}, "ts"),
-        ({"dt": -0.1}, "dt"),
-        ({"rtol": 0.0}, "rtol"),
-        ({"dt": 0.1, "rtol": 1e-3}, "dt"),
-        ({"events": [svkc.at(-0.5, cut="hook")]}, "before the start"),
-        ({"events": [svkc.at(0.5, cut="hoook")]}, "hoook"),
-        ({"events": ["hook"]}, "svkc.at"),
-        ({"control": 3}, "control"),
-        ({"control": lambda t, s, a: jnp.zeros(5)}, "expected 1 joint torques"),
-        ({"max_events": -1}, "max_events"),
-        ({"max_steps": 0}, "max_steps"),
-        ({"stabilization": "none"}, "stabilization"),
-    ],
-)
-def test_wrong_calls(kw, message):
-    chain = (
-        svkc.load(PENDULUM, virtual_links=[svkc.VirtualLink("hook", "world", "arm", "weld")])
-        if message in ("hoook", "before the start")
-        else svkc.load(PENDULUM)
-    )
-    kw = {"state": chain.state(), "t1": 1.0} | kw
-    with pytest.raises(ValueError, match=message):
-        svkc.simulate(chain, **kw)
-    single = eqx.tree_at(
-        lambda s: (s.q, s.v), chain.state(), replace_fn=lambda x: x.astype(jnp.float32)
-    )
-    with pytest.raises(ValueError, match="same precision"):
-        svkc.simulate(chain, single, 1.0)
-    for wrong in (
-        lambda: svkc.at(0.5, connect=3),
-        lambda: svkc.when(3),
-        lambda: svkc.when(angle(0), direction="up"),
-        lambda: svkc.at(1.0, here="a"),
-    ):
-        with pytest.raises((ValueError, TypeError)):
-            wrong()
-
-
 def test_save_and_load(tmp_path, pendulum, caught):
     traj = caught
     traj.save(tmp_path / "run.npz", pendulum)
@@ -452,8 +409,6 @@ def test_one_step_by_itself():
         exact = svkc.simulate(chain, start, 0.5, rtol=1e-9).final.q
         coarse, fine = (float(jnp.abs(ends.q[lane] - exact).max()) for lane in (i, i + 1))
         assert 0.8 < np.log2(coarse / fine) < 1.2
-    with pytest.raises(ValueError, match="expected 4 joint torques"):
-        svkc.step(chain, state, jnp.zeros(2), dt)
 
 
 @pytest.mark.parametrize(

@@ -181,16 +181,6 @@ def test_an_interrupted_run_goes_on(case, alone, tmp_path, monkeypatch):
         call(chain, states, {**data, "torque": data["torque"] + 1}, chunk=4, out=tmp_path / "run")
 
 
-def test_bad_calls(case):
-    chain, states, _ = case
-    with pytest.raises(ValueError, match=r"states: expected a svkc.State"):
-        svkc.rollout(chain, states.q, 1.0)
-    with pytest.raises(ValueError, match=r"one leading axis of lanes, got sizes \['11', '3'\]"):
-        svkc.rollout(chain, states, 1.0, data=jnp.zeros(3))
-    with pytest.raises(ValueError, match=r"one leading axis of lanes"):
-        svkc.rollout(chain, chain.state(), 1.0)
-
-
 def start(count, out, dies=""):
     with socket.socket() as s:
         s.bind(("localhost", 0))

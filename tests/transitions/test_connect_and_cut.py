@@ -1,6 +1,7 @@
-"""Structure changes: the velocity after, two ways; momentum, energy; cuts, locks, grips where the
+"""Structure changes: the velocity after, two ways; cuts, locks, grips where the
 hand is."""
 
+import cases
 import jax
 import jax.numpy as jnp
 import models
@@ -9,23 +10,10 @@ import pytest
 from references import paper
 
 import svkc
-from svkc.transitions.transition import change
 
 
-@pytest.fixture(scope="module")
-def flight(high_bar):
-    """The figure in flight beside the bar, spinning, its hands still where the grips are; with
-    gravity off."""
-    chain, state = high_bar
-    rng = np.random.default_rng(2)
-    free = svkc.cut(chain, state, "right_hand_grip", "left_hand_grip")
-    return chain, svkc.State(
-        free.q, free.v.at[: chain.nv].set(jnp.asarray(rng.normal(size=chain.nv))), free.structure
-    )
-
-
-def test_both_forms_of_the_impact_agree(flight):
-    chain, state = flight
+def test_both_forms_of_the_impact_agree():
+    chain, state = cases.flight()
     for name in ("left_hand_grip", "right_hand_grip"):
         v, F = paper.velocity_by_impulse(chain, state, name)
         after = svkc.connect(chain, state, name)
@@ -39,25 +27,9 @@ def test_both_forms_of_the_impact_agree(flight):
         state = after
 
 
-def test_impulse_energy_and_rank(flight):
-    chain, state = flight
-    mask = jnp.array([True, True])
-    done = change(chain, state, mask)
-    lost = svkc.kinetic_energy(chain, state) - svkc.kinetic_energy(chain, done.state)
-    assert float(done.energy_lost) > 0
-    np.testing.assert_allclose(done.energy_lost, lost, rtol=1e-10)
-    # the impulses of the two hands are all that changes the figure's momentum
-    before, after = svkc.momentum(chain, state), svkc.momentum(chain, done.state)
-    np.testing.assert_allclose(done.impulse.sum(0), after[0] - before[0], atol=1e-9)
-    points = np.array([[0, -0.3, 2.6], [0, 0.3, 2.6]])
-    moment = np.cross(points, done.impulse).sum(0) + np.asarray(done.angular_impulse).sum(0)
-    np.testing.assert_allclose(moment, after[1] - before[1], atol=1e-9)
-    assert np.abs(np.asarray(done.angular_impulse)[:, 1]).max() < 1e-10
-
-
-def test_one_by_one_or_together_is_the_same(flight):
+def test_one_by_one_or_together_is_the_same():
     """Plastic latches are projections; their order does not matter."""
-    chain, state = flight
+    chain, state = cases.flight()
     together = svkc.connect(chain, state, "left_hand_grip", "right_hand_grip")
     left_first = svkc.connect(
         chain, svkc.connect(chain, state, "left_hand_grip"), "right_hand_grip"
@@ -87,55 +59,26 @@ def test_a_cut_keeps_every_bit(high_bar):
         )
 
 
-TWO = models.MJCF.format(
-    '<body name="a"><freejoint name="a"/><geom type="box" size="0.1 0.2 0.3"'
-    ' contype="0"/></body><body name="b" pos="1 0 0"><freejoint name="b"/><geom type="box"'
-    ' size="0.3 0.1 0.2" contype="0"/></body>'
-)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("joint", ["hinge", "weld", "ball", "slide"])
-def test_momentum_across_a_connect(joint):
-    """Two free bodies caught together: momentum stays to 1e-12, energy never grows, the joint's
-    freedoms take nothing."""
-    chain = svkc.load(
-        TWO,
-        virtual_links=[
-            svkc.VirtualLink(
-                "grip",
-                "a",
-                "b",
-                joint,
-                pos=(0.4, 0.1, 0),
-                real_pos=(-0.6, 0.1, 0),
-                axis=(0.2, 0.5, 1),
-            )
-        ],
-    )
-    rng = np.random.default_rng(1)
+def test_both_forms_of_it_agree_between_free_bodies(joint):
+    chain, rng = models.two_boxes(joint), np.random.default_rng(1)
     state = chain.state(v=rng.normal(size=12))
     after = svkc.connect(chain, state, "grip")
-    for a, b in zip(svkc.momentum(chain, state), svkc.momentum(chain, after), strict=True):
-        np.testing.assert_allclose(a, b, atol=1e-12 * float(jnp.abs(a).max()))
-    assert float(svkc.kinetic_energy(chain, after)) < float(svkc.kinetic_energy(chain, state))
     assert float(jnp.abs(svkc.velocity_gaps(chain, after)).max()) < 1e-12
     v, _ = paper.velocity_by_impulse(chain, state, "grip")
     np.testing.assert_allclose(after.v, v, atol=1e-10)
 
 
 def test_grip_where_it_is():
-    """Bodies away from the declared placement: refused by name and distance; here=True makes the
-    joint where the real link is."""
+    """Bodies away from the declared placement: here=True makes the joint where the real link is."""
     chain = svkc.load(
-        TWO,
+        models.TWO_BOXES,
         virtual_links=[
             svkc.VirtualLink("grip", "a", "b", "hinge", pos=(0, 0, 0), real_pos=(-0.6, 0.1, 0))
         ],
     )
     state = chain.state(v=np.arange(12.0))
-    with pytest.raises(ValueError, match=r"away from where the joint is declared.*here=True"):
-        svkc.connect(chain, state, "grip")
     after = svkc.connect(chain, state, "grip", here=True)
     np.testing.assert_allclose(after.q[:14], state.q[:14], atol=1e-15)
     np.testing.assert_allclose(after.structure.pos[0], [0.4, 0.1, 0], atol=1e-15)
@@ -159,38 +102,6 @@ def test_lock_and_unlock(high_bar):
     assert float(svkc.forward_dynamics(chain, free, jnp.zeros(chain.dofs))[knee]) != 0
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (
-            lambda c, s: svkc.connect(c, s, "third_hand"),
-            "third_hand.*virtual links: right_hand_grip",
-        ),
-        (lambda c, s: svkc.cut(c, s, "nose"), "nose"),
-        (lambda c, s: svkc.transition(c, s, np.array([1, 0])), "Booleans"),
-        (lambda c, s: svkc.lock(c, s, "neck"), "neck"),
-        (lambda c, s: svkc.bind(c, s, "left_hand_grip", "world", "head"), "not a spare slot"),
-        (lambda c, s: c.state(q={"nose": 1.0}), "no joint 'nose'"),
-        (lambda c, s: c.state(q=np.zeros(3)), "shape"),
-        (lambda c, s: c.state(q={"base": np.zeros(3)}), "got 3 numbers, the joint has 7"),
-        (lambda c, s: c.state(q={"base": [0, 0, 0, 2, 0, 0, 0]}), "norm 2"),
-        (lambda c, s: c.state(v=np.full(c.nv, np.nan)), "finite"),
-        (lambda c, s: c.state(v=["x"] * c.nv), "real numbers"),
-        (
-            lambda c, s: c.state(
-                q={"base": [9, 0, 0, 1, 0, 0, 0], "left_knee": 0.1}, connected="foot"
-            ),
-            "foot",
-        ),
-        (lambda c, s: svkc.forward_dynamics(c, s, jnp.zeros(3)), "expected 24 joint torques"),
-        (lambda c, s: svkc.inverse_dynamics(c, s, jnp.zeros(3)), "expected 22"),
-    ],
-)
-def test_wrong_calls(high_bar, call, message):
-    with pytest.raises(ValueError, match=message):
-        call(*high_bar)
-
-
 @pytest.mark.slow
 def test_states_and_changes_under_jit_and_vmap(high_bar):
     """The verbs are functions of arrays: the same numbers compiled, and lane by lane."""
@@ -208,22 +119,3 @@ def test_states_and_changes_under_jit_and_vmap(high_bar):
     moving, again = lanes(v)
     np.testing.assert_allclose(moving.v[1], chain.state(state.q[: chain.nq], v[1]).v, atol=1e-12)
     np.testing.assert_allclose(again.v, moving.v, atol=1e-12)
-
-
-def test_loops_that_cannot_be_closed():
-    """Two links too short to reach: says which loop, and by how much."""
-    xml = models.MJCF.format(
-        models.bar(
-            "short", models.Y, "0 0 0.2", inside=models.bar("tip", models.Y, "0.2 0 0.1", "0 0 0.2")
-        )
-    )
-    chain = svkc.load(
-        xml,
-        virtual_links=[
-            svkc.VirtualLink(
-                "far", "world", "tip", "ball", pos=(3, 0, 0), real_pos=(0.2, 0, 0), connected=True
-            )
-        ],
-    )
-    with pytest.raises(ValueError, match=r"cannot be closed.*far by \d\.\d+ m and"):
-        chain.state()

@@ -1,9 +1,7 @@
 """Open chains against MuJoCo, every intermediate along a trajectory: random trees, figures nobody
 here wrote, one URDF."""
 
-import pathlib
-
-import gymnasium
+import cases
 import jax
 import jax.numpy as jnp
 import models
@@ -17,49 +15,15 @@ from svkc.loops.forward_dynamics import acceleration
 from svkc.tree.configuration import rates
 from svkc.tree.kinematics import kinematics
 
-ASSETS = pathlib.Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
-URDF = """<robot name="arm">
-<link name="base"/><link name="upper"><inertial><origin xyz="0 0.02 0.15" rpy="0.1 0.2 0.3"/><mass
-  value="2"/>
-<inertia ixx="0.02" iyy="0.03" izz="0.015" ixy="0.002" ixz="0.001" iyz="0.003"/></inertial></link>
-<link name="lower"><inertial><origin xyz="0 0 0.1"/><mass value="1"/><inertia ixx="0.01" iyy="0.01"
-  izz="0.004" ixy="0" ixz="0" iyz="0"/></inertial></link>
-<link name="tool"><inertial><mass value="0.5"/><inertia ixx="0.001" iyy="0.001" izz="0.001" ixy="0"
-  ixz="0" iyz="0"/></inertial></link>
-<joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/><origin
-  xyz="0 0 0.4" rpy="0 0.3 0"/><axis xyz="0 1 0"/>
-<limit lower="-2" upper="2" effort="50" velocity="5"/><dynamics damping="0.2"/></joint>
-<joint name="elbow" type="continuous"><parent link="upper"/><child link="lower"/><origin
-  xyz="0 0 0.3"/><axis xyz="1 1 0"/></joint>
-<joint name="wrist" type="prismatic"><parent link="lower"/><child link="tool"/><origin
-  xyz="0 0 0.2"/><axis xyz="0 0 1"/>
-<limit lower="-0.1" upper="0.1" effort="50" velocity="5"/></joint></robot>"""
 # MuJoCo says it of gymnasium's half_cheetah.xml
 pytestmark = pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass' is deprecated")
-SOURCES = {
-    name: str(ASSETS / f"{name}.xml")
-    for name in ("humanoid", "ant", "half_cheetah", "hopper", "walker2d")
-}
-SOURCES |= {f"random_{n}": models.random_tree(n, seed=n) for n in (2, 7, 25, 60)} | {
-    "urdf": URDF,
-    "figure40": str(svkc.scenes.FOLDER / "figure40.xml"),
-}
 
 
-# of each kind one, in the fast tier: a tree of everything, a figure of others, a URDF
-FAST = ("random_7", "hopper", "urdf")
-
-
-@pytest.fixture(
-    params=[
-        name if name in FAST else pytest.param(name, marks=pytest.mark.slow) for name in SOURCES
-    ],
-    scope="module",
-)
+@pytest.fixture(params=cases.params("tree"), scope="module")
 def run(request):
     """A chain, MuJoCo's data without constraints, and eight states along MuJoCo's own motion with
     random torques."""
-    chain = svkc.load(SOURCES[request.param])
+    chain = cases.CASES[request.param].build()
     model = chain.model.model
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     model.opt.timestep, model.opt.integrator = 0.002, mujoco.mjtIntegrator.mjINT_RK4
@@ -145,34 +109,8 @@ def test_every_intermediate(run):
             assert np.abs(np.asarray(got[name]) - value).max() <= 1e-10 * scale, name
 
 
-def test_momentum_of_a_free_system():
-    """No gravity, no ground: forces inside change neither linear nor angular momentum."""
-    text = models.random_tree(8, seed=4, kinds=("free", "ball", "hinge")).replace(
-        'gravity="0.3 -0.2 -9.81"', 'gravity="0 0 0"'
-    )
-    import re
-
-    text = re.sub(
-        r'<body name="b1"([^>]*)>(<joint[^>]*/>)*', r'<body name="b1"\1><freejoint/>', text, count=1
-    )
-    chain = svkc.load(text)
-    if np.sum(np.array(chain.parent) == 0) > 1 or chain.topology.kind[1] != 4:
-        pytest.fail("the model should be one free tree")
-    rng = np.random.default_rng(0)
-    state = chain.state(v=rng.normal(size=chain.nv))
-    vdot = svkc.forward_dynamics(
-        chain, state, jnp.concatenate([jnp.zeros(6), jnp.asarray(rng.normal(size=chain.nv - 6))])
-    )
-
-    def both(q, v):
-        return jnp.concatenate(svkc.momentum(chain, svkc.State(q, v, state.structure)))
-
-    value, change = jax.jvp(both, (state.q, state.v), (rates(chain, state.q, state.v), vdot))
-    assert float(jnp.max(jnp.abs(change))) < 1e-10 * float(jnp.max(jnp.abs(value)))
-
-
 def test_integrate_and_difference_are_inverse():
-    chain = svkc.load(SOURCES["random_7"])
+    chain = cases.CASES["random_7"].build()
     rng = np.random.default_rng(0)
     q, dv = chain.state().q, jnp.asarray(0.5 * rng.normal(size=chain.nv))
     np.testing.assert_allclose(
@@ -183,7 +121,7 @@ def test_integrate_and_difference_are_inverse():
 
 
 def test_open_chain_has_nothing_of_the_closure():
-    chain = svkc.load(SOURCES["hopper"])
+    chain = cases.CASES["hopper"].build()
     text = str(jax.make_jaxpr(lambda s: svkc.forward_dynamics(chain, s, s.v))(chain.state()))
     for foreign in ("while", "scan", "argmax"):
         assert foreign not in text

@@ -1,5 +1,5 @@
-"""What the library raises, read from its sources and from the page that lists it, and what a call
-looks like without the tests' own type checks."""
+"""docs/errors.md and the messages that the library raises, read from its sources,
+and what a call looks like without the tests' own type checks."""
 
 import ast
 import contextlib

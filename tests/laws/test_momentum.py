@@ -1,0 +1,118 @@
+"""Momentum: of what hangs on nothing it is kept; otherwise it changes by what the world gives."""
+
+import cases
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import models
+import numpy as np
+import pytest
+
+import svkc
+from svkc.transitions.transition import change
+from svkc.tree.configuration import rates
+
+
+@pytest.mark.parametrize("name", cases.params("afloat"))
+def test_its_rate(name):
+    """That of the weight and of the loop forces: joint torques change neither of the two."""
+    chain, state, tau = cases.CASES[name].moving()
+    # the base is moved by none, and no grip is driven
+    tau = tau.at[:6].set(0).at[chain.nv :].set(0)
+    vdot = svkc.forward_dynamics(chain, state, tau)
+
+    def both(q, v):
+        return jnp.stack(svkc.momentum(chain, svkc.State(q, v, state.structure)))
+
+    value, rate = jax.jvp(both, (state.q, state.v), (rates(chain, state.q, state.v), vdot))
+    force, torque = svkc.loop_forces(chain, state, tau)
+    weighed = lambda g: svkc.potential_energy(eqx.tree_at(lambda c: c.gravity, chain, g), state)
+    # the mass times the place of its centre
+    place = -jax.grad(weighed)(chain.gravity)
+    weight, held = jnp.sum(chain.mass) * chain.gravity, np.cross(state.structure.pos, force)
+    moment = np.cross(place, chain.gravity) + torque.sum(0) + held.sum(0)
+    largest = max(float(jnp.abs(value).max()), float(jnp.abs(force).max(initial=0)))
+    np.testing.assert_allclose(rate, [weight + force.sum(0), moment], atol=1e-10 * largest)
+
+
+def by_itself(step):
+    """A change in which the world gives nothing."""
+    return lambda state: (step(state), np.zeros((2, 3)))
+
+
+def caught():
+    """The figure beside the bar, caught by both hands: their impulses, and the moments of those."""
+    chain, state = cases.flight()
+
+    def hands(state):
+        done = change(chain, state, jnp.array([True, True]))
+        moment = np.cross(chain.structure.pos, done.impulse) + np.asarray(done.angular_impulse)
+        lost = svkc.kinetic_energy(chain, state) - svkc.kinetic_energy(chain, done.state)
+        np.testing.assert_allclose(done.energy_lost, lost, rtol=1e-10)
+        # about the bar the hands turn freely
+        assert np.abs(np.asarray(done.angular_impulse)[:, 1]).max() < 1e-10
+        return done.state, np.stack([done.impulse.sum(0), moment.sum(0)])
+
+    return chain, state, [("connect", hands)]
+
+
+def joined(joint):
+    """Two free boxes."""
+    chain, rng = models.two_boxes(joint), np.random.default_rng(1)
+    connect = by_itself(lambda s: svkc.connect(chain, s, "grip"))
+    return chain, chain.state(v=rng.normal(size=12)), [("connect", connect)]
+
+
+def every_kind():
+    """Connect, cut, bind, unbind, lock, unlock, a joint coming off and made again."""
+    chain, rng = models.box_with_a_limb(), np.random.default_rng(7)
+    state = chain.state(
+        {"limb": 0.3}, {"a": rng.normal(size=6), "b": rng.normal(size=6), "limb": 1.0}
+    )
+    bind = lambda s: svkc.bind(chain, s, "spare_0", "limb", "b", joint="ball")
+    steps = [
+        ("connect", lambda s: svkc.connect(chain, s, "weld", here=True)),
+        ("lock", lambda s: svkc.lock(chain, s, "limb")),
+        ("unlock", lambda s: svkc.unlock(chain, s, "limb")),
+        ("cut", lambda s: svkc.cut(chain, s, "weld")),
+        ("grip", lambda s: svkc.connect(chain, bind(s), "spare_0", here=True)),
+        ("cut", lambda s: svkc.cut(chain, s, "limb")),
+        ("cut", lambda s: svkc.unbind(chain, s, "spare_0")),
+        ("move", lambda s: svkc.simulate(chain, s, 0.1, rtol=1e-9, atol=1e-11).final),
+        ("connect", lambda s: svkc.connect(chain, s, "limb", here=True)),
+    ]
+    return chain, state, [(name, by_itself(step)) for name, step in steps]
+
+
+CHANGES = {
+    "caught": caught,
+    **{joint: lambda joint=joint: joined(joint) for joint in ("hinge", "weld", "ball", "slide")},
+    "every_kind": every_kind,
+}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "caught",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in CHANGES if name != "caught"),
+    ],
+)
+def test_across_changes(name):
+    """It changes by the impulses of the world, to round-off; energy never grows; cuts change no
+    velocity."""
+    chain, state, steps = CHANGES[name]()
+    for kind, step in steps:
+        after, given = step(state)
+        for before, now, by_world in zip(
+            svkc.momentum(chain, state), svkc.momentum(chain, after), given, strict=True
+        ):
+            bound = (1e-8 if kind == "move" else 1e-12) * float(jnp.abs(before).max())
+            np.testing.assert_allclose(now - before, by_world, atol=bound, err_msg=kind)
+        gain = float(svkc.kinetic_energy(chain, after) - svkc.kinetic_energy(chain, state))
+        # (of the boxes some are caught that move together already)
+        assert gain < 0 or name == "every_kind"
+        assert gain <= 1e-12 or kind == "move"
+        if kind in ("cut", "unlock"):
+            assert bool(jnp.all(after.v == state.v))
+        state = after

@@ -1,0 +1,383 @@
+"""Calls that are to be refused, by the message that each is refused with."""
+
+from unittest import mock
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import models
+import mujoco
+import numpy as np
+
+import svkc
+from svkc._jax.primitive import operation
+from svkc.cli import run as commands
+
+FREE = models.MJCF.format(models.bar("base", 'type="free"', "0 0 1"))
+
+
+class Setting:
+    """What calls are made on."""
+
+    def __init__(self, folder):
+        self.folder = folder
+        self.four = models.four_bar()
+        self.state = self.four.state()
+        self.spare = svkc.load(models.MJCF.format(models.FOUR_BAR), spare=1)
+        self.empty = self.spare.state()
+        self.motor = models.MJCF.format(models.bar("arm", models.Y, "0 0 -1")).replace(
+            "</mujoco>", '<actuator><motor joint="arm"/></actuator></mujoco>'
+        )
+        self.free = svkc.load(FREE)
+        self.data = mujoco.MjData(svkc.load(self.motor).model.model)
+
+    def simulate(self, chain=None, **kw):
+        chain = chain or self.four
+        state = kw.pop("state", self.state if chain is self.four else self.empty)
+        return svkc.simulate(chain, state, **({"t1": 1.0} | kw))
+
+    def load(self, text=None, **kw):
+        return svkc.load(text or models.MJCF.format(models.FOUR_BAR), **kw)
+
+    def file(self, **changed):
+        """Loads a run whose file was changed."""
+        path = self.folder / "run.npz"
+        if not path.exists():
+            self.simulate(t1=1e-3, dt=1e-3).save(path)
+        with np.load(path) as file:
+            arrays = dict(file) | changed
+        np.savez(
+            self.folder / "changed.npz", **{name: x for name, x in arrays.items() if x is not None}
+        )
+        return svkc.load_trajectory(self.folder / "changed.npz")
+
+    def gripped(self, *args, **kw):
+        grip = svkc.Grip(*args, **kw)
+        return self.simulate(self.spare, t1=0.5, events=[svkc.at(0.1, bind=grip)])
+
+    def bound(self, *args, **kw):
+        return svkc.bind(self.spare, self.empty, "spare_0", *args, **kw)
+
+
+def away(s):
+    """A link that is to hold what is elsewhere."""
+    chain = s.load(virtual_links=[link(pos=(5, 0, 0), real_pos=(0, 0, 0))])
+    return svkc.connect(chain, chain.state(), "x")
+
+
+def link(**kw):
+    return svkc.VirtualLink(**({"name": "x", "parent": "world", "real": "rocker"} | kw))
+
+
+def far(s):
+    """A link that its bars are too short for."""
+    return s.load(virtual_links=[link(pos=(50, 0, 0), real_pos=(0, 0, 0), connected=True)])
+
+
+def endless():
+    model = mujoco.MjModel.from_xml_string(models.MJCF.format(models.bar("a", models.Y, "0 0 -1")))
+    model.body_mass[1] = np.inf
+    return model
+
+
+def single(s):
+    with jax.enable_x64(False):
+        s.simulate()
+
+
+def crowded(s):
+    with mock.patch("jax.process_count", return_value=9):
+        svkc.rollout(s.four, jax.tree.map(lambda x: x[None], s.state), 1.0)
+
+
+def too_large(s):
+    exhausted = jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory.")
+    with mock.patch("svkc.tools.rollout._piece", side_effect=exhausted):
+        svkc.rollout(s.four, jax.tree.map(lambda x: x[None], s.state), 1.0)
+
+
+def undrawn(s):
+    traj = s.simulate(t1=1e-3, dt=1e-3)
+    with mock.patch.dict(
+        "sys.modules", {"mujoco.egl": None, "mujoco.osmesa": None, "mujoco.glfw": None}
+    ):
+        svkc.render(s.four, traj, s.folder / "x.gif")
+
+
+def twice(s):
+    """Two specs attached with one prefix: two default classes of one name."""
+    spec = mujoco.MjSpec()
+    for name in ("a", "b"):
+        part = mujoco.MjSpec()
+        body = part.worldbody.add_body(name=name)
+        body.add_joint(name=f"{name}_joint")
+        body.add_geom(size=[0.1, 0, 0])
+        spec.attach(part, prefix="the_", frame=spec.worldbody.add_frame())
+    svkc.load(spec).to_mjcf()
+
+
+def without_ffmpeg(s):
+    with mock.patch.dict("sys.modules", {"imageio_ffmpeg": None}):
+        svkc.render(s.four, s.simulate(t1=1e-3, dt=1e-3), s.folder / "x.mp4")
+
+
+def nameless(s):
+    path = s.folder / "nameless.npz"
+    s.simulate(t1=1e-3, dt=1e-3).save(path)
+    svkc.load_chain(path)
+
+
+def undrawable(s):
+    with mock.patch.dict("sys.modules", {"matplotlib": None}):
+        s.simulate(t1=1e-3, dt=1e-3).plot()
+
+
+CASES = {
+    "pictures need": undrawable,
+    "... holds no model": nameless,
+    "camera: no": lambda s: svkc.render(
+        s.four, s.simulate(t1=1e-3, dt=1e-3), s.folder / "x.gif", camera="nobody's"
+    ),
+    "mp4 needs": without_ffmpeg,
+    "run: no scene": lambda s: commands._scene("nowhere", ()),
+    "run: no virtual": lambda s: commands._asked(s.four, [("release", "nobody", 0.1)]),
+    "trails: no": lambda s: svkc.render(
+        s.four, s.simulate(t1=1e-3, dt=1e-3), s.folder / "x.gif", trails=("nobody",)
+    ),
+    "... is not linear": lambda s: jax.linear_transpose(
+        operation("odd", jnp.sin, lambda p, t: (p[0], t[0])), jnp.ones(2)
+    )(jnp.ones(2)),
+    "no library to draw with": undrawn,
+    "state and chain are float64": single,
+    "states: ... lanes": crowded,
+    "... has schema": lambda s: s.file(metadata=np.array('{"schema": 99}')),
+    "... is not a whole trajectory": lambda s: s.file(metadata=None),
+    "... lacks": lambda s: s.file(ts=None),
+    "...: expected a function": lambda s: s.simulate(control=3),
+    "...: expected finite": lambda s: s.four.state([np.nan, 0, 0]),
+    "...: expected real": lambda s: s.four.state(["a", "b", "c"]),
+    "...: expected names": lambda s: svkc.at(0.5, connect=3),
+    "...: got ..., expected True": lambda s: link(connected="no"),
+    "...: got ..., expected a whole": lambda s: s.load(spare=1e300),
+    "...: got shape ..., expected (...,); for many use": lambda s: svkc.xyzw(s.four, jnp.zeros(9)),
+    "...: got ..., expected a positive": lambda s: s.simulate(dt=-1.0),
+    "...: got shape ..., expected (...,) for the tree": lambda s: s.four.state(np.zeros(7)),
+    "...: got shape ..., expected a number or": lambda s: svkc.actuation(
+        s.four, s.state, jnp.zeros(4), bounds=(np.zeros(2), np.ones(2))
+    ),
+    "...: got shape ..., expected ... numbers": lambda s: svkc.render(
+        s.four, s.simulate(t1=1e-3, dt=1e-3), s.folder / "x.gif", lookat=(1, 2)
+    ),
+    "...: got shape ..., expected one number": lambda s: s.simulate(t1=jnp.ones(2)),
+    "...[...]: got": lambda s: s.four.state({"crank": [1.0, 2.0]}),
+    "actuated: expected": lambda s: svkc.actuation(
+        s.four, s.state, jnp.zeros(4), actuated=np.ones(2, bool)
+    ),
+    "adjoint: expected": lambda s: s.simulate(adjoint="replay"),
+    "adjoint: svkc.Replay": lambda s: s.simulate(
+        stepsize_controller=diffrax.StepTo(jnp.linspace(0, 1, 5)), adjoint=svkc.Replay()
+    ),
+    "at: got time": lambda s: s.simulate(events=[svkc.at(-1.0, cut="pin")]),
+    "at: time must": lambda s: s.simulate(events=[svkc.at(jnp.ones(2), cut="pin")]),
+    "bind: ... is not": lambda s: svkc.bind(s.four, s.state, "pin", "world", "rocker"),
+    "bind: a spare slot has no": lambda s: s.bound("world", "rocker", joint="universal"),
+    "bind: axis": lambda s: s.bound("world", "rocker", joint="hinge", axis=(0, 0, 0)),
+    "bind: expected": lambda s: svkc.at(0.5, bind="rocker"),
+    "bind: no body": lambda s: s.bound("world", "nobody"),
+    "bind: ...: expected three": lambda s: s.simulate(
+        s.spare, events=[svkc.at(0.5, bind=[svkc.Grip("world", "rocker", real_pos=jnp.zeros(2))])]
+    ),
+    "bind: the chain": lambda s: s.simulate(
+        events=[svkc.at(0.5, bind=[svkc.Grip("world", "rocker")])]
+    ),
+    "bounds: expected (": lambda s: svkc.actuation(s.four, s.state, jnp.zeros(4), bounds=3),
+    "bounds: expected lower": lambda s: svkc.actuation(
+        s.four, s.state, jnp.zeros(4), bounds=(1.0, -1.0)
+    ),
+    "bounds: the bounded": lambda s: jax.jit(
+        lambda x: svkc.actuation(s.four, s.state, x, bounds=(-1.0, 1.0))
+    )(jnp.zeros(4)),
+    "chain: expected": lambda s: svkc.poses(3, s.state),
+    "check_grad: f(x) has": lambda s: svkc.check_grad(lambda x: 1, jnp.asarray(1.0)),
+    "check_grad: f(x)...": lambda s: svkc.check_grad(lambda x: jnp.log(x), jnp.asarray(-1.0)),
+    "check_grad: x has": lambda s: svkc.check_grad(lambda x: x, jnp.asarray(1)),
+    "chunk=... lanes": too_large,
+    "connect: the bodies": away,
+    "connected: expected": lambda s: s.four.state(connected=np.ones(3)),
+    "cost: got": lambda s: svkc.rollout(
+        s.four, jax.tree.map(lambda x: x[None], s.state), 1.0, cost=jnp.ones((1, 2))
+    ),
+    "cuttable: ... belongs": lambda s: s.load(
+        models.MJCF.format(
+            '<body name="b"><joint name="x" type="slide"/><joint name="y" type="slide"/><geom'
+            ' size="0.1"/></body>'
+        ),
+        cuttable="x",
+    ),
+    "cuttable: no joint": lambda s: s.load(cuttable="nobody"),
+    "data: got": lambda s: svkc.to_mujoco(
+        s.four, s.state, type("Data", (), {"qpos": np.zeros(1), "qvel": np.zeros(1)})()
+    ),
+    "devices: expected": lambda s: svkc.rollout(
+        s.four, jax.tree.map(lambda x: x[None], s.state), 1.0, devices=[]
+    ),
+    "dt: got": lambda s: s.simulate(dt=1e-12),
+    "dt asks": lambda s: s.simulate(dt=0.1, rtol=1e-3),
+    "dynamics.hold": lambda s: s.simulate(dynamics=svkc.dynamics.CompositeBodies(hold=2.0)),
+    "dynamics.inertia": lambda s: s.simulate(dynamics=svkc.Dynamics(inertia=lambda *_: None)),
+    "dynamics: expected": lambda s: s.simulate(dynamics=3),
+    "events: expected": lambda s: s.simulate(events=["pin"]),
+    "here: ...": lambda s: svkc.at(0.5, connect="pin", here="other"),
+    "ignore: got": lambda s: s.load(ignore=("nothing",)),
+    "joint: got": lambda s: link(joint="screw"),
+    "lane: expected a dict": lambda s: svkc.rollout(
+        s.four, jax.tree.map(lambda x: x[None], s.state), 1.0, lane=lambda chain, data: 3
+    ),
+    "load_trajectory: expected": lambda s: svkc.load_trajectory(3),
+    "leaves: axis": lambda s: svkc.leaves(s.four, "pin", axis=(0, 0, 0)),
+    "mode: got": lambda s: svkc.check_grad(lambda x: x, jnp.asarray(1.0), mode="sideways"),
+    "no joint ...": lambda s: s.four.state({"nobody": 1.0}),
+    "no joint coordinate": lambda s: svkc.prefer(s.four, s.state, "nobody"),
+    "source: no such file": lambda s: s.load("nowhere.xml"),
+    "no virtual link": lambda s: svkc.cut(s.four, s.state, "nobody"),
+    "overload: give": lambda s: svkc.overload(s.four, "pin"),
+    "q: the quaternion": (
+        lambda s: s.load(models.MJCF.format(models.bar("b", 'type="ball"', "0 0 1"))).state(
+            [1.0, 1.0, 0, 0]
+        )
+    ),
+    "render: a picture": lambda s: svkc.render(
+        s.four, jax.tree.map(lambda x: x[None], s.simulate(t1=1e-3, dt=1e-3)), s.folder / "x.html"
+    ),
+    "render: ... should": lambda s: svkc.render(s.four, s.simulate(t1=1e-3, dt=1e-3), "x.bmp"),
+    "rtol and atol": lambda s: s.simulate(
+        rtol=1e-3, stepsize_controller=diffrax.PIDController(rtol=1e-3, atol=1e-6)
+    ),
+    "simulate stopped": lambda s: s.simulate(t1=1e-2, dt=1e-3, max_steps=2),
+    "solver: ... does not": lambda s: s.simulate(solver=diffrax.Euler()),
+    "solver: expected": lambda s: s.simulate(solver="euler"),
+    "source: expected": lambda s: svkc.load(3),
+    "source: names of": lambda s: s.load(
+        models.MJCF.format(
+            models.bar("joint_1", models.Y, "0 0 -1", inside=models.bar("", models.Y, "0 0 -1"))
+        )
+    ),
+    "source: the model has no joints": lambda s: svkc.load("<mujoco/>"),
+    "source: the model has numbers": lambda s: svkc.load(endless()),
+    "...: expected a diffrax one": lambda s: s.simulate(stepsize_controller=3),
+    "source: the model cannot": lambda s: s.load("<mujoco><nonsense/></mujoco>"),
+    "stabilization": lambda s: s.simulate(stabilization=3),
+    "state....: got": lambda s: s.simulate(
+        state=svkc.State(jnp.zeros(2), s.state.v, s.state.structure)
+    ),
+    "state.q is": lambda s: s.simulate(
+        state=eqx.tree_at(lambda x: (x.q, x.v), s.state, replace_fn=lambda x: x.astype(jnp.float32))
+    ),
+    "state: expected": lambda s: svkc.poses(s.four, 3),
+    "state: q and v": lambda s: s.simulate(
+        state=svkc.State(s.state.q * jnp.nan, s.state.v, s.state.structure)
+    ),
+    "states, data, cost": lambda s: svkc.rollout(
+        s.four, jax.tree.map(lambda x: x[None], s.state), 1.0, data=jnp.zeros(3)
+    ),
+    "states: expected": lambda s: svkc.rollout(s.four, 3, 1.0),
+    "t1: got": lambda s: s.simulate(t1=-1.0),
+    "target: ... cannot": lambda s: svkc.tune(
+        s.four,
+        s.state,
+        1e-2,
+        target=1e-3,
+        control=lambda t, x, args: jnp.full(s.four.dofs, jnp.nan),
+    ),
+    "tau: got": lambda s: svkc.forward_dynamics(s.four, s.state, jnp.zeros(9)),
+    "the loops cannot": lambda s: far(s).state(),
+    "the model has elements": lambda s: s.load(
+        s.motor.replace("</worldbody>", '<site name="s"/></worldbody>').replace(
+            "<motor", "<position"
+        )
+    ),
+    "to_mjcf: MuJoCo": twice,
+    "to_mjcf: the": lambda s: svkc.load(s.four.model.model).to_mjcf(),
+    "traj: expected": lambda s: svkc.render(s.four, 3, "x.gif"),
+    "touch: axes": lambda s: svkc.touch(s.four, "pin", 0.1, axes="w"),
+    "ts: expected": lambda s: s.simulate(ts=jnp.array([0.5, 0.2])),
+    "u: got": lambda s: s.load(s.motor).motors(jnp.zeros(3)),
+    "unbind: expected": lambda s: svkc.at(0.5, unbind=3),
+    "vdot: got": lambda s: svkc.inverse_dynamics(s.four, s.state, jnp.zeros(9)),
+    "vdot_G: got": lambda s: svkc.actuation(s.four, s.state, jnp.zeros(9)),
+    "virtual link: ...": lambda s: link(name=3),
+    "virtual link ...: ... is": lambda s: s.load(virtual_links=[link(parent="nobody")]),
+    "virtual link ...: ... must be ... finite": lambda s: link(pos=(1, 2)),
+    "virtual link ...: ... must be a unit": lambda s: link(quat=(1, 1, 0, 0)),
+    "virtual link ...: axis": lambda s: link(axis=(0, 0, 0)),
+    "virtual_links: expected": lambda s: s.load(virtual_links=["pin"]),
+    "virtual_links: names": lambda s: s.load(virtual_links=[link(), link()]),
+    "weight: expected": lambda s: svkc.actuation(s.four, s.state, jnp.zeros(4), weight=-np.ones(4)),
+    "when: direction": lambda s: svkc.when(lambda t, x, args: t, direction="up"),
+    "when: guard": lambda s: svkc.when(3),
+}
+
+# other ways to some of the messages, by words of those
+ALSO = [
+    ("libegl1 libgl1", undrawn),
+    # runs
+    ("ts", lambda s: s.simulate(ts=[0.0, 2.0])),
+    ("rtol", lambda s: s.simulate(rtol=0.0)),
+    ("max_events", lambda s: s.simulate(max_events=-1)),
+    ("max_steps", lambda s: s.simulate(max_steps=0)),
+    ("hoook", lambda s: s.simulate(events=[svkc.at(0.5, cut="hoook")])),
+    ("expected 4 joint torques", lambda s: s.simulate(control=lambda t, x, args: jnp.zeros(5))),
+    ("expected 4 joint torques", lambda s: svkc.step(s.four, s.state, jnp.zeros(2), 1e-3)),
+    ("here", lambda s: svkc.at(1.0, here="a")),
+    ("target: got 0", lambda s: svkc.tune(s.four, s.state, 0.5, target=0.0)),
+    ("expected an object of svkc.dynamics", lambda s: s.simulate(dynamics=svkc.Projection())),
+    (
+        "expected an object of svkc.dynamics",
+        lambda s: s.simulate(dynamics=svkc.dynamics.UnitVectors),
+    ),
+    (
+        "dynamics.hold: got 2.0",
+        lambda s: s.simulate(dynamics=svkc.dynamics.ArticulatedBodies(hold=2.0)),
+    ),
+    ("dynamics.hold: got 2.0", lambda s: s.simulate(dynamics=svkc.Dynamics(hold=2.0))),
+    (
+        "dynamics.inertia: got",
+        lambda s: s.simulate(dynamics=svkc.Dynamics(inertia=svkc.mass_matrix)),
+    ),
+    ("one leading axis of lanes", lambda s: svkc.rollout(s.four, s.state, 1.0)),
+    ("check_grad: x has", lambda s: svkc.check_grad(jnp.sin, 3)),
+    # verbs
+    ("weight.*positive", lambda s: svkc.actuation(s.four, s.state, jnp.zeros(4), np.zeros(4))),
+    ("weight.*shape", lambda s: svkc.actuation(s.four, s.state, jnp.zeros(4), np.ones(2))),
+    ("nobody.*virtual links: pin", lambda s: svkc.connect(s.four, s.state, "nobody")),
+    ("Booleans", lambda s: svkc.transition(s.four, s.state, np.array([1]))),
+    ("neck", lambda s: svkc.lock(s.four, s.state, "neck")),
+    ("expected 4 joint torques", lambda s: svkc.forward_dynamics(s.four, s.state, jnp.zeros(2))),
+    ("got 1 qpos and 1 qvel.* has 3 and 3", lambda s: svkc.to_mujoco(s.four, s.state, s.data)),
+    ("got 1 qpos and 1 qvel.* has 3 and 3", lambda s: svkc.from_mujoco(s.four, s.data)),
+    ("no virtual link 'pins'", lambda s: svkc.touch(s.four, "pins")),
+    ("axes", lambda s: svkc.touch(s.four, "pin", axes="xx")),
+    # states
+    ("got 3 numbers, the joint has 7", lambda s: s.free.state(q={"base": np.zeros(3)})),
+    ("norm 2", lambda s: s.free.state(q={"base": [0, 0, 0, 2, 0, 0, 0]})),
+    ("finite", lambda s: s.four.state(v=np.full(3, np.nan))),
+    ("real numbers", lambda s: s.four.state(v=["x"] * 3)),
+    ("foot", lambda s: s.four.state({"crank": 0.1}, connected="foot")),
+    # how far two bars reach
+    (r"cannot be closed.*x by \d+\.\d+ m and", lambda s: far(s).state()),
+    # grips in a run
+    ("no body 'nose'", lambda s: s.gripped("crank", "nose")),
+    ("no coordinates for 'universal'", lambda s: s.gripped("crank", "rocker", joint="universal")),
+    ("axis", lambda s: s.gripped("crank", "rocker", joint="hinge", axis=(0, 0, 0))),
+    ("no virtual link 'x'", lambda s: s.gripped("crank", "rocker", slot="x")),
+    # models
+    ("cannot be read", lambda s: s.load("<mujoco><worldbody><bod/></worldbody></mujoco>")),
+    ("no such file", lambda s: s.load("/no/such/file.xml")),
+    ("'leg', neither a body nor a site", lambda s: s.load(virtual_links=[link(real="leg")])),
+    ("neither a body nor a site", lambda s: s.load(virtual_links=[link(parent="\ud800")])),
+    ("whole number", lambda s: s.load(spare=[[1.0], [1.0, 2.0]])),
+    ("'base' belongs to body 'base'", lambda s: s.load(FREE, cuttable="base")),
+    ("no joint 'nose'; joints: crank", lambda s: s.load(cuttable="nose")),
+    ("chin", lambda s: s.load(cuttable=["rocker", "chin"])),
+]
