@@ -94,6 +94,13 @@ def test_the_door_is_what_is_listed():
     assert sorted(names) == sorted(DOOR.split())
 
 
+def test_old_names_of_stabilizations():
+    import svkc
+
+    assert svkc.Exact is svkc.stabilization.CoordinatePartitioning
+    assert svkc.Drift is svkc.stabilization.NoStabilization
+
+
 EXAMPLES = {
     "01_high_bar": ("24 joint freedoms", "22 joint freedoms"),
     "02_swing": ("31 joint freedoms", "29 joint freedoms"),
