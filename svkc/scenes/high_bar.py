@@ -21,7 +21,7 @@ def high_bar(**options) -> tuple[Chain, State]:
     for y in (-1.2, 1.2):
         add_rod(spec, (0, y, 0), (0, y, BAR_HEIGHT), radius=0.03)
     hands = [
-        hand_on_bar(f"{side}_hand_grip", side, x=0, y=y, connected=True)
+        hand_on_bar(f"{side}_hand_grip", side, x=0.0, y=y, connected=True)
         for side, y in (("right", -GRIP), ("left", GRIP))
     ]
     chain = load(spec, virtual_links=hands, **options)
