@@ -58,5 +58,5 @@ def hanging(arm: float, angle: float) -> list[float]:
     backwards (rad).
     """
     below = arm + PALM + SHOULDER
-    turn = [np.cos(angle / 2), 0, np.sin(angle / 2), 0]
-    return [-below * np.sin(angle), 0, BAR_HEIGHT - below * np.cos(angle), *turn]
+    turn = [np.cos(angle / 2), 0.0, np.sin(angle / 2), 0.0]
+    return [-below * np.sin(angle), 0.0, BAR_HEIGHT - below * np.cos(angle), *turn]
