@@ -1,4 +1,17 @@
-"""Derivatives of the time and the state at the end of a phase, by the implicit function theorem."""
+"""Derivatives of the time and the state at the end of a phase, by the implicit function theorem.
+
+A phase follows y' = f(t, y; p) and ends at the time T. Integration gives the change dy of y at a
+time that stays, for a change dp of everything else. The end moves along the field: its state
+changes by dy + f dT.
+
+- At a scheduled end, dT is the change of the schedule.
+- At an event, g(T, y(T); p) = 0 holds for every p, so that g_t dT + g_y (dy + f dT) + g_p dp = 0:
+  dT = -(g_y dy + g_p dp) / (g_t + g_y f). Where a guard touches zero without crossing it, the
+  denominator vanishes and dT is NaN. Where a guard jumps over zero, dT = 0.
+
+Second derivatives differentiate dy by T as well: d(dy)/dT = f_y dy + f_p dp. `carried` has this
+derivative and the value dy.
+"""
 
 import equinox as eqx
 import jax
