@@ -72,20 +72,22 @@ FOUR_BAR = bar(
 )
 
 
+PIN = svkc.VirtualLink(
+    "pin",
+    "world",
+    "rocker",
+    "hinge",
+    pos=(1.2, 0, 0),
+    axis=(0, 1, 0),
+    real_pos=(0.2, 0, -0.6),
+    connected=True,
+)
+
+
 def four_bar() -> svkc.Chain:
     """Crank, coupler, rocker on hinges about y; closed by a hinge. In space: 3 of the 6 rows are
     redundant."""
-    link = svkc.VirtualLink(
-        "pin",
-        "world",
-        "rocker",
-        "hinge",
-        pos=(1.2, 0, 0),
-        axis=(0, 1, 0),
-        real_pos=(0.2, 0, -0.6),
-        connected=True,
-    )
-    return svkc.load(MJCF.format(FOUR_BAR), virtual_links=[link])
+    return svkc.load(MJCF.format(FOUR_BAR), virtual_links=[PIN])
 
 
 def parallelogram(middle: bool = True) -> svkc.Chain:
