@@ -215,6 +215,10 @@ CASES = {
         ),
         cuttable="x",
     ),
+    "cuttable: got armature": lambda s: s.load(
+        models.MJCF.format(models.bar("arm", 'type="hinge" armature="0.1"', "0 0 -1")),
+        cuttable="arm",
+    ),
     "cuttable: no joint": lambda s: s.load(cuttable="nobody"),
     "data: got": lambda s: svkc.to_mujoco(
         s.four, s.state, type("Data", (), {"qpos": np.zeros(1), "qvel": np.zeros(1)})()
@@ -230,6 +234,7 @@ CASES = {
     "events: expected": lambda s: s.simulate(events=["pin"]),
     "here: ...": lambda s: svkc.at(0.5, connect="pin", here="other"),
     "ignore: got": lambda s: s.load(ignore=("nothing",)),
+    "ignore_armature: no joint": lambda s: s.load(ignore_armature="nobody"),
     "joint: got": lambda s: link(joint="screw"),
     "lane: expected a dict": lambda s: svkc.rollout(
         s.four, jax.tree.map(lambda x: x[None], s.state), 1.0, lane=lambda chain, data: 3

@@ -9,7 +9,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.eager import eager_jit
 from svkc._jax.pytrees import concrete
-from svkc.loops.constrained_dynamics import with_links
 from svkc.loops.constraint import loop_kinematics, scales
 from svkc.loops.coordinates import constrained, open_coordinates
 from svkc.loops.forward_dynamics import constraint_forces
@@ -17,7 +16,7 @@ from svkc.loops.pivoting import Selection, select, select_with_rank
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import check_state
 from svkc.model.validation import arrayed, numbers
-from svkc.tree.inverse_dynamics import generalized_forces, passive_forces
+from svkc.tree.inverse_dynamics import generalized_forces, over_all_dofs, passive_forces
 from svkc.tree.kinematics import kinematics, twists
 
 
@@ -143,8 +142,8 @@ def _solve(chain: Chain, state: State, vdot_G, weight, actuated: Bool[Array, " d
     co, kin, V = _coordinates(chain, state)
     _, column = scales(chain)
     vdot = co.W @ jnp.where(co.independent, vdot_G, 0) + co.bias
-    forces = with_links(
-        chain, generalized_forces(chain, kin, V, state.v, vdot[:nv]), vdot
+    forces = over_all_dofs(
+        chain, generalized_forces(chain, kin, V, state.v, vdot[:nv])
     ) - passive_forces(chain, state.q, state.v)
     wanted = co.W.T @ forces
     # without units: torques over metres, as the columns of J_C

@@ -18,7 +18,7 @@ from svkc.loops.pivoting import Selection, square
 from svkc.model.chain import Chain, Structure, active_dofs
 from svkc.model.validation import one
 from svkc.tree.articulated_body import accelerations, articulate
-from svkc.tree.inverse_dynamics import inertia_times
+from svkc.tree.inverse_dynamics import inertia_times, over_all_dofs
 from svkc.tree.kinematics import Kinematics
 from svkc.tree.mass_matrix import inertia_by_composites, inertia_by_unit_vectors
 
@@ -28,21 +28,7 @@ def reduced_inertia(
 ) -> Float[Array, "dofs dofs"]:
     """A = W^T M W (23), ones on the diagonal of coordinates that are not independent."""
     W = co.W[: chain.nv]
-    A = W.T @ (M @ W) + jnp.diag(jnp.where(co.independent, 0, 1).astype(M.dtype))
-    if chain.link_armature is None:
-        return A
-    own = co.W[chain.nv :]
-    return A + own.T @ (chain.link_armature[:, None] * own)
-
-
-def with_links(
-    chain: Chain, tree: Float[Array, " nv"], own: Float[Array, " dofs"]
-) -> Float[Array, " dofs"]:
-    """Generalized forces of the tree, and those that the armatures of virtual joints need for `own`
-    (accelerations, or jumps of velocity)."""
-    if chain.link_armature is None:
-        return jnp.concatenate([tree, jnp.zeros(chain.dofs - chain.nv, tree.dtype)])
-    return jnp.concatenate([tree, chain.link_armature * own[chain.nv :]])
+    return W.T @ (M @ W) + jnp.diag(jnp.where(co.independent, 0, 1).astype(M.dtype))
 
 
 class AbstractDynamics(eqx.Module):
@@ -221,8 +207,7 @@ def _implicit_solve(
         x, mu = unknown
         held = pick(loops.J) / column[None]
         moving = jnp.where(active, x, 0)
-        tree = inertia_times(chain, loops.kin, moving[:nv])
-        force = with_links(chain, tree, moving) + held.T @ mu
+        force = over_all_dofs(chain, inertia_times(chain, loops.kin, moving[:nv])) + held.T @ mu
         return jnp.where(active, force, x), held @ x + jnp.where(used, 0, mu)
 
     def solve(force: Float[Array, " dofs"], bias: Float[Array, " rows"]) -> Float[Array, " dofs"]:
@@ -250,8 +235,8 @@ def _by_independent(
 
     def solve(force, rate):
         x = column * (chosen.P.T @ solve_triangle(JS, rate))
-        x = x + W @ A_inverse(W.T @ (force - with_links(chain, tree @ x[:nv], x)))
-        rest = column * (force - with_links(chain, tree @ x[:nv], x))
+        x = x + W @ A_inverse(W.T @ (force - over_all_dofs(chain, tree @ x[:nv])))
+        rest = column * (force - over_all_dofs(chain, tree @ x[:nv]))
         return x, jnp.where(chosen.used, solve_triangle(JS, chosen.P @ rest, trans=True), rate)
 
     return solve

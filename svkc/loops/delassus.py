@@ -12,7 +12,6 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import block_diag
 from jaxtyping import Array, Bool, Float
 
 from svkc._jax.batched_lapack import factor_positive
@@ -33,34 +32,29 @@ LARGE = 36
 
 
 class Joints(eqx.Module):
-    """The virtual joints' own coordinates, link by link, as many as the freest has: motion [links,
-    row, freedom] of those without inertia, and (S^T S)^-1 of it; of those with armature (N m s^2, N
-    s^2/m), and that (None: no joint has any); where each stands among the coordinates of virtual
-    joints (`count`: nowhere)."""
+    """The virtual joints' own coordinates, link by link, as many as the freest has: their motion S
+    [links, row, freedom], and (S^T S)^-1; where each stands among the coordinates of virtual joints
+    (`count`: nowhere)."""
 
-    light: Float[Array, "links 6 d"]
+    S: Float[Array, "links 6 d"]
     inverse: Float[Array, "links d d"]
-    heavy: Float[Array, "links 6 d"] | None
-    armature: Float[Array, "links d"] | None
     place: np.ndarray
     count: int
 
     def across(self, x: Float[Array, "*n rows"]) -> Float[Array, "*n rows"]:
-        """The part of the rows that virtual joints without inertia cannot follow."""
+        """The part of the rows that virtual joints cannot follow."""
         rates = self.along(x)
-        return x - rotate(_led(self.light, rates), rates).reshape(x.shape)
+        return x - rotate(_led(self.S, rates), rates).reshape(x.shape)
 
     def part(self, links: np.ndarray) -> "Joints":
         """Those of some links."""
-        heavy, armature = (None if x is None else x[links] for x in (self.heavy, self.armature))
-        return Joints(
-            self.light[links], self.inverse[links], heavy, armature, self.place[links], self.count
-        )
+        S, inverse, place = self.S[links], self.inverse[links], self.place[links]
+        return Joints(S=S, inverse=inverse, place=place, count=self.count)
 
     def along(self, x: Float[Array, "*n rows"]) -> Float[Array, "*n links d"]:
-        """The rates of virtual joints without inertia that follow the rows best."""
+        """The rates of virtual joints that follow the rows best."""
         x = x.reshape(*x.shape[:-1], -1, 6)
-        return rotate(_led(self.inverse, x), rotate(_led(jnp.swapaxes(self.light, -1, -2), x), x))
+        return rotate(_led(self.inverse, x), rotate(_led(jnp.swapaxes(self.S, -1, -2), x), x))
 
     def of(self, x: Float[Array, " virtual"]) -> Float[Array, "links d"]:
         """What stands for each freedom of each link; zero for those that are none."""
@@ -86,8 +80,8 @@ class Rows(NamedTuple):
 
 
 def rows_held(chain: Chain, locked: bool) -> Rows:
-    """A declared ball turns freely where none of its coordinates is locked or has inertia; what a
-    spare slot holds is known at run time alone."""
+    """A declared ball turns freely where none of its coordinates is locked; what a spare slot holds
+    is known at run time alone."""
     top = chain.topology
     free = np.array(
         [
@@ -96,7 +90,7 @@ def rows_held(chain: Chain, locked: bool) -> Rows:
         ],
         bool,
     )
-    free = free & (not locked and chain.link_armature is None)
+    free = free & (not locked)
     six = np.arange(6 * len(free)).reshape(-1, 6)
     kept = np.concatenate([six[~free].ravel(), six[free][:, 3:].ravel()])
     back = np.full(six.size, len(kept))
@@ -115,18 +109,25 @@ def joints(chain: Chain, J: Float[Array, "rows dofs"]) -> Joints:
     place, count = np.sort(chain.topology.links.dof - chain.nv, 1), chain.dofs - chain.nv
     place = place[:, : max(1, np.max(np.sum(place < count, 1)))]
     own = jnp.concatenate([J[:, chain.nv :], jnp.zeros_like(J[:, :1])], 1).reshape(-1, 6, count + 1)
-    light = jnp.swapaxes(own[np.arange(len(place))[:, None], :, np.minimum(place, count)], -1, -2)
-    heavy = armature = None
-    if chain.link_armature is not None:
-        armature = take(chain.link_armature, np.minimum(place, count))
-        heavy = jnp.where(armature[:, None] > 0, light, 0)
-        light = light - heavy
-    still = jnp.where(jnp.all(light == 0, 1), 1, 0).astype(J.dtype)
+    S = jnp.swapaxes(own[np.arange(len(place))[:, None], :, np.minimum(place, count)], -1, -2)
+    still = jnp.where(jnp.all(S == 0, 1), 1, 0).astype(J.dtype)
     G = (
-        jnp.sum(light[:, :, :, None] * light[:, :, None], 1)
+        jnp.sum(S[:, :, :, None] * S[:, :, None], 1)
         + still[:, :, None] * np.eye(place.shape[1], dtype=J.dtype)[None]
     )
-    return Joints(light, inverse_positive(G), heavy, armature, place, count)
+    return Joints(S=S, inverse=inverse_positive(G), place=place, count=count)
+
+
+def _nearly_inverse(D: Float[Array, "kept kept"]) -> Callable:
+    """Return x -> (D + a little)^-1 x."""
+    most = jnp.max(jnp.where(np.eye(D.shape[0], dtype=bool), D, 0))
+    # (none where no loop is closed)
+    little = jnp.finfo(D.dtype).eps ** 0.625 * jnp.where(most > 0, most, 1)
+    raised = D + little * jnp.eye(D.shape[0], dtype=D.dtype)
+    if D.shape[0] >= LARGE:
+        return factor_positive(raised)
+    inverse = inverse_positive(raised)
+    return lambda x: rotate(inverse, x)
 
 
 def by_loop_forces(
@@ -146,44 +147,19 @@ def by_loop_forces(
     )
     some, six = own.part(held.whole), 6 * len(held.whole)
     across = lambda x: jnp.concatenate([some.across(x[..., :six]), x[..., six:]], -1) if six else x
-    D = seen_by(top, bodies, take(tree, held.kept))
-    if own.heavy is not None:
-        # virtual joints with armature add what they give way by
-        weight = jnp.where(own.armature > 0, 1 / jnp.where(own.armature > 0, own.armature, 1), 0)
-        given = lambda force, mu: (
-            weight * (force + rotate(jnp.swapaxes(own.heavy, -1, -2), mu.reshape(-1, 6)))
-        )
-        D = D + block_diag(
-            *jnp.sum(own.heavy[:, :, None] * own.heavy[:, None] * weight[:, None, None], -1)
-        )
-    D = across(across(D).T)
-    most = jnp.max(jnp.where(np.eye(D.shape[0], dtype=bool), D, 0))
-    # (none where no loop is closed)
-    little = jnp.finfo(J.dtype).eps ** 0.625 * jnp.where(most > 0, most, 1)
-    raised = D + little * jnp.eye(D.shape[0], dtype=J.dtype)
-    if D.shape[0] < LARGE:
-        inverse = inverse_positive(raised)
-        nearly = lambda x: rotate(inverse, x)
-    else:
-        nearly = factor_positive(raised)
+    D = across(across(seen_by(top, bodies, take(tree, held.kept))).T)
+    nearly = _nearly_inverse(D)
 
     def solve(force, rate):
-        applied = own.of(force[nv:])
-        massless = applied if own.heavy is None else jnp.where(own.armature > 0, 0, applied)
-        # what acts on joints without inertia is carried by the loops
-        carried = -rotate(own.light, rotate(own.inverse, massless)).ravel()
+        # what acts on virtual joints is carried by the loops
+        carried = -rotate(own.S, rotate(own.inverse, own.of(force[nv:]))).ravel()
         alone = accelerations(top, bodies, force[:nv] + carried @ tree)
-        left = rate - tree @ alone
-        if own.heavy is not None:
-            left = left - rotate(own.heavy, given(applied, carried)).ravel()
-        left = across(take(left, held.kept))
+        left = across(take(rate - tree @ alone, held.kept))
         z = nearly(left)
         for _ in range(REFINEMENTS):
             z = z + nearly(left - D @ z)
         mu = carried + held.fill(across(z))
         x = accelerations(top, bodies, force[:nv] + mu @ tree)
-        turning = jnp.zeros_like(applied) if own.heavy is None else given(applied, mu)
-        seen = tree @ x if own.heavy is None else tree @ x + rotate(own.heavy, turning).ravel()
-        return jnp.concatenate([x, own.order(turning + own.along(rate - seen))]), -mu
+        return jnp.concatenate([x, own.order(own.along(rate - tree @ x))]), -mu
 
     return solve

@@ -12,7 +12,6 @@ from svkc.loops.constrained_dynamics import (
     AbstractDynamics,
     ArticulatedBodies,
     default_dynamics,
-    with_links,
 )
 from svkc.loops.constraint import loop_kinematics, loop_rates, scales
 from svkc.loops.coordinates import agreeing
@@ -27,7 +26,7 @@ from svkc.loops.pivoting import (
 )
 from svkc.model.chain import Chain, State, Structure, active_dofs
 from svkc.model.checked_jit import joint_torques, verb
-from svkc.tree.inverse_dynamics import generalized_forces, passive_forces
+from svkc.tree.inverse_dynamics import generalized_forces, over_all_dofs, passive_forces
 from svkc.tree.kinematics import kinematics, twists
 
 
@@ -66,11 +65,7 @@ def moving(
         kin, loops = kinematics(chain, q), None
     V = twists(chain, kin, v)
     bias = generalized_forces(chain, kin, V, v, jnp.zeros(chain.nv, v.dtype))
-    force = (
-        tau
-        + passive_forces(chain, q, v)
-        - jnp.concatenate([bias, jnp.zeros(chain.dofs - chain.nv, v.dtype)])
-    )
+    force = tau + passive_forces(chain, q, v) - over_all_dofs(chain, bias)
     if loops is None:
         return v, dynamics.prepare_open(chain, structure, kin)(force)
     rates = loop_rates(chain, structure, v, loops, V, baumgarte)
@@ -149,7 +144,7 @@ def loop_forces(chain: Chain, state: State, tau: Float[Array, " torques"]) -> Lo
     kin, J = loops.kin, loops.J
     V = twists(chain, kin, v)
     vdot = acceleration(chain, s, q, v, tau, default_dynamics(chain))
-    needed = with_links(chain, generalized_forces(chain, kin, V, v, vdot[:nv]), vdot)
+    needed = over_all_dofs(chain, generalized_forces(chain, kin, V, v, vdot[:nv]))
     selection = choose(s, J)
     wrench = -constraint_forces(chain, selection, J, needed - passive_forces(chain, q, v) - tau)
     return LoopForces(wrench[:, 3:], wrench[:, :3], ~self_stressed(s, selection))

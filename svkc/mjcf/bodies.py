@@ -150,6 +150,18 @@ def joint_forces_of(model, ignored, topology) -> tuple[np.ndarray, np.ndarray, n
     return stiffness, limit, spring
 
 
+def armature_of(model, ignored, without: tuple[str, ...]) -> np.ndarray:
+    """The model's armature [nv], zero for joints in `without`; ValueError: no such joint."""
+    names = [name_of(model, "joint", j) for j in range(model.njnt)]
+    armature = np.zeros(model.nv) if "armature" in ignored else np.array(model.dof_armature)
+    for name in without:
+        if name not in names:
+            known = ", ".join(names) or "none"
+            raise ValueError(f"ignore_armature: no joint {name!r}; joints: {known}")
+        armature[model.dof_jntid == names.index(name)] = 0
+    return armature
+
+
 def by_dof(topology, values) -> np.ndarray:
     """[dofs] from the model's own [nv]: zero for virtual joints that are none of its."""
     out = np.zeros(topology.dofs)

@@ -84,6 +84,18 @@ def _cut(model, name: str, body: int) -> Cut:
     return Cut(link, body, joints)
 
 
+def check_rotors(model, cuts: list[Cut], armature: np.ndarray) -> None:
+    """ValueError where a joint that may be cut has armature [nv], as virtual joints have no
+    inertia."""
+    turning = set(np.asarray(model.dof_jntid)[armature != 0])
+    names = [name_of(model, "joint", j) for cut in cuts for j in cut.joints if j in turning]
+    if names:
+        raise ValueError(
+            f"cuttable: got armature on {', '.join(names)}; a rotor has no place in the tree once"
+            f" its joint is cut. To load without: svkc.load(..., ignore_armature={names})"
+        )
+
+
 def placed_in(model, topology: Topology, cuts: list[Cut], first: int) -> Topology:
     """The topology with the cuts' tables: their links start at slot `first`; where the model's own
     qpos and qvel are to be found."""

@@ -10,9 +10,17 @@ from typing import Any
 import jax
 import numpy as np
 
-from svkc.mjcf.bodies import bodies_of, by_dof, joint_forces_of, motors_of, name_of, rows_of
+from svkc.mjcf.bodies import (
+    armature_of,
+    bodies_of,
+    by_dof,
+    joint_forces_of,
+    motors_of,
+    name_of,
+    rows_of,
+)
 from svkc.mjcf.convert import text_of
-from svkc.mjcf.cuttable_joints import Cut, cuts_of, placed_in
+from svkc.mjcf.cuttable_joints import Cut, check_rotors, cuts_of, placed_in
 from svkc.mjcf.unsupported import what_is_left_out
 from svkc.mjcf.virtual_links import floats, links_of, structure_of
 from svkc.model.chain import Chain
@@ -35,7 +43,7 @@ class Source:
     digest: str
 
 
-def load(source, *, virtual_links=(), cuttable=(), spare=0, ignore=()) -> Chain:
+def load(source, *, virtual_links=(), cuttable=(), spare=0, ignore=(), ignore_armature=()) -> Chain:
     """A Chain from MJCF or URDF (path or text), a mujoco.MjSpec or a mujoco.MjModel.
 
     `virtual_links`: more of them, beside the <equality> connect (ball) and weld of the model;
@@ -45,6 +53,8 @@ def load(source, *, virtual_links=(), cuttable=(), spare=0, ignore=()) -> Chain:
     `ignore`: kinds of elements to leave out, by the names the error message uses, or "all";
     "equality" means those that are neither connect nor weld. "limit" leaves out joint ranges.
     Collisions between geoms are never modelled.
+    `ignore_armature`: names of joints whose armature (rotor inertia) is left out, others keep
+    theirs; a joint that may be cut cannot have any.
     Functions are compiled once for all loads of one model with the same arguments, and again for
     another model, even where only numbers differ. For other numbers and one program replace floats
     of one chain (`eqx.tree_at`).
@@ -56,16 +66,25 @@ def load(source, *, virtual_links=(), cuttable=(), spare=0, ignore=()) -> Chain:
     cuts = cuts_of(model, cuttable)
     ignore, spare = texts("ignore", ignore), whole("spare", spare, 0, 1000)
     left_out = what_is_left_out(model, ignore)
+    ignore_armature = texts("ignore_armature", ignore_armature)
+    armature = armature_of(model, ignore, ignore_armature)
+    check_rotors(model, cuts, armature)
     rows, topology = _tree_of(model, cuts)
     links = links_of(model, declared, [cut.link for cut in cuts], spare)
     topology = _with_links(topology, links, spare)
     topology = placed_in(model, topology, cuts, first=len(links) - spare - len(cuts))
     structure = structure_of(model, topology, links)
-    arguments = {"virtual_links": declared, "cuttable": cuttable, "spare": spare, "ignore": ignore}
+    arguments = {
+        "virtual_links": declared,
+        "cuttable": cuttable,
+        "spare": spare,
+        "ignore": ignore,
+        "ignore_armature": ignore_armature,
+    }
     # here and not where it is compared: a MjModel may be changed after the chain is made
     digest = _digest(model, text, arguments)
     kept = Source(model=model, text=text, arguments=arguments, digest=digest)
-    return _finite(_chain(kept, topology, rows, structure, set(ignore), left_out))
+    return _finite(_chain(kept, topology, rows, structure, armature, left_out))
 
 
 def _tree_of(model, cuts: list[Cut]) -> tuple[list[tuple[int, int]], Topology]:
@@ -102,7 +121,8 @@ def _digest(model, text: str | None, arguments: dict[str, Any]) -> str:
     image = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, image)
     links = tuple(map(_written_out, arguments["virtual_links"]))
-    rest = arguments["cuttable"], arguments["spare"], sorted(set(arguments["ignore"]))
+    sets = (sorted(set(arguments[name])) for name in ("ignore", "ignore_armature"))
+    rest = arguments["cuttable"], arguments["spare"], *sets
     digest = hashlib.sha256(image)
     digest.update(repr((text, links, rest)).encode())
     return digest.hexdigest()
@@ -226,20 +246,14 @@ def _length(bodies: dict[str, np.ndarray], topology: Topology) -> float:
 
 
 def _passive(model, ignored: set[str], topology: Topology, q_load) -> dict[str, Any]:
-    """Return the chain's fields on rotors, dampers, springs and ranges; None for those that act on
-    no joint."""
+    """Return the chain's fields on dampers, springs and ranges; None for those that act on no
+    joint."""
     stiffness, limit, spring = joint_forces_of(model, ignored, topology)
-    damping, armature = (
-        by_dof(topology, 0 * values if name in ignored else values)
-        for name, values in (("damping", model.dof_damping), ("armature", model.dof_armature))
-    )
+    damping = by_dof(topology, 0 * model.dof_damping if "damping" in ignored else model.dof_damping)
     q_spring = np.array(q_load)
     q_spring[np.array(topology.model_q, int)] = model.qpos_spring
     sprung, limited = stiffness.any(), np.isfinite(limit).any()
-    own, others = np.split(armature, [topology.nv])
     return {
-        "armature": floats(own) if own.any() else None,
-        "link_armature": floats(others) if others.any() else None,
         "damping": floats(damping) if damping.any() else None,
         "stiffness": floats(stiffness) if sprung else None,
         "q_spring": floats(q_spring) if sprung else None,
@@ -248,9 +262,9 @@ def _passive(model, ignored: set[str], topology: Topology, q_load) -> dict[str, 
     }
 
 
-def _chain(source: Source, topology, rows, structure, ignored: set[str], left_out) -> Chain:
+def _chain(source: Source, topology, rows, structure, armature, left_out) -> Chain:
     """Return the chain with the numbers of the model."""
-    model = source.model
+    model, ignored = source.model, set(source.arguments["ignore"])
     bodies = bodies_of(model, topology, rows)
     gear, control, force = motors_of(model, ignored, topology)
     q_load = _load_pose(model, topology)
@@ -266,6 +280,7 @@ def _chain(source: Source, topology, rows, structure, ignored: set[str], left_ou
         force_range=floats(force),
         structure=structure,
         anchor=floats(bodies["anchor"]) if bodies["anchor"].any() else None,
+        armature=floats(by_dof(topology, armature)[: topology.nv]) if armature.any() else None,
         **_passive(model, ignored, topology, q_load),
         model=source,
         left_out=left_out,

@@ -70,7 +70,6 @@ class Chain(eqx.Module):
     structure: Structure
     anchor: Float[Array, "rows 3"] | None = None
     armature: Float[Array, " nv"] | None = None
-    link_armature: Float[Array, " own"] | None = None
     damping: Float[Array, " dofs"] | None = None
     stiffness: Float[Array, " dofs"] | None = None
     q_spring: Float[Array, " q"] | None = None

@@ -4,16 +4,12 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from svkc.loops.constrained_dynamics import (
-    ArticulatedBodies,
-    CompositeBodies,
-    with_links,
-)
+from svkc.loops.constrained_dynamics import ArticulatedBodies, CompositeBodies
 from svkc.loops.constraint import LoopKinematics, scales
 from svkc.loops.forward_dynamics import constraint_forces
 from svkc.loops.pivoting import Selection
 from svkc.model.chain import Chain, State, Structure
-from svkc.tree.inverse_dynamics import inertia_times
+from svkc.tree.inverse_dynamics import inertia_times, over_all_dofs
 from svkc.tree.kinematics import kinematics
 
 
@@ -28,7 +24,7 @@ def velocity_after_impact(
     """
     solve = CompositeBodies().prepare(chain, structure, loops, selection)
     jump = solve(jnp.zeros_like(v), loops.J @ (v / scales(chain)[1]))
-    impulse = with_links(chain, inertia_times(chain, loops.kin, jump[: chain.nv]), jump)
+    impulse = over_all_dofs(chain, inertia_times(chain, loops.kin, jump[: chain.nv]))
     # v- and v+ differ by a vector orthogonal to v+, so that the loss is a square and cannot be
     # negative
     return v + jump, -constraint_forces(chain, selection, loops.J, impulse), jump @ impulse / 2

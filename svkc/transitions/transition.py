@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from svkc._jax.eager import eager_jit
-from svkc.model.chain import Chain, State, Structure, active_dofs
+from svkc.model.chain import Chain, State, Structure
 from svkc.model.checked_jit import check_state
 from svkc.model.names import connection_mask, joint_slice, link_index, spare_slot
 from svkc.model.topology import V_SIZE
@@ -81,11 +81,7 @@ def change(
             left=nothing[:, 0],
         )
     structure, new_q = _placed(chain, structure, new_links, here, q)
-    # the armature of a joint that is made anew is at rest before
-    before = (
-        v if chain.link_armature is None else jnp.where(active_dofs(chain, state.structure), v, 0)
-    )
-    joined = solve_structure(chain, structure, new_q, before, Held(), Schedule(RANK + CONNECT))
+    joined = solve_structure(chain, structure, new_q, v, Held(), Schedule(RANK + CONNECT))
     structure = eqx.tree_at(lambda s: (s.rank, s.margin), structure, (joined.rank, joined.margin))
     q, v = jnp.where(holds, joined.q, q), jnp.where(holds, joined.v, v)
     wrench = jnp.where(holds, joined.wrench, 0)

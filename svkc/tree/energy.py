@@ -27,15 +27,10 @@ def _energies(
     kinetic = jnp.sum(chain.mass * jnp.sum(u * u, -1)) / 2 + jnp.sum(w * spin) / 2
     if chain.armature is not None:
         kinetic = kinetic + jnp.sum(chain.armature * state.v[: chain.nv] ** 2) / 2
-    active = active_dofs(chain, state.structure)
-    if chain.link_armature is not None:
-        kinetic = (
-            kinetic
-            + jnp.sum(jnp.where(active, state.v, 0)[chain.nv :] ** 2 * chain.link_armature) / 2
-        )
     potential = -jnp.sum(chain.mass * jnp.sum((kin.root + c) * chain.gravity[None], -1))
     if chain.stiffness is not None:
-        stretch = jnp.where(active, difference(chain, chain.q_spring, state.q), 0)
+        stretch = difference(chain, chain.q_spring, state.q)
+        stretch = jnp.where(active_dofs(chain, state.structure), stretch, 0)
         potential = potential + jnp.sum(chain.stiffness * stretch**2) / 2
     return kinetic, potential
 

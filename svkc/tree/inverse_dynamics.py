@@ -60,6 +60,12 @@ def inertia_times(chain: Chain, kin: Kinematics, x: Float[Array, " nv"]) -> Floa
     return tau if chain.armature is None else tau + chain.armature * x
 
 
+def over_all_dofs(chain: Chain, force: Float[Array, " nv"]) -> Float[Array, " dofs"]:
+    """Return forces of the tree's joints, then a zero for each coordinate of virtual joints, which
+    have no inertia."""
+    return jnp.concatenate([force, jnp.zeros(chain.dofs - chain.nv, force.dtype)])
+
+
 def passive_forces(
     chain: Chain, q: Float[Array, " q"], v: Float[Array, " dofs"]
 ) -> Float[Array, " dofs"]:

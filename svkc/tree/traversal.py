@@ -39,11 +39,12 @@ def up(top: Topology, x: Float[Array, "rows *n"]) -> Float[Array, "rows *n"]:
         for _, below in _doublings(top):
             x = x + jnp.sum(take(x, below), 1)
         return x
-    levels, below = [], None
-    for level, (first, last) in reversed(list(enumerate(top.levels))):
-        below = x[first:last] if below is None else x[first:last] + from_children(top, level, below)
-        levels.append(below)
-    return jnp.concatenate(levels[::-1])
+    sums, below = [], None
+    for level, (first, last) in reversed(list(zip(levels(top), top.levels[1:], strict=True))):
+        own = x[first:last]
+        below = own if below is None else own + from_rows(level.children, below)
+        sums.append(below)
+    return jnp.concatenate([x[:1] + jnp.sum(below, 0, keepdims=True), *sums[::-1]])
 
 
 @functools.cache
@@ -58,23 +59,10 @@ def _doublings(top: Topology) -> list[tuple[np.ndarray, np.ndarray]]:
         table = np.full((none, max(map(len, below))), none)
         for row, own in zip(table, below, strict=True):
             row[: len(own)] = own
-        # (as small as jax has them in both precisions: `articulated.levels`)
+        # (as small as jax has them in both precisions: `levels`)
         found.append((above[:-1].astype(np.int32), table.astype(np.int32)))
         above = above[above]
     return found
-
-
-def from_children(
-    top: Topology, level: int, below: Float[Array, "below *n"]
-) -> Float[Array, "here *n"]:
-    """For each row of a level, the sum of its children's rows in the level below."""
-    (first, last), (lo, hi) = top.levels[level], top.levels[level + 1]
-    parent = np.array(top.parent)[lo:hi]
-    children = [np.flatnonzero(parent == i) for i in range(first, last)]
-    table = np.full((last - first, max(map(len, children))), hi - lo)
-    for i, c in enumerate(children):
-        table[i, : len(c)] = c
-    return jnp.sum(take(below, table), 1)
 
 
 def put(

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import models
+import mujoco
 import numpy as np
 import pytest
 
@@ -104,8 +105,6 @@ def part_momentum(chain, state, part):
     pos, quat = (np.asarray(x) for x in svkc.poses(chain, state))
     lin, ang = (np.asarray(x) for x in svkc.velocities(chain, state))
     p, L = np.zeros(3), np.zeros(3)
-    import mujoco
-
     for b in np.flatnonzero(part):
         R, Ri = np.zeros(9), np.zeros(9)
         mujoco.mju_quat2Mat(R, quat[b])
@@ -150,14 +149,14 @@ def test_a_link_in_the_middle_of_a_loop():
 
 
 @pytest.mark.slow
-def test_springs_ranges_armature_and_motors_go_with_the_joint():
-    """A hinge with all of them, with ref: the same motion while it holds, nothing of them acts when
-    it is cut."""
+def test_springs_ranges_and_motors_go_with_the_joint():
+    """A hinge with all of them, with ref, beside one with armature: the same motion while it holds,
+    nothing of them acts when it is cut."""
     xml = """<mujoco><compiler angle="radian"/><worldbody><body name="a"><joint name="a"
-      axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -1" size="0.05"/>
+      axis="0 1 0" armature="0.05"/><geom type="capsule" fromto="0 0 0 0 0 -1" size="0.05"/>
       <body name="b" pos="0 0 -1" euler="0.2 0 0.1"><joint name="b" axis="0.3 1 0" pos="0.02 0 0"
         ref="0.3" damping="0.2" stiffness="4" springref="0.5"
-       armature="0.05" range="-0.2 0.6" limited="true"/><geom type="capsule" fromto="0 0 0 0 0 -1"
+       range="-0.2 0.6" limited="true"/><geom type="capsule" fromto="0 0 0 0 0 -1"
          size="0.05"/></body></body></worldbody>
       <actuator><motor joint="b" gear="3"/></actuator></mujoco>"""
     plain, chain = svkc.load(xml), svkc.load(xml, cuttable="b")
@@ -224,6 +223,38 @@ def test_a_joint_that_breaks():
     broken = svkc.State(traj.final.q, traj.final.v, start.structure)
     carried = svkc.loop_forces(chain, broken, jnp.zeros(chain.dofs))
     assert abs(float(jnp.linalg.norm(carried.force[0])) - limit) < 1e-6
+
+
+ROTORS = models.MJCF.format(
+    models.bar(
+        "a",
+        'type="hinge" axis="0 1 0" armature="0.3"',
+        "0 0 -1",
+        inside=models.bar("b", 'type="hinge" axis="0 1 0" armature="0.2"', "0 0 -1", "0 0 -1"),
+    )
+)
+
+
+def test_armature_is_left_out_joint_by_joint():
+    """The inertia is MuJoCo's, less the armature of the joints named; a joint that may be cut has
+    none."""
+    model = mujoco.MjModel.from_xml_string(ROTORS)
+    data, M = mujoco.MjData(model), np.zeros((2, 2))
+    mujoco.mj_forward(model, data)
+    mujoco.mj_fullM(model, data, M)
+    for ignored, left_out in ((["a"], [0.3, 0]), ("b", [0, 0.2]), (["b", "a"], [0.3, 0.2])):
+        chain = svkc.load(ROTORS, ignore_armature=ignored)
+        np.testing.assert_allclose(
+            svkc.mass_matrix(chain, chain.state()), M - np.diag(left_out), atol=1e-13
+        )
+    assert chain.armature is None
+    with pytest.raises(ValueError, match=r"armature on a; .*ignore_armature=\['a'\]\)"):
+        svkc.load(ROTORS, cuttable="a", ignore_armature="b")
+    chain = svkc.load(ROTORS, cuttable="a", ignore_armature=["a"])
+    assert chain.armature.tolist() == [0, 0, 0, 0, 0, 0, 0.2]
+    assert svkc.load(ROTORS, cuttable="a", ignore="armature").armature is None
+    with pytest.raises(ValueError, match="ignore_armature: no joint 'nose'; joints: a, b"):
+        svkc.load(ROTORS, ignore_armature="nose")
 
 
 SPARE = models.MJCF.format(

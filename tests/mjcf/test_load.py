@@ -85,6 +85,7 @@ def test_chains_of_other_models_keep_their_own():
         svkc.load(PENDULUM.replace("<mujoco>", "<mujoco><!-- this --><size nuser_body='1'/>")),
         svkc.load(mujoco.MjModel.from_xml_string(PENDULUM)),
         svkc.load(PENDULUM, ignore="limit"),
+        svkc.load(PENDULUM, ignore_armature="arm"),
         svkc.load(PENDULUM, virtual_links=link()),
         svkc.load(PENDULUM, virtual_links=link(connected=True)),
         svkc.load(PENDULUM, virtual_links=link(axis=(0, 1, 0))),

@@ -313,6 +313,7 @@ def load_options(link):
     return some_of(
         virtual_links=or_anything(st.lists(link, max_size=2)),
         cuttable=or_anything(st.lists(label, max_size=2)),
+        ignore_armature=or_anything(st.lists(label, max_size=2)),
         spare=or_anything(st.integers(-1, 3)),
         ignore=or_anything(
             st.one_of(

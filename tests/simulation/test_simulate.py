@@ -353,7 +353,8 @@ def test_a_chain_from_a_file_is_the_same_program(tmp_path, pendulum):
     """With every argument that `load` takes, as numbers and arrays: equal, and traced once."""
     hold = svkc.VirtualLink("hold", "world", "arm", "ball", axis=np.array([0, 1e-3, 1 / 3]))
     text = pendulum.model.text
-    chain = svkc.load(text, virtual_links=hold, cuttable="arm", spare=np.int64(1), ignore="all")
+    given = {"cuttable": "arm", "ignore": "all", "ignore_armature": {"arm"}}
+    chain = svkc.load(text, virtual_links=hold, spare=np.int64(1), **given)
     svkc.simulate(pendulum, pendulum.state(), 0.1).save(tmp_path / "run.npz", chain)
     again = svkc.load_chain(tmp_path / "run.npz")
     assert bool(eqx.tree_equal(again, chain))
