@@ -2,7 +2,6 @@
 loops; the loop forces."""
 
 import cases
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import models
@@ -34,52 +33,6 @@ def test_acceleration_is_that_of_the_multipliers(case):
     assert np.abs(fast[: chain.nv] - expected).max() < 1e-9 * scale
     assert np.abs(columns - fast).max() < 1e-10 * np.abs(fast).max()
     assert np.abs(bodies - fast).max() < 1e-10 * np.abs(fast).max()
-
-
-@pytest.mark.slow
-def test_articulated_bodies_carry_what_acts_on_virtual_joints(case):
-    """The same with torques at the joints of the loops, and with a joint of the tree locked; and
-    its derivative by masses and along the loops, on each side."""
-    name, chain, state, tau = case
-    locked = (
-        svkc.lock(chain, state, chain.joint_names[-1])
-        if name in ("stewart", "two_hands")
-        else state
-    )
-    along = svkc.coordinates(chain, locked).W @ jnp.linspace(-1.0, 1.0, chain.dofs)
-
-    def both(scale):
-        c = eqx.tree_at(
-            lambda c: c.mass,
-            chain,
-            chain.mass * (1 + scale * jnp.linspace(0.0, 3.0, chain.mass.shape[0])),
-        )
-        q = svkc.integrate(chain, locked.q, scale * along)
-        return [
-            accelerated(c, locked.structure, q, locked.v, tau, way)
-            for way in (svkc.dynamics.CompositeBodies(), svkc.dynamics.ArticulatedBodies())
-        ]
-
-    for usual, bodies in (both(0.0), jax.jvp(both, (0.0,), (1.0,))[1]):
-        assert np.abs(bodies - usual).max() < 1e-9 * np.abs(usual).max()
-    back = [
-        jax.grad(lambda x, i=i: jnp.sum(both(x)[i] * jnp.linspace(-1.0, 2.0, chain.dofs)))(0.0)
-        for i in (0, 1)
-    ]
-    np.testing.assert_allclose(*back, rtol=1e-8)
-
-
-def test_the_choice_of_coordinates_does_not_matter(case):
-    """Asking for what was dependent gives another choice of theta_G and the same acceleration."""
-    _, chain, state, tau = case
-    first = svkc.coordinates(chain, state)
-    asked = eqx.tree_at(
-        lambda s: s.structure.independent, state, first.dependent, is_leaf=lambda x: x is None
-    )
-    second = svkc.coordinates(chain, asked)
-    assert bool(jnp.any(first.independent != second.independent))
-    a, b = svkc.forward_dynamics(chain, state, tau), svkc.forward_dynamics(chain, asked, tau)
-    np.testing.assert_allclose(a, b, rtol=0, atol=1e-9 * float(jnp.max(jnp.abs(a))))
 
 
 def test_velocities_and_accelerations_keep_the_loops(case):

@@ -2,7 +2,6 @@
 Rodrigues' integration."""
 
 import importlib.util
-import itertools
 import pathlib
 
 import jax
@@ -51,29 +50,6 @@ def test_printed_matrices(links):
         [[0, 0], [0, 0], [0, 0], [0, 0], [0.5, -0.5], [0.5, 0.5]],
         atol=1e-15,
     )
-
-
-@pytest.mark.slow
-def test_every_admissible_pair_gives_the_same_motion(links):
-    """Of the 28 pairs those of theta_1, theta_6, theta_7, theta_8 can be theta_G, and no others;
-    all six give one motion."""
-    chain, _ = links
-    state = chain.state(v={"base": [0.9, 0, 0, 0, 0, 0.2], "link1": 0.5})
-    admissible, asked = [], []
-    for pair in itertools.combinations(range(8), 2):
-        wish = svkc.prefer(chain, state, *(chain.dof_names[i] for i in pair))
-        chosen = tuple(np.flatnonzero(svkc.coordinates(chain, wish).independent).tolist())
-        assert set(chosen) <= {0, 5, 6, 7}
-        if chosen == pair:
-            admissible.append(pair)
-            asked.append(wish)
-    assert admissible == list(itertools.combinations((0, 5, 6, 7), 2))
-    stacked = jax.tree.map(lambda *x: jnp.stack(x), *asked)
-    final = jax.vmap(
-        lambda s: svkc.simulate(chain, s, 1.0, rtol=1e-11, atol=1e-13, throw=False).final
-    )(stacked)
-    assert float(jnp.abs(final.q - final.q[:1]).max()) < 1e-9
-    assert float(jnp.abs(final.v - final.v[:1]).max()) < 1e-9
 
 
 def planar_impact(model, x, theta, v):

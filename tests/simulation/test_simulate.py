@@ -1,7 +1,5 @@
 """Runs: the high bar end to end, events, batches, steps, results."""
 
-import json
-
 import diffrax
 import equinox as eqx
 import jax
@@ -288,24 +286,6 @@ def test_drift_grows_where_nothing_is_done():
 
 
 @pytest.mark.slow
-def test_the_motion_does_not_depend_on_the_coordinates():
-    """A four-bar through 1 s with its own choice of theta_G and with another asked for."""
-    chain = models.four_bar()
-    state = chain.state(v={"crank": 4.0})
-    chosen = svkc.coordinates(chain, state)
-    own, asked = (
-        eqx.tree_at(lambda s: s.structure.independent, state, mask, is_leaf=lambda x: x is None)
-        for mask in (jnp.zeros_like(chosen.dependent), chosen.dependent)
-    )
-    a, b = (svkc.simulate(chain, s, 1.0, rtol=1e-10, atol=1e-12).final for s in (own, asked))
-    first, second = (svkc.mobility(chain, s).independent for s in (own, asked))
-    np.testing.assert_array_equal(first, chosen.independent)
-    assert bool(jnp.any(first != second))
-    np.testing.assert_allclose(a.q, b.q, atol=1e-9)
-    np.testing.assert_allclose(a.v, b.v, atol=1e-8)
-
-
-@pytest.mark.slow
 def test_results_tell_what_went_wrong(pendulum):
     """Too few steps; a link that is elsewhere. (Too many events: with the time of one; numbers that
     are none: with control.)"""
@@ -316,49 +296,6 @@ def test_results_tell_what_went_wrong(pendulum):
         svkc.simulate(pendulum, state, 1.0, dt=1e-3, max_steps=10)
     away = svkc.simulate(pendulum, state, 1.0, events=[svkc.at(0.5, connect="hook")], throw=False)
     assert away.result == svkc.RESULTS.not_in_place
-
-
-def test_save_and_load(tmp_path, pendulum, caught):
-    traj = caught
-    traj.save(tmp_path / "run.npz", pendulum)
-    assert bool(eqx.tree_equal(traj, svkc.load_trajectory(tmp_path / "run.npz")))
-    whole = (tmp_path / "run.npz").read_bytes()
-    (tmp_path / "cut.npz").write_bytes(whole[: len(whole) // 2])
-    (tmp_path / "text.npz").write_text("no")
-    for name in ("cut.npz", "text.npz"):
-        with pytest.raises(ValueError, match="not a whole trajectory"):
-            svkc.load_trajectory(tmp_path / name)
-    assert [p.name for p in tmp_path.glob("*.part")] == []
-
-
-def test_a_saved_run_goes_on(tmp_path, pendulum):
-    """Chain and state from the file, the chain's floats no longer those of its model: on bit for
-    bit. What else is told of the run."""
-    heavier = eqx.tree_at(lambda c: c.mass, pendulum, pendulum.mass * 1.1)
-    traj = svkc.simulate(heavier, pendulum.state({"arm": 1.2}), 1.0, ts=FIVE)
-    traj.save(tmp_path / "run.npz", heavier, rtol=1e-8, solver=diffrax.Tsit5())
-    chain = svkc.load_chain(tmp_path / "run.npz")
-    assert bool(eqx.tree_equal(chain, heavier))
-    assert chain.model.text == pendulum.model.text
-    again = svkc.simulate(chain, svkc.load_trajectory(tmp_path / "run.npz").final, 1.0, ts=FIVE)
-    assert bool(eqx.tree_equal(again, svkc.simulate(heavier, traj.final, 1.0, ts=FIVE)))
-    with np.load(tmp_path / "run.npz") as file:
-        told = json.loads(str(file["metadata"]))
-    assert told["options"] == {"rtol": 1e-8, "solver": "Tsit5()"}
-    assert told["certificate"]["gap"] == float(traj.report().gap)
-    assert "<mujoco" in told["model"]
-
-
-def test_a_chain_from_a_file_is_the_same_program(tmp_path, pendulum):
-    """With every argument that `load` takes, as numbers and arrays: equal, and traced once."""
-    hold = svkc.VirtualLink("hold", "world", "arm", "ball", axis=np.array([0, 1e-3, 1 / 3]))
-    text = pendulum.model.text
-    chain = svkc.load(text, virtual_links=hold, cuttable="arm", spare=np.int64(1), ignore="all")
-    svkc.simulate(pendulum, pendulum.state(), 0.1).save(tmp_path / "run.npz", chain)
-    again = svkc.load_chain(tmp_path / "run.npz")
-    assert bool(eqx.tree_equal(again, chain))
-    total = jax.jit(eqx.debug.assert_max_traces(lambda chain: chain.mass.sum(), max_traces=1))
-    assert total(again) == total(chain)
 
 
 @pytest.mark.slow
