@@ -8,7 +8,7 @@ import maximal
 import models
 import numpy as np
 import pytest
-from test_reference import given, n_four_bar
+from reference_problems import given, n_four_bar
 
 import svkc
 
