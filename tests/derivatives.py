@@ -12,13 +12,14 @@ import jax
 import jax.numpy as jnp
 import models
 import numpy as np
+from tolerances import DIFFERENCE
 
 import svkc
 import svkc.scenes
 from svkc.tools.gradient_check import _differences
 
 TIGHT = {"rtol": 1e-11, "atol": 1e-13, "solver": diffrax.Dopri8()}
-ALGEBRA, RUN = 1e-8, 1e-6
+ALGEBRA, RUN = 1e-8, DIFFERENCE
 FLOATS = "mass com inertia pos quat axis anchor gravity armature damping stiffness q_spring".split()
 
 

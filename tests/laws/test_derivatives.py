@@ -8,6 +8,7 @@ import models
 import numpy as np
 import pytest
 from compile import counted
+from tolerances import DIFFERENCE, REFERENCE, ROUND_OFF
 
 import svkc
 
@@ -147,7 +148,7 @@ def test_a_collision_that_swaps_velocities(balls):
         return svkc.simulate(balls, swapped, 2.0, t0=first.t_final, **TIGHT).final.q
 
     for jacobian in both_ways(bounced)(start)[1:]:
-        np.testing.assert_allclose(jacobian, np.array([[0, 1, 0, 2], [1, 0, 2, 0]]), atol=1e-9)
+        np.testing.assert_allclose(jacobian, np.array([[0, 1, 0, 2], [1, 0, 2, 0]]), atol=REFERENCE)
 
 
 @pytest.mark.slow
@@ -193,7 +194,7 @@ def test_times_that_coincide(balls):
         else:
             formula_here = formula
         value, forward, backward = both(x)
-        np.testing.assert_allclose(value, formula_here(x), atol=1e-12)
+        np.testing.assert_allclose(value, formula_here(x), atol=ROUND_OFF)
         for mode in (forward, backward):
             jax.tree.map(
                 lambda got, want: np.testing.assert_allclose(got, want, atol=1e-10),
@@ -201,7 +202,7 @@ def test_times_that_coincide(balls):
                 jax.jacfwd(formula_here)(x),
             )
         jax.tree.map(
-            lambda got, want: np.testing.assert_allclose(got, want, atol=1e-9),
+            lambda got, want: np.testing.assert_allclose(got, want, atol=REFERENCE),
             twice_simulated(x),
             twice(formula_here)(x),
         )
@@ -244,7 +245,7 @@ def test_nothing_is_not_a_number():
     forwards = jax.jvp(total, (x,), (jax.tree.map(jnp.ones_like, x),))[1]
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(backwards))
     np.testing.assert_allclose(
-        sum(float(jnp.sum(leaf)) for leaf in jax.tree.leaves(backwards)), forwards, rtol=1e-9
+        sum(float(jnp.sum(leaf)) for leaf in jax.tree.leaves(backwards)), forwards, rtol=REFERENCE
     )
 
 
@@ -266,7 +267,7 @@ def test_gradients_in_the_tangent():
     np.testing.assert_allclose(
         jax.grad(lambda dv: height(svkc.integrate(chain, state.q, dv)))(jnp.zeros(3)),
         slope,
-        atol=1e-12,
+        atol=ROUND_OFF,
     )
     lower = svkc.integrate(chain, state.q, -0.01 * slope)
     assert float(height(lower)) < float(height(state.q))
@@ -285,12 +286,12 @@ def test_the_check_finds_what_is_wrong():
         lambda x: {"good": x["a"] * x["b"], "bad": wrong(x["b"])},
         {"a": jnp.arange(3.0), "b": jnp.ones(3), "count": 4},
     )
-    assert found.error == pytest.approx(0.1 / 2.1, rel=1e-6)
+    assert found.error == pytest.approx(0.1 / 2.1, rel=DIFFERENCE)
     assert "bad" in found.output
     assert "'b'" in found.input
     for part in ("bad", "'b'", "by differentiation"):
         assert part in str(found)
-    assert svkc.check_grad(jnp.sin, 1.0).error < 1e-9
+    assert svkc.check_grad(jnp.sin, 1.0).error < REFERENCE
     # a derivative that is no number is as wrong as can be
     found = svkc.check_grad(
         lambda x: {"a": x, "root": jnp.where(x > 0, jnp.sqrt(x), x)}, jnp.zeros(())

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tolerances import REFERENCE, ROUND_OFF
 
 import svkc
 
@@ -52,12 +53,12 @@ def test_its_numbers_are_those_of_the_run(run, tmp_path):
     old, new = svkc.load_trajectory(FILE), svkc.load_trajectory(tmp_path / "again.npz")
     assert jax.tree.structure(old) == jax.tree.structure(new) == jax.tree.structure(traj)
     for a, b, c in zip(*map(jax.tree.leaves, (old, new, traj)), strict=True):
-        np.testing.assert_allclose(a, c, atol=1e-9)
+        np.testing.assert_allclose(a, c, atol=REFERENCE)
         np.testing.assert_array_equal(b, c)
     loaded = svkc.load_chain(FILE)
     assert jax.tree.structure(loaded) == jax.tree.structure(chain)
     for a, b in zip(*map(jax.tree.leaves, (loaded, chain)), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-12)
+        np.testing.assert_allclose(a, b, rtol=ROUND_OFF)
 
 
 @pytest.mark.parametrize("schema", [1, 3, 5])

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import models
 import numpy as np
 import pytest
+from tolerances import ROUND_OFF
 
 import svkc
 
@@ -171,7 +172,7 @@ def test_the_file_has_everything_in_it(release, tmp_path):
     np.testing.assert_array_equal(run["times"], traj.ts)
     np.testing.assert_array_equal(run["gaps"], traj.gaps)
     np.testing.assert_allclose(
-        run["energy"], jax.vmap(lambda s: svkc.energy(chain, s))(traj.states), rtol=1e-12
+        run["energy"], jax.vmap(lambda s: svkc.energy(chain, s))(traj.states), rtol=ROUND_OFF
     )
     poses = np.frombuffer(base64.b64decode(run["poses"]), "<f4").reshape(
         21, len(chain.body_names), 7
