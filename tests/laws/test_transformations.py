@@ -1,19 +1,18 @@
 """Derivatives of runs with a guard: under every transformation, twice, by every adjoint, and where
 there are none."""
 
-import derivatives
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import models
 import numpy as np
+import parameters
 import pytest
 from tolerances import DIFFERENCE, REFERENCE
 
 import svkc
 
 SLOPE = models.MJCF.replace("0.3 -0.2 -9.81", "0 0 -9.81")
-TIGHT = derivatives.TIGHT
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +32,14 @@ def held(chain, x, ts=None, **kw):
     state = svkc.State(state.q.at[0].set(x[0]), state.v, state.structure)
     events = [svkc.when(angle, connect="hook", here=True), svkc.at(x[2], cut="hook")]
     return svkc.simulate(
-        chain, state, x[3], ts=ts, events=events, args=x[1], max_events=2, **(kw or TIGHT)
+        chain,
+        state,
+        x[3],
+        ts=ts,
+        events=events,
+        args=x[1],
+        max_events=2,
+        **(kw or parameters.TIGHT),
     )
 
 
@@ -72,7 +78,7 @@ def test_every_order_of_the_transformations(pendulum):
 
     def loss(x, com):
         """By the lanes' own starts and times, and by what they share."""
-        traj = held(derivatives.changed(pendulum, {"com": com}), x)
+        traj = held(parameters.changed(pendulum, {"com": com}), x)
         return traj.final.q[0], traj.events.count
 
     one = lambda x, com: loss(x, com)[0]
@@ -101,7 +107,7 @@ def test_every_order_of_the_transformations(pendulum):
 def twice(f, x):
     """The largest relative error of the gradient's derivative, as `svkc.check_grad(jax.grad(f), x,
     "forward", directions=1)` has it, by one program."""
-    return derivatives.worst(jax.jit(lambda x, along: jax.jvp(jax.grad(f), (x,), (along,))), x)
+    return parameters.worst(jax.jit(lambda x, along: jax.jvp(jax.grad(f), (x,), (along,))), x)
 
 
 @pytest.mark.slow
@@ -110,7 +116,7 @@ def test_second_derivatives_of_forward_dynamics():
     chain = models.four_bar()
 
     def power(x):
-        c = derivatives.changed(chain, x)
+        c = parameters.changed(chain, x)
         c = eqx.tree_at(
             lambda c: c.structure.real_pos, c, chain.structure.real_pos.at[:, ::2].add(x["pin"])
         )
@@ -132,7 +138,7 @@ def test_second_derivatives_of_a_run(pendulum):
     """Hessian-vector products with a guard and a scheduled event."""
 
     def loss(x):
-        traj = held(derivatives.changed(pendulum, x), x["held"])
+        traj = held(parameters.changed(pendulum, x), x["held"])
         return traj.final.q[0] ** 2 + traj.final.v[0] + traj.events.time[0]
 
     assert twice(loss, {"held": jnp.array([1.2, 0.3, 0.8, 1.0]), "com": pendulum.com}) <= DIFFERENCE
@@ -189,7 +195,7 @@ def test_where_there_is_no_derivative(pendulum):
             ts=jnp.array([0.5]),
             events=[svkc.when(above, stop=True)],
             args=size,
-            **TIGHT,
+            **parameters.TIGHT,
         )
         return traj.events.time[0], traj.derivative
 
@@ -217,7 +223,7 @@ def test_where_there_is_no_derivative(pendulum):
             events=events,
             args=(first, second),
             max_events=6,
-            **TIGHT,
+            **parameters.TIGHT,
         ).derivative
 
     rest, never = jnp.array([1.0, 0, 0, 0]), 9.0
