@@ -160,9 +160,7 @@ def impact():
 def pendulum_cut():
     """Two rods, the second comes off at an angle of the first, and is taken hold of again where it
     is: both times, the angle and the model count."""
-    rods = models.bar(
-        "upper", models.Y, "0 0 -1", inside=models.bar("lower", models.Y, "0 0 -0.8", "0 0 -1")
-    )
+    rods = models.TWO_RODS
     chain = svkc.load(models.MJCF.format(rods), cuttable="lower")
     state = chain.state({"upper": 1.2, "lower": 0.3}, {"upper": 0.1, "lower": 0.2})
 
@@ -187,9 +185,7 @@ def pendulum_cut():
 
 def breaking():
     """A joint that breaks under its load, and a grip made with a spare slot."""
-    rods = models.bar(
-        "upper", models.Y, "0 0 -1", inside=models.bar("lower", models.Y, "0 0 -0.8", "0 0 -1")
-    )
+    rods = models.TWO_RODS
     rods += models.bar("other", models.Y, "0 0 -1", "1 0 0")
     chain = svkc.load(models.MJCF.format(rods), cuttable="lower", spare=1)
     state = chain.state({"upper": 1.2, "lower": 0.3})

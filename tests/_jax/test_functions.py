@@ -26,7 +26,7 @@ GAIN, LIST = 1.0, []
 
 @pytest.fixture(scope="module")
 def arm():
-    chain = svkc.load(models.MJCF.format(models.bar("arm", models.Y, "0 0 -1")))
+    chain = svkc.load(models.ARM)
     return chain, chain.state({"arm": 0.3})
 
 

@@ -13,6 +13,7 @@ from tolerances import REFERENCE, ROUND_OFF
 
 import svkc
 from svkc.loops.forward_dynamics import acceleration as accelerated
+from svkc.tree.configuration import rates
 
 
 @pytest.fixture(params=cases.params("loops"), scope="module")
@@ -36,21 +37,19 @@ def test_acceleration_is_that_of_the_multipliers(case):
     assert np.abs(bodies - fast).max() < 1e-10 * np.abs(fast).max()
 
 
+def keeps_the_loops(chain, state, vdot):
+    """J_C vdot + Jdot_C v = 0, against the derivative of J_C v along the motion."""
+    relative = lambda q, v: svkc.velocity_gaps(chain, svkc.State(q, v, state.structure))
+    _, change = jax.jvp(relative, (state.q, state.v), (rates(chain, state.q, state.v), vdot))
+    assert float(jnp.max(jnp.abs(change))) < REFERENCE * max(1, float(jnp.max(jnp.abs(vdot))))
+
+
 def test_velocities_and_accelerations_keep_the_loops(case):
-    """J_C W = 0 and J_C vdot + Jdot_C v = 0, the latter against the derivative of J_C v along the
-    motion."""
+    """J_C W = 0 and J_C vdot + Jdot_C v = 0."""
     name, chain, state, tau = case
     assert float(jnp.max(jnp.abs(svkc.loop_gaps(chain, state)))) < ROUND_OFF
     assert float(jnp.max(jnp.abs(svkc.velocity_gaps(chain, state)))) < ROUND_OFF
-    from svkc.tree.configuration import rates
-
-    vdot = svkc.forward_dynamics(chain, state, tau)
-
-    def relative(q, v):
-        return svkc.velocity_gaps(chain, svkc.State(q, v, state.structure))
-
-    _, change = jax.jvp(relative, (state.q, state.v), (rates(chain, state.q, state.v), vdot))
-    assert float(jnp.max(jnp.abs(change))) < REFERENCE * max(1, float(jnp.max(jnp.abs(vdot))))
+    keeps_the_loops(chain, state, svkc.forward_dynamics(chain, state, tau))
     assert int(svkc.mobility(chain, state).freedoms) == cases.CASES[name].freedoms
 
 
@@ -128,14 +127,7 @@ def test_every_kind_of_virtual_joint(joint):
     assert int(svkc.mobility(chain, state).freedoms) == 6 + freedoms
     assert float(jnp.max(jnp.abs(svkc.velocity_gaps(chain, state)))) < ROUND_OFF
     tau = jnp.asarray(rng.normal(size=chain.nv))
-    vdot = svkc.forward_dynamics(chain, state, tau)
-    from svkc.tree.configuration import rates
-
-    def relative(q, v):
-        return svkc.velocity_gaps(chain, svkc.State(q, v, state.structure))
-
-    _, change = jax.jvp(relative, (state.q, state.v), (rates(chain, state.q, state.v), vdot))
-    assert float(jnp.max(jnp.abs(change))) < REFERENCE * max(1, float(jnp.max(jnp.abs(vdot))))
+    keeps_the_loops(chain, state, svkc.forward_dynamics(chain, state, tau))
     if joint not in (
         "weld",
         "universal",

@@ -73,7 +73,7 @@ def test_scalar_last():
     q = chain.state({"a": 0.4, "c": ball, "b": [1, 2, 3, *free]}).q
     last = turns.as_quat()
     np.testing.assert_allclose(svkc.xyzw(chain, q), [0.4, *last[0], 1, 2, 3, *last[1]], atol=1e-15)
-    plain = svkc.load(models.MJCF.format(models.bar("arm", models.Y, "0 0 -1")))
+    plain = svkc.load(models.ARM)
     np.testing.assert_array_equal(svkc.xyzw(plain, jnp.array([0.7])), [0.7])
 
 

@@ -206,9 +206,7 @@ def test_springs_ranges_armature_and_motors_go_with_the_joint():
 def test_a_joint_that_breaks():
     """The pivot of a pendulum breaks where it carries 50 N: the load at that moment by the
     pendulum's own law, then free fall."""
-    xml = models.MJCF.format(models.bar("arm", models.Y, "0 0 -1")).replace(
-        'gravity="0.3 -0.2 -9.81"', 'gravity="0 0 -10"'
-    )
+    xml = models.ARM.replace('gravity="0.3 -0.2 -9.81"', 'gravity="0 0 -10"')
     chain = svkc.load(xml, cuttable="arm")
     limit = 50.0
     start = chain.state({"arm": 1.5})

@@ -17,7 +17,7 @@ import svkc
 ROOT = pathlib.Path(__file__).parents[2]
 MINITAUR = pathlib.Path(__file__).parent / "robots" / "minitaur_v1.urdf"
 
-PENDULUM = models.MJCF.format(models.bar("arm", models.Y, "0 0 -1"))
+PENDULUM = models.ARM
 
 
 def test_four_ways_in(tmp_path):

@@ -83,9 +83,7 @@ def test_loops_that_allow_only_the_first_order():
 @pytest.mark.slow
 def test_a_loop_of_no_length():
     """A second pin on a hinge that is there already takes nothing away."""
-    rods = models.bar(
-        "upper", models.Y, "0 0 -1", inside=models.bar("lower", models.Y, "0 0 -0.8", "0 0 -1")
-    )
+    rods = models.TWO_RODS
     again = svkc.VirtualLink(
         "again",
         "upper",

@@ -11,9 +11,7 @@ from tolerances import REFERENCE, ROUND_OFF
 
 import svkc
 
-PENDULUM = models.MJCF.format(models.bar("arm", models.Y, "0 0 -1")).replace(
-    'gravity="0.3 -0.2 -9.81"', 'gravity="0 0 -10"'
-)
+PENDULUM = models.ARM.replace('gravity="0.3 -0.2 -9.81"', 'gravity="0 0 -10"')
 
 
 @pytest.fixture(scope="module")
