@@ -113,12 +113,7 @@ def test_only_dependent_coordinates_move():
     """Where no other may: the loops are closed, and the independent coordinates stay."""
     chain = models.four_bar()
     rough = svkc.simulate(
-        chain,
-        chain.state(v={"crank": 4.0}),
-        0.1,
-        dt=0.1,
-        stabilization=svkc.Drift(),
-        throw=False,
+        chain, chain.state(v={"crank": 4.0}), 0.1, dt=0.1, stabilization=svkc.Drift(), throw=False
     ).final
     moved = lambda dependent: settle_loops(
         chain, rough.structure, rough.q, rough.v, iterations=3, dependent=dependent
