@@ -27,7 +27,7 @@ import soft_loops
 
 # isort: split
 import maximal
-import test_reference as reference
+import reference_problems as reference
 from munthe_kaas import MuntheKaas
 
 import svkc

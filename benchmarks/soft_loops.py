@@ -7,12 +7,11 @@ import sys
 import mujoco
 import numpy as np
 
-# the tests' reader of the reference problems, and the references themselves
-for folder in ("", "references", "problems"):
-    sys.path.insert(0, str(pathlib.Path(__file__).parents[1] / "tests" / folder))
+# the tests' reference problems
+sys.path.insert(0, str(pathlib.Path(__file__).parents[1] / "tests" / "references"))
 
 import maximal
-import test_reference as reference
+import reference_problems as reference
 
 import svkc.scenes
 from svkc.scenes.swing import parts

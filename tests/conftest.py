@@ -45,7 +45,8 @@ gc.set_threshold(100_000, 20, 50)
 
 # the longest first, so that no worker is left with one of them in the end
 LONGEST = (
-    "test_project",
+    "test_examples",
+    "test_commands",
     "test_transformations",
     "test_derivatives",
     "test_simulate",

@@ -67,6 +67,10 @@ def bar(name: str, joint: str, to: str, pos="0 0 0", inside="") -> str:
 Y = 'type="hinge" axis="0 1 0" damping="0"'
 
 
+# a rod on a hinge; two of them
+ARM = MJCF.format(bar("arm", Y, "0 0 -1"))
+TWO_RODS = bar("upper", Y, "0 0 -1", inside=bar("lower", Y, "0 0 -0.8", "0 0 -1"))
+
 FOUR_BAR = bar(
     "crank",
     Y,

@@ -26,7 +26,7 @@ class Setting:
         self.state = self.four.state()
         self.spare = svkc.load(models.MJCF.format(models.FOUR_BAR), spare=1)
         self.empty = self.spare.state()
-        self.motor = models.MJCF.format(models.bar("arm", models.Y, "0 0 -1")).replace(
+        self.motor = models.ARM.replace(
             "</mujoco>", '<actuator><motor joint="arm"/></actuator></mujoco>'
         )
         self.free = svkc.load(FREE)
@@ -37,6 +37,21 @@ class Setting:
         state = kw.pop("state", self.state if chain is self.four else self.empty)
         return svkc.simulate(chain, state, **({"t1": 1.0} | kw))
 
+    def short(self):
+        return self.simulate(t1=1e-3, dt=1e-3)
+
+    def lanes(self, one=None):
+        return jax.tree.map(lambda x: x[None], one or self.state)
+
+    def drawn(self, **kw):
+        return svkc.render(self.four, self.short(), self.folder / "x.gif", **kw)
+
+    def actuation(self, *args, **kw):
+        return svkc.actuation(self.four, self.state, jnp.zeros(4), *args, **kw)
+
+    def rollout(self, **kw):
+        return svkc.rollout(self.four, self.lanes(), 1.0, **kw)
+
     def load(self, text=None, **kw):
         return svkc.load(text or models.MJCF.format(models.FOUR_BAR), **kw)
 
@@ -44,7 +59,7 @@ class Setting:
         """Loads a run whose file was changed."""
         path = self.folder / "run.npz"
         if not path.exists():
-            self.simulate(t1=1e-3, dt=1e-3).save(path)
+            self.short().save(path)
         with np.load(path) as file:
             arrays = dict(file) | changed
         np.savez(
@@ -88,17 +103,17 @@ def single(s):
 
 def crowded(s):
     with mock.patch("jax.process_count", return_value=9):
-        svkc.rollout(s.four, jax.tree.map(lambda x: x[None], s.state), 1.0)
+        s.rollout()
 
 
 def too_large(s):
     exhausted = jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory.")
     with mock.patch("svkc.tools.rollout._piece", side_effect=exhausted):
-        svkc.rollout(s.four, jax.tree.map(lambda x: x[None], s.state), 1.0)
+        s.rollout()
 
 
 def undrawn(s):
-    traj = s.simulate(t1=1e-3, dt=1e-3)
+    traj = s.short()
     with mock.patch.dict(
         "sys.modules", {"mujoco.egl": None, "mujoco.osmesa": None, "mujoco.glfw": None}
     ):
@@ -119,32 +134,28 @@ def twice(s):
 
 def without_ffmpeg(s):
     with mock.patch.dict("sys.modules", {"imageio_ffmpeg": None}):
-        svkc.render(s.four, s.simulate(t1=1e-3, dt=1e-3), s.folder / "x.mp4")
+        svkc.render(s.four, s.short(), s.folder / "x.mp4")
 
 
 def nameless(s):
     path = s.folder / "nameless.npz"
-    s.simulate(t1=1e-3, dt=1e-3).save(path)
+    s.short().save(path)
     svkc.load_chain(path)
 
 
 def undrawable(s):
     with mock.patch.dict("sys.modules", {"matplotlib": None}):
-        s.simulate(t1=1e-3, dt=1e-3).plot()
+        s.short().plot()
 
 
 CASES = {
     "pictures need": undrawable,
     "... holds no model": nameless,
-    "camera: no": lambda s: svkc.render(
-        s.four, s.simulate(t1=1e-3, dt=1e-3), s.folder / "x.gif", camera="nobody's"
-    ),
+    "camera: no": lambda s: s.drawn(camera="nobody's"),
     "mp4 needs": without_ffmpeg,
     "run: no scene": lambda s: commands._scene("nowhere", ()),
     "run: no virtual": lambda s: commands._asked(s.four, [("release", "nobody", 0.1)]),
-    "trails: no": lambda s: svkc.render(
-        s.four, s.simulate(t1=1e-3, dt=1e-3), s.folder / "x.gif", trails=("nobody",)
-    ),
+    "trails: no": lambda s: s.drawn(trails=("nobody",)),
     "... is not linear": lambda s: jax.linear_transpose(
         operation("odd", jnp.sin, lambda p, t: (p[0], t[0])), jnp.ones(2)
     )(jnp.ones(2)),
@@ -163,17 +174,13 @@ CASES = {
     "...: got shape ..., expected (...,); for many use": lambda s: svkc.xyzw(s.four, jnp.zeros(9)),
     "...: got ..., expected a positive": lambda s: s.simulate(dt=-1.0),
     "...: got shape ..., expected (...,) for the tree": lambda s: s.four.state(np.zeros(7)),
-    "...: got shape ..., expected a number or": lambda s: svkc.actuation(
-        s.four, s.state, jnp.zeros(4), bounds=(np.zeros(2), np.ones(2))
+    "...: got shape ..., expected a number or": lambda s: s.actuation(
+        bounds=(np.zeros(2), np.ones(2))
     ),
-    "...: got shape ..., expected ... numbers": lambda s: svkc.render(
-        s.four, s.simulate(t1=1e-3, dt=1e-3), s.folder / "x.gif", lookat=(1, 2)
-    ),
+    "...: got shape ..., expected ... numbers": lambda s: s.drawn(lookat=(1, 2)),
     "...: got shape ..., expected one number": lambda s: s.simulate(t1=jnp.ones(2)),
     "...[...]: got": lambda s: s.four.state({"crank": [1.0, 2.0]}),
-    "actuated: expected": lambda s: svkc.actuation(
-        s.four, s.state, jnp.zeros(4), actuated=np.ones(2, bool)
-    ),
+    "actuated: expected": lambda s: s.actuation(actuated=np.ones(2, bool)),
     "adjoint: expected": lambda s: s.simulate(adjoint="replay"),
     "adjoint: svkc.Replay": lambda s: s.simulate(
         stepsize_controller=diffrax.StepTo(jnp.linspace(0, 1, 5)), adjoint=svkc.Replay()
@@ -191,10 +198,8 @@ CASES = {
     "bind: the chain": lambda s: s.simulate(
         events=[svkc.at(0.5, bind=[svkc.Grip("world", "rocker")])]
     ),
-    "bounds: expected (": lambda s: svkc.actuation(s.four, s.state, jnp.zeros(4), bounds=3),
-    "bounds: expected lower": lambda s: svkc.actuation(
-        s.four, s.state, jnp.zeros(4), bounds=(1.0, -1.0)
-    ),
+    "bounds: expected (": lambda s: s.actuation(bounds=3),
+    "bounds: expected lower": lambda s: s.actuation(bounds=(1.0, -1.0)),
     "bounds: the bounded": lambda s: jax.jit(
         lambda x: svkc.actuation(s.four, s.state, x, bounds=(-1.0, 1.0))
     )(jnp.zeros(4)),
@@ -205,9 +210,7 @@ CASES = {
     "chunk=... lanes": too_large,
     "connect: the bodies": away,
     "connected: expected": lambda s: s.four.state(connected=np.ones(3)),
-    "cost: got": lambda s: svkc.rollout(
-        s.four, jax.tree.map(lambda x: x[None], s.state), 1.0, cost=jnp.ones((1, 2))
-    ),
+    "cost: got": lambda s: s.rollout(cost=jnp.ones((1, 2))),
     "cuttable: ... belongs": lambda s: s.load(
         models.MJCF.format(
             '<body name="b"><joint name="x" type="slide"/><joint name="y" type="slide"/><geom'
@@ -223,9 +226,7 @@ CASES = {
     "data: got": lambda s: svkc.to_mujoco(
         s.four, s.state, type("Data", (), {"qpos": np.zeros(1), "qvel": np.zeros(1)})()
     ),
-    "devices: expected": lambda s: svkc.rollout(
-        s.four, jax.tree.map(lambda x: x[None], s.state), 1.0, devices=[]
-    ),
+    "devices: expected": lambda s: s.rollout(devices=[]),
     "dt: got": lambda s: s.simulate(dt=1e-12),
     "dt asks": lambda s: s.simulate(dt=0.1, rtol=1e-3),
     "dynamics.hold": lambda s: s.simulate(dynamics=svkc.dynamics.CompositeBodies(hold=2.0)),
@@ -236,9 +237,7 @@ CASES = {
     "ignore: got": lambda s: s.load(ignore=("nothing",)),
     "ignore_armature: no joint": lambda s: s.load(ignore_armature="nobody"),
     "joint: got": lambda s: link(joint="screw"),
-    "lane: expected a dict": lambda s: svkc.rollout(
-        s.four, jax.tree.map(lambda x: x[None], s.state), 1.0, lane=lambda chain, data: 3
-    ),
+    "lane: expected a dict": lambda s: s.rollout(lane=lambda chain, data: 3),
     "load_trajectory: expected": lambda s: svkc.load_trajectory(3),
     "leaves: axis": lambda s: svkc.leaves(s.four, "pin", axis=(0, 0, 0)),
     "mode: got": lambda s: svkc.check_grad(lambda x: x, jnp.asarray(1.0), mode="sideways"),
@@ -252,10 +251,8 @@ CASES = {
             [1.0, 1.0, 0, 0]
         )
     ),
-    "render: a picture": lambda s: svkc.render(
-        s.four, jax.tree.map(lambda x: x[None], s.simulate(t1=1e-3, dt=1e-3)), s.folder / "x.html"
-    ),
-    "render: ... should": lambda s: svkc.render(s.four, s.simulate(t1=1e-3, dt=1e-3), "x.bmp"),
+    "render: a picture": lambda s: svkc.render(s.four, s.lanes(s.short()), s.folder / "x.html"),
+    "render: ... should": lambda s: svkc.render(s.four, s.short(), "x.bmp"),
     "rtol and atol": lambda s: s.simulate(
         rtol=1e-3, stepsize_controller=diffrax.PIDController(rtol=1e-3, atol=1e-6)
     ),
@@ -283,9 +280,7 @@ CASES = {
     "state: q and v": lambda s: s.simulate(
         state=svkc.State(s.state.q * jnp.nan, s.state.v, s.state.structure)
     ),
-    "states, data, cost": lambda s: svkc.rollout(
-        s.four, jax.tree.map(lambda x: x[None], s.state), 1.0, data=jnp.zeros(3)
-    ),
+    "states, data, cost": lambda s: s.rollout(data=jnp.zeros(3)),
     "states: expected": lambda s: svkc.rollout(s.four, 3, 1.0),
     "t1: got": lambda s: s.simulate(t1=-1.0),
     "target: ... cannot": lambda s: svkc.tune(
@@ -318,7 +313,7 @@ CASES = {
     "virtual link ...: axis": lambda s: link(axis=(0, 0, 0)),
     "virtual_links: expected": lambda s: s.load(virtual_links=["pin"]),
     "virtual_links: names": lambda s: s.load(virtual_links=[link(), link()]),
-    "weight: expected": lambda s: svkc.actuation(s.four, s.state, jnp.zeros(4), weight=-np.ones(4)),
+    "weight: expected": lambda s: s.actuation(weight=-np.ones(4)),
     "when: direction": lambda s: svkc.when(lambda t, x, args: t, direction="up"),
     "when: guard": lambda s: svkc.when(3),
 }
@@ -353,8 +348,8 @@ ALSO = [
     ("one leading axis of lanes", lambda s: svkc.rollout(s.four, s.state, 1.0)),
     ("check_grad: x has", lambda s: svkc.check_grad(jnp.sin, 3)),
     # verbs
-    ("weight.*positive", lambda s: svkc.actuation(s.four, s.state, jnp.zeros(4), np.zeros(4))),
-    ("weight.*shape", lambda s: svkc.actuation(s.four, s.state, jnp.zeros(4), np.ones(2))),
+    ("weight.*positive", lambda s: s.actuation(np.zeros(4))),
+    ("weight.*shape", lambda s: s.actuation(np.ones(2))),
     ("nobody.*virtual links: pin", lambda s: svkc.connect(s.four, s.state, "nobody")),
     ("Booleans", lambda s: svkc.transition(s.four, s.state, np.array([1]))),
     ("neck", lambda s: svkc.lock(s.four, s.state, "neck")),

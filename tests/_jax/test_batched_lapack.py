@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tolerances import REFERENCE, ROUND_OFF
 
 from svkc._jax.batched_lapack import factor_positive, solve_triangle
 
@@ -25,8 +26,8 @@ def test_batches_are_their_single_solves(lanes, size):
     np.testing.assert_allclose(
         positive(A, x),
         np.linalg.solve(np.asarray(A), np.asarray(x)[..., None])[..., 0],
-        rtol=1e-9,
-        atol=1e-12,
+        rtol=REFERENCE,
+        atol=ROUND_OFF,
     )
     for trans in False, True:
         solve, upper = triangle(trans), np.triu(np.asarray(A))
@@ -35,7 +36,7 @@ def test_batches_are_their_single_solves(lanes, size):
         expected = np.linalg.solve(
             np.swapaxes(upper, -1, -2) if trans else upper, np.asarray(x)[..., None]
         )[..., 0]
-        np.testing.assert_allclose(solve(A, x), expected, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(solve(A, x), expected, rtol=REFERENCE, atol=ROUND_OFF)
 
 
 TWO_DEVICES = """

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import models
 import numpy as np
 import pytest
+from tolerances import REFERENCE
 
 import svkc
 from svkc._jax import eager
@@ -49,8 +50,8 @@ def close(got, wanted):
         np.testing.assert_allclose(
             got[name],
             wanted[name],
-            rtol=1e-9,
-            atol=1e-9 * (1 + float(np.abs(wanted[name]).max())),
+            rtol=REFERENCE,
+            atol=REFERENCE * (1 + float(np.abs(wanted[name]).max())),
             err_msg=name,
         )
 
@@ -87,7 +88,7 @@ def test_derivatives_of_each(linkage):
     np.testing.assert_allclose(
         backwards,
         sum(np.sum(np.asarray(forwards[name]) * w) for name, w in weights.items()),
-        rtol=1e-9,
+        rtol=REFERENCE,
     )
 
 

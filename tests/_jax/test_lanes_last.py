@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import models
 import numpy as np
 import pytest
+from tolerances import ROUND_OFF
 
 import svkc
 from svkc._jax import lanes_last as rules
@@ -115,18 +116,20 @@ def test_a_step_in_every_transformation():
     tau = jax.random.normal(KEY, (2, 3, chain.nv))
     v = lambda tau: svkc.step(chain, state, tau, 1e-2).v
     alone = jnp.stack([jnp.stack([v(one) for one in some]) for some in tau])
-    np.testing.assert_allclose(jax.vmap(jax.vmap(v))(tau), alone, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(jax.vmap(jax.vmap(v))(tau), alone, rtol=ROUND_OFF, atol=ROUND_OFF)
     slopes = jnp.stack([jax.jacrev(v)(one) for one in tau[0]])
-    np.testing.assert_allclose(jax.vmap(jax.jacrev(v))(tau[0]), slopes, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(
+        jax.vmap(jax.jacrev(v))(tau[0]), slopes, rtol=ROUND_OFF, atol=ROUND_OFF
+    )
     np.testing.assert_allclose(
         jax.jacfwd(jax.vmap(v))(tau[0])[np.arange(3), :, np.arange(3)],
         slopes,
-        rtol=1e-12,
-        atol=1e-12,
+        rtol=ROUND_OFF,
+        atol=ROUND_OFF,
     )
     each = jax.grad(lambda tau: jnp.sum(jax.vmap(v)(tau) ** 2))(tau[0])
     np.testing.assert_allclose(
-        each, 2 * jnp.einsum("nji,nj->ni", slopes, alone[0]), rtol=1e-12, atol=1e-12
+        each, 2 * jnp.einsum("nji,nj->ni", slopes, alone[0]), rtol=ROUND_OFF, atol=ROUND_OFF
     )
     assert svkc.check_grad(lambda tau: jnp.sum(v(tau) ** 2), tau[0, 0]).error < 1e-8
 
@@ -160,5 +163,5 @@ def test_runs_by_articulated_bodies():
     for got, expected in zip(
         batch, map(jnp.stack, zip(*(lane[:-1] for lane in single), strict=True)), strict=True
     ):
-        np.testing.assert_allclose(got, expected, rtol=0, atol=1e-12)
-    assert float(jnp.max(gap)) < 1e-12
+        np.testing.assert_allclose(got, expected, rtol=0, atol=ROUND_OFF)
+    assert float(jnp.max(gap)) < ROUND_OFF

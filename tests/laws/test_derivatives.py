@@ -6,12 +6,13 @@ import jax
 import jax.numpy as jnp
 import models
 import numpy as np
+import parameters
 import pytest
 from compile import counted
+from tolerances import DIFFERENCE, REFERENCE, ROUND_OFF
 
 import svkc
 
-TIGHT = derivatives.TIGHT
 BUDGET = 42500
 
 
@@ -41,7 +42,7 @@ def test_a_release_against_differences():
     def loss(x):
         events = [svkc.when(lambda t, s, args: svkc.poses(chain, s)[1][1, 2] - args, cut="rod")]
         start = svkc.State(state.q, x["speed"] * state.v, state.structure)
-        c = derivatives.changed(chain, x)
+        c = parameters.changed(chain, x)
         traj = svkc.simulate(
             c,
             start,
@@ -50,12 +51,12 @@ def test_a_release_against_differences():
             args=x["sine"],
             max_events=1,
             adjoint=svkc.Replay(),
-            **TIGHT,
+            **parameters.TIGHT,
         )
         # (without the event its time is infinite, and so is this)
         return traj.events.time[0] + jnp.sum(jnp.sin(traj.final.q)) + jnp.sum(traj.final.v**2) / 10
 
-    x = {"sine": jnp.asarray(0.3), "speed": jnp.asarray(1.0)} | derivatives.heavier(chain)
+    x = {"sine": jnp.asarray(0.3), "speed": jnp.asarray(1.0)} | parameters.heavier(chain)
     rng = np.random.default_rng(0)
     way = {name: jnp.asarray(rng.normal(size=leaf.shape)) for name, leaf in x.items()}
 
@@ -70,7 +71,7 @@ def test_a_release_against_differences():
     lowered = program.lower(part, part)
     # 10 % above what was counted with jax 0.10.1
     assert counted(lowered.compiler_ir("hlo").as_hlo_text()) <= BUDGET
-    assert derivatives.worst(lowered.compile(), part) <= derivatives.RUN
+    assert parameters.worst(lowered.compile(), part) <= derivatives.RUN
 
 
 def both_ways(f):
@@ -118,7 +119,11 @@ def test_a_catch_with_a_closed_form(balls):
     def simulated(x):
         state, met = meeting(balls, x)
         traj = svkc.simulate(
-            balls, state, 2.0, events=[svkc.when(met, connect="weld", here=True)], **TIGHT
+            balls,
+            state,
+            2.0,
+            events=[svkc.when(met, connect="weld", here=True)],
+            **parameters.TIGHT,
         )
         return jnp.array([traj.final.q[0], traj.events.time[0], traj.events.energy_lost[0]])
 
@@ -142,12 +147,14 @@ def test_a_collision_that_swaps_velocities(balls):
 
     def bounced(x):
         state, met = meeting(balls, x)
-        first = svkc.simulate(balls, state, 2.0, events=[svkc.when(met, stop=True)], **TIGHT)
+        first = svkc.simulate(
+            balls, state, 2.0, events=[svkc.when(met, stop=True)], **parameters.TIGHT
+        )
         swapped = svkc.State(first.final.q, first.final.v[::-1], first.final.structure)
-        return svkc.simulate(balls, swapped, 2.0, t0=first.t_final, **TIGHT).final.q
+        return svkc.simulate(balls, swapped, 2.0, t0=first.t_final, **parameters.TIGHT).final.q
 
     for jacobian in both_ways(bounced)(start)[1:]:
-        np.testing.assert_allclose(jacobian, np.array([[0, 1, 0, 2], [1, 0, 2, 0]]), atol=1e-9)
+        np.testing.assert_allclose(jacobian, np.array([[0, 1, 0, 2], [1, 0, 2, 0]]), atol=REFERENCE)
 
 
 @pytest.mark.slow
@@ -158,7 +165,9 @@ def test_times_that_coincide(balls):
     def simulated(x):
         state, _ = meeting(balls, jnp.concatenate([jnp.zeros(2), x["v"]]))
         events = [svkc.at(x["event"], connect="weld", here=True)]
-        traj = svkc.simulate(balls, state, x["t1"], t0=x["t0"], ts=x["ts"], events=events, **TIGHT)
+        traj = svkc.simulate(
+            balls, state, x["t1"], t0=x["t0"], ts=x["ts"], events=events, **parameters.TIGHT
+        )
         return jnp.append(traj.states.q[:, 0], traj.final.q[0])
 
     def formula(x):
@@ -193,7 +202,7 @@ def test_times_that_coincide(balls):
         else:
             formula_here = formula
         value, forward, backward = both(x)
-        np.testing.assert_allclose(value, formula_here(x), atol=1e-12)
+        np.testing.assert_allclose(value, formula_here(x), atol=ROUND_OFF)
         for mode in (forward, backward):
             jax.tree.map(
                 lambda got, want: np.testing.assert_allclose(got, want, atol=1e-10),
@@ -201,7 +210,7 @@ def test_times_that_coincide(balls):
                 jax.jacfwd(formula_here)(x),
             )
         jax.tree.map(
-            lambda got, want: np.testing.assert_allclose(got, want, atol=1e-9),
+            lambda got, want: np.testing.assert_allclose(got, want, atol=REFERENCE),
             twice_simulated(x),
             twice(formula_here)(x),
         )
@@ -222,7 +231,7 @@ def test_nothing_is_not_a_number():
     state = chain.state()
 
     def everything(x):
-        c = derivatives.changed(chain, x)
+        c = parameters.changed(chain, x)
         s = svkc.lock(c, svkc.State(x["q"], x["v"], state.structure), "fore")
         traj = svkc.simulate(
             c,
@@ -231,12 +240,12 @@ def test_nothing_is_not_a_number():
             events=[svkc.at(x["time"], connect="hook", here=True), svkc.at(0.07, unlock="fore")],
             dt=0.02,
         )
-        return derivatives.motion(traj) | {
+        return parameters.motion(traj) | {
             "forces": svkc.loop_forces(c, traj.final, jnp.zeros(chain.dofs)).force,
             "gap": traj.gaps,
         }
 
-    x = {"q": state.q, "v": state.v, "time": jnp.asarray(0.05)} | derivatives.model(
+    x = {"q": state.q, "v": state.v, "time": jnp.asarray(0.05)} | parameters.model(
         chain, "mass", "inertia", "com", "pos", "gravity"
     )
     total = lambda x: sum(jnp.sum(leaf) for leaf in jax.tree.leaves(everything(x)))
@@ -244,7 +253,7 @@ def test_nothing_is_not_a_number():
     forwards = jax.jvp(total, (x,), (jax.tree.map(jnp.ones_like, x),))[1]
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(backwards))
     np.testing.assert_allclose(
-        sum(float(jnp.sum(leaf)) for leaf in jax.tree.leaves(backwards)), forwards, rtol=1e-9
+        sum(float(jnp.sum(leaf)) for leaf in jax.tree.leaves(backwards)), forwards, rtol=REFERENCE
     )
 
 
@@ -266,7 +275,7 @@ def test_gradients_in_the_tangent():
     np.testing.assert_allclose(
         jax.grad(lambda dv: height(svkc.integrate(chain, state.q, dv)))(jnp.zeros(3)),
         slope,
-        atol=1e-12,
+        atol=ROUND_OFF,
     )
     lower = svkc.integrate(chain, state.q, -0.01 * slope)
     assert float(height(lower)) < float(height(state.q))
@@ -285,12 +294,12 @@ def test_the_check_finds_what_is_wrong():
         lambda x: {"good": x["a"] * x["b"], "bad": wrong(x["b"])},
         {"a": jnp.arange(3.0), "b": jnp.ones(3), "count": 4},
     )
-    assert found.error == pytest.approx(0.1 / 2.1, rel=1e-6)
+    assert found.error == pytest.approx(0.1 / 2.1, rel=DIFFERENCE)
     assert "bad" in found.output
     assert "'b'" in found.input
     for part in ("bad", "'b'", "by differentiation"):
         assert part in str(found)
-    assert svkc.check_grad(jnp.sin, 1.0).error < 1e-9
+    assert svkc.check_grad(jnp.sin, 1.0).error < REFERENCE
     # a derivative that is no number is as wrong as can be
     found = svkc.check_grad(
         lambda x: {"a": x, "root": jnp.where(x > 0, jnp.sqrt(x), x)}, jnp.zeros(())

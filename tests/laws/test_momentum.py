@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import models
 import numpy as np
 import pytest
+from tolerances import ROUND_OFF
 
 import svkc
 from svkc.transitions.transition import change
@@ -112,7 +113,7 @@ def test_across_changes(name):
         gain = float(svkc.kinetic_energy(chain, after) - svkc.kinetic_energy(chain, state))
         # (of the boxes some are caught that move together already)
         assert gain < 0 or name == "every_kind"
-        assert gain <= 1e-12 or kind == "move"
+        assert gain <= ROUND_OFF or kind == "move"
         if kind in ("cut", "unlock"):
             assert bool(jnp.all(after.v == state.v))
         state = after

@@ -1,18 +1,18 @@
 """Derivatives of runs with a guard: under every transformation, twice, by every adjoint, and where
 there are none."""
 
-import derivatives
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import models
 import numpy as np
+import parameters
 import pytest
+from tolerances import DIFFERENCE, REFERENCE
 
 import svkc
 
 SLOPE = models.MJCF.replace("0.3 -0.2 -9.81", "0 0 -9.81")
-TIGHT = derivatives.TIGHT
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,14 @@ def held(chain, x, ts=None, **kw):
     state = svkc.State(state.q.at[0].set(x[0]), state.v, state.structure)
     events = [svkc.when(angle, connect="hook", here=True), svkc.at(x[2], cut="hook")]
     return svkc.simulate(
-        chain, state, x[3], ts=ts, events=events, args=x[1], max_events=2, **(kw or TIGHT)
+        chain,
+        state,
+        x[3],
+        ts=ts,
+        events=events,
+        args=x[1],
+        max_events=2,
+        **(kw or parameters.TIGHT),
     )
 
 
@@ -55,7 +62,7 @@ def test_the_end_and_an_event_at_a_save_time(pendulum):
     assert found.modes <= 1e-10, found
     along = {"start": jnp.zeros(()), "angle": jnp.zeros(()), "t1": jnp.ones(())}
     value, rate = jax.jvp(f, (x,), (along,))
-    np.testing.assert_allclose(rate["end"], value["rate"], rtol=1e-9)
+    np.testing.assert_allclose(rate["end"], value["rate"], rtol=REFERENCE)
 
 
 @pytest.mark.slow
@@ -71,7 +78,7 @@ def test_every_order_of_the_transformations(pendulum):
 
     def loss(x, com):
         """By the lanes' own starts and times, and by what they share."""
-        traj = held(derivatives.changed(pendulum, {"com": com}), x)
+        traj = held(parameters.changed(pendulum, {"com": com}), x)
         return traj.final.q[0], traj.events.count
 
     one = lambda x, com: loss(x, com)[0]
@@ -90,17 +97,17 @@ def test_every_order_of_the_transformations(pendulum):
         )(lanes, com),
         "grad(scan)": jax.jit(jax.grad(looped, both))(lanes, com),
     }.items():
-        np.testing.assert_allclose(got, single, atol=1e-9, err_msg=name)
+        np.testing.assert_allclose(got, single, atol=REFERENCE, err_msg=name)
         # gradients by what is shared add up
         np.testing.assert_allclose(
-            share, shares if share.ndim > com.ndim else shares.sum(0), atol=1e-9, err_msg=name
+            share, shares if share.ndim > com.ndim else shares.sum(0), atol=REFERENCE, err_msg=name
         )
 
 
 def twice(f, x):
     """The largest relative error of the gradient's derivative, as `svkc.check_grad(jax.grad(f), x,
     "forward", directions=1)` has it, by one program."""
-    return derivatives.worst(jax.jit(lambda x, along: jax.jvp(jax.grad(f), (x,), (along,))), x)
+    return parameters.worst(jax.jit(lambda x, along: jax.jvp(jax.grad(f), (x,), (along,))), x)
 
 
 @pytest.mark.slow
@@ -109,7 +116,7 @@ def test_second_derivatives_of_forward_dynamics():
     chain = models.four_bar()
 
     def power(x):
-        c = derivatives.changed(chain, x)
+        c = parameters.changed(chain, x)
         c = eqx.tree_at(
             lambda c: c.structure.real_pos, c, chain.structure.real_pos.at[:, ::2].add(x["pin"])
         )
@@ -131,10 +138,10 @@ def test_second_derivatives_of_a_run(pendulum):
     """Hessian-vector products with a guard and a scheduled event."""
 
     def loss(x):
-        traj = held(derivatives.changed(pendulum, x), x["held"])
+        traj = held(parameters.changed(pendulum, x), x["held"])
         return traj.final.q[0] ** 2 + traj.final.v[0] + traj.events.time[0]
 
-    assert twice(loss, {"held": jnp.array([1.2, 0.3, 0.8, 1.0]), "com": pendulum.com}) <= 1e-6
+    assert twice(loss, {"held": jnp.array([1.2, 0.3, 0.8, 1.0]), "com": pendulum.com}) <= DIFFERENCE
 
 
 @pytest.mark.slow
@@ -188,7 +195,7 @@ def test_where_there_is_no_derivative(pendulum):
             ts=jnp.array([0.5]),
             events=[svkc.when(above, stop=True)],
             args=size,
-            **TIGHT,
+            **parameters.TIGHT,
         )
         return traj.events.time[0], traj.derivative
 
@@ -196,7 +203,7 @@ def test_where_there_is_no_derivative(pendulum):
     slopes, codes = jax.jit(jax.vmap(jax.grad(grazed, has_aux=True)))(jnp.array([0.01, 1e-15]))
     assert (codes == svkc.RESULTS.successful).tolist() == [True, False]
     assert (codes == svkc.RESULTS.grazing).tolist() == [False, True]
-    np.testing.assert_allclose(slopes[0], -5.0, rtol=1e-9)
+    np.testing.assert_allclose(slopes[0], -5.0, rtol=REFERENCE)
     assert np.isnan(slopes[1])
 
     @jax.jit
@@ -216,7 +223,7 @@ def test_where_there_is_no_derivative(pendulum):
             events=events,
             args=(first, second),
             max_events=6,
-            **TIGHT,
+            **parameters.TIGHT,
         ).derivative
 
     rest, never = jnp.array([1.0, 0, 0, 0]), 9.0

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import models
 import numpy as np
 import pytest
+from tolerances import DIFFERENCE, REFERENCE, ROUND_OFF
 
 import svkc
 
@@ -48,7 +49,7 @@ def test_square(five_bar):
     assert not np.any(found.null_space)
     # theta_G's accelerations alone, in order, say the same
     short = svkc.actuation(chain, state, vdot[np.asarray(co.independent)], actuated=motors)
-    np.testing.assert_allclose(short.tau, found.tau, rtol=1e-12)
+    np.testing.assert_allclose(short.tau, found.tau, rtol=ROUND_OFF)
 
 
 def test_redundant(five_bar):
@@ -69,7 +70,7 @@ def test_redundant(five_bar):
     weighted = svkc.actuation(chain, state, vdot, weight, actuated=motors)
     root = np.sqrt(weight[motors])
     np.testing.assert_allclose(
-        np.asarray(weighted.tau)[motors], np.linalg.pinv(S.T / root) @ wanted / root, rtol=1e-9
+        np.asarray(weighted.tau)[motors], np.linalg.pinv(S.T / root) @ wanted / root, rtol=REFERENCE
     )
     assert abs(float(weighted.tau[mask(chain, "left_fore")][0])) < abs(
         float(found.tau[mask(chain, "left_fore")][0])
@@ -84,10 +85,10 @@ def test_redundant(five_bar):
     load = [svkc.loop_forces(chain, state, found.tau + k * column) for k in (0.0, 1.0)]
     which = int(np.flatnonzero(np.any(null, 0))[0])
     np.testing.assert_allclose(
-        load[1].force - load[0].force, found.null_force[:, :, which], atol=1e-9
+        load[1].force - load[0].force, found.null_force[:, :, which], atol=REFERENCE
     )
     np.testing.assert_allclose(
-        load[1].torque - load[0].torque, found.null_torque[:, :, which], atol=1e-9
+        load[1].torque - load[0].torque, found.null_torque[:, :, which], atol=REFERENCE
     )
     assert float(jnp.abs(found.null_force).max()) > 1e-3
 
@@ -103,14 +104,14 @@ def test_missing(five_bar):
     undriven = np.asarray(found.undriven)
     assert int(np.any(undriven, 0).sum()) == 1
     direction = undriven[:, np.any(undriven, 0)][:, 0]
-    assert np.abs(direction[motors]).max() < 1e-12
+    assert np.abs(direction[motors]).max() < ROUND_OFF
     there = svkc.State(state.q, jnp.asarray(direction), state.structure)
-    assert float(jnp.abs(svkc.velocity_gaps(chain, there)).max()) < 1e-12
+    assert float(jnp.abs(svkc.velocity_gaps(chain, there)).max()) < ROUND_OFF
     # what can be reached is: with an acceleration that the one motor makes, nothing is left
     possible = svkc.forward_dynamics(chain, state, jnp.where(motors, 3.0, 0.0))
     exact = svkc.actuation(chain, state, possible, actuated=motors)
     assert float(jnp.abs(exact.residual).max()) < 1e-10
-    np.testing.assert_allclose(exact.tau[motors], 3.0, rtol=1e-9)
+    np.testing.assert_allclose(exact.tau[motors], 3.0, rtol=REFERENCE)
 
 
 @pytest.mark.slow
@@ -140,7 +141,7 @@ def test_over_constrained():
     felt = np.einsum("lkd,lkr->dr", linear, force) + np.einsum("lkd,lkr->dr", angular, torque)
     stresses = np.concatenate([force, torque], 1).reshape(12, -1)
     assert np.linalg.matrix_rank(stresses) == int(np.any(stresses, 0).sum()) == 7
-    assert np.abs(felt).max() < 1e-12
+    assert np.abs(felt).max() < ROUND_OFF
     assert svkc.loop_forces(chain, chain.state(connected=["pin2"]), found.tau).unique.tolist() == [
         True,
         False,
@@ -157,11 +158,11 @@ def test_both_hands_on_the_bar(high_bar):
     assert (int(found.rank), int(found.redundancy), int(found.deficiency)) == (11, 5, 1)
     possible = svkc.forward_dynamics(chain, state, jnp.where(chain.actuated, vdot, 0))
     exact = svkc.actuation(chain, state, possible)
-    assert float(jnp.abs(exact.residual).max()) < 1e-9
+    assert float(jnp.abs(exact.residual).max()) < REFERENCE
     assert reached(chain, state, possible, exact) < 1e-10 * float(jnp.abs(possible).max())
     # the swing, every joint held: no actuator works on it
     swing = np.asarray(found.undriven)[:, np.any(found.undriven, 0)][:, 0]
-    assert np.abs(swing[np.asarray(chain.actuated)]).max() < 1e-12 * np.abs(swing).max()
+    assert np.abs(swing[np.asarray(chain.actuated)]).max() < ROUND_OFF * np.abs(swing).max()
 
 
 def test_bounds(five_bar):
@@ -171,7 +172,7 @@ def test_bounds(five_bar):
     motors = mask(chain, "left_arm", "right_arm", "left_fore")
     free = svkc.actuation(chain, state, vdot, actuated=motors)
     loose = svkc.actuation(chain, state, vdot, actuated=motors, bounds=(-1e3, 1e3))
-    np.testing.assert_allclose(loose.tau, free.tau, atol=1e-9)
+    np.testing.assert_allclose(loose.tau, free.tau, atol=REFERENCE)
     worst = int(jnp.argmax(jnp.abs(free.tau)))
     limit = np.full(chain.dofs, 1e3)
     limit[worst] = 0.5 * abs(float(free.tau[worst]))
@@ -200,7 +201,7 @@ def test_open_chain_and_derivative(five_bar):
     state, vdot = moving(tree)
     found = svkc.actuation(tree, state, vdot)
     np.testing.assert_allclose(
-        found.tau, svkc.inverse_dynamics(tree, state, vdot), rtol=1e-10, atol=1e-12
+        found.tau, svkc.inverse_dynamics(tree, state, vdot), rtol=1e-10, atol=ROUND_OFF
     )
     chain, state, vdot, _ = five_bar
     state = svkc.prefer(chain, state, "left_arm", "right_arm")
@@ -223,6 +224,8 @@ def test_open_chain_and_derivative(five_bar):
             ).tau
         )
         forward = jax.jacfwd(f)(0.0)
-        np.testing.assert_allclose(jax.jacrev(f)(0.0), forward, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(jax.jacrev(f)(0.0), forward, rtol=REFERENCE, atol=REFERENCE)
         h = 1e-5
-        np.testing.assert_allclose(forward, (f(h) - f(-h)) / (2 * h), rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(
+            forward, (f(h) - f(-h)) / (2 * h), rtol=DIFFERENCE, atol=DIFFERENCE
+        )

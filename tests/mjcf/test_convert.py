@@ -16,6 +16,7 @@ import mujoco
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tolerances import REFERENCE, ROUND_OFF
 
 import svkc
 from svkc.model.topology import V_SIZE
@@ -72,7 +73,7 @@ def test_scalar_last():
     q = chain.state({"a": 0.4, "c": ball, "b": [1, 2, 3, *free]}).q
     last = turns.as_quat()
     np.testing.assert_allclose(svkc.xyzw(chain, q), [0.4, *last[0], 1, 2, 3, *last[1]], atol=1e-15)
-    plain = svkc.load(models.MJCF.format(models.bar("arm", models.Y, "0 0 -1")))
+    plain = svkc.load(models.ARM)
     np.testing.assert_array_equal(svkc.xyzw(plain, jnp.array([0.7])), [0.7])
 
 
@@ -202,8 +203,8 @@ def test_a_scene_as_mjcf_and_back(scene):
     a, b = (
         svkc.forward_dynamics(c, s, tau)[: chain.nv] for c, s in ((chain, state), (again, other))
     )
-    np.testing.assert_allclose(a, b, atol=1e-9 * float(jnp.abs(a).max()))
-    assert residual(again, other) < 1e-9
+    np.testing.assert_allclose(a, b, atol=REFERENCE * float(jnp.abs(a).max()))
+    assert residual(again, other) < REFERENCE
 
 
 def test_what_has_no_mjcf_is_said():
@@ -306,7 +307,7 @@ def test_the_viewer_is_shown_every_state(monkeypatch, capsys):
     places = jax.vmap(lambda s: svkc.poses(done["chain"], s)[0])(
         jax.tree.map(jnp.asarray, done["states"])
     )
-    np.testing.assert_allclose(shown, places, atol=1e-12)
+    np.testing.assert_allclose(shown, places, atol=ROUND_OFF)
     assert np.ptp(places, 0).max() > 1
     # no longer than an example may be, and of public names alone
     text = VIEWER.read_text()

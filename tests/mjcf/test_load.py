@@ -10,13 +10,14 @@ import models
 import mujoco
 import numpy as np
 import pytest
+from tolerances import REFERENCE, ROUND_OFF
 
 import svkc
 
 ROOT = pathlib.Path(__file__).parents[2]
 MINITAUR = pathlib.Path(__file__).parent / "robots" / "minitaur_v1.urdf"
 
-PENDULUM = models.MJCF.format(models.bar("arm", models.Y, "0 0 -1"))
+PENDULUM = models.ARM
 
 
 def test_four_ways_in(tmp_path):
@@ -146,7 +147,9 @@ def test_ends_of_virtual_links_by_sites():
     assert by_sites.parent.tolist() == by_bodies.parent.tolist()
     assert by_sites.real.tolist() == by_bodies.real.tolist()
     for name in ("pos", "quat", "real_pos", "real_quat"):
-        np.testing.assert_allclose(getattr(by_sites, name), getattr(by_bodies, name), atol=1e-12)
+        np.testing.assert_allclose(
+            getattr(by_sites, name), getattr(by_bodies, name), atol=ROUND_OFF
+        )
 
 
 def test_equalities_become_virtual_links():
@@ -164,7 +167,7 @@ def test_equalities_become_virtual_links():
     assert int(svkc.mobility(chain, chain.state(connected=["w"])).freedoms) == 7 - 6
     # both hold in the load pose, where MuJoCo wrote them
     np.testing.assert_allclose(
-        chain.state(connected=["c", "w"]).q[: chain.nq], chain.model.model.qpos0, atol=1e-12
+        chain.state(connected=["c", "w"]).q[: chain.nq], chain.model.model.qpos0, atol=ROUND_OFF
     )
 
 
@@ -317,7 +320,7 @@ def test_urdf_with_a_mesh(tmp_path, written, stands):
         assert {"fore", "tip"} < set(chain.body_names)
         row = chain.topology.body_row[chain.body_names.index("fore")]
         assert float(chain.mass[row]) == 2.0
-        np.testing.assert_allclose(chain.inertia[row], np.diag([0.01, 0.02, 0.025]), atol=1e-12)
+        np.testing.assert_allclose(chain.inertia[row], np.diag([0.01, 0.02, 0.025]), atol=ROUND_OFF)
         np.testing.assert_allclose(chain.limit[:, 0], [-1, 1])
 
 
@@ -363,7 +366,7 @@ def test_a_scene_written_in_python():
     np.testing.assert_allclose(
         svkc.forward_dynamics(chain, chain.state(), tau),
         expected,
-        atol=1e-9 * float(jnp.abs(expected).max()),
+        atol=REFERENCE * float(jnp.abs(expected).max()),
     )
     # a change of the caller's afterwards is not the chain's
     spec.worldbody.add_body(name="late").add_geom(size=[0.1, 0, 0])

@@ -1,7 +1,5 @@
-"""Independent solutions of other people's problems (tests/reference: where each comes from), and
-what they hold this library to."""
+"""Independent solutions of other people's problems, and what they hold this library to."""
 
-import json
 import os
 import pathlib
 import subprocess
@@ -13,34 +11,10 @@ import jax.numpy as jnp
 import maximal
 import numpy as np
 import pytest
+from reference_problems import ROTATION, given, n_four_bar, numbers, places, springs, tight
+from tolerances import REFERENCE, ROUND_OFF
 
 import svkc
-
-FOLDER = pathlib.Path(__file__).parents[1] / "references" / "data"
-ROTATION = (
-    '<mujoco><compiler balanceinertia="false"/><option gravity="{}"/><worldbody><body'
-    ' name="top"><joint name="top" type="ball"/>'
-)
-ROTATION += '<inertial pos="{}" mass="{}" diaginertia="{}"/></body></worldbody></mujoco>'
-
-
-def given(name):
-    return json.loads((FOLDER / f"{name}.json").read_text())
-
-
-def tight(tolerance):
-    return {"rtol": tolerance, "atol": tolerance / 100, "solver": diffrax.Dopri8()}
-
-
-def numbers(x):
-    return " ".join(repr(float(value)) for value in x)
-
-
-def places(chain, traj, body):
-    """[times 3] of the body's frame."""
-    return np.asarray(jax.vmap(lambda s: svkc.poses(chain, s)[0])(traj.states))[
-        :, chain.body_names.index(body)
-    ]
 
 
 def turned_alike(q, expected):
@@ -89,29 +63,8 @@ def test_heavy_top(case):
         **tight(1e-13),
     )
     np.testing.assert_allclose(
-        *turned_alike(traj.states.q, case["quat_wxyz_body_to_world"]), atol=1e-9
+        *turned_alike(traj.states.q, case["quat_wxyz_body_to_world"]), atol=REFERENCE
     )
-
-
-def n_four_bar(windows):
-    """The problem of two windows with as many as asked for."""
-    problem = given("n_four_bar")["problem"]
-    upright, level = problem["bodies"][0], problem["bodies"][-1]
-    hinge = {"type": "revolute", "axis_world0": [0, 0, 1]}
-    bodies = [upright | {"name": f"vert{i}", "com_world0": [i, 0.5, 0]} for i in range(windows + 1)]
-    bodies += [level | {"name": f"horiz{i}", "com_world0": [i + 0.5, 1, 0]} for i in range(windows)]
-    joints = [
-        hinge | {"parent": "ground", "child": f"vert{i}", "point_world0": [i, 0, 0]}
-        for i in range(windows + 1)
-    ]
-    for i in range(windows):
-        joints.append(
-            hinge | {"parent": f"vert{i}", "child": f"horiz{i}", "point_world0": [i, 1, 0]}
-        )
-        joints.append(
-            hinge | {"parent": f"horiz{i}", "child": f"vert{i + 1}", "point_world0": [i + 1, 1, 0]}
-        )
-    return problem | {"bodies": bodies, "joints": joints}
 
 
 # largest error of the angles at each tolerance
@@ -143,7 +96,7 @@ def test_n_four_bar_through_its_singular_configurations(windows, tolerances):
         np.testing.assert_allclose(found, case["B0"], atol=ERROR_AT[tolerance])
         energy = jax.vmap(lambda s: svkc.energy(chain, s))(traj.states)
         assert np.max(np.abs(energy - energy[0])) <= 1e-6 * case["energy"]
-        assert np.max(traj.gaps) < 1e-12
+        assert np.max(traj.gaps) < ROUND_OFF
         dependent = np.asarray(
             jax.vmap(lambda s: svkc.coordinates(chain, s).dependent)(traj.states)
         )
@@ -166,7 +119,7 @@ def forty_windows():
     np.testing.assert_allclose(2 * places(chain, traj, "vert0")[1, :2], case["B0"][1], atol=1e-6)
     assert abs(float(traj.report().energy_drift)) <= 1e-6 * case["energy"]
     assert int(traj.report().swaps) > 0
-    assert np.max(traj.gaps) < 1e-12
+    assert np.max(traj.gaps) < ROUND_OFF
 
 
 @pytest.mark.slow
@@ -186,44 +139,6 @@ def test_n_four_bar_of_forty_windows():
         check=False,
     )
     assert done.returncode == 0, done.stderr
-
-
-def springs(chain, problem):
-    """control: two-point springs and constant torques of a problem, as joint torques."""
-
-    def end(q, structure, body, point, name):
-        place, quat = svkc.poses(chain, svkc.State(q, jnp.zeros(chain.dofs), structure))
-        row = chain.body_names.index("world" if name == "ground" else name)
-        local = body.turn.T @ (np.asarray(point) - body.place)
-        w, u = quat[row, 0], quat[row, 1:]
-        return place[row] + local + 2 * jnp.cross(u, jnp.cross(u, local) + w * local)
-
-    bodies = {body["name"]: maximal.Body(body) for body in problem["bodies"]} | {
-        "ground": maximal.Body()
-    }
-
-    def potential(q, structure):
-        total = 0.0
-        for spring in (force for force in problem["forces"] if force["type"] == "spring_damper"):
-            one, other = (
-                end(q, structure, bodies[spring[e]], spring[f"point_{e}_world0"], spring[e])
-                for e in ("parent", "child")
-            )
-            total = (
-                total
-                + spring["stiffness"]
-                / 2
-                * (jnp.linalg.norm(other - one) - spring["rest_length"]) ** 2
-            )
-        return total
-
-    def control(t, state, args):
-        torque = -svkc.tangent(chain, state.q, jax.grad(potential)(state.q, state.structure))
-        for force in (force for force in problem["forces"] if force["type"] == "torque"):
-            torque = torque.at[chain.dof_names.index(force["body"])].add(force["world"][2])
-        return torque
-
-    return control
 
 
 @pytest.mark.slow
@@ -275,7 +190,7 @@ def test_slider_crank_3d(variant):
     traj = svkc.simulate(chain, state, 5.0, ts=jnp.array(variant["t"]), **tight(1e-12))
     np.testing.assert_allclose(places(chain, traj, "slider")[:, 0], variant["slider_x"], atol=1e-10)
     np.testing.assert_allclose(
-        traj.states.v[:, chain.dof_names.index("slider")], variant["slider_v"], atol=1e-9
+        traj.states.v[:, chain.dof_names.index("slider")], variant["slider_v"], atol=REFERENCE
     )
 
 
@@ -287,7 +202,7 @@ def test_rssr_does_not_notice_its_idle_spin():
         chain, state = maximal.load(variant["problem"])
         traj = svkc.simulate(chain, state, 4.0, ts=jnp.array(variant["t"]), **tight(1e-12))
         np.testing.assert_allclose(
-            places(chain, traj, "coupler"), variant["coupler_com"], atol=1e-9
+            places(chain, traj, "coupler"), variant["coupler_com"], atol=REFERENCE
         )
         np.testing.assert_allclose(
             traj.states.v[:, chain.dof_names.index("crank")], variant["crank_rate"], atol=1e-8
@@ -380,7 +295,7 @@ def test_slider_crank_with_gradients():
     for column, name in enumerate(("q", "x", "p")):
         np.testing.assert_allclose(path[:, column], reference[name], atol=1e-10)
     assert float(value) == pytest.approx(wanted["value"], rel=1e-11)
-    np.testing.assert_allclose(slope, [wanted["dG_dk"], wanted["dG_dc"]], rtol=1e-9)
+    np.testing.assert_allclose(slope, [wanted["dG_dk"], wanted["dG_dc"]], rtol=REFERENCE)
 
 
 @pytest.mark.slow
@@ -438,7 +353,7 @@ def test_pendulum_released():
         events=[event],
         **tight(1e-13),
     )
-    assert float(traj.events.time[0]) == pytest.approx(case["t_event"], abs=1e-12)
+    assert float(traj.events.time[0]) == pytest.approx(case["t_event"], abs=ROUND_OFF)
     place, quat = (
         np.asarray(x)[:, 1] for x in jax.vmap(lambda s: svkc.poses(chain, s))(traj.states)
     )
@@ -464,7 +379,7 @@ def test_simple_pendulum_for_a_long_time():
     ts = [t for t in case["t"] if t <= 100]
     traj = svkc.simulate(chain, chain.state(), 100.0, ts=jnp.array(ts), **tight(1e-13))
     found = np.stack([np.cos(traj.states.q[:, 0]), np.sin(traj.states.q[:, 0])], 1)
-    np.testing.assert_allclose(found, case["xy"][: len(ts)], atol=1e-9)
+    np.testing.assert_allclose(found, case["xy"][: len(ts)], atol=REFERENCE)
 
 
 @pytest.mark.slow
@@ -518,6 +433,6 @@ def test_a_ball_that_bounces_ever_faster():
     for impact in case["impacts"]:
         end = fall(state)
         time = time + float(end.events.time[0])
-        assert time == pytest.approx(impact, abs=1e-12)
+        assert time == pytest.approx(impact, abs=ROUND_OFF)
         state = svkc.State(end.final.q, -0.5 * end.final.v, end.final.structure)
     assert float(end.final.v[0]) == pytest.approx(-np.sqrt(2 * 9.81) * 0.5**24, rel=1e-6)

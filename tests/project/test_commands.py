@@ -1,8 +1,7 @@
 """The command line, in processes of its own."""
 
 import pytest
-import test_project
-from test_project import run
+from processes import looks_drawn, run
 
 import svkc
 
@@ -35,7 +34,7 @@ def test_a_model_of_ones_own(tmp_path):
     traj = svkc.load_trajectory(out / "rod.npz")
     assert traj.phases.freedoms[:3].tolist() == [0, 2, 0]
     for name in ("rod.png", "rod_curves.png"):
-        test_project._looks_drawn(out / name)
+        looks_drawn(out / name)
     assert ("libegl1" in done.stdout) or {"rod.gif", "rod.mp4"} <= {
         path.name for path in out.iterdir()
     }
@@ -71,3 +70,87 @@ def test_scenes_are_listed():
     listed = command("scenes")
     for name in ("high_bar", "swing", "brachiation", "walking"):
         assert name in listed.stdout
+
+
+def test_main_job(tmp_path):
+    """python -m svkc: the table, the npz, the strobe and, where there is GL, the animation."""
+    done = run("-m", "svkc", "--out", tmp_path)
+    assert done.returncode == 0, done.stderr
+    for word in (
+        "24     12        12",
+        "23      6        17",
+        "22      0        22",
+        "largest loop gap",
+        "energy drift",
+        "compilation",
+    ):
+        assert word in done.stdout, done.stdout
+    looks_drawn(tmp_path / "high_bar.png")
+    looks_drawn(tmp_path / "high_bar_curves.png")
+    assert "high_bar.html" in done.stdout
+    traj = svkc.load_trajectory(tmp_path / "high_bar.npz")
+    assert traj.events.time.tolist() == [0.9, 1.15]
+    if "libegl1" in done.stdout:
+        assert not (tmp_path / "high_bar.gif").exists()
+    else:
+        from PIL import Image
+
+        with Image.open(tmp_path / "high_bar.gif") as image:
+            assert image.n_frames > 40
+            assert len(image.convert("RGB").getcolors(1 << 20)) > 10
+
+
+def test_the_swing_from_the_command_line(tmp_path):
+    """python -m svkc swing: 30 joint freedoms and the swing's own, two fewer at the end."""
+    done = run("-m", "svkc", "swing", "--out", tmp_path, optimized=False)
+    assert done.returncode == 0, done.stderr
+    for word in ("31     21        10", "29     12        17", "largest loop gap", "wrote"):
+        assert word in done.stdout, done.stdout
+    looks_drawn(tmp_path / "swing.png")
+    assert svkc.load_trajectory(tmp_path / "swing.npz").phases.joint_freedoms[:2].tolist() == [
+        31,
+        29,
+    ]
+
+
+def test_info(tmp_path):
+    xml = (
+        '<mujoco><worldbody><body name="a"><joint name="j" frictionloss="1"/><geom'
+        ' size="0.1"/></body></worldbody></mujoco>'
+    )
+    (tmp_path / "m.xml").write_text(xml)
+    done = run(
+        "-m",
+        "svkc",
+        "info",
+        tmp_path / "m.xml",
+        settings={"JAX_COMPILATION_CACHE_DIR": "", "SVKC_CACHE_DIR": str(tmp_path / "kept")},
+    )
+    assert done.returncode == 0, done.stderr
+    assert f"compiled programs: {tmp_path / 'kept'}" in done.stdout
+    assert list(tmp_path.glob("kept/jaxlib-*/*-cache"))
+    assert "friction" in done.stdout
+    assert "1 joint freedoms in the tree" in done.stdout
+    assert "mobility (N_F = N_J - m)     1" in done.stdout
+    assert "independent coordinates: j" in done.stdout
+    rod = (
+        '<body name="{0}"{2}><joint name="{0}" axis="0 1 0"/><geom type="capsule" fromto="0 0 0'
+        ' {1}" size=".03"/>{3}</body>'
+    )
+    bars = rod.format(
+        "crank", "0 0 .4", "", rod.format("coupler", "1 0 .2", ' pos="0 0 .4"', "")
+    ) + rod.format("rocker", "0 0 .6", ' pos="1 0 0"', "")
+    pin = (
+        '<equality><connect name="pin" body1="coupler" body2="rocker" anchor="1 0 .2"/></equality>'
+    )
+    (tmp_path / "m.xml").write_text(f"<mujoco><worldbody>{bars}</worldbody>{pin}</mujoco>")
+    told = run("-m", "svkc", "info", tmp_path / "m.xml").stdout
+    for line in (
+        "1 virtual links: pin", "rank of the loops (m)        5",
+        "pin: 6 rows, 1 of them redundant", "left out: collision",
+        "joints that can be cut, load(..., cuttable=[...]): crank, coupler, rocker",
+        "ends of the tree, which could be held: coupler, rocker",
+    ):  # fmt: skip
+        assert line in told, (line, told)
+    (tmp_path / "bad.xml").write_text("<mujoco")
+    assert run("-m", "svkc", "info", tmp_path / "bad.xml").returncode == 1

@@ -7,6 +7,8 @@ import itertools
 import pathlib
 import re
 
+from processes import run
+
 ROOT = pathlib.Path(__file__).parents[2] / "svkc"
 TESTS = pathlib.Path(__file__).parents[1]
 # a package may import from those to its left and from itself
@@ -206,3 +208,8 @@ def test_the_table_of_the_paper_names_what_there_is():
         assert any((folder / file).exists() for folder in (ROOT, ROOT.parent, TESTS)), file
     for file, test in re.findall(r"`([\w/]+\.py)::(\w+)`", table):
         assert f"def {test}(" in (TESTS / file).read_text(), test
+
+
+def test_ruff_is_content():
+    done = run(*"-m ruff check svkc tests examples benchmarks".split())
+    assert done.returncode == 0, done.stdout

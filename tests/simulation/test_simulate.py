@@ -1,7 +1,5 @@
 """Runs: the high bar end to end, events, batches, steps, results."""
 
-import json
-
 import diffrax
 import equinox as eqx
 import jax
@@ -9,12 +7,11 @@ import jax.numpy as jnp
 import models
 import numpy as np
 import pytest
+from tolerances import REFERENCE, ROUND_OFF
 
 import svkc
 
-PENDULUM = models.MJCF.format(models.bar("arm", models.Y, "0 0 -1")).replace(
-    'gravity="0.3 -0.2 -9.81"', 'gravity="0 0 -10"'
-)
+PENDULUM = models.ARM.replace('gravity="0.3 -0.2 -9.81"', 'gravity="0 0 -10"')
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +48,7 @@ def test_high_bar(high_bar, compiled):
     assert p.rank[:3].tolist() == [12, 6, 0]
     assert p.freedoms[:3].tolist() == [12, 17, 22]
     assert float(jnp.max(jnp.abs(p.energy_drift[:3] / p.energy[:3, 0]))) <= 1e-8
-    assert float(traj.gaps.max()) <= 1e-9
+    assert float(traj.gaps.max()) <= REFERENCE
     np.testing.assert_array_equal(traj.events.time[:2], [0.5, 0.75])
     assert traj.events.which[:2].tolist() == [0, 1]
     # what is saved is on the loops as seen from outside, too
@@ -59,12 +56,12 @@ def test_high_bar(high_bar, compiled):
     hand = positions[:20, chain.body_names.index("right_hand")]
     assert (
         float(jnp.abs(jnp.linalg.norm(hand - jnp.array([[0, -0.3, 2.6]]), axis=1) - 0.0681).max())
-        < 1e-12
+        < ROUND_OFF
     )
     caught = compiled(chain, state, *jnp.array([0.3, 0.6, 0.8]))
     assert caught.phases.joint_freedoms[:4].tolist() == [24, 23, 22, 23]
     assert float(caught.events.energy_lost[2]) > 0
-    assert float(caught.gaps.max()) <= 1e-9
+    assert float(caught.gaps.max()) <= REFERENCE
     assert int(caught.events.count) == 3
 
 
@@ -123,7 +120,7 @@ def test_guards_two_in_one_step_the_earliest_wins(pendulum):
         traj = quarter(pendulum, events=[svkc.when(angle(g), stop=True) for g in guards], dt=0.2)
         assert int(traj.events.which[0]) == guards.index(0.7)
         assert abs(float(traj.events.time[0] - fine.events.time[0])) < 3e-5
-        assert abs(float(traj.final.q[0]) - 0.7) < 1e-12
+        assert abs(float(traj.final.q[0]) - 0.7) < ROUND_OFF
         assert traj.result == svkc.RESULTS.stopped
         assert float(traj.states.q[-1, 0]) == pytest.approx(0.7)
 
@@ -144,8 +141,8 @@ def test_guards_at_the_same_instant(caught):
     assert int(traj.events.count) == 2
     assert traj.events.which[:2].tolist() == [0, 1]
     assert float(traj.events.time[0]) == float(traj.events.time[1])
-    assert abs(float(traj.final.q[0]) - 0.7) < 1e-9
-    assert float(jnp.abs(traj.final.v).max()) < 1e-12
+    assert abs(float(traj.final.q[0]) - 0.7) < REFERENCE
+    assert float(jnp.abs(traj.final.v).max()) < ROUND_OFF
     assert float(traj.events.energy_lost[0]) > 0
 
 
@@ -215,7 +212,7 @@ def test_events_at_the_ends_and_together(pendulum):
     assert traj.events.which[:4].tolist() == [0, 1, 2, 3]
     assert traj.result == svkc.RESULTS.stopped
     assert traj.connected[:, 0].tolist() == [True, True, False, True]
-    np.testing.assert_allclose(traj.states.q[:3, 0], 0.5, atol=1e-12)
+    np.testing.assert_allclose(traj.states.q[:3, 0], 0.5, atol=ROUND_OFF)
     assert traj.final.structure.connected.tolist() == [True]
     assert float(traj.final.q[0]) < 0.5
 
@@ -224,7 +221,7 @@ def test_events_at_the_ends_and_together(pendulum):
 def test_fixed_and_adaptive_steps_agree(pendulum):
     fixed = quarter(pendulum, ts=FIVE, dt=1e-3)
     adaptive = quarter(pendulum, ts=FIVE, rtol=1e-11, atol=1e-13)
-    np.testing.assert_allclose(fixed.states.q, adaptive.states.q, atol=1e-9)
+    np.testing.assert_allclose(fixed.states.q, adaptive.states.q, atol=REFERENCE)
     assert int(fixed.report().accepted) == 1000
     euler = quarter(pendulum, ts=FIVE, dt=1e-3, solver=diffrax.Euler())
     assert 1e-5 < float(jnp.abs(euler.states.q - adaptive.states.q).max()) < 1e-1
@@ -288,24 +285,6 @@ def test_drift_grows_where_nothing_is_done():
 
 
 @pytest.mark.slow
-def test_the_motion_does_not_depend_on_the_coordinates():
-    """A four-bar through 1 s with its own choice of theta_G and with another asked for."""
-    chain = models.four_bar()
-    state = chain.state(v={"crank": 4.0})
-    chosen = svkc.coordinates(chain, state)
-    own, asked = (
-        eqx.tree_at(lambda s: s.structure.independent, state, mask, is_leaf=lambda x: x is None)
-        for mask in (jnp.zeros_like(chosen.dependent), chosen.dependent)
-    )
-    a, b = (svkc.simulate(chain, s, 1.0, rtol=1e-10, atol=1e-12).final for s in (own, asked))
-    first, second = (svkc.mobility(chain, s).independent for s in (own, asked))
-    np.testing.assert_array_equal(first, chosen.independent)
-    assert bool(jnp.any(first != second))
-    np.testing.assert_allclose(a.q, b.q, atol=1e-9)
-    np.testing.assert_allclose(a.v, b.v, atol=1e-8)
-
-
-@pytest.mark.slow
 def test_results_tell_what_went_wrong(pendulum):
     """Too few steps; a link that is elsewhere. (Too many events: with the time of one; numbers that
     are none: with control.)"""
@@ -316,50 +295,6 @@ def test_results_tell_what_went_wrong(pendulum):
         svkc.simulate(pendulum, state, 1.0, dt=1e-3, max_steps=10)
     away = svkc.simulate(pendulum, state, 1.0, events=[svkc.at(0.5, connect="hook")], throw=False)
     assert away.result == svkc.RESULTS.not_in_place
-
-
-def test_save_and_load(tmp_path, pendulum, caught):
-    traj = caught
-    traj.save(tmp_path / "run.npz", pendulum)
-    assert bool(eqx.tree_equal(traj, svkc.load_trajectory(tmp_path / "run.npz")))
-    whole = (tmp_path / "run.npz").read_bytes()
-    (tmp_path / "cut.npz").write_bytes(whole[: len(whole) // 2])
-    (tmp_path / "text.npz").write_text("no")
-    for name in ("cut.npz", "text.npz"):
-        with pytest.raises(ValueError, match="not a whole trajectory"):
-            svkc.load_trajectory(tmp_path / name)
-    assert [p.name for p in tmp_path.glob("*.part")] == []
-
-
-def test_a_saved_run_goes_on(tmp_path, pendulum):
-    """Chain and state from the file, the chain's floats no longer those of its model: on bit for
-    bit. What else is told of the run."""
-    heavier = eqx.tree_at(lambda c: c.mass, pendulum, pendulum.mass * 1.1)
-    traj = svkc.simulate(heavier, pendulum.state({"arm": 1.2}), 1.0, ts=FIVE)
-    traj.save(tmp_path / "run.npz", heavier, rtol=1e-8, solver=diffrax.Tsit5())
-    chain = svkc.load_chain(tmp_path / "run.npz")
-    assert bool(eqx.tree_equal(chain, heavier))
-    assert chain.model.text == pendulum.model.text
-    again = svkc.simulate(chain, svkc.load_trajectory(tmp_path / "run.npz").final, 1.0, ts=FIVE)
-    assert bool(eqx.tree_equal(again, svkc.simulate(heavier, traj.final, 1.0, ts=FIVE)))
-    with np.load(tmp_path / "run.npz") as file:
-        told = json.loads(str(file["metadata"]))
-    assert told["options"] == {"rtol": 1e-8, "solver": "Tsit5()"}
-    assert told["certificate"]["gap"] == float(traj.report().gap)
-    assert "<mujoco" in told["model"]
-
-
-def test_a_chain_from_a_file_is_the_same_program(tmp_path, pendulum):
-    """With every argument that `load` takes, as numbers and arrays: equal, and traced once."""
-    hold = svkc.VirtualLink("hold", "world", "arm", "ball", axis=np.array([0, 1e-3, 1 / 3]))
-    text = pendulum.model.text
-    given = {"cuttable": "arm", "ignore": "all", "ignore_armature": {"arm"}}
-    chain = svkc.load(text, virtual_links=hold, spare=np.int64(1), **given)
-    svkc.simulate(pendulum, pendulum.state(), 0.1).save(tmp_path / "run.npz", chain)
-    again = svkc.load_chain(tmp_path / "run.npz")
-    assert bool(eqx.tree_equal(again, chain))
-    total = jax.jit(eqx.debug.assert_max_traces(lambda chain: chain.mass.sum(), max_traces=1))
-    assert total(again) == total(chain)
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import models
 import numpy as np
 import pytest
+from tolerances import REFERENCE, ROUND_OFF
 
 import svkc
 from svkc.loops.constrained_dynamics import default_dynamics
@@ -133,81 +134,9 @@ def test_only_dependent_coordinates_move():
     closed = svkc.State(q, v, rough.structure)
     assert np.abs(svkc.loop_gaps(chain, rough)).max() > 1e-6
     assert np.abs(svkc.loop_gaps(chain, closed)).max() < 1e-13
-    assert np.abs(svkc.velocity_gaps(chain, closed)).max() < 1e-12
+    assert np.abs(svkc.velocity_gaps(chain, closed)).max() < ROUND_OFF
     # in the metric of the inertia they move too
     assert np.abs(moved(False)[0][independent] - rough.q[independent]).max() > 1e-9
-
-
-WAYS = {
-    "exact": {"stabilization": svkc.stabilization.CoordinatePartitioning()},
-    "unit vectors": {"dynamics": svkc.dynamics.UnitVectors()},
-    "bodies": {"dynamics": svkc.dynamics.ArticulatedBodies()},
-    "chosen at every evaluation": {"dynamics": svkc.dynamics.CompositeBodies(hold=None)},
-    "held": {"dynamics": svkc.dynamics.CompositeBodies(hold=0.0)},
-}
-
-
-@pytest.fixture(scope="module")
-def swinging():
-    """Three equal bars that swing on a base too long for any of them to go round: whatever two
-    coordinates depend on the third, they come in line."""
-    inner = models.bar(
-        "coupler",
-        models.Y,
-        "1 0 0",
-        "0.6 0 0.8",
-        models.bar("rocker", models.Y, "0.6 0 -0.8", "1 0 0"),
-    )
-    pin = svkc.VirtualLink(
-        "pin",
-        "world",
-        "rocker",
-        "hinge",
-        pos=(2.2, 0, 0),
-        axis=(0, 1, 0),
-        real_pos=(0.6, 0, -0.8),
-        connected=True,
-    )
-    chain = svkc.load(
-        models.MJCF.format(models.bar("crank", models.Y, "0.6 0 0.8", inside=inner)),
-        virtual_links=[pin],
-    )
-    start, ts = chain.state(v={"crank": 1.0}), jnp.linspace(0, 1.5, 16)
-
-    def run(crank, **way):
-        state = eqx.tree_at(lambda s: s.v, start, crank * start.v)
-        return svkc.simulate(
-            chain, state, 1.5, ts=ts, rtol=1e-10, atol=1e-12, solver=diffrax.Dopri8(), **way
-        )
-
-    return run, run(1.0)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("way", WAYS)
-def test_each_way_to_compute_is_the_same_motion(swinging, way):
-    run, usual = swinging
-    other = run(1.0, **WAYS[way])
-    # the steps' own errors, and what the ways back onto the loops make of them
-    np.testing.assert_allclose(other.states.q, usual.states.q, atol=1e-8)
-    swaps = int(other.phases.swaps[0])
-    # (articulated bodies do without pivots)
-    assert swaps == {"held": 0, "bodies": -1}[way] if way in ("held", "bodies") else swaps >= 3
-    tries = [int(r.report().accepted + r.report().rejected) for r in (other, usual)]
-    assert tries[0] < 1.5 * tries[1]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("way", ["held", "bodies"])
-def test_how_loops_are_kept_leaves_derivatives_as_they_are(swinging, way):
-    run, _ = swinging
-    end = lambda x: run(x, **WAYS[way]).final.q
-    forward, step = jax.jacfwd(end)(1.0), 1e-4
-    differences = (end(1 + step) - end(1 - step)) / (2 * step)
-    np.testing.assert_allclose(forward, differences, rtol=1e-5, atol=1e-5)
-    np.testing.assert_allclose(
-        jax.grad(lambda x: jnp.sum(jnp.sin(end(x))))(1.0), jnp.cos(end(1.0)) @ forward, rtol=1e-10
-    )
 
 
 def test_the_older_spelling_of_dynamics():
@@ -229,7 +158,7 @@ def test_the_older_spelling_of_dynamics():
         assert type(svkc.Dynamics().resolved(chain)) is usual
 
 
-def test_the_certificate(tmp_path):
+def test_the_certificate():
     """Every line of it against what is known otherwise: four bars driven round, a figure in flight,
     lanes."""
     chain = models.four_bar()
@@ -262,7 +191,7 @@ def test_the_certificate(tmp_path):
         chain, jax.tree.map(lambda x: x[0], states)
     )
     assert float(report.energy_drift) == pytest.approx(
-        float(gained - coarse.phases.work[0]), rel=1e-9
+        float(gained - coarse.phases.work[0]), rel=REFERENCE
     )
     assert (
         int(report.accepted),
@@ -290,8 +219,6 @@ def test_the_certificate(tmp_path):
         "successful",
     ):
         assert word in str(report)
-    coarse.save(tmp_path / "run.npz")
-    assert str(svkc.load_trajectory(tmp_path / "run.npz").report()) == str(report)
 
 
 @pytest.mark.slow
@@ -312,8 +239,8 @@ def test_gaps_are_seen_between_saved_times():
         chain, chain.state(v={"crank": 6.0}), 0.2, ts=0.02 * np.arange(11), **rough
     )
     gap = float(whole.gaps[:, 1].max())
-    assert float(cut.gaps.max()) < 1e-12 < 1e-4 < float(whole.gaps[-1, 1]) < gap
-    assert float(cut.report().gap) == pytest.approx(gap, rel=1e-12)
+    assert float(cut.gaps.max()) < ROUND_OFF < 1e-4 < float(whole.gaps[-1, 1]) < gap
+    assert float(cut.report().gap) == pytest.approx(gap, rel=ROUND_OFF)
     assert cut.result == svkc.RESULTS.loop_open
 
 
@@ -367,7 +294,7 @@ def test_what_is_not_finite_ends_its_lane_where_it_appears(arm):
         # beside lanes in which nothing goes wrong
         alone = batch(jnp.ones((3, 2)))
         assert np.all(alone.result == svkc.RESULTS.successful)
-        np.testing.assert_allclose(lanes.final.q[0], alone.final.q[0], atol=1e-12)
+        np.testing.assert_allclose(lanes.final.q[0], alone.final.q[0], atol=ROUND_OFF)
     with pytest.raises(
         RuntimeError, match=r"t = 0\.2\d* s, in phase 2: A number that is not finite"
     ):

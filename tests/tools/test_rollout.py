@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import models
 import numpy as np
 import pytest
+from tolerances import ROUND_OFF
 
 import svkc
 
@@ -111,7 +112,7 @@ def alone(case):
 
 def agrees(traj, alone):
     for i, one in enumerate(alone):
-        np.testing.assert_allclose(traj.final.q[i], one.final.q, atol=1e-12)
+        np.testing.assert_allclose(traj.final.q[i], one.final.q, atol=ROUND_OFF)
         np.testing.assert_allclose(traj.events.time[i], one.events.time)
         assert float(traj.t_final[i]) == pytest.approx(float(one.t_final))
     assert np.all(traj.result == svkc.RESULTS.successful)
@@ -208,7 +209,7 @@ def test_several_processes(alone, tmp_path, count):
         assert process.returncode == 0, said[-3000:]
     for i in range(count):
         whole = np.load(tmp_path / f"whole_{i}.npz")
-        np.testing.assert_allclose(whole["q"], [one.final.q for one in alone], atol=1e-12)
+        np.testing.assert_allclose(whole["q"], [one.final.q for one in alone], atol=ROUND_OFF)
         assert whole["result"].tolist() == [0] * LANES
     assert len(list(tmp_path.glob("chunk_*.npz"))) == 6
 

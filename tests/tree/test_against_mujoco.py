@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 from references import paper
+from tolerances import REFERENCE, ROUND_OFF
 
 import svkc
 from svkc.loops.forward_dynamics import acceleration
@@ -100,7 +101,7 @@ def test_every_intermediate(run):
             "kinetic": v @ M @ v / 2,
             "power": tau @ v + damping,
         }
-        np.testing.assert_allclose(R, data.xmat, atol=1e-12)
+        np.testing.assert_allclose(R, data.xmat, atol=ROUND_OFF)
         for name, value in expected.items():
             scale = max(np.abs(value).max(), 1e-3)
             if name in ("inverse", "power"):
@@ -166,7 +167,9 @@ def test_deep_chain_agrees_with_mujoco(twigs):
         jnp.zeros(model.nv),
         svkc.dynamics.CompositeBodies(),
     )
-    np.testing.assert_allclose(vdot, by_composites, rtol=1e-9, atol=1e-10 * np.abs(data.qacc).max())
+    np.testing.assert_allclose(
+        vdot, by_composites, rtol=REFERENCE, atol=1e-10 * np.abs(data.qacc).max()
+    )
 
 
 @pytest.mark.slow

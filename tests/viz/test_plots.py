@@ -31,7 +31,7 @@ def test_a_long_floor_does_not_make_the_figure_small(tmp_path):
 
 def test_curves_have_what_a_run_has():
     """Lines over the saved times, the axes named, an event marked."""
-    chain = svkc.load(models.MJCF.format(models.bar("arm", models.Y, "0 0 -1")))
+    chain = svkc.load(models.ARM)
     traj = svkc.simulate(
         chain,
         chain.state({"arm": 0.5}),

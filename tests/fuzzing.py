@@ -1,0 +1,247 @@
+"""What tests/project/test_fuzz_*.py share: how random calls are made and judged, what they are
+given, and the scenes that they are made on.
+
+What comes out of a call is a good value, a message of docs/errors.md, or a NaN that can be seen.
+The suite makes a few hundred calls, the same every time; `SVKC_FUZZ=10000 python -m pytest
+tests/project/test_fuzz_*.py -m slow -n 0` makes that many, others each time.
+What counts is what users see: annotations are not checked while these tests call
+(`error_page.as_users_see`), and jax promotes types as it does by default.
+Programs are compiled for a handful of fixed scenes alone; where a call would compile another
+(`simulate`, `rollout`, `tune`), it is only traced.
+"""
+
+import functools
+import math
+import os
+import pathlib
+import re
+import types
+import warnings
+
+import diffrax
+import equinox as eqx
+import error_page
+import hypothesis
+import jax
+import jax.numpy as jnp
+import models
+import numpy as np
+import pytest
+from hypothesis import strategies as st
+
+import svkc
+
+LONG = int(os.environ.get("SVKC_FUZZ", "0"))
+DOCUMENTED = [re.compile(error_page.pattern(row)) for row in error_page.ROWS]
+CALLS = {"count": 0, "raised": 0}
+
+
+def examples(share: float):
+    """Of all examples this part, for one test."""
+    settings = hypothesis.settings(
+        max_examples=max(1, round(share * (LONG or 250))),
+        deadline=None,
+        database=None,
+        derandomize=not LONG,
+        suppress_health_check=list(hypothesis.HealthCheck),
+        report_multiple_bugs=bool(LONG),
+        print_blob=False,
+    )
+    return lambda test: settings(test)
+
+
+def is_documented(error: Exception) -> bool:
+    text = " ".join(str(error).split())
+    return isinstance(error, ValueError | RuntimeError) and any(
+        row.fullmatch(text) for row in DOCUMENTED
+    )
+
+
+NOTHING = object()
+
+
+def outcome(call, *others):
+    """What the call gives; NOTHING where it raises what the page, or the list `others`, has."""
+    CALLS["count"] += 1
+    with (
+        warnings.catch_warnings(),
+        jax.numpy_dtype_promotion("standard"),
+        jax.numpy_rank_promotion("allow"),
+    ):
+        warnings.simplefilter("ignore")
+        try:
+            return call()
+        except others:
+            CALLS["raised"] += 1
+            return NOTHING
+        except Exception as error:
+            if not is_documented(error):
+                raise
+            CALLS["raised"] += 1
+            return NOTHING
+
+
+def floats(tree) -> list[np.ndarray]:
+    return [np.asarray(x) for x in jax.tree.leaves(tree) if eqx.is_inexact_array_like(x)]
+
+
+def all_finite(tree) -> bool:
+    return all(np.isfinite(x).all() for x in floats(tree))
+
+
+# what is given
+
+ODD = [math.nan, math.inf, -math.inf, 1e300, -1e300, 5e-324, 1e-12, 0.0, -1.0, 1.0, 10**30]
+TEXTS = [
+    "",
+    "pin",
+    "nobody",
+    "crank",
+    "spare_0",
+    "world",
+    "rocker",
+    "all",
+    "\u00e9\n\0",
+    "weld",
+    "hinge",
+    "universal",
+    "xyz",
+    "a.b",
+    "x" * 5000,
+    "\ud800",
+]
+THINGS = [
+    None,
+    True,
+    False,
+    0,
+    1,
+    -1,
+    3,
+    2.5,
+    b"pin",
+    b"",
+    (),
+    [],
+    {},
+    set(),
+    object(),
+    1j,
+    [[1.0], [1.0, 2.0]],
+    ["pin"],
+    ["nobody", 3],
+    {"crank": 1.0},
+    {3: "a"},
+    ["spare_0"],
+    [None],
+    ["a", "b", "c"],
+    np.array("a"),
+    np.array(["a", "b", "c"]),
+    np.array([None] * 3),
+    np.zeros(3, complex),
+    np.ones(3, bool),
+    np.ones(1, bool),
+    np.float64(0.5),
+    np.zeros((2, 2)),
+    np.zeros(0),
+    range(3),
+    types.SimpleNamespace(q=1),
+    svkc,
+    pathlib.Path("nowhere"),
+    diffrax.Tsit5(),
+]
+arrays = st.builds(
+    lambda n, kind, fill: (
+        np.full(n, fill, dtype=kind) if kind != np.int32 else np.arange(n, dtype=np.int32)
+    ),
+    st.integers(0, 8),
+    st.sampled_from([np.float64, np.float32, np.int32]),
+    st.sampled_from([0.0, 1.0, 0.3, math.nan, math.inf]),
+)
+anything = st.one_of(
+    st.sampled_from(THINGS),
+    st.sampled_from(TEXTS),
+    st.sampled_from(ODD),
+    arrays,
+    st.text(max_size=6),
+)
+vectors = lambda n: st.lists(
+    st.one_of(st.floats(-1.5, 1.5), st.sampled_from(ODD[:-1])), min_size=n, max_size=n
+)
+
+
+def or_anything(good, part: int = 3):
+    """Mostly what is right: a strategy with one wrong value in `part`."""
+    return st.integers(1, part).flatmap(lambda i: anything if i == 1 else good)
+
+
+def some_of(**strategies):
+    """A few of these arguments."""
+    return st.fixed_dictionaries({}, optional=strategies)
+
+
+TREE = models.MJCF.format(
+    models.bar(
+        "base",
+        'type="free"',
+        "0 0 1",
+        inside=models.bar(
+            "arm", models.Y + ' stiffness="2" range="-1 1" limited="true"', "0 0 1", "0 0 1"
+        ),
+    )
+    + models.bar("b", 'type="ball"', "0.5 0 1")
+)
+
+
+@functools.cache
+def scenes() -> dict:
+    """Names to (chain, state): a closed loop; a tree that has none, nor slots; a loop and an empty
+    slot."""
+    return {
+        name: (chain, chain.state())
+        for name, chain in (
+            ("four", models.four_bar()),
+            ("tree", svkc.load(TREE)),
+            ("spare", models.four_bar(spare=1)),
+        )
+    }
+
+
+@pytest.fixture(scope="module", autouse=True)
+def ready():
+    """The scenes are made before anything is drawn, and annotations are not checked."""
+    scenes()
+    with error_page.as_users_see():
+        yield
+    if LONG:
+        print(
+            f"\n{CALLS['count']} calls, of which {CALLS['raised']} raised what docs/errors.md has"
+        )
+
+
+scene = st.sampled_from(["four", "tree", "spare"])
+NUMBER_OF = {"four": (4, 4), "tree": (12, 10), "spare": (11, 10)}
+TREE_NUMBER_OF = {"four": (3, 3), "tree": (12, 10), "spare": (3, 3)}
+
+
+def broken(state, how: str, value):
+    """The state with something wrong: a NaN, or another thing in its place."""
+    # (of what is free in space an angle, for nothing depends on where it is)
+    at = 3 if state.q.shape == (12,) else 0
+    if how == "q":
+        return svkc.State(state.q.at[at].set(jnp.nan), state.v, state.structure)
+    if how == "v":
+        return svkc.State(state.q, state.v.at[at].set(jnp.nan), state.structure)
+    return {
+        "thing": value,
+        "q of a thing": svkc.State(value, state.v, state.structure),
+        "structure": svkc.State(state.q, state.v, value),
+        "whole": svkc.State(jnp.arange(state.q.shape[0]), state.v, state.structure),
+        "lanes": jax.tree.map(lambda x: x[None], state),
+        "": state,
+    }[how]
+
+
+wrongs = st.sampled_from(
+    ["", "", "", "", "", "q", "v", "thing", "q of a thing", "structure", "whole", "lanes"]
+)

@@ -1,0 +1,70 @@
+"""The choice of independent coordinates theta_G changes no acceleration and no motion."""
+
+import itertools
+
+import cases
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import models
+import numpy as np
+import pytest
+from tolerances import REFERENCE
+
+import svkc
+from svkc.scenes.two_links import two_links
+
+
+@pytest.mark.parametrize("name", cases.params("loops"))
+def test_the_choice_of_coordinates_does_not_matter(name):
+    """Asking for what was dependent gives another choice of theta_G and the same acceleration."""
+    chain, state, tau = cases.CASES[name].moving()
+    first = svkc.coordinates(chain, state)
+    asked = eqx.tree_at(
+        lambda s: s.structure.independent, state, first.dependent, is_leaf=lambda x: x is None
+    )
+    second = svkc.coordinates(chain, asked)
+    assert bool(jnp.any(first.independent != second.independent))
+    a, b = svkc.forward_dynamics(chain, state, tau), svkc.forward_dynamics(chain, asked, tau)
+    np.testing.assert_allclose(a, b, rtol=0, atol=REFERENCE * float(jnp.max(jnp.abs(a))))
+
+
+def four_bar():
+    chain = models.four_bar()
+    return chain, chain.state(v={"crank": 4.0})
+
+
+def free_links():
+    chain, _ = two_links()
+    return chain, chain.state(v={"base": [0.9, 0, 0, 0, 0, 0.2], "link1": 0.5})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("scene", "admissible", "all_the_way"),
+    [
+        (four_bar, [(0,), (1,), (2,), (3,)], 2),
+        # of the 28 pairs those of theta_1, theta_6, theta_7, theta_8, and no others
+        (free_links, list(itertools.combinations((0, 5, 6, 7), 2)), 6),
+    ],
+    ids=["four_bar", "two_links"],
+)
+def test_every_admissible_choice_gives_the_same_motion(scene, admissible, all_the_way):
+    """Through 1 s, on a four-bar and on the paper's two links. (The four-bar's rocker and pin
+    stand still on the way: there they are no coordinates.)"""
+    chain, state = scene()
+    found, asked = [], []
+    for choice in itertools.combinations(range(chain.dofs), len(admissible[0])):
+        wish = svkc.prefer(chain, state, *(chain.dof_names[i] for i in choice))
+        chosen = tuple(np.flatnonzero(svkc.coordinates(chain, wish).independent).tolist())
+        assert set(chosen) <= set(itertools.chain(*admissible))
+        if chosen == choice:
+            found.append(choice)
+            asked.append(wish)
+    assert found == admissible
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *asked[:all_the_way])
+    final = jax.vmap(
+        lambda s: svkc.simulate(chain, s, 1.0, rtol=1e-11, atol=1e-13, throw=False).final
+    )(stacked)
+    assert float(jnp.abs(final.q - final.q[:1]).max()) < REFERENCE
+    assert float(jnp.abs(final.v - final.v[:1]).max()) < REFERENCE

@@ -1,0 +1,47 @@
+"""Python in processes of their own, and the pictures that they draw."""
+
+import os
+import pathlib
+import subprocess
+import sys
+import tempfile
+
+import jax
+
+ROOT = pathlib.Path(__file__).parents[1]
+
+CACHE = tempfile.TemporaryDirectory()
+
+
+def run(*args, cwd=ROOT, optimized=True, settings=None):
+    """Runs Python with these arguments."""
+    env = dict(os.environ)
+    if optimized:
+        env["XLA_FLAGS"] = env.get("XLA_FLAGS", "").replace(
+            "--xla_backend_optimization_level=0", ""
+        )
+    # an example and the command of the same scene compile the same program; jax alone, as an
+    # example uses it, may leave half an entry: not among the tests' own
+    kept = jax.config.jax_compilation_cache_dir
+    env |= {
+        "JAX_COMPILATION_CACHE_DIR": f"{kept}/processes" if kept else CACHE.name,
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+    }
+    env |= settings or {}
+    return subprocess.run(
+        [sys.executable, *map(str, args)],
+        capture_output=True,
+        text=True,
+        cwd=cwd,
+        timeout=1200,
+        check=False,
+        env=env,
+    )
+
+
+def looks_drawn(path):
+    """A picture of more than a few colours."""
+    from PIL import Image
+
+    with Image.open(path) as image:
+        assert len(image.convert("RGB").getcolors(1 << 22)) > 20

@@ -1,0 +1,399 @@
+"""Random runs, rollouts and files: looked at and traced, and some of them computed."""
+
+import functools
+import math
+import sys
+
+import diffrax
+import equinox as eqx
+import hypothesis
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from fuzzing import (
+    NOTHING,
+    all_finite,
+    anything,
+    broken,
+    examples,
+    or_anything,
+    outcome,
+    ready,  # noqa: F401 (a fixture)
+    scenes,
+    some_of,
+    vectors,
+    wrongs,
+)
+from hypothesis import strategies as st
+
+import svkc
+
+pytestmark = pytest.mark.slow
+
+
+class Asked(Exception):
+    """A run would begin."""
+
+
+@pytest.fixture
+def only_traced(monkeypatch):
+    """Runs are traced for their shapes, and not compiled."""
+    whole = functools.partial(
+        eqx.filter_eval_shape, sys.modules["svkc.simulation.simulate"]._run.__wrapped__
+    )
+
+    def run(*args):
+        whole(*args)
+        raise Asked
+
+    monkeypatch.setattr(sys.modules["svkc.simulation.simulate"], "_run", run)
+    rollout = sys.modules["svkc.tools.rollout"]
+    monkeypatch.setattr(
+        rollout, "_piece", functools.partial(eqx.filter_eval_shape, rollout._piece.__wrapped__)
+    )
+
+
+RETURNS = [
+    None,
+    3,
+    1.0,
+    "a",
+    1j,
+    math.nan,
+    [0.0] * 4,
+    (0, 0, 0),
+    np.zeros(4),
+    np.zeros(3),
+    np.zeros(9),
+    np.zeros((4, 1)),
+    np.zeros(4, bool),
+    {},
+    np.float32(1),
+    jnp.zeros(()),
+    jnp.ones(1),
+]
+functions = st.sampled_from(RETURNS).map(lambda value: lambda t, state, args: value)
+good_guard = st.just(lambda t, state, args: state.q[0] + t)
+link_names = or_anything(st.sampled_from(["pin", "spare_0", ("pin", "spare_0"), ["pin"], ()]), 6)
+grips = st.builds(
+    lambda given: outcome(lambda: svkc.Grip(**({"parent": "world", "real": "rocker"} | given))),
+    some_of(
+        parent=or_anything(st.just("crank")),
+        joint=or_anything(st.just("ball")),
+        axis=or_anything(vectors(3)),
+        real_pos=or_anything(vectors(3)),
+        slot=or_anything(st.just("spare_0")),
+    ),
+)
+actions = some_of(
+    connect=link_names,
+    cut=link_names,
+    lock=or_anything(st.just("crank")),
+    unlock=or_anything(st.just("crank")),
+    here=or_anything(st.booleans()),
+    stop=or_anything(st.booleans(), 6),
+    bind=or_anything(st.lists(grips, max_size=1), 6),
+    unbind=or_anything(st.sampled_from(["spare_0", ("world", "rocker")])),
+)
+
+
+@st.composite
+def events(draw):
+    options = draw(actions)
+    if draw(st.booleans()):
+        time = draw(or_anything(st.sampled_from([0.0, 0.5, jnp.asarray(0.5)])))
+        return outcome(lambda: svkc.at(time, **options))
+    guard = draw(st.one_of(good_guard, good_guard, functions, anything, sensors()))
+    direction = draw(or_anything(st.sampled_from([None, True, np.False_])))
+    return outcome(lambda: svkc.when(guard, direction=direction, **options))
+
+
+@st.composite
+def sensors(draw):
+    chain, _ = scenes()["spare"]
+    link = draw(or_anything(st.just("pin"), 6))
+    number = or_anything(st.floats(0.1, 1))
+    call = draw(
+        st.sampled_from(
+            [
+                lambda: svkc.touch(
+                    chain,
+                    link,
+                    **draw(
+                        some_of(distance=number, axes=or_anything(st.sampled_from(["xy", "z"])))
+                    ),
+                ),
+                lambda: svkc.leaves(chain, link, **draw(some_of(axis=or_anything(vectors(3))))),
+                lambda: svkc.overload(chain, link, **draw(some_of(force=number, torque=number))),
+            ]
+        )
+    )
+    return outcome(call)
+
+
+def one_of_these(*makers):
+    """What one of these functions gives, made where annotations are not checked."""
+    return or_anything(st.sampled_from(makers).map(outcome))
+
+
+times = st.sampled_from([0.0, 0.5, 1.0, 1, np.float32(0.5), jnp.asarray(0.5)])
+simulations = dict(
+    t0=or_anything(st.sampled_from([0.0, -1.0, 0])),
+    ts=or_anything(st.sampled_from([[0.0, 0.5], jnp.linspace(0, 0.5, 3), (0,), np.zeros((1, 1))])),
+    events=or_anything(st.one_of(st.lists(events(), max_size=2), events()), 6),
+    control=or_anything(functions, 6),
+    dt=or_anything(st.sampled_from([0.1, 1e-2, jnp.asarray(0.1)])),
+    rtol=or_anything(st.sampled_from([1e-3, jnp.asarray(1e-3)])),
+    atol=or_anything(st.just(1e-6)),
+    solver=one_of_these(
+        diffrax.Tsit5, lambda: diffrax.Tsit5, diffrax.Euler, svkc.RodriguesEuler, diffrax.Kvaerno3
+    ),
+    stepsize_controller=one_of_these(
+        lambda: diffrax.PIDController(rtol=1e-3, atol=1e-6),
+        diffrax.ConstantStepSize,
+        lambda: diffrax.StepTo(jnp.linspace(0, 1, 3)),
+    ),
+    stabilization=one_of_these(
+        svkc.Projection,
+        svkc.stabilization.CoordinatePartitioning,
+        svkc.stabilization.NoStabilization,
+        svkc.Baumgarte,
+        lambda: svkc.Baumgarte("a"),
+        lambda: svkc.Projection(-1),
+    ),
+    dynamics=one_of_these(
+        svkc.Dynamics,
+        lambda: svkc.Dynamics(svkc.by_bodies),
+        lambda: svkc.Dynamics(3),
+        lambda: svkc.Dynamics(hold="a"),
+        lambda: svkc.Dynamics(hold=math.nan),
+    ),
+    adjoint=one_of_these(
+        svkc.Replay,
+        lambda: svkc.Replay(every=0),
+        lambda: svkc.Replay(every="a"),
+        diffrax.ForwardMode,
+        diffrax.DirectAdjoint,
+        diffrax.RecursiveCheckpointAdjoint,
+    ),
+    max_events=or_anything(st.integers(0, 4)),
+    max_steps=or_anything(st.integers(1, 64)),
+    progress_meter=one_of_these(diffrax.NoProgressMeter),
+    args=anything,
+)
+
+
+@st.composite
+def few(draw, strategies: dict, most: int = 3):
+    names = draw(st.lists(st.sampled_from(sorted(strategies)), max_size=most, unique=True))
+    return {name: draw(strategies[name]) for name in names}
+
+
+@examples(0.04)
+@hypothesis.given(t1=or_anything(times, 8), options=few(simulations), wrong=wrongs, value=anything)
+def test_requests(only_traced, t1, options, wrong, value):
+    chain, state = scenes()["spare"]
+    given = broken(state, wrong, value)
+    outcome(lambda: svkc.simulate(chain, given, t1, **options), Asked)
+
+
+LANES = [
+    {},
+    {"t1": 0.1},
+    {"t1": "a"},
+    {"events": 3},
+    {"control": 3},
+    3,
+    None,
+    [("t1", 0.1)],
+    {"args": 1.0},
+    {"chain": 3},
+]
+rollouts = dict(
+    data=or_anything(
+        st.sampled_from([jnp.zeros(2), np.zeros((2, 3)), {"a": jnp.ones(2)}, jnp.zeros(3), ()])
+    ),
+    lane=or_anything(st.sampled_from(LANES).map(lambda own: lambda chain, data: own)),
+    cost=or_anything(st.sampled_from([[1.0, 2.0], np.zeros(2), np.zeros((2, 2)), [math.nan, 1.0]])),
+    chunk=or_anything(st.integers(0, 3)),
+    devices=or_anything(st.just(jax.devices())),
+    dt=or_anything(st.just(0.1)),
+    events=or_anything(st.lists(events(), max_size=1), 6),
+    control=or_anything(functions, 6),
+)
+
+
+@examples(0.02)
+@hypothesis.given(
+    t1=or_anything(times, 6), options=few(rollouts), states=or_anything(st.just("lanes"), 4)
+)
+def test_rollouts_and_tuning(only_traced, t1, options, states):
+    chain, state = scenes()["spare"]
+    lanes = (
+        jax.tree.map(lambda x: jnp.stack([x, x]), state)
+        if isinstance(states, str) and states == "lanes"
+        else states
+    )
+    outcome(lambda: svkc.rollout(chain, lanes, t1, progress=False, **options), Asked)
+
+
+SEEN = ["size", "lookat", "distance", "azimuth", "camera", "trails"]
+calls = st.sampled_from(
+    [
+        "tune",
+        "halved",
+        "check_grad",
+        "to_mujoco",
+        "from_mujoco",
+        "render",
+        "motors",
+        "bounds",
+        "weight",
+        "actuated",
+        "load_trajectory",
+        "save",
+        "plot",
+        *SEEN,
+    ]
+)
+
+
+@examples(0.045)
+@hypothesis.given(call=calls, value=anything, other=anything)
+def test_other_calls(only_traced, place, call, value, other):
+    chain, state = scenes()["spare"]
+    zero, path = np.zeros(chain.dofs), place.with_name("seen.gif")
+    traj = svkc.load_trajectory(place)
+    # (what is no fault is drawn)
+    seen = {
+        name: lambda name=name: svkc.render(
+            chain, traj, path, **({"size": (64, 48)} | {name: value})
+        )
+        for name in SEEN
+    }
+    made = {
+        "tune": lambda: svkc.tune(chain, state, value, target=other),
+        "halved": lambda: svkc.halved(chain, state, value, dt=other),
+        "check_grad": lambda: svkc.check_grad(
+            jnp.sin if isinstance(value, float) else value, other
+        ),
+        "to_mujoco": lambda: svkc.to_mujoco(chain, state, value),
+        "from_mujoco": lambda: svkc.from_mujoco(chain, value),
+        "render": lambda: svkc.render(chain, value, other if isinstance(other, str) else "x.png"),
+        "motors": lambda: chain.motors(value),
+        "bounds": lambda: svkc.actuation(
+            chain, state, zero, bounds=(value, other) if isinstance(other, float) else value
+        ),
+        "weight": lambda: svkc.actuation(chain, state, zero, weight=value),
+        "actuated": lambda: svkc.actuation(chain, state, zero, actuated=value),
+        "load_trajectory": lambda: svkc.load_trajectory(value),
+        "save": lambda: traj.save(place.with_name("saved.npz"), value),
+        "plot": lambda: traj.plot(value),
+    } | seen
+    outcome(made[call], Asked, FileNotFoundError)
+
+
+# ---- runs
+
+
+def pulled(t, state, args):
+    return args * jnp.cos(3 * t) * jnp.arange(1.0, state.v.shape[0] + 1)
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory):
+    """A file that holds a run."""
+    path = tmp_path_factory.mktemp("fuzz") / "run.npz"
+    chain, state = scenes()["spare"]
+    svkc.simulate(chain, state, 0.1, dt=0.05).save(path, chain)
+    return path.read_bytes(), path
+
+
+@pytest.fixture(scope="module")
+def place(kept):
+    """Of that file. (What a test is given is printed whole where it fails.)"""
+    return kept[1]
+
+
+@examples(0.015)
+@hypothesis.given(
+    q=st.floats(-0.3, 0.3),
+    v=st.floats(-3, 3),
+    pull=st.sampled_from([0.0, 1.0, -3.0, 1e3, 1e8, 1e300, math.nan, math.inf, 5e-324]),
+    t1=st.sampled_from([0.0, 1e-12, 0.1, 0.3]),
+    dt=st.sampled_from([1e-300, 1e-9, 1e-3, 1e-2, 0.1, 1e300, math.inf]),
+    at=st.sampled_from([0.0, 0.05, 0.3, 10.0, 1e300]),
+    lossy=st.booleans(),
+)
+def test_runs(q, v, pull, t1, dt, at, lossy):
+    """What comes to its end is finite and closed; what is not finite says so."""
+    chain, _ = scenes()["spare"]
+    state = outcome(lambda: chain.state({"crank": q}, {"crank": v}))
+    event = [svkc.at(jnp.asarray(at), cut="pin")]
+    steps = {"dt": jnp.asarray(dt)} if lossy else {"rtol": jnp.asarray(min(max(dt, 1e-9), 1.0))}
+    traj = outcome(
+        lambda: svkc.simulate(
+            chain,
+            state,
+            t1,
+            events=event,
+            control=pulled,
+            args=jnp.asarray(pull),
+            max_steps=400,
+            throw=False,
+            **steps,
+        )
+    )
+    assert traj is not NOTHING
+    good = bool((traj.result == svkc.RESULTS.successful) | (traj.result == svkc.RESULTS.stopped))
+    assert all_finite((traj.states, traj.final)), svkc.RESULTS[traj.result]
+    if good:
+        assert float(traj.t_final) == t1
+        assert math.isfinite(pull) or t1 == 0
+        held = np.asarray(traj.connected).any(1)
+        assert np.asarray(traj.gaps)[held].max(initial=0) < 1e-5
+
+
+@examples(0.035)
+@hypothesis.given(data=st.data())
+def test_files(kept, data):
+    """A file that was cut short, written over, or made of other arrays."""
+    whole, path = kept
+    how = data.draw(st.integers(0, 3))
+    path = path.with_name("changed.npz")
+    if how == 0:
+        content = whole[: data.draw(st.integers(0, len(whole)))]
+    elif how == 1:
+        at = data.draw(st.integers(0, len(whole) - 1))
+        piece = data.draw(st.binary(min_size=1, max_size=8))
+        content = whole[:at] + piece + whole[at + len(piece) :]
+    elif how == 2:
+        content = data.draw(st.binary(max_size=100))
+    if how < 3:
+        path.write_bytes(content)
+    else:
+        with np.load(kept[1]) as file:
+            arrays = dict(file)
+        name = data.draw(st.sampled_from(sorted(arrays)))
+        new = data.draw(
+            st.one_of(
+                st.none(),
+                st.sampled_from(
+                    [
+                        np.zeros(3),
+                        np.array("{}"),
+                        np.array('{"schema": "a"}'),
+                        np.array("[4]"),
+                        np.array("a"),
+                        np.zeros((2, 2), complex),
+                        np.array(4),
+                    ]
+                ),
+            )
+        )
+        arrays = {n: x for n, x in arrays.items() if n != name} | (
+            {} if new is None else {name: new}
+        )
+        np.savez(path, **arrays)
+    outcome(lambda: svkc.load_trajectory(path))

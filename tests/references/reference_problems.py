@@ -1,0 +1,98 @@
+"""Problems of others and their independent solutions: the data (where each comes from stands in its
+file), and how a problem becomes a model."""
+
+import json
+import pathlib
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import maximal
+import numpy as np
+
+import svkc
+
+FOLDER = pathlib.Path(__file__).parent / "data"
+ROTATION = (
+    '<mujoco><compiler balanceinertia="false"/><option gravity="{}"/><worldbody><body'
+    ' name="top"><joint name="top" type="ball"/>'
+)
+ROTATION += '<inertial pos="{}" mass="{}" diaginertia="{}"/></body></worldbody></mujoco>'
+
+
+def given(name):
+    return json.loads((FOLDER / f"{name}.json").read_text())
+
+
+def tight(tolerance):
+    return {"rtol": tolerance, "atol": tolerance / 100, "solver": diffrax.Dopri8()}
+
+
+def numbers(x):
+    return " ".join(repr(float(value)) for value in x)
+
+
+def places(chain, traj, body):
+    """[times 3] of the body's frame."""
+    return np.asarray(jax.vmap(lambda s: svkc.poses(chain, s)[0])(traj.states))[
+        :, chain.body_names.index(body)
+    ]
+
+
+def n_four_bar(windows):
+    """The problem of two windows with as many as asked for."""
+    problem = given("n_four_bar")["problem"]
+    upright, level = problem["bodies"][0], problem["bodies"][-1]
+    hinge = {"type": "revolute", "axis_world0": [0, 0, 1]}
+    bodies = [upright | {"name": f"vert{i}", "com_world0": [i, 0.5, 0]} for i in range(windows + 1)]
+    bodies += [level | {"name": f"horiz{i}", "com_world0": [i + 0.5, 1, 0]} for i in range(windows)]
+    joints = [
+        hinge | {"parent": "ground", "child": f"vert{i}", "point_world0": [i, 0, 0]}
+        for i in range(windows + 1)
+    ]
+    for i in range(windows):
+        joints.append(
+            hinge | {"parent": f"vert{i}", "child": f"horiz{i}", "point_world0": [i, 1, 0]}
+        )
+        joints.append(
+            hinge | {"parent": f"horiz{i}", "child": f"vert{i + 1}", "point_world0": [i + 1, 1, 0]}
+        )
+    return problem | {"bodies": bodies, "joints": joints}
+
+
+def springs(chain, problem):
+    """control: two-point springs and constant torques of a problem, as joint torques."""
+
+    def end(q, structure, body, point, name):
+        place, quat = svkc.poses(chain, svkc.State(q, jnp.zeros(chain.dofs), structure))
+        row = chain.body_names.index("world" if name == "ground" else name)
+        local = body.turn.T @ (np.asarray(point) - body.place)
+        w, u = quat[row, 0], quat[row, 1:]
+        return place[row] + local + 2 * jnp.cross(u, jnp.cross(u, local) + w * local)
+
+    bodies = {body["name"]: maximal.Body(body) for body in problem["bodies"]} | {
+        "ground": maximal.Body()
+    }
+
+    def potential(q, structure):
+        total = 0.0
+        for spring in (force for force in problem["forces"] if force["type"] == "spring_damper"):
+            one, other = (
+                end(q, structure, bodies[spring[e]], spring[f"point_{e}_world0"], spring[e])
+                for e in ("parent", "child")
+            )
+            total = (
+                total
+                + spring["stiffness"]
+                / 2
+                * (jnp.linalg.norm(other - one) - spring["rest_length"]) ** 2
+            )
+        return total
+
+    def control(t, state, args):
+        torque = -svkc.tangent(chain, state.q, jax.grad(potential)(state.q, state.structure))
+        for force in (force for force in problem["forces"] if force["type"] == "torque"):
+            torque = torque.at[chain.dof_names.index(force["body"])].add(force["world"][2])
+        return torque
+
+    return control
