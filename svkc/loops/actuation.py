@@ -209,12 +209,12 @@ def _within(problem, weight, lower, upper) -> tuple[Float[Array, " dofs"], Float
     """
     B, wanted, column = problem
     root, small = jnp.sqrt(weight), jnp.finfo(B.dtype).eps ** 0.25
-    scaled = frozen((B * column / root, wanted, root * lower, root * upper))
+    scaled = frozen((B * (column / root)[None], wanted, root * lower, root * upper))
     target = _target(*scaled) / jax.lax.stop_gradient(root)
     nearest, drives = jnp.clip(target, lower, upper), jnp.any(B != 0, 0)
     free = drives & (lower < target) & (target < upper)
     held = jnp.where(drives & ~free, jnp.where(target <= lower, lower, upper), 0)
-    part = jnp.where(free, B, 0)
+    part = jnp.where(free[None], B, 0)
     y = _reach(select_with_rank(part)[0], part, wanted - B @ (column * held), weight / column**2)
     solved = jnp.where(free, y / column, nearest)
     tau = jnp.clip(solved, lower, upper)
@@ -238,7 +238,7 @@ def _target(A, b, lower, upper):
     def stage(_, carry):
         held, target = carry
         rest = b - A @ jnp.where(held, jnp.clip(target, lower, upper), 0)
-        part = jnp.where(held, 0, A)
+        part = jnp.where(held[None], 0, A)
         Z = select_with_rank(part)[0].Q
         part, rest = Z @ part, Z @ rest
         target = jnp.where(held, target, _multiplier(part, rest, lower, upper) @ part)
@@ -266,20 +266,21 @@ def _multiplier(A, b, lower, upper):
         target = mu @ A
         x, free = jnp.clip(target, lower, upper), (lower < target) & (target < upper)
         gradient = A @ x - b + damping * (mu - center)
-        hessian = (A * free) @ A.T + damping * jnp.eye(b.size, dtype=A.dtype)
+        hessian = jnp.where(free[None], A, 0) @ A.T + damping * jnp.eye(b.size, dtype=A.dtype)
         d = -solve_positive(hessian, gradient)
         along = d @ A
         # the slope along d is linear in t between the t at which a coordinate meets a bound
-        t = jnp.stack([lower - target, upper - target]) / jnp.where(along == 0, 1, along)
-        t = jnp.sort(jnp.append(jnp.clip(t.ravel(), 0, 1), jnp.array([0, 1], A.dtype)))
-        slope = jnp.clip(target + t[:, None] * along, lower, upper) @ along - b @ d
-        slope = slope + damping * ((mu - center) @ d + t * (d @ d))
-        mu = mu + jnp.interp(0, slope, t) * d
+        speed = jnp.where(along == 0, 1, along)
+        meets = jnp.append((lower - target) / speed, (upper - target) / speed)
+        t = jnp.sort(jnp.append(jnp.clip(meets, 0, 1), jnp.array([0, 1], A.dtype)))
+        clipped = jax.vmap(lambda t: jnp.clip(target + t * along, lower, upper))(t)
+        slope = clipped @ along - b @ d + damping * ((mu - center) @ d + t * (d @ d))
+        mu = mu + jnp.interp(jnp.zeros((), A.dtype), slope, t) * d
         after = jnp.clip(mu @ A, lower, upper)
-        error = jnp.max(jnp.abs(after - x - free * along))
+        error = jnp.max(jnp.abs(after - x - jnp.where(free, along, 0)))
         # true for NaN
         solved = ~(error > eps**0.5 * jnp.max(jnp.abs(after)))
-        return mu, jnp.where(solved, mu, center), updates + solved, k + 1
+        return mu, jnp.where(solved, mu, center), jnp.where(solved, updates + 1, updates), k + 1
 
     more = lambda carry: (carry[2] < 10) & (carry[3] < 10 * b.size + 10)
     return jax.lax.while_loop(more, step, (jnp.zeros_like(b), jnp.zeros_like(b), 0, 0))[0]
