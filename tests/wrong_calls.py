@@ -200,9 +200,6 @@ CASES = {
     ),
     "bounds: expected (": lambda s: s.actuation(bounds=3),
     "bounds: expected lower": lambda s: s.actuation(bounds=(1.0, -1.0)),
-    "bounds: the bounded": lambda s: jax.jit(
-        lambda x: svkc.actuation(s.four, s.state, x, bounds=(-1.0, 1.0))
-    )(jnp.zeros(4)),
     "chain: expected": lambda s: svkc.poses(3, s.state),
     "check_grad: f(x) has": lambda s: svkc.check_grad(lambda x: 1, jnp.asarray(1.0)),
     "check_grad: f(x)...": lambda s: svkc.check_grad(lambda x: jnp.log(x), jnp.asarray(-1.0)),

@@ -8,11 +8,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.eager import eager_jit
-from svkc._jax.pytrees import concrete
+from svkc._jax.pytrees import concrete, frozen
 from svkc.loops.constraint import loop_kinematics, scales
 from svkc.loops.coordinates import constrained, open_coordinates
 from svkc.loops.forward_dynamics import constraint_forces
-from svkc.loops.pivoting import Selection, select, select_with_rank
+from svkc.loops.pivoting import Selection, select, select_with_rank, solve_positive
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import check_state
 from svkc.model.validation import arrayed, numbers
@@ -59,9 +59,9 @@ def actuation(
     state).independent`) are read, or theta_G's alone, in order.
     weight [dofs]: positive; what is least is sum(weight tau^2), by default the plain sum. actuated:
     mask, by default `chain.actuated`.
-    bounds: (lower, upper) torques, scalars or [dofs]: the least within them, by scipy's SLSQP on
-    the host (not under jit); where they leave no exact solution, the one of least residual. Springs
-    and dampers are counted. ValueError: wrong sizes, weights that are not positive, crossed bounds.
+    bounds: (lower, upper) torques, scalars or [dofs]: the least within them; where they leave no
+    exact solution, the one of least residual. Crossed bounds that are traced give NaN. Springs and
+    dampers are counted. ValueError: wrong sizes, weights that are not positive, crossed bounds.
     """
     check_state(chain, state)
     independent, vdot_G = None, numbers("vdot_G", vdot_G, state.v.dtype)
@@ -91,7 +91,10 @@ def actuation(
         )
     actuated = jnp.asarray(actuated)
     done, problem = _solve(chain, state, vdot_G, weight, actuated)
-    return done if bounds is None else _within(chain, state, done, problem, weight, bounds)
+    if bounds is None:
+        return done
+    tau, residual = _within(problem, weight, *_limits(chain, bounds, state))
+    return eqx.tree_at(lambda d: (d.tau, d.residual), done, (tau, residual))
 
 
 def _per_dof(chain: Chain, name: str, value, default, state: State) -> Float[Array, " dofs"]:
@@ -99,6 +102,17 @@ def _per_dof(chain: Chain, name: str, value, default, state: State) -> Float[Arr
     if value.shape not in ((), (chain.dofs,)):
         raise ValueError(f"{name}: got shape {value.shape}, expected a number or ({chain.dofs},)")
     return jnp.broadcast_to(value, (chain.dofs,))
+
+
+def _limits(chain: Chain, bounds, state: State) -> list[Float[Array, " dofs"]]:
+    """Return the lower and the upper bounds; ValueError where they are not two, or cross."""
+    if not isinstance(bounds, tuple | list | np.ndarray | jax.Array) or len(bounds) != 2:
+        raise ValueError(f"bounds: expected (lower, upper), got {bounds!r}")
+    limits = [_per_dof(chain, "bounds", b, 0.0, state) for b in bounds]
+    if concrete(limits) and not np.all(np.asarray(limits[0]) <= np.asarray(limits[1])):
+        lower, upper = np.asarray(limits)
+        raise ValueError(f"bounds: expected lower at or below upper, got {lower} and {upper}")
+    return limits
 
 
 @eager_jit
@@ -170,78 +184,102 @@ def _solve(chain: Chain, state: State, vdot_G, weight, actuated: Bool[Array, " d
     tau = y / column
     residual = wanted - S.T @ tau
     done = Actuation(
-        tau, residual, null, carried[:, 3:], carried[:, :3], stress[:, 3:], stress[:, :3],
-        undriven, rank, count(reachable) - rank, count(co.independent) - rank,
-    )  # fmt: skip
+        tau=tau,
+        residual=residual,
+        null_space=null,
+        null_force=carried[:, 3:],
+        null_torque=carried[:, :3],
+        stress_force=stress[:, 3:],
+        stress_torque=stress[:, :3],
+        undriven=undriven,
+        rank=rank,
+        redundancy=count(reachable) - rank,
+        deficiency=count(co.independent) - rank,
+    )
     return done, (B, column * wanted, column)
 
 
-def _within(chain: Chain, state: State, done: Actuation, problem, weight, bounds) -> Actuation:
-    """The least weighted torques within the bounds that give what is wanted, or come nearest to
-    it."""
-    if isinstance(done.tau, jax.core.Tracer):
-        raise ValueError(
-            "bounds: the bounded problem is solved on the host; call actuation with bounds outside"
-            " of jit, vmap and grad"
-        )
-    if not isinstance(bounds, tuple | list | np.ndarray | jax.Array) or len(bounds) != 2:
-        raise ValueError(f"bounds: expected (lower, upper), got {bounds!r}")
-    lower, upper = (np.asarray(_per_dof(chain, "bounds", b, 0.0, state), float) for b in bounds)
-    if not np.all(lower <= upper):
-        raise ValueError(f"bounds: expected lower at or below upper, got {lower} and {upper}")
-    B, wanted, column = (np.asarray(x, float) for x in problem)
-    drives, lower, upper = np.any(B != 0, 0), lower * column, upper * column
-    y = np.where(drives, np.clip(0, lower, upper), 0.0)
-    used = drives & (upper > lower)
-    if not (np.isfinite(B).all() and np.isfinite(wanted).all()):
-        y[:] = np.nan
-    elif used.any():
-        cost = (np.asarray(weight, float) / column**2)[used]
-        y[used] = _least_within(
-            B[:, used], wanted - B[:, ~used] @ y[~used], cost, (lower[used], upper[used])
-        )
-    tau = jnp.asarray(y / column, done.tau.dtype)
-    residual = jnp.asarray((wanted - B @ y) / column, done.tau.dtype)
-    return eqx.tree_at(lambda d: (d.tau, d.residual), done, (tau, residual))
+@eager_jit
+def _within(problem, weight, lower, upper) -> tuple[Float[Array, " dofs"], Float[Array, " dofs"]]:
+    """Return the least weighted torques of least residual within the bounds, and that residual.
+
+    The active bounds are found on frozen numbers. The free torques then follow from one linear
+    solve, so derivatives are exact wherever the active set is locally constant.
+    """
+    B, wanted, column = problem
+    root, small = jnp.sqrt(weight), jnp.finfo(B.dtype).eps ** 0.25
+    scaled = frozen((B * (column / root)[None], wanted, root * lower, root * upper))
+    target = _target(*scaled) / jax.lax.stop_gradient(root)
+    nearest, drives = jnp.clip(target, lower, upper), jnp.any(B != 0, 0)
+    free = drives & (lower < target) & (target < upper)
+    held = jnp.where(drives & ~free, jnp.where(target <= lower, lower, upper), 0)
+    part = jnp.where(free[None], B, 0)
+    y = _reach(select_with_rank(part)[0], part, wanted - B @ (column * held), weight / column**2)
+    solved = jnp.where(free, y / column, nearest)
+    tau = jnp.clip(solved, lower, upper)
+    # the iterate, should a free torque leave its bounds by more than round-off
+    inside = jnp.max(jnp.abs(solved - tau)) <= small * jnp.max(jnp.abs(nearest))
+    tau = jnp.where(free, jnp.where(inside, tau, nearest), held)
+    valid = jnp.all(lower <= upper) & jnp.isfinite(jnp.sum(B) + jnp.sum(wanted))
+    tau = jnp.where(valid, tau, jnp.nan)
+    return tau, (wanted - B @ (column * tau)) / column
 
 
-def _least_within(A, b, cost, box):
-    """The x in the box of least sum(cost x^2) among those that make |A x - b| least."""
-    from scipy.optimize import lsq_linear, minimize
+def _target(A, b, lower, upper):
+    """Return the z for which clip(z, lower, upper) is the x of least norm in the box among those
+    that make |A x - b| least.
 
-    nearest = lsq_linear(A, b, box, method="bvls", tol=1e-15).x
-    # independent rows of what is to be kept
-    U, size, _ = np.linalg.svd(A, full_matrices=False)
-    A = U[:, size > 1e-9 * size[0]].T @ A
-    kept, scale = A @ nearest, max(1.0, np.abs(nearest).max())
-    kept_by = {"type": "eq", "fun": lambda x: (A @ x - kept) / scale, "jac": lambda x: A / scale}
-    best = minimize(
-        lambda x: np.sum(cost * (x / scale) ** 2),
-        nearest,
-        jac=lambda x: 2 * cost * x / scale**2,
-        bounds=list(zip(*box, strict=True)),
-        method="SLSQP",
-        constraints=[kept_by],
-        options={"ftol": 1e-14, "maxiter": 500},
-    )
-    return _polished(A, kept, cost, box, best.x if best.success else nearest)
+    In two stages: in the second the coordinates that the residual presses against a bound stay
+    there. Without them the residual no longer drives the multiplier, which keeps its precision.
+    """
+    small = jnp.finfo(A.dtype).eps ** 0.25
+
+    def stage(_, carry):
+        held, target = carry
+        rest = b - A @ jnp.where(held, jnp.clip(target, lower, upper), 0)
+        part = jnp.where(held[None], 0, A)
+        Z = select_with_rank(part)[0].Q
+        part, rest = Z @ part, Z @ rest
+        target = jnp.where(held, target, _multiplier(part, rest, lower, upper) @ part)
+        press = (rest - part @ jnp.clip(target, lower, upper)) @ part
+        far = jnp.abs(press) > small * jnp.sqrt(jnp.sum(part**2, 0) * jnp.sum(rest**2))
+        return held | (far & ((target <= lower) | (target >= upper))), target
+
+    start = jnp.zeros(b.shape, bool), jnp.zeros_like(b)
+    return jax.lax.fori_loop(0, 2, stage, start)[1]
 
 
-def _polished(A, b, cost, box, x):
-    """The same point to round-off: what is at a bound stays there, the others are the least that
-    give b."""
-    lower, upper = box
-    x = np.clip(x, lower, upper)
-    width = 1e-7 * np.maximum(1, np.abs(x))
-    free = (x > lower + width) & (x < upper - width)
-    if not free.any():
-        return x
-    rest = b - A[:, ~free] @ x[~free]
-    half = A[:, free] / np.sqrt(cost[free])
-    y = np.linalg.lstsq(half, rest, rcond=1e-10)[0] / np.sqrt(cost[free])
-    inside = np.all((y >= lower[free]) & (y <= upper[free])) and np.abs(
-        A[:, free] @ y - rest
-    ).max() <= 1e-9 * max(1.0, np.abs(b).max())
-    if inside:
-        x[free] = y
-    return x
+def _multiplier(A, b, lower, upper):
+    """Return the mu for which x = clip(A^T mu, lower, upper) is of least norm in the box among
+    those that make |A x - b| least.
+
+    Augmented Lagrangian, ten updates of `center`; where no x of the box solves A x = b it converges
+    to the closest problem that has a solution (Chiche and Gilbert, 2016). Each inner problem is
+    solved in its dual, by semismooth Newton with exact line search.
+    """
+    eps, size = jnp.finfo(A.dtype).eps, jnp.sum(A * A)
+    damping = eps**0.8 * jnp.where(size > 0, size, 1)
+
+    def step(carry):
+        mu, center, updates, k = carry
+        target = mu @ A
+        x, free = jnp.clip(target, lower, upper), (lower < target) & (target < upper)
+        gradient = A @ x - b + damping * (mu - center)
+        hessian = jnp.where(free[None], A, 0) @ A.T + damping * jnp.eye(b.size, dtype=A.dtype)
+        d = -solve_positive(hessian, gradient)
+        along = d @ A
+        # the slope along d is linear in t between the t at which a coordinate meets a bound
+        speed = jnp.where(along == 0, 1, along)
+        meets = jnp.append((lower - target) / speed, (upper - target) / speed)
+        t = jnp.sort(jnp.append(jnp.clip(meets, 0, 1), jnp.array([0, 1], A.dtype)))
+        clipped = jax.vmap(lambda t: jnp.clip(target + t * along, lower, upper))(t)
+        slope = clipped @ along - b @ d + damping * ((mu - center) @ d + t * (d @ d))
+        mu = mu + jnp.interp(jnp.zeros((), A.dtype), slope, t) * d
+        after = jnp.clip(mu @ A, lower, upper)
+        error = jnp.max(jnp.abs(after - x - jnp.where(free, along, 0)))
+        # true for NaN
+        solved = ~(error > eps**0.5 * jnp.max(jnp.abs(after)))
+        return mu, jnp.where(solved, mu, center), jnp.where(solved, updates + 1, updates), k + 1
+
+    more = lambda carry: (carry[2] < 10) & (carry[3] < 10 * b.size + 10)
+    return jax.lax.while_loop(more, step, (jnp.zeros_like(b), jnp.zeros_like(b), 0, 0))[0]

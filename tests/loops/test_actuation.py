@@ -6,9 +6,11 @@ import jax.numpy as jnp
 import models
 import numpy as np
 import pytest
+from scipy.optimize import lsq_linear, minimize
 from tolerances import DIFFERENCE, REFERENCE, ROUND_OFF
 
 import svkc
+from svkc.loops.actuation import _within
 
 
 def mask(chain, *names):
@@ -229,3 +231,123 @@ def test_open_chain_and_derivative(five_bar):
         np.testing.assert_allclose(
             forward, (f(h) - f(-h)) / (2 * h), rtol=DIFFERENCE, atol=DIFFERENCE
         )
+
+
+def bounded_problem(seed, n=12, dtype=np.float64):
+    """B, wanted, cost and box at random: redundant or deficient, exact or out of reach."""
+    rng = np.random.default_rng(seed)
+    rank = rng.integers(1, n + 1)
+    B = rng.normal(size=(n, rank)) @ rng.normal(size=(rank, n))
+    B[:, rng.random(n) < 0.1] = 0
+    wanted = B @ rng.normal(size=n) if seed % 2 else 5 * rng.normal(size=n)
+    lower, upper = -np.abs(rng.normal(size=n)), np.abs(rng.normal(size=n))
+    if seed % 3 == 1:
+        lower[:] = 0
+    if seed % 3 == 2:
+        lower, upper = np.sort(rng.normal(size=(2, n)), 0)
+    upper = np.where(rng.random(n) < 0.1, lower, upper)
+    lower = np.where(rng.random(n) < 0.15, -np.inf, lower)
+    upper = np.where(rng.random(n) < 0.15, np.inf, upper)
+    cost = 10 ** rng.uniform(-1, 1, size=n)
+    return tuple(x.astype(dtype) for x in (B, wanted, cost, lower, upper))
+
+
+@jax.jit
+def within(B, wanted, cost, lower, upper):
+    return _within((B, wanted, jnp.ones_like(wanted)), cost, lower, upper)[0]
+
+
+def by_scipy(B, wanted, cost, lower, upper):
+    """The least residual by BVLS, then the least cost by SLSQP with what is reached held."""
+    y = np.where(np.any(B != 0, 0), np.clip(0, lower, upper), 0)
+    used = np.any(B != 0, 0) & (lower < upper)
+    A, box = B[:, used], (lower[used], upper[used])
+    y[used] = lsq_linear(A, wanted - B @ np.where(used, 0, y), box, method="bvls", tol=1e-15).x
+    U, size, _ = np.linalg.svd(A, full_matrices=False)
+    A = U[:, size > 1e-9 * size[0]].T @ A
+    kept = {"type": "eq", "fun": lambda x: A @ (x - y[used]), "jac": lambda x: A}
+    best = minimize(
+        lambda x: np.sum(cost[used] * x**2),
+        y[used],
+        jac=lambda x: 2 * cost[used] * x,
+        bounds=list(zip(*box, strict=True)),
+        method="SLSQP",
+        constraints=[kept],
+        options={"ftol": 1e-14, "maxiter": 500},
+    )
+    if best.success:
+        y[used] = best.x
+    return y
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-7), (np.float32, 1e-3)])
+def test_bounded_against_scipy(dtype, tolerance):
+    """No residual and, at the same residual, no cost above scipy's, whatever the active set."""
+    problems = [bounded_problem(seed, dtype=dtype) for seed in range(60)]
+    found = np.asarray(jax.vmap(within)(*map(jnp.asarray, zip(*problems, strict=True))), float)
+    for seed, y in enumerate(found):
+        # as it is in float64, for in float32 the rank of B is not to be seen
+        B, wanted, cost, lower, upper = bounded_problem(seed)
+        drives = np.any(B != 0, 0)
+        assert np.all(((lower - tolerance <= y) & (y <= upper + tolerance))[drives]), seed
+        assert not np.any(y[~drives])
+        other = by_scipy(B, wanted, cost, lower, upper)
+        residual, least = (np.linalg.norm(B @ x - wanted) for x in (y, other))
+        scale = np.linalg.norm(wanted) + np.linalg.norm(B) * np.abs(other).max()
+        assert residual <= least + tolerance * scale, seed
+        if residual > least - tolerance * scale:
+            assert np.sum(cost * y**2) <= np.sum(cost * other**2) * (1 + 10 * tolerance), seed
+        if dtype == np.float64:
+            np.testing.assert_allclose(within(B, wanted, cost, lower, upper), y, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_derivative_of_bounded():
+    """By the matrix, what is wanted, the cost and the bounds, both modes against differences."""
+    for seed in range(6):
+        B, *given = bounded_problem(seed, n=6)
+        ways = [np.random.default_rng(k).normal(size=B.shape) for k in range(4)]
+        at = [np.where(np.isfinite(x), x, np.sign(x) * 50) for x in given]
+        # the rank of B, its empty columns and equal bounds stay as they are
+        along = [ways[0] @ B, *(w[0] for w in ways[:2]), w3 := ways[3][0], w3]
+        f = lambda h, B=B, at=at, along=along: within(
+            *(x + h * d for x, d in zip((B, *at), along, strict=True))
+        )
+        forward = jax.jacfwd(f)(0.0)
+        np.testing.assert_allclose(jax.jacrev(f)(0.0), forward, rtol=1e-8, atol=1e-8)
+        h = 1e-6
+        np.testing.assert_allclose(forward, (f(h) - f(-h)) / (2 * h), rtol=1e-5, atol=1e-5)
+    B, wanted, cost, _, _ = bounded_problem(1)
+    loose = jax.grad(lambda u: jnp.sum(within(B, wanted, cost, -u, u)))(np.full(12, np.inf))
+    assert not np.any(loose)
+
+
+def test_bounds_under_transformations(five_bar):
+    """Under jit, vmap and grad: another active set in each lane, NaN where a lane's bounds cross or
+    its numbers are not finite."""
+    chain, state, vdot, _ = five_bar
+    motors = mask(chain, "left_arm", "right_arm", "left_fore")
+    limited = jax.jit(
+        jax.vmap(lambda a, u: svkc.actuation(chain, state, a, actuated=motors, bounds=(-u, u)).tau)
+    )
+    free = svkc.actuation(chain, state, vdot, actuated=motors).tau
+    largest = float(jnp.abs(free).max())
+    limits = largest * jnp.array([2.0, 0.9, 0.5, 0.1, -1.0, 1.0])
+    tau = limited(jnp.stack([vdot] * 5 + [jnp.nan * vdot]), limits)
+    np.testing.assert_allclose(tau[0], free, atol=1e-9)
+    assert np.isnan(tau[4:]).all()
+    for k in (1, 2, 3):
+        alone = svkc.actuation(
+            chain, state, vdot, actuated=motors, bounds=(-limits[k], np.full(5, limits[k]))
+        )
+        np.testing.assert_allclose(tau[k], alone.tau, atol=1e-9)
+    at_bound = np.sum(np.isclose(np.abs(tau[:4]), limits[:4, None], rtol=1e-12), 1)
+    assert at_bound[0] == 0 < at_bound[1] < at_bound[3] == 3
+    tight = lambda s: jnp.sum(
+        jnp.sin(
+            svkc.actuation(
+                chain, state, s * vdot, actuated=motors, bounds=(-limits[1], limits[1])
+            ).tau
+        )
+    )
+    svkc.check_grad(tight, jnp.asarray(0.99))
