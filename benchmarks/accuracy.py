@@ -40,8 +40,8 @@ FIXED, ADAPTIVE, SINGLE = (
     (1e-2, 1e-3, 1e-4, 1e-5),
 )
 INTEGRATORS = {
-    "Rodrigues-Euler": (svkc.RodriguesEuler(), FIXED),
-    "symplectic Euler": (svkc.SemiImplicitEuler(), FIXED),
+    "Rodrigues-Euler": (svkc.integrators.RodriguesEuler(), FIXED),
+    "symplectic Euler": (svkc.integrators.SymplecticEuler(), FIXED),
     "Heun, fixed": (diffrax.Heun(), FIXED),
     "Tsit5, fixed": (diffrax.Tsit5(), FIXED),
     "Tsit5": (diffrax.Tsit5(), ADAPTIVE),
@@ -59,15 +59,15 @@ LEFT_OUT = {
 # on what has loops: with every integrator, at some of its settings, and in float32 with Tsit5
 DRIFT = {
     "exact": {"stabilization": svkc.stabilization.CoordinatePartitioning()},
-    "Baumgarte": {"stabilization": svkc.Baumgarte()},
+    "Baumgarte": {"stabilization": svkc.stabilization.Baumgarte()},
     "drift": {"stabilization": svkc.stabilization.NoStabilization()},
 }
 # with Dopri8
 WAYS = DRIFT | {
-    "pivots never new": {"dynamics": svkc.Dynamics(hold=0.0)},
-    "pivots always new": {"dynamics": svkc.Dynamics(hold=None)},
-    "articulated bodies": {"dynamics": svkc.Dynamics(inertia=svkc.by_bodies)},
-    "unit vectors": {"dynamics": svkc.Dynamics(inertia=svkc.inertia_by_unit_vectors)},
+    "pivots never new": {"dynamics": svkc.dynamics.CompositeBodies(hold=0.0)},
+    "pivots always new": {"dynamics": svkc.dynamics.CompositeBodies(hold=None)},
+    "articulated bodies": {"dynamics": svkc.dynamics.ArticulatedBodies()},
+    "unit vectors": {"dynamics": svkc.dynamics.UnitVectors()},
 }
 
 
@@ -345,7 +345,7 @@ def draw(name: str):
     way against drift with Dopri8, float32 with Tsit5."""
     import matplotlib.pyplot as plt
 
-    with (RESULTS / "accuracy.csv").open() as file:
+    with (RESULTS / "accuracy.csv").search_gaps() as file:
         table = [[*row[1:3], *map(float, row[3:6])] for row in csv.reader(file) if row[0] == name]
     figure, axes = plt.subplots(figsize=(8, 5), layout="constrained")
     curves, drawn = (
@@ -393,13 +393,13 @@ def save(name: str, only: str, head, table):
     another problem may have been run beside."""
     path, kept = RESULTS / "accuracy.csv", []
     if path.exists():
-        with path.open() as file:
+        with path.search_gaps() as file:
             kept = [
                 row
                 for row in list(csv.reader(file))[1:]
                 if row[0] != name or only not in f"{row[1]} {row[2]}"
             ]
-    with path.open("w", newline="") as file:
+    with path.search_gaps("w", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows([head, *kept, *table])
 
 

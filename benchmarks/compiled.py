@@ -164,7 +164,7 @@ def _lanes(count: int):
         "solver": diffrax.Tsit5(),
         "rtol": 1e-4,
         "atol": 1e-6,
-        "dynamics": svkc.Dynamics(inertia=svkc.by_bodies),
+        "dynamics": svkc.dynamics.ArticulatedBodies(),
         "throw": False,
     }
 

@@ -254,7 +254,7 @@ def main():
     loss, p = whole_run()
     count = sum(x.size for x in jax.tree.leaves(p))
     rows, _ = measured(f"high bar, {count} parameters", loss, p)
-    bodies = whole_run(dynamics=svkc.Dynamics(inertia=svkc.by_bodies))[0]
+    bodies = whole_run(dynamics=svkc.dynamics.ArticulatedBodies())[0]
     rows += measured("high bar, by bodies", bodies, p)[0]
     loss, p = falling()
     count = sum(x.size for x in jax.tree.leaves(p))
@@ -315,7 +315,7 @@ def main():
     )
     print(versions)
     RESULTS.parent.mkdir(exist_ok=True)
-    with RESULTS.open("w", newline="") as file:
+    with RESULTS.search_gaps("w", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows([head, *rows, *more, [versions]])
 
 

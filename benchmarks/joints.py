@@ -167,7 +167,7 @@ if __name__ == "__main__":
         "numpy": np.__version__,
     }
     machine |= {"backend": jax.default_backend(), "processor": cpu[0], "cores": os.cpu_count()}
-    with RESULTS.open("w", newline="") as file:
+    with RESULTS.search_gaps("w", newline="") as file:
         table = csv.writer(file, lineterminator="\n")
         table.writerow(
             [

@@ -17,7 +17,7 @@ from svkc.tree.configuration import integrate, rates
 def turned(chain, u, v):
     """The rate of u where q = q0 exp(u) moves with v: the inverse of the exponential's derivative,
     on every ball and free joint."""
-    at = chain.topology.quaternions[1][:, None] + np.arange(3)
+    at = chain.topology.quaternion_starts[1][:, None] + np.arange(3)
     x, w = u[at], v[at]
     square = jnp.sum(x * x, -1, keepdims=True)
     small = square < 1e-4

@@ -67,7 +67,7 @@ def by_pinocchio(name: str, chain, state, batch: int, steps: int):
     data, calls = model.createData(), steps * batch
     still = svkc.State(state.q, jnp.zeros_like(state.v), state.structure)
     q, v, force = (
-        np.asarray(svkc.xyzw(chain, state.q))[: chain.nq],
+        np.asarray(svkc.interop.quaternions_xyzw(chain, state.q))[: chain.nq],
         np.zeros(chain.nv),
         np.zeros(chain.nv),
     )

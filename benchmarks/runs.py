@@ -27,10 +27,10 @@ import numpy as np
 
 import svkc
 
-BODIES = {"dynamics": svkc.Dynamics(inertia=svkc.by_bodies)}
+BODIES = {"dynamics": svkc.dynamics.ArticulatedBodies()}
 EULER = {
-    "solver": svkc.SemiImplicitEuler(),
-    "stabilization": svkc.Projection(iterations=1),
+    "solver": svkc.integrators.SymplecticEuler(),
+    "stabilization": svkc.stabilization.Projection(iterations=1),
     **BODIES,
 }
 TSIT5 = {"solver": diffrax.Tsit5(), "rtol": 1e-4, "atol": 1e-6, **BODIES}
@@ -193,7 +193,7 @@ def main(lanes: int):
         for line in rows:
             table.append(line)
             print("| " + " | ".join(map(str, line)) + " |", flush=True)
-        with (speed.RESULTS / "runs.csv").open("w", newline="") as file:
+        with (speed.RESULTS / "runs.csv").search_gaps("w", newline="") as file:
             csv.writer(file, lineterminator="\n").writerows(
                 [[*HEAD, *machine], *([*line, *machine.values()] for line in table)]
             )

@@ -77,7 +77,7 @@ def main():
         "a State through simulate": lambda: svkc.simulate(
             chain, state, 0.05, events=[release], dt=1e-2
         ),
-        "a VirtualLink, from load to the loop Jacobian": lambda: svkc.jacobian(load(), state),
+        "a VirtualLink, from load to the loop Jacobian": lambda: svkc.loop_jacobian(load(), state),
         "a guard, from when to the derivative of its time": lambda: jax.grad(event_time)(
             jnp.asarray(-0.4)
         ),

@@ -45,7 +45,7 @@ with mujoco.viewer.launch_passive(model, data, show_left_ui=False, show_right_ui
     )
     begin = time.perf_counter()
     for i, t in enumerate(ts):
-        svkc.to_mujoco(chain, jax.tree.map(lambda x, i=i: x[i], states), data)
+        svkc.interop.to_mujoco(chain, jax.tree.map(lambda x, i=i: x[i], states), data)
         mujoco.mj_forward(model, data)  # where the bodies are
         viewer.sync()
         if not viewer.is_running():

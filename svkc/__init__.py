@@ -1,95 +1,152 @@
 """svkc: structure-varying kinematic chains in JAX, after Nakamura and Yamane (2000)."""
 
-from importlib.metadata import PackageNotFoundError as _Missing
-from importlib.metadata import version as _version
+from importlib.metadata import PackageNotFoundError as _Missing, version as _version
+
+from svkc import _deprecated
+
+# groups with several members have a namespace of their own
+from svkc import (
+    accuracy as accuracy,
+    dynamics as dynamics,
+    integrators as integrators,
+    interop as interop,
+    stabilization as stabilization,
+    types as types,
+)
 
 # nouns
 from svkc.model.chain import Chain as Chain, State as State, Structure as Structure
 from svkc.model.virtual_link import VirtualLink as VirtualLink
-
-# models in, runs out
-from svkc.simulation.archive import load_chain as load_chain, load_trajectory as load_trajectory
-from svkc.mjcf.convert import from_mujoco as from_mujoco, to_mujoco as to_mujoco
-from svkc.tree.configuration import xyzw as xyzw
-from svkc.mjcf.load import load as load
-from svkc.simulation.records import RESULTS as RESULTS
+from svkc.transitions.spare_links import Grip as Grip
 from svkc.simulation.trajectory import Trajectory as Trajectory
-from svkc import page as page
-from svkc.viz.render import plot as plot, render as render
+from svkc.simulation.records import RESULTS as RESULTS
 
-# how bodies are and move
-from svkc.tree.configuration import difference as difference, integrate as integrate
+# files
+from svkc.mjcf.load import load as load
+from svkc.simulation.archive import load_chain as load_chain, load_trajectory as load_trajectory
+
+# bodies: how they are placed and move
 from svkc.tree.kinematics import poses as poses, velocities as velocities
+from svkc.tree.configuration import integrate as integrate, difference as difference
 from svkc.tree.energy import (
     energy as energy,
     kinetic_energy as kinetic_energy,
-    momentum as momentum,
     potential_energy as potential_energy,
+    momentum as momentum,
 )
+from svkc.tree.mass_matrix import mass_matrix as mass_matrix
 from svkc.tree.inverse_dynamics import (
     bias_force as bias_force,
     inverse_dynamics as inverse_dynamics,
 )
-from svkc.tree.mass_matrix import mass_matrix as mass_matrix
 
 # loops
-from svkc.loops.constraint import (
-    jacobian as jacobian,
-    loop_gaps as loop_gaps,
-    velocity_gaps as velocity_gaps,
-)
-from svkc.loops.coordinates import coordinates as coordinates
+from svkc.loops.mobility import mobility as mobility
+from svkc.loops.coordinates import coordinates as coordinates, prefer as with_independent
 from svkc.loops.forward_dynamics import (
     forward_dynamics as forward_dynamics,
     loop_forces as loop_forces,
 )
 from svkc.loops.actuation import actuation as actuation
-from svkc.loops.mobility import mobility as mobility
-from svkc.loops.coordinates import prefer as prefer
+from svkc.loops.constraint import (
+    loop_gaps as loop_gaps,
+    velocity_gaps as loop_gap_rates,
+    jacobian as loop_jacobian,
+)
 
 # changes of structure
 from svkc.transitions.transition import (
     connect as connect,
     cut as cut,
     lock as lock,
-    transition as transition,
-    unbind as unbind,
     unlock as unlock,
+    unbind as unbind,
+    transition as transition,
 )
-from svkc.transitions.spare_links import Grip as Grip, bind as bind
+from svkc.transitions.spare_links import bind as bind
+
+# events
 from svkc.transitions.events import at as at, when as when
-from svkc.transitions.guards import leaves as leaves, overload as overload, touch as touch
+from svkc.transitions.guards import touch as touch, leaves as leaves, overload as overload
 
 # runs
 from svkc.simulation.simulate import simulate as simulate
-from svkc.integration.replay import Replay as Replay
+from svkc.integration.integrators import step as step
 from svkc.tools.rollout import rollout as rollout
-from svkc.tools.accuracy import error_between as error_between, halved as halved, tune as tune
-from svkc.integration.stabilization import (
-    Baumgarte as Baumgarte,
-    Projection as Projection,
-)
-from svkc import dynamics as dynamics, stabilization as stabilization
-from svkc.loops.constrained_dynamics import by_bodies as by_bodies
-from svkc.loops.constrained_dynamics import Dynamics as Dynamics
-from svkc.tree.mass_matrix import (
-    inertia_by_composites as inertia_by_composites,
-    inertia_by_unit_vectors as inertia_by_unit_vectors,
-)
-from svkc.integration.integrators import (
-    RodriguesEuler as RodriguesEuler,
-    SemiImplicitEuler as SemiImplicitEuler,
-    step as step,
-)
 
 # derivatives
-from svkc.tools.gradient_check import Check as Check, check_grad as check_grad
-from svkc.tree.configuration import tangent as tangent
+from svkc.tools.gradient_check import check_grad as check_grad
+from svkc.tree.configuration import tangent as tangent_gradient
 
-# old names
-Exact, Drift = stabilization.CoordinatePartitioning, stabilization.NoStabilization
+# pictures
+from svkc.viz.render import render as render, plot as plot
+from svkc.viz.html_page import show as show
+
+__all__ = [
+    "Chain",
+    "State",
+    "Structure",
+    "VirtualLink",
+    "Grip",
+    "Trajectory",
+    "RESULTS",
+    "load",
+    "load_chain",
+    "load_trajectory",
+    "poses",
+    "velocities",
+    "integrate",
+    "difference",
+    "energy",
+    "kinetic_energy",
+    "potential_energy",
+    "momentum",
+    "mass_matrix",
+    "bias_force",
+    "inverse_dynamics",
+    "mobility",
+    "coordinates",
+    "forward_dynamics",
+    "loop_forces",
+    "actuation",
+    "loop_gaps",
+    "loop_gap_rates",
+    "loop_jacobian",
+    "with_independent",
+    "connect",
+    "cut",
+    "lock",
+    "unlock",
+    "bind",
+    "unbind",
+    "transition",
+    "at",
+    "when",
+    "touch",
+    "leaves",
+    "overload",
+    "simulate",
+    "step",
+    "rollout",
+    "check_grad",
+    "tangent_gradient",
+    "render",
+    "plot",
+    "show",
+    "dynamics",
+    "stabilization",
+    "integrators",
+    "accuracy",
+    "interop",
+    "types",
+]
 
 try:
     __version__ = _version("svkc")
 except _Missing:  # a source tree that is not installed
     __version__ = "0"
+
+
+def __getattr__(name: str):
+    """Return the object of a deprecated name, with a `DeprecationWarning`."""
+    return _deprecated.resolve(name)

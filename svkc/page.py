@@ -1,3 +1,8 @@
-"""The page of a run, by the path that notebooks know."""
+"""Deprecated: `svkc.page.show` is `svkc.show`."""
 
-from svkc.viz.html_page import show as show
+from svkc import _deprecated
+
+
+def __getattr__(name: str):
+    """Return `svkc.show` for `show`, with a `DeprecationWarning`."""
+    return _deprecated.resolve(f"page.{name}")

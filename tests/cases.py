@@ -76,7 +76,7 @@ class Case:
     # for each loop, whether its force is unique
     unique: tuple[bool, ...] | None = None
 
-    def moving(self) -> tuple[svkc.Chain, svkc.State, jax.Array]:
+    def random_motion(self) -> tuple[svkc.Chain, svkc.State, jax.Array]:
         """Return the chain, a state with velocities at random, projected on what the loops allow,
         and torques at random."""
         chain, rng = self.build(), np.random.default_rng(3)

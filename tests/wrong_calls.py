@@ -11,8 +11,9 @@ import mujoco
 import numpy as np
 
 import svkc
-from svkc._jax.primitive import operation
+from svkc._jax.primitive import custom_primitive
 from svkc.cli import run as commands
+from svkc.loops.constrained_dynamics import Dynamics
 
 FREE = models.MJCF.format(models.bar("base", 'type="free"', "0 0 1"))
 
@@ -157,7 +158,7 @@ CASES = {
     "run: no virtual": lambda s: commands._asked(s.four, [("release", "nobody", 0.1)]),
     "trails: no": lambda s: s.drawn(trails=("nobody",)),
     "... is not linear": lambda s: jax.linear_transpose(
-        operation("odd", jnp.sin, lambda p, t: (p[0], t[0])), jnp.ones(2)
+        custom_primitive("odd", jnp.sin, lambda p, t: (p[0], t[0])), jnp.ones(2)
     )(jnp.ones(2)),
     "no library to draw with": undrawn,
     "state and chain are float64": single,
@@ -171,7 +172,9 @@ CASES = {
     "...: expected names": lambda s: svkc.at(0.5, connect=3),
     "...: got ..., expected True": lambda s: link(connected="no"),
     "...: got ..., expected a whole": lambda s: s.load(spare=1e300),
-    "...: got shape ..., expected (...,); for many use": lambda s: svkc.xyzw(s.four, jnp.zeros(9)),
+    "...: got shape ..., expected (...,); for many use": lambda s: svkc.interop.quaternions_xyzw(
+        s.four, jnp.zeros(9)
+    ),
     "...: got ..., expected a positive": lambda s: s.simulate(dt=-1.0),
     "...: got shape ..., expected (...,) for the tree": lambda s: s.four.state(np.zeros(7)),
     "...: got shape ..., expected a number or": lambda s: s.actuation(
@@ -182,8 +185,8 @@ CASES = {
     "...[...]: got": lambda s: s.four.state({"crank": [1.0, 2.0]}),
     "actuated: expected": lambda s: s.actuation(actuated=np.ones(2, bool)),
     "adjoint: expected": lambda s: s.simulate(adjoint="replay"),
-    "adjoint: svkc.Replay": lambda s: s.simulate(
-        stepsize_controller=diffrax.StepTo(jnp.linspace(0, 1, 5)), adjoint=svkc.Replay()
+    "adjoint: svkc.integrators.Replay": lambda s: s.simulate(
+        stepsize_controller=diffrax.StepTo(jnp.linspace(0, 1, 5)), adjoint=svkc.integrators.Replay()
     ),
     "at: got time": lambda s: s.simulate(events=[svkc.at(-1.0, cut="pin")]),
     "at: time must": lambda s: s.simulate(events=[svkc.at(jnp.ones(2), cut="pin")]),
@@ -220,14 +223,14 @@ CASES = {
         cuttable="arm",
     ),
     "cuttable: no joint": lambda s: s.load(cuttable="nobody"),
-    "data: got": lambda s: svkc.to_mujoco(
+    "data: got": lambda s: svkc.interop.to_mujoco(
         s.four, s.state, type("Data", (), {"qpos": np.zeros(1), "qvel": np.zeros(1)})()
     ),
     "devices: expected": lambda s: s.rollout(devices=[]),
     "dt: got": lambda s: s.simulate(dt=1e-12),
     "dt asks": lambda s: s.simulate(dt=0.1, rtol=1e-3),
     "dynamics.hold": lambda s: s.simulate(dynamics=svkc.dynamics.CompositeBodies(hold=2.0)),
-    "dynamics.inertia": lambda s: s.simulate(dynamics=svkc.Dynamics(inertia=lambda *_: None)),
+    "dynamics.inertia": lambda s: s.simulate(dynamics=Dynamics(inertia=lambda *_: None)),
     "dynamics: expected": lambda s: s.simulate(dynamics=3),
     "events: expected": lambda s: s.simulate(events=["pin"]),
     "here: ...": lambda s: svkc.at(0.5, connect="pin", here="other"),
@@ -239,7 +242,7 @@ CASES = {
     "leaves: axis": lambda s: svkc.leaves(s.four, "pin", axis=(0, 0, 0)),
     "mode: got": lambda s: svkc.check_grad(lambda x: x, jnp.asarray(1.0), mode="sideways"),
     "no joint ...": lambda s: s.four.state({"nobody": 1.0}),
-    "no joint coordinate": lambda s: svkc.prefer(s.four, s.state, "nobody"),
+    "no joint coordinate": lambda s: svkc.with_independent(s.four, s.state, "nobody"),
     "source: no such file": lambda s: s.load("nowhere.xml"),
     "no virtual link": lambda s: svkc.cut(s.four, s.state, "nobody"),
     "overload: give": lambda s: svkc.overload(s.four, "pin"),
@@ -280,7 +283,7 @@ CASES = {
     "states, data, cost": lambda s: s.rollout(data=jnp.zeros(3)),
     "states: expected": lambda s: svkc.rollout(s.four, 3, 1.0),
     "t1: got": lambda s: s.simulate(t1=-1.0),
-    "target: ... cannot": lambda s: svkc.tune(
+    "target: ... cannot": lambda s: svkc.accuracy.tune(
         s.four,
         s.state,
         1e-2,
@@ -327,8 +330,11 @@ ALSO = [
     ("expected 4 joint torques", lambda s: s.simulate(control=lambda t, x, args: jnp.zeros(5))),
     ("expected 4 joint torques", lambda s: svkc.step(s.four, s.state, jnp.zeros(2), 1e-3)),
     ("here", lambda s: svkc.at(1.0, here="a")),
-    ("target: got 0", lambda s: svkc.tune(s.four, s.state, 0.5, target=0.0)),
-    ("expected an object of svkc.dynamics", lambda s: s.simulate(dynamics=svkc.Projection())),
+    ("target: got 0", lambda s: svkc.accuracy.tune(s.four, s.state, 0.5, target=0.0)),
+    (
+        "expected an object of svkc.dynamics",
+        lambda s: s.simulate(dynamics=svkc.stabilization.Projection()),
+    ),
     (
         "expected an object of svkc.dynamics",
         lambda s: s.simulate(dynamics=svkc.dynamics.UnitVectors),
@@ -337,10 +343,13 @@ ALSO = [
         "dynamics.hold: got 2.0",
         lambda s: s.simulate(dynamics=svkc.dynamics.ArticulatedBodies(hold=2.0)),
     ),
-    ("dynamics.hold: got 2.0", lambda s: s.simulate(dynamics=svkc.Dynamics(hold=2.0))),
+    (
+        "dynamics.hold: got 2.0",
+        lambda s: s.simulate(dynamics=svkc.dynamics.CompositeBodies(hold=2.0)),
+    ),
     (
         "dynamics.inertia: got",
-        lambda s: s.simulate(dynamics=svkc.Dynamics(inertia=svkc.mass_matrix)),
+        lambda s: s.simulate(dynamics=Dynamics(inertia=svkc.mass_matrix)),
     ),
     ("one leading axis of lanes", lambda s: svkc.rollout(s.four, s.state, 1.0)),
     ("check_grad: x has", lambda s: svkc.check_grad(jnp.sin, 3)),
@@ -351,8 +360,11 @@ ALSO = [
     ("Booleans", lambda s: svkc.transition(s.four, s.state, np.array([1]))),
     ("neck", lambda s: svkc.lock(s.four, s.state, "neck")),
     ("expected 4 joint torques", lambda s: svkc.forward_dynamics(s.four, s.state, jnp.zeros(2))),
-    ("got 1 qpos and 1 qvel.* has 3 and 3", lambda s: svkc.to_mujoco(s.four, s.state, s.data)),
-    ("got 1 qpos and 1 qvel.* has 3 and 3", lambda s: svkc.from_mujoco(s.four, s.data)),
+    (
+        "got 1 qpos and 1 qvel.* has 3 and 3",
+        lambda s: svkc.interop.to_mujoco(s.four, s.state, s.data),
+    ),
+    ("got 1 qpos and 1 qvel.* has 3 and 3", lambda s: svkc.interop.from_mujoco(s.four, s.data)),
     ("no virtual link 'pins'", lambda s: svkc.touch(s.four, "pins")),
     ("axes", lambda s: svkc.touch(s.four, "pin", axes="xx")),
     # states

@@ -15,10 +15,10 @@ from jax import lax
 from jaxtyping import Array, Float
 
 # operations that jaxlib does in one thread
-FEW = 200_000 - 1
+SINGLE_THREAD_OPERATIONS = 200_000 - 1
 
 
-def _in_parts(function: Callable, cost: Callable) -> Callable:
+def _in_chunks(function: Callable, cost: Callable) -> Callable:
     """A function of matrices [*lanes, n, m] with any lanes; cost: operations for one of them, from
     shapes."""
 
@@ -27,7 +27,7 @@ def _in_parts(function: Callable, cost: Callable) -> Callable:
         lanes = matrices[0].shape[:-2]
         many, most = (
             math.prod(lanes),
-            max(1, FEW // max(1, cost(*(x.shape[-2:] for x in matrices)))),
+            max(1, SINGLE_THREAD_OPERATIONS // max(1, cost(*(x.shape[-2:] for x in matrices)))),
         )
         if many <= most or jax.default_backend() != "cpu" or jax.local_device_count() == 1:
             return function(*matrices)
@@ -50,29 +50,31 @@ def _in_parts(function: Callable, cost: Callable) -> Callable:
     return batch
 
 
-_cholesky = _in_parts(
+_cholesky = _in_chunks(
     functools.partial(lax.linalg.cholesky, symmetrize_input=False), lambda A: A[0] ** 3 // 3
 )
 
 
 @functools.cache
-def _triangular(lower: bool, trans: bool) -> Callable:
+def _triangular_solver(lower: bool, trans: bool) -> Callable:
     solve = functools.partial(
         lax.linalg.triangular_solve, left_side=True, lower=lower, transpose_a=trans
     )
-    return _in_parts(solve, lambda A, x: x[0] * x[0] * x[1])
+    return _in_chunks(solve, lambda A, x: x[0] * x[0] * x[1])
 
 
-def solve_triangle(
+def batched_solve_triangular(
     A: Float[Array, "n n"], x: Float[Array, "n *m"], trans: bool = False, lower: bool = False
 ) -> Float[Array, "n *m"]:
     """A^-1 x or A^-T x; only the triangle that is named is read. Not to be differentiated: for the
     `solve` of a `custom_linear_solve`."""
-    return _triangular(lower, trans)(A, x.reshape(x.shape[0], -1)).reshape(x.shape)
+    return _triangular_solver(lower, trans)(A, x.reshape(x.shape[0], -1)).reshape(x.shape)
 
 
-def factor_positive(A: Float[Array, "n n"]) -> Callable:
+def cholesky_solver(A: Float[Array, "n n"]) -> Callable:
     """What takes x [n] or [n m] to A^-1 x, by Cholesky's factor of a symmetric positive A; the same
     is true of it."""
     L = _cholesky(A)
-    return lambda x: solve_triangle(L, solve_triangle(L, x, lower=True), trans=True, lower=True)
+    return lambda x: batched_solve_triangular(
+        L, batched_solve_triangular(L, x, lower=True), trans=True, lower=True
+    )

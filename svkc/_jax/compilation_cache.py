@@ -12,8 +12,8 @@ import sys
 import tempfile
 import threading
 
-SIZE = 512 * 2**20  # bytes, of all processors and versions together
-DESCRIBES = (
+MAX_BYTES = 512 * 2**20  # bytes, of all processors and versions together
+CPUINFO_KEYS = (
     "vendor_id",
     "cpu family",
     "model",
@@ -25,10 +25,10 @@ DESCRIBES = (
 )
 # XLA reports these preferences of LLVM as missing features of the processor (openxla/xla issue
 # 44565)
-PREFERENCE = re.compile(
+FALSE_WARNING = re.compile(
     rb"cpu_aot_loader\.cc.*Target machine feature \+prefer-no-(gather|scatter) is not"
 )
-_loading = threading.Lock()
+_stderr_lock = threading.Lock()
 
 
 def use_cache() -> pathlib.Path | None:
@@ -49,18 +49,18 @@ def use_cache() -> pathlib.Path | None:
         return None
     # without a home, or in one that is read only, programs are compiled anew
     with contextlib.suppress(OSError, RuntimeError):
-        top = _top()
-        folder = top and top / f"jaxlib-{importlib.metadata.version('jaxlib')}-{processor()}"
-        if folder and _own(top) and _own(folder):
+        top = _root_folder()
+        folder = top and top / f"jaxlib-{importlib.metadata.version('jaxlib')}-{processor_id()}"
+        if folder and _make_private(top) and _make_private(folder):
             _prune(top)
             jax.config.update("jax_compilation_cache_dir", str(folder))
             jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-            _amend()
+            _patch_jax()
             return folder
     return None
 
 
-def _top() -> pathlib.Path | None:
+def _root_folder() -> pathlib.Path | None:
     """Return the folder of all versions and processors, None where the user wants none."""
     named = os.environ.get("SVKC_CACHE_DIR")
     if named is not None:
@@ -71,7 +71,7 @@ def _top() -> pathlib.Path | None:
     return (pathlib.Path(usual) if usual else pathlib.Path.home() / ".cache") / "svkc"
 
 
-def processor(cpuinfo: str = "/proc/cpuinfo") -> str:
+def processor_id(cpuinfo: str = "/proc/cpuinfo") -> str:
     """Name the model of the processor, with a hash of its features."""
     try:
         lines = pathlib.Path(cpuinfo).read_text().partition("\n\n")[0].splitlines()
@@ -82,11 +82,11 @@ def processor(cpuinfo: str = "/proc/cpuinfo") -> str:
     except OSError:
         told = {"model name": platform.processor() or platform.machine()}
     model = re.sub(r"[^A-Za-z0-9]+", "-", told.get("model name", platform.machine())).strip("-")
-    described = repr([told.get(name) for name in DESCRIBES])
+    described = repr([told.get(name) for name in CPUINFO_KEYS])
     return f"{model}-{hashlib.sha256(described.encode()).hexdigest()[:12]}"
 
 
-def _own(folder: pathlib.Path) -> bool:
+def _make_private(folder: pathlib.Path) -> bool:
     """Make a folder of mode 0700 and return True. Return False for one that others own or can write
     to, as its programs are executed."""
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -110,24 +110,24 @@ def _prune(top: pathlib.Path):
             files += [(max(found.st_atime, found.st_mtime), found.st_size, path)] * path.is_file()
     total = sum(size for _, size, _ in files)
     for _, size, path in sorted(files):
-        if total <= SIZE:
+        if total <= MAX_BYTES:
             return
         path.unlink(missing_ok=True)
         total -= size
 
 
-def _amend():
+def _patch_jax():
     """Make jax write entries atomically, and load them without false warnings. If a later jax lacks
     the names patched here, nothing is patched."""
     with contextlib.suppress(ImportError, AttributeError):
         from jax._src import compilation_cache, lru_cache
 
-        if lru_cache.LRUCache.put is not _put:
-            quiet = _without_preferences(compilation_cache.get_executable_and_time)
-            lru_cache.LRUCache.put, compilation_cache.get_executable_and_time = _put, quiet
+        if lru_cache.LRUCache.put is not _write_entry:
+            quiet = _without_false_warnings(compilation_cache.get_executable_and_time)
+            lru_cache.LRUCache.put, compilation_cache.get_executable_and_time = _write_entry, quiet
 
 
-def _put(entries, key: str, value: bytes):
+def _write_entry(entries, key: str, value: bytes):
     """Write an entry atomically. jax writes in place, and never replaces an entry that was cut
     short."""
     path = pathlib.Path(entries.path)
@@ -138,13 +138,13 @@ def _put(entries, key: str, value: bytes):
         whole.replace(path / f"{key}-cache")
 
 
-def _without_preferences(load):
+def _without_false_warnings(load):
     """Wrap jax's loading of a program so that the warnings of `PREFERENCE` are dropped from
     stderr."""
 
     def quiet(*args, **kw):
         # one at a time, as the process has one stderr
-        with _loading, tempfile.TemporaryFile() as heard:
+        with _stderr_lock, tempfile.TemporaryFile() as heard:
             kept = os.dup(2)
             os.dup2(heard.fileno(), 2)
             try:
@@ -153,7 +153,7 @@ def _without_preferences(load):
                 os.dup2(kept, 2)
                 os.close(kept)
                 heard.seek(0)
-                os.write(2, b"".join(line for line in heard if not PREFERENCE.search(line)))
+                os.write(2, b"".join(line for line in heard if not FALSE_WARNING.search(line)))
 
     # the user may ask for all that XLA says
     return load if os.environ.get("TF_CPP_MIN_LOG_LEVEL") == "0" else quiet

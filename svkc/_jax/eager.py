@@ -14,7 +14,7 @@ except ImportError:
     from jax._src.core import trace_state_clean
 
 # LLVM's optimization and the fusion emitters take most of XLA's compile time on a CPU
-_OPTIONS = {
+_FAST_COMPILE_OPTIONS = {
     "xla_backend_optimization_level": 0,
     "xla_cpu_use_fusion_emitters": False,
     "xla_cpu_parallel_codegen_split_count": 1,
@@ -36,20 +36,20 @@ def eager_jit(function: Callable, jit: Callable = jax.jit) -> Callable:
         if not trace_state_clean() or jax.default_backend() != "cpu":
             return plain(*args, **kw)
         while True:
-            known = tuple(_OPTIONS)
+            known = tuple(_FAST_COMPILE_OPTIONS)
             if known not in quick:
                 # jax caches programs by the wrapper, so there is one for each set of options
-                quick[known] = jit(function, compiler_options=dict(_OPTIONS))
+                quick[known] = jit(function, compiler_options=dict(_FAST_COMPILE_OPTIONS))
             try:
                 return quick[known](*args, **kw)
             except Exception as error:
-                if not _left_out(str(error)):
+                if not _drop_unknown_option(str(error)):
                     raise
 
     return call
 
 
-def _left_out(message: str) -> bool:
+def _drop_unknown_option(message: str) -> bool:
     """Leave out the option that the message says is unknown; False where it says something else."""
     unknown = re.search(r"[Nn]o such compile option: '?(\w+)", message)
-    return unknown is not None and _OPTIONS.pop(unknown[1], None) is not None
+    return unknown is not None and _FAST_COMPILE_OPTIONS.pop(unknown[1], None) is not None

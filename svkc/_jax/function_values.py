@@ -17,46 +17,49 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from svkc._jax.pytrees import concrete
+from svkc._jax.pytrees import is_concrete
 
-PLAIN = (type(None), bool, int, float, complex, str, bytes, range, type(...))
+PLAIN_TYPES = (type(None), bool, int, float, complex, str, bytes, range, type(...))
 # objects that libraries define do not change between two calls; svkc counts as a library, wherever
 # its sources are
 _PATHS = {sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")} | {
     *site.getsitepackages(),
     site.getusersitepackages(),
 }
-LIBRARIES = tuple(
+LIBRARY_FOLDERS = tuple(
     path + os.sep for path in (*_PATHS, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 )
 # errors of jax where Python code reads the value of a tracer
-LOOKED_AT = (
+CONCRETIZATION_ERRORS = (
     jax.errors.ConcretizationTypeError,
     jax.errors.TracerArrayConversionError,
     jax.errors.TracerIntegerConversionError,
 )
-LOOKED_AT += (jax.errors.TracerBoolConversionError, jax.errors.NonConcreteBooleanIndexError)
-JIT = type(jax.jit(len))
+CONCRETIZATION_ERRORS += (
+    jax.errors.TracerBoolConversionError,
+    jax.errors.NonConcreteBooleanIndexError,
+)
+JIT_FUNCTION_TYPE = type(jax.jit(len))
 # code of functions whose arrays Python has to read
-looking: set = set()
+needs_concrete_arrays: set = set()
 
 
 @dataclasses.dataclass(frozen=True)
-class Still:
+class StaticValue:
     """A static value, compared by a key: its content, or its id. It holds the original object, so
     that writes to a list are kept."""
 
     key: Any
-    thing: Any = dataclasses.field(compare=False)
+    value: Any = dataclasses.field(compare=False)
 
 
-def _refuse(what: str) -> NoReturn:
+def _raise_incomparable(what: str) -> NoReturn:
     """Raise the error that makes `shared` compare a function by identity."""
     error = TypeError(what)
     raise error
 
 
-class Function(eqx.Module):
+class FunctionPytree(eqx.Module):
     """A function, or a container that it reads, as build(*parts). Parts are arrays (the leaves),
     `Still`s, or again `Function`s. Writes to a rebuilt container are lost."""
 
@@ -67,7 +70,11 @@ class Function(eqx.Module):
         """Return the function or the container itself."""
         return self.build(
             *(
-                x.made() if isinstance(x, Function) else x.thing if isinstance(x, Still) else x
+                x.made()
+                if isinstance(x, FunctionPytree)
+                else x.value
+                if isinstance(x, StaticValue)
+                else x
                 for x in self.parts
             )
         )
@@ -76,9 +83,9 @@ class Function(eqx.Module):
         function = self.made()
         try:
             return function(*args)
-        except LOOKED_AT:
+        except CONCRETIZATION_ERRORS:
             if any(map(eqx.is_array, jax.tree.leaves(self.parts))):
-                looking.add(code_of(function))
+                needs_concrete_arrays.add(code_of(function))
             raise
 
 
@@ -97,21 +104,21 @@ _dict = lambda keys, *values: dict(zip(keys, values))
 _tree = lambda shape, *parts: jax.tree.unflatten(shape, parts)
 
 
-def _of_library(space) -> bool:
+def _is_library_module(space) -> bool:
     """Return whether these are the globals of a module of Python, of an installed package, or of
     svkc."""
-    return str(space.get("__file__")).startswith(LIBRARIES) or getattr(
+    return str(space.get("__file__")).startswith(LIBRARY_FOLDERS) or getattr(
         space.get("__spec__"), "origin", None
     ) in ("built-in", "frozen")
 
 
-def named(x) -> bool:
+def defined_by_library(x) -> bool:
     """Return whether a library defines x: a module, a class, or a name of a module. jax compares
     jit-wrapped functions of any module by identity."""
     if isinstance(x, types.ModuleType):
-        return _of_library(vars(x))
+        return _is_library_module(vars(x))
     found = sys.modules.get(str(getattr(x, "__module__", None)))
-    if found is None or not (_of_library(vars(found)) or isinstance(x, JIT)):
+    if found is None or not (_is_library_module(vars(found)) or isinstance(x, JIT_FUNCTION_TYPE)):
         return False
     for name in str(getattr(x, "__qualname__", None) or getattr(x, "__name__", None)).split("."):
         found = getattr(found, name, None)
@@ -119,7 +126,7 @@ def named(x) -> bool:
 
 
 @functools.cache
-def _facts(code: types.CodeType) -> tuple[set[str], set[str], set[str]]:
+def _code_references(code: types.CodeType) -> tuple[set[str], set[str], set[str]]:
     """Return the names in a code object and those nested in it, the modules that they import, and
     the outer variables that they assign or delete."""
     lines = [(line.opname, line.argval) for line in dis.get_instructions(code)]
@@ -132,7 +139,7 @@ def _facts(code: types.CodeType) -> tuple[set[str], set[str], set[str]]:
         for operation, name in lines
         if operation in ("STORE_GLOBAL", "DELETE_GLOBAL", "STORE_DEREF", "DELETE_DEREF")
     } - set(code.co_cellvars)
-    for inner in (_facts(x) for x in code.co_consts if isinstance(x, types.CodeType)):
+    for inner in (_code_references(x) for x in code.co_consts if isinstance(x, types.CodeType)):
         names, imports, written = (
             names | inner[0],
             imports | inner[1],
@@ -141,14 +148,16 @@ def _facts(code: types.CodeType) -> tuple[set[str], set[str], set[str]]:
     return names, imports, written
 
 
-def _split(f: types.FunctionType):
+def _decompose_function(f: types.FunctionType):
     """Return how to build a function, and from what: code, globals, the names among them, and the
     values it reads."""
-    names, imports, written = _facts(f.__code__)
+    names, imports, written = _code_references(f.__code__)
     if written or set(vars(f)) - {"__wrapped__"}:
-        _refuse("a variable outside that it assigns" if written else "a function with attributes")
+        _raise_incomparable(
+            "a variable outside that it assigns" if written else "a function with attributes"
+        )
     # globals of libraries stay as they are
-    space, own = f.__globals__, not _of_library(f.__globals__)
+    space, own = f.__globals__, not _is_library_module(f.__globals__)
     names, imports = (
         tuple(sorted(found)) if own else () for found in (names & space.keys(), imports)
     )
@@ -158,8 +167,8 @@ def _split(f: types.FunctionType):
         *(sys.modules[name] for name in imports),
     ]
     return _function, [
-        Still(f.__code__, f.__code__),
-        Still(id(space), space),
+        StaticValue(f.__code__, f.__code__),
+        StaticValue(id(space), space),
         names,
         f.__defaults__,
         f.__kwdefaults__,
@@ -171,45 +180,45 @@ class Reader:
     """Reads the values that one function depends on. as_data: whether floating-point arrays are
     data."""
 
-    def __init__(self, as_data: bool):
+    def __init__(self, arrays_as_data: bool):
         # by id: values read before; None while one is being read
-        self.as_data, self.known = as_data, {}
+        self.as_data, self.known = arrays_as_data, {}
 
     def read(self, x):
         """Return x as an array, a `Still`, or a `Function`. TypeError: x is not of a simple
         kind."""
         kind = type(x)
-        if kind is Still:
+        if kind is StaticValue:
             return x
-        if kind in PLAIN or isinstance(x, enum.Enum | np.dtype):
+        if kind in PLAIN_TYPES or isinstance(x, enum.Enum | np.dtype):
             # compared by their text, nan equals nan and -0.0 differs from 0.0
-            return Still((kind, repr(x) if kind in (float, complex) else x), x)
+            return StaticValue((kind, repr(x) if kind in (float, complex) else x), x)
         if isinstance(x, np.ndarray | np.generic | jax.Array):
             return self.array(x)
-        if named(x):
-            return Still(id(x), x)
+        if defined_by_library(x):
+            return StaticValue(id(x), x)
         if id(x) in self.known:
             # without this, functions that call each other would be read for ever
-            return self.known[id(x)] or _refuse("something that holds itself")
+            return self.known[id(x)] or _raise_incomparable("something that holds itself")
         parts = self.parts(x)
         del self.known[id(x)]
         leaves, shape = jax.tree.flatten(parts)
-        if not all(isinstance(leaf, Still) for leaf in leaves):
+        if not all(isinstance(leaf, StaticValue) for leaf in leaves):
             return parts
-        self.known[id(x)] = Still(("again", len(self.known)), x)
-        return Still((shape, *leaves), x)
+        self.known[id(x)] = StaticValue(("again", len(self.known)), x)
+        return StaticValue((shape, *leaves), x)
 
     def array(self, x):
         if isinstance(x, jax.Array):
             # tracers are always data, and so are arrays whose values this process cannot read
             data = (
                 self.as_data
-                or not concrete(x)
+                or not is_concrete(x)
                 or jnp.issubdtype(x.dtype, jax.dtypes.extended)
                 or not x.is_fully_addressable
             )
         elif x.dtype.hasobject or type(x) not in (np.ndarray, x.dtype.type):
-            _refuse("an array of objects or of a class of its own")
+            _raise_incomparable("an array of objects or of a class of its own")
         else:
             # integers are sizes and indices, which Python needs; jax has no long double
             data = (
@@ -218,7 +227,7 @@ class Reader:
         return (
             x
             if data
-            else Still(
+            else StaticValue(
                 (
                     type(x),
                     repr(x.dtype),
@@ -230,12 +239,12 @@ class Reader:
             )
         )
 
-    def parts(self, x) -> Function:
+    def parts(self, x) -> FunctionPytree:
         """Return the parts of a function or a container."""
         kind = type(x)
         self.known[id(x)] = None
         if kind is types.FunctionType:
-            build, parts = _split(x)
+            build, parts = _decompose_function(x)
         elif kind is functools.partial:
             build, parts = _partial, [x.func, x.args, x.keywords]
         elif kind is slice:
@@ -244,7 +253,7 @@ class Reader:
             # in insertion order, which jax does not keep
             build, parts = _dict, [tuple(x), *x.values()]
         elif isinstance(x, dict) or jax.tree_util.all_leaves([x]):
-            _refuse(f"an object of type {kind.__name__}")
+            _raise_incomparable(f"an object of type {kind.__name__}")
         else:
             parts, shape = eqx.tree_flatten_one_level(x)
             # raise now if the static part is not hashable
@@ -253,8 +262,8 @@ class Reader:
                 if isinstance(x, eqx.Module)
                 else shape.node_data()
             )
-            build, parts = _tree, [Still(shape, shape), *parts]
-        return Function([self.read(part) for part in parts], build)
+            build, parts = _tree, [StaticValue(shape, shape), *parts]
+        return FunctionPytree([self.read(part) for part in parts], build)
 
 
 def code_of(function):

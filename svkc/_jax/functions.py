@@ -17,13 +17,19 @@ from typing import Any
 import equinox as eqx
 import jax
 
-from svkc._jax.function_values import LOOKED_AT, Reader, code_of, looking, named
-from svkc._jax.pytrees import concrete
+from svkc._jax.function_values import (
+    CONCRETIZATION_ERRORS,
+    Reader,
+    code_of,
+    defined_by_library,
+    needs_concrete_arrays,
+)
+from svkc._jax.pytrees import is_concrete
 
 # the static part of each function when it was first seen; the first function of each argument
 # and code that is compared by identity
-_first: weakref.WeakKeyDictionary = weakref.WeakKeyDictionary()
-_identified: dict[tuple, Any] = {}
+_first_static: weakref.WeakKeyDictionary = weakref.WeakKeyDictionary()
+_compared_by_identity: dict[tuple, Any] = {}
 
 
 def comparable(function) -> Any:
@@ -33,18 +39,18 @@ def comparable(function) -> Any:
     As in jax, one function object keeps its program when a number or a list that it reads changes.
     Its arrays are read at each call.
     """
-    if not isinstance(function, types.FunctionType | types.MethodType | functools.partial) or named(
-        function
-    ):
+    if not isinstance(
+        function, types.FunctionType | types.MethodType | functools.partial
+    ) or defined_by_library(function):
         return function
-    made = Reader(code_of(function) not in looking).parts(function)
+    made = Reader(code_of(function) not in needs_concrete_arrays).parts(function)
     arrays, static = eqx.partition(made, eqx.is_array)
-    if jax.tree.structure(_first.setdefault(function, static)) != jax.tree.structure(static):
-        _first[function] = static
-    return eqx.combine(arrays, _first[function])
+    if jax.tree.structure(_first_static.setdefault(function, static)) != jax.tree.structure(static):
+        _first_static[function] = static
+    return eqx.combine(arrays, _first_static[function])
 
 
-def shared(program: Callable, **functions) -> Any:
+def call_with_comparable(program: Callable, **functions) -> Any:
     """Call program(**functions) with comparable functions, so that equal function objects share a
     compiled program.
 
@@ -53,7 +59,7 @@ def shared(program: Callable, **functions) -> Any:
     arrays static.
     """
     while True:
-        known, identified = len(looking), []
+        known, identified = len(needs_concrete_arrays), []
 
         def given(name, function, identified=identified):
             try:
@@ -71,13 +77,13 @@ def shared(program: Callable, **functions) -> Any:
                 }
             )
             break
-        except LOOKED_AT:
-            if len(looking) == known:
+        except CONCRETIZATION_ERRORS:
+            if len(needs_concrete_arrays) == known:
                 raise
-    for name, function, error in identified if concrete(out) else ():
+    for name, function, error in identified if is_concrete(out) else ():
         key = name, code_of(function)
-        if _identified.setdefault(key, function) not in (None, function):
-            _identified[key] = None
+        if _compared_by_identity.setdefault(key, function) not in (None, function):
+            _compared_by_identity[key] = None
             warnings.warn(
                 f"{name}: a new function object with the same code is compiled again; {error}"
                 " cannot be compared. Define it outside the loop.",

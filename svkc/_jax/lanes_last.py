@@ -16,20 +16,20 @@ from jax import lax
 from jax.extend import core
 from jaxtyping import Array
 
-from svkc._jax.primitive import operation
+from svkc._jax.primitive import custom_primitive
 
 # lanes that one processor takes at a time: what they need between two operations stays in its cache
 # (benchmarks/README.md)
 TILE = 32
 # terms of a sum at a time: 46 in one loop cost a step with two grips a quarter of its time, 22 one
 # of the high bar's 16-joint figure a third
-FEW = 8
+TERMS_PER_SUM = 8
 ELEMENTWISE = set(
     "abs add add_any and atan2 ceil clamp convert_element_type copy copy_p cos div eq exp exp2"
     " expm1 floor ge gt integer_pow is_finite le log log1p lt max min mul ne neg not or pow rem"
     " round rsqrt select_n sign sin sqrt square stop_gradient sub tan tanh xor".split()
 )
-ALONG = {
+UNBATCHED_AXES = {
     "argmax",
     "argmin",
     "cumsum",
@@ -42,8 +42,8 @@ ALONG = {
     "split",
     "squeeze",
 }
-JOINING = {"concatenate", "stack"}
-CALLS = {
+CONCATENATIONS = {"concatenate", "stack"}
+CALL_JAXPR_PARAMETERS = {
     "closed_call": "call_jaxpr",
     "core_call": "call_jaxpr",
     "custom_jvp_call": "call_jaxpr",
@@ -53,17 +53,17 @@ CALLS = {
 }
 
 
-class Lanes(NamedTuple):
+class Batched(NamedTuple):
     """A value of its own for each lane."""
 
     x: Array
 
 
-def spread(x, lanes: int) -> Array:
+def broadcast_to_lanes(x, lanes: int) -> Array:
     """[..., lanes] of any value."""
     return (
         x.x
-        if isinstance(x, Lanes)
+        if isinstance(x, Batched)
         else jnp.broadcast_to(jnp.asarray(x)[..., None], (*jnp.shape(x), lanes))
     )
 
@@ -78,7 +78,7 @@ def _slice(x: Array, lanes: int, *, start_indices, limit_indices, strides):
     )
 
 
-MOVING = {
+SHAPE_RULES = {
     "broadcast_in_dim": _broadcast,
     "reshape": lambda x, lanes, *, new_sizes, **_: x.reshape(*new_sizes, lanes),
     "slice": _slice,
@@ -88,7 +88,7 @@ MOVING = {
 
 def _gather(x, index, lanes: int, *, dimension_numbers, slice_sizes, **rest):
     d = dimension_numbers
-    if not isinstance(index, Lanes):
+    if not isinstance(index, Batched):
         last = jnp.ndim(index) - 1 + len(d.offset_dims)
         return lax.gather(
             x.x,
@@ -99,7 +99,7 @@ def _gather(x, index, lanes: int, *, dimension_numbers, slice_sizes, **rest):
         )
     # the index's own axis stays its last
     index = jnp.swapaxes(index.x, -1, -2)
-    if not isinstance(x, Lanes):
+    if not isinstance(x, Batched):
         return lax.gather(x, index, d, slice_sizes, **rest)
     of_x, of_index = (
         (*d.operand_batching_dims, x.x.ndim - 1),
@@ -114,22 +114,22 @@ def _gather(x, index, lanes: int, *, dimension_numbers, slice_sizes, **rest):
     )
 
 
-def sum_by_few(x: Array, axes: tuple[int, ...]) -> Array:
+def sum_in_chunks(x: Array, axes: tuple[int, ...]) -> Array:
     """Sums of few at a time: such a loop is unrolled, and the one around it, over lanes or what
     else is last, can take several in one instruction."""
     for axis in sorted(axes, reverse=True):
         size = x.shape[axis]
         parts = [
-            jnp.sum(lax.slice_in_dim(x, i, min(i + FEW, size), axis=axis), axis, x.dtype)
-            for i in range(0, max(size, 1), FEW)
+            jnp.sum(lax.slice_in_dim(x, i, min(i + TERMS_PER_SUM, size), axis=axis), axis, x.dtype)
+            for i in range(0, max(size, 1), TERMS_PER_SUM)
         ]
         x = functools.reduce(jnp.add, parts)
     return x
 
 
-def _dot(*sides, dimension_numbers, preferred_element_type, **_):
+def _dot_general(*sides, dimension_numbers, preferred_element_type, **_):
     """Products and sums: XLA has no `dot` whose lanes come last."""
-    sides = [v.x if isinstance(v, Lanes) else jnp.asarray(v)[..., None] for v in sides]
+    sides = [v.x if isinstance(v, Batched) else jnp.asarray(v)[..., None] for v in sides]
     contracted, batch = dimension_numbers
     free = [
         [i for i in range(x.ndim - 1) if i not in (*c, *b)]
@@ -149,78 +149,79 @@ def _dot(*sides, dimension_numbers, preferred_element_type, **_):
     products = (
         products if preferred_element_type is None else products.astype(preferred_element_type)
     )
-    return sum_by_few(products, tuple(range(end, end + len(contracted[0]))))
+    return sum_in_chunks(products, tuple(range(end, end + len(contracted[0]))))
 
 
 def _solve(inputs: list, lanes: int, *, const_lengths, jaxprs, **_):
     """The solve itself; what it is the inverse of matters to derivatives alone."""
     before = const_lengths.matvec + const_lengths.vecmat
-    return evaluate(
+    return evaluate_jaxpr(
         jaxprs.solve,
         [*inputs[before : before + const_lengths.solve], *inputs[sum(const_lengths) :]],
         lanes,
     )
 
 
-def _as_jax_does(primitive, inputs: list, params: dict, lanes: int):
+def _apply_vmap(primitive, inputs: list, params: dict, lanes: int):
     """Lanes first, through jax's own rule, and back."""
-    axes = [0 if isinstance(v, Lanes) else None for v in inputs]
-    moved = [jnp.moveaxis(v.x, -1, 0) if isinstance(v, Lanes) else v for v in inputs]
+    axes = [0 if isinstance(v, Batched) else None for v in inputs]
+    moved = [jnp.moveaxis(v.x, -1, 0) if isinstance(v, Batched) else v for v in inputs]
     out = jax.vmap(lambda *values: primitive.bind(*values, **params), axes, axis_size=lanes)(*moved)
     return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), out)
 
 
-def _one(primitive, inputs: list, params: dict, shape: tuple[int, ...], lanes: int):
+def _apply_rule(primitive, inputs: list, params: dict, shape: tuple[int, ...], lanes: int):
     """What one operation makes of values of which some are `Lanes`, in arrays [..., lanes]."""
     name, alone = primitive.name, len(inputs) == 1
     if name == "reduce_sum":
-        return sum_by_few(inputs[0].x, params["axes"])
-    if name in ALONG:
+        return sum_in_chunks(inputs[0].x, params["axes"])
+    if name in UNBATCHED_AXES:
         return primitive.bind(inputs[0].x, **params)
-    if name in JOINING:
-        return primitive.bind(*(spread(v, lanes) for v in inputs), **params)
+    if name in CONCATENATIONS:
+        return primitive.bind(*(broadcast_to_lanes(v, lanes) for v in inputs), **params)
     if name in ELEMENTWISE:
         # (numbers and axes of one go with any size)
         return primitive.bind(
-            *(jnp.broadcast_to(spread(v, lanes), (*shape, lanes)) for v in inputs), **params
+            *(jnp.broadcast_to(broadcast_to_lanes(v, lanes), (*shape, lanes)) for v in inputs),
+            **params,
         )
-    if name in MOVING and alone:
-        return MOVING[name](inputs[0].x, lanes, **params)
+    if name in SHAPE_RULES and alone:
+        return SHAPE_RULES[name](inputs[0].x, lanes, **params)
     if name == "taking":
         # (its axis is counted from the front)
         return primitive.bind(inputs[0].x, **params)
     if name == "gather":
         return _gather(inputs[0], inputs[1], lanes, **params)
     if name == "dot_general":
-        return _dot(*inputs, **params)
-    return _as_jax_does(primitive, inputs, params, lanes)
+        return _dot_general(*inputs, **params)
+    return _apply_vmap(primitive, inputs, params, lanes)
 
 
-def evaluate(closed: core.ClosedJaxpr, inputs: list, lanes: int) -> list:
+def evaluate_jaxpr(closed: core.ClosedJaxpr, inputs: list, lanes: int) -> list:
     """The outputs of a jaxpr for inputs of which some are `Lanes`."""
     jaxpr = closed.jaxpr
     known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*closed.consts, *inputs], strict=True))
     read = lambda v: v.val if isinstance(v, core.Literal) else known[v]
     for eqn in jaxpr.eqns:
         values, name, params = [read(v) for v in eqn.invars], eqn.primitive.name, eqn.params
-        mixed = any(isinstance(v, Lanes) for v in values)
-        if name in CALLS:
-            out = evaluate(params[CALLS[name]], values, lanes)
+        mixed = any(isinstance(v, Batched) for v in values)
+        if name in CALL_JAXPR_PARAMETERS:
+            out = evaluate_jaxpr(params[CALL_JAXPR_PARAMETERS[name]], values, lanes)
         elif name in ("custom_linear_solve", "linear_solve") and mixed:
             out = _solve(values, lanes, **params)
         else:
             out = (
                 eqn.primitive.bind(*values, **params)
                 if not mixed
-                else _one(eqn.primitive, values, params, eqn.outvars[0].aval.shape, lanes)
+                else _apply_rule(eqn.primitive, values, params, eqn.outvars[0].aval.shape, lanes)
             )
             out = out if eqn.primitive.multiple_results else [out]
-            out = [Lanes(x) for x in out] if mixed else out
+            out = [Batched(x) for x in out] if mixed else out
         known |= dict(zip(eqn.outvars, out, strict=True))
     return [read(v) for v in jaxpr.outvars]
 
 
-def _for_lanes(function: Callable, lanes: int, flags: list[bool], args):
+def _evaluate_batch(function: Callable, lanes: int, flags: list[bool], args):
     """All lanes first and last to the eye, last in between."""
     leaves, tree = jax.tree.flatten(args)
     shapes = [
@@ -234,15 +235,15 @@ def _for_lanes(function: Callable, lanes: int, flags: list[bool], args):
 
     def some(own):
         own = iter(own)
-        out = evaluate(
+        out = evaluate_jaxpr(
             closed,
             [
-                Lanes(jnp.moveaxis(next(own), 0, -1)) if flag else x
+                Batched(jnp.moveaxis(next(own), 0, -1)) if flag else x
                 for x, flag in zip(leaves, flags, strict=True)
             ],
             tile,
         )
-        return [jnp.moveaxis(spread(x, tile), -1, 0) for x in out]
+        return [jnp.moveaxis(broadcast_to_lanes(x, tile), -1, 0) for x in out]
 
     own = [x for x, flag in zip(leaves, flags, strict=True) if flag]
     if count == 1:
@@ -264,11 +265,11 @@ def with_lanes_last(function: Callable) -> Callable:
 
     @batched.def_vmap
     def _(lanes: int, flags, *args):
-        out = _for_lanes(function, lanes, jax.tree.leaves(flags), args)
+        out = _evaluate_batch(function, lanes, jax.tree.leaves(flags), args)
         return out, jax.tree.map(lambda _: True, out)
 
     def jvp(values, tangents):
         return whole(*values), eqx.filter_jvp(function, values, tangents)[1]
 
-    whole = operation(function.__name__, batched, jvp)
+    whole = custom_primitive(function.__name__, batched, jvp)
     return whole

@@ -10,7 +10,7 @@ import jax
 from jax.interpreters import ad
 
 
-def operation(
+def custom_primitive(
     name: str, function: Callable, jvp: Callable, transpose: Callable | None = None
 ) -> Callable:
     """The function as an operation of its own; jax.custom_jvp would lose its rule where a scan is
@@ -49,7 +49,7 @@ def is_cotangent_of(x) -> bool:
     return isinstance(x, ad.UndefinedPrimal)
 
 
-class Closed(eqx.Module):
+class ClosureConverted(eqx.Module):
     """A function with all the arrays that it closes over as leaves, so that it can be
     differentiated by them.
 
@@ -62,7 +62,7 @@ class Closed(eqx.Module):
     out: Any = eqx.field(static=True)
 
     @classmethod
-    def over(cls, function: Callable, *example) -> "Closed":
+    def from_function(cls, function: Callable, *example) -> "Closed":
         """`function`, for arguments like these."""
         made, out, static = eqx.filter_make_jaxpr(function)(*example)
         return cls(made.consts, made.jaxpr, (jax.tree.structure(out), static))

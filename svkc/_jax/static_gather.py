@@ -13,10 +13,10 @@ from jaxtyping import Array, Float, Int
 
 # a table of what goes to each row may have so many times the entries that are there and taken; else
 # it is a scatter
-WASTE = 8
+MAX_TABLE_RATIO = 8
 
 
-def take(
+def static_take(
     x: Float[Array, "rows *n"], index: Int[np.ndarray, "*m"] | Int[Array, "*m"]
 ) -> Float[Array, "..."]:
     """x[index] along the first axis; zeros where the index is one past the last row."""
@@ -24,11 +24,11 @@ def take(
         return jnp.concatenate([x, jnp.zeros_like(x[:1])])[index]
     if index.ndim == 1 and np.array_equal(index, np.arange(x.shape[0])):
         return x
-    taken = taking.bind(x, index=index.astype(np.int32).tobytes(), axis=0)
+    taken = static_take_p.bind(x, index=index.astype(np.int32).tobytes(), axis=0)
     return taken if index.ndim == 1 else taken.reshape(*index.shape, *x.shape[1:])
 
 
-def _take(x, *, index: bytes, axis: int):
+def _gather_rows(x, *, index: bytes, axis: int):
     table, n = np.frombuffer(index, np.int32), x.shape[axis]
     if table.max(initial=0) == n:
         x = lax.concatenate(
@@ -44,17 +44,17 @@ def _take(x, *, index: bytes, axis: int):
     )
 
 
-def _shape(x, *, index: bytes, axis: int):
+def _abstract_eval(x, *, index: bytes, axis: int):
     return x.update(shape=(*x.shape[:axis], len(index) // 4, *x.shape[axis + 1 :]))
 
 
-def _back(ct, x, *, index: bytes, axis: int):
+def _transpose(ct, x, *, index: bytes, axis: int):
     """For each row of x the sum of what was taken of it."""
     table, n = np.frombuffer(index, np.int32), x.aval.shape[axis]
     order = np.argsort(table, kind="stable")
     count = np.bincount(table, minlength=n + 1)[:n]
     most = int(count.max(initial=0))
-    if n * most > WASTE * (n + len(table)):
+    if n * most > MAX_TABLE_RATIO * (n + len(table)):
         shape = (*x.aval.shape[:axis], n + 1, *x.aval.shape[axis + 1 :])
         added = jnp.zeros(shape, ct.dtype).at[(slice(None),) * axis + (table,)].add(ct)
         return [lax.slice_in_dim(added, 0, n, axis=axis)]
@@ -62,7 +62,7 @@ def _back(ct, x, *, index: bytes, axis: int):
     back, first = np.full((n, most), len(table), np.int32), np.cumsum(count) - count
     for row in range(n):
         back[row, : count[row]] = order[first[row] : first[row] + count[row]]
-    parts = taking.bind(ct, index=back.tobytes(), axis=axis)
+    parts = static_take_p.bind(ct, index=back.tobytes(), axis=axis)
     return [
         parts
         if most == 1
@@ -70,14 +70,14 @@ def _back(ct, x, *, index: bytes, axis: int):
     ]
 
 
-def _lanes(args, axes, *, index: bytes, axis: int):
+def _batch(args, axes, *, index: bytes, axis: int):
     (x,), (lane,) = args, axes
-    return taking.bind(x, index=index, axis=axis + (lane <= axis)), lane
+    return static_take_p.bind(x, index=index, axis=axis + (lane <= axis)), lane
 
 
-taking = Primitive("taking")
-taking.def_impl(_take)
-taking.def_abstract_eval(_shape)
-ad.deflinear2(taking, _back)
-batching.primitive_batchers[taking] = _lanes
-mlir.register_lowering(taking, mlir.lower_fun(_take, multiple_results=False))
+static_take_p = Primitive("taking")
+static_take_p.def_impl(_gather_rows)
+static_take_p.def_abstract_eval(_abstract_eval)
+ad.deflinear2(static_take_p, _transpose)
+batching.primitive_batchers[static_take_p] = _batch
+mlir.register_lowering(static_take_p, mlir.lower_fun(_gather_rows, multiple_results=False))

@@ -47,7 +47,7 @@ def _state_or_none(chain):
 def _suggest(chain):
     """Joints that can be cut, and bodies at the ends of the tree, which could hold on to
     something."""
-    from svkc.mjcf.cuttable_joints import cuts_of
+    from svkc.mjcf.cuttable_joints import cuttable_joints
 
     def cut(name):
         try:
@@ -101,5 +101,5 @@ def view(path: pathlib.Path, show: bool) -> int:
             missing.append(f"{target.name} not drawn: {error}")
     print("\n".join(missing) + "\n" * bool(missing) + "wrote " + ", ".join(map(str, written)))
     if show:
-        webbrowser.open(written[0].resolve().as_uri())
+        webbrowser.search_gaps(written[0].resolve().as_uri())
     return 0

@@ -179,7 +179,7 @@ def _next(stages, what: str):
 
 def _wanted(name: str, t1: float | None, events, ignore):
     """Chain, state, events and end of the run that was asked for."""
-    from svkc.model.validation import positive
+    from svkc.model.validation import positive_scalar
 
     chain, state, own, end = _scene(name, ignore)
     end = end if t1 is None else t1

@@ -17,8 +17,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from svkc._jax.primitive import is_cotangent_of, operation
-from svkc._jax.pytrees import filled
+from svkc._jax.primitive import custom_primitive, is_cotangent_of
+from svkc._jax.pytrees import materialise_zeros
 from svkc.integration.event_location import field_of
 from svkc.integration.integrators import Motion, Scene
 from svkc.integration.vector_field import Field
@@ -42,10 +42,10 @@ def arrival_tangent(primals, tangents, end, at: Motion, rate: Motion):
     field, d_field = (
         (guards, d_guards) if isinstance(guards, Field) else (guards.field, d_guards.field)
     )
-    d_t = filled(t, d_t)
-    changes = filled(y, dy), d_scene, d_field
+    d_t = materialise_zeros(t, d_t)
+    changes = materialise_zeros(y, dy), d_scene, d_field
     dy = carried(changes, rate, delay=end - t, t=end, at=at, scene=scene, field=field)
-    dt = filled(late, d_late)
+    dt = materialise_zeros(late, d_late)
     if found is not None:
         guard = lambda t, y, scene, guards: guards(t, y, scene)[found.first]
         slope = jax.jvp(
@@ -63,7 +63,7 @@ def arrival_tangent(primals, tangents, end, at: Motion, rate: Motion):
 
 # arrived(t, y, late, scene, guards or field, found or None) -> t, y: the end of a phase, where the
 # motion y was found at the time t, a guard's zero, or, `late` by nothing, the time scheduled
-arrived = operation("arrived", lambda t, y, *_: (t, y), _arrived_jvp)
+arrived = custom_primitive("arrived", lambda t, y, *_: (t, y), _arrived_jvp)
 
 
 def _rate_of(changes, t, at: Motion, scene: Scene, field: Field) -> Motion:
@@ -76,7 +76,7 @@ def _rate_of(changes, t, at: Motion, scene: Scene, field: Field) -> Motion:
 def _carried_jvp(primals, tangents):
     changes, _, *where = primals
     (further, _, _), delay, *_ = tangents
-    ddy = filled(changes[0], further)
+    ddy = materialise_zeros(changes[0], further)
     if delay is not None:
         ddy = jax.tree.map(lambda d, r: d + delay * r, ddy, _rate_of(changes, *where))
     return _carried(*primals), ddy
@@ -89,12 +89,14 @@ def _carried_transpose(inputs, cotangent: Motion):
         changes,
         is_leaf=is_cotangent_of,
     )
-    return _brought_back(filled(where[2], cotangent), asked, *where), *jax.tree.map(
+    return _brought_back(materialise_zeros(where[2], cotangent), asked, *where), *jax.tree.map(
         lambda _: None, tuple(where)
     )
 
 
-_carried = operation("carried", lambda changes, *_: changes[0], _carried_jvp, _carried_transpose)
+_carried = custom_primitive(
+    "carried", lambda changes, *_: changes[0], _carried_jvp, _carried_transpose
+)
 
 
 def carried(changes, rate: Motion, *, delay, t, at: Motion, scene: Scene, field: Field) -> Motion:
@@ -117,7 +119,7 @@ def _back(cotangent: Motion, asked, *_):
 def _back_jvp(primals, tangents):
     cotangent, asked, _, t, at, scene, field = primals
     further, _, delay, *_ = tangents
-    change = _back(filled(cotangent, further), asked)
+    change = _back(materialise_zeros(cotangent, further), asked)
     if delay is not None:
         pulled = eqx.filter_vjp(lambda y, scene, field: field(t, y, scene), at, scene, field)[1](
             cotangent
@@ -129,4 +131,4 @@ def _back_jvp(primals, tangents):
 
 # _brought_back(cotangent of dy, shapes, delay, t, at, scene, field) -> cotangents of (dy, d_scene,
 # d_field): the transpose of `_carried`
-_brought_back = operation("brought_back", _back, _back_jvp)
+_brought_back = custom_primitive("brought_back", _back, _back_jvp)

@@ -8,11 +8,11 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from svkc._jax.pytrees import chosen
+from svkc._jax.pytrees import tree_where
 from svkc.integration.integrators import Motion, Scene
 from svkc.integration.vector_field import Field
 from svkc.model.chain import State
-from svkc.model.validation import one
+from svkc.model.validation import scalar
 from svkc.transitions.plan import Plan
 
 # how often a bracket may be narrowed
@@ -87,7 +87,7 @@ class Reading(eqx.Module):
             else jnp.zeros_like(y.v)
         )
         values = [g.value(scene.chain, t, state, scene.args, tau) for g in guards]
-        return jnp.stack([jnp.asarray(one("guard", x), y.q.dtype) for x in values])
+        return jnp.stack([jnp.asarray(scalar("guard", x), y.q.dtype) for x in values])
 
 
 class Found(eqx.Module):
@@ -174,8 +174,8 @@ def watch(
     )
     # the largest of the guards that crossed: positive where one has
     passed = lambda values: jnp.max(jnp.where(side != 0, side * values, -jnp.inf))
-    bracket = chosen(old.narrow, old.bracket.narrowed(t1, passed(values)), old.bracket)
-    bracket = chosen(begun, Bracket.around(t0, t1, passed(before), passed(values)), bracket)
+    bracket = tree_where(old.narrow, old.bracket.narrowed(t1, passed(values)), old.bracket)
+    bracket = tree_where(begun, Bracket.around(t0, t1, passed(before), passed(values)), bracket)
     at_right = begun | (old.narrow & (passed(values) >= 0))
     done = old.on & ~old.narrow
     on = begun | (old.on & ~done)
@@ -184,7 +184,7 @@ def watch(
         side=side,
         size=jnp.where(begun, jnp.maximum(jnp.abs(before), jnp.abs(values)), old.size),
         bracket=bracket,
-        motion=chosen(at_right, y, old.motion),
+        motion=tree_where(at_right, y, old.motion),
         values=jnp.where(at_right, values, old.values),
         ahead=jnp.where(done, values, old.ahead),
         on=on,

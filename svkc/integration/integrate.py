@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from svkc._jax.control_flow import buffer_at_set, while_loop
-from svkc._jax.pytrees import chosen
+from svkc._jax.pytrees import tree_where
 from svkc.integration.event_location import Bracket, Search, found, watch
 from svkc.integration.integrators import REST, Motion, finite, motion_norm
 from svkc.integration.solution import (
@@ -199,7 +199,7 @@ def _located(s: Step, world: World, how: How) -> tuple[Tried, Array, Search, Arr
     )
     still = s.search.on | search.on
     blind = tried.keep & jnp.any(jnp.isnan(guards))
-    t, y = chosen(search.done, (search.bracket.b, search.motion), (tried.t, tried.y))
+    t, y = tree_where(search.done, (search.bracket.b, search.motion), (tried.t, tried.y))
     tried = dataclasses.replace(
         tried,
         t=t,
@@ -235,9 +235,9 @@ def _step(s: Step, times, world: World, how: How) -> Step:
         guards, search, still = None, None, jnp.zeros((), bool)
     else:
         tried, guards, search, still = _located(s, world, how)
-    moved = lambda new, old: chosen(tried.keep, new, old)
+    moved = lambda new, old: tree_where(tried.keep, new, old)
     # while a zero is looked for, nothing else goes on
-    next_ = lambda new, old: chosen(still, old, new)
+    next_ = lambda new, old: tree_where(still, old, new)
     t, accepted = moved(tried.t, s.t), s.accepted + tried.keep.astype(jnp.int32)
     saved, kept = _saved(s, tried, t, at, accepted, how.every)
     result = next_(tried.result, s.result)

@@ -14,8 +14,8 @@ from svkc._jax.lanes_last import with_lanes_last
 from svkc.loops.constrained_dynamics import ArticulatedBodies
 from svkc.loops.forward_dynamics import moving
 from svkc.model.chain import Chain, State, Structure, active_dofs
-from svkc.model.checked_jit import joint_torques, verb
-from svkc.model.validation import one
+from svkc.model.checked_jit import checked_jit, joint_torques
+from svkc.model.validation import scalar
 from svkc.tree.configuration import integrate
 from svkc.tree.inverse_dynamics import limit_forces
 
@@ -152,7 +152,7 @@ class SimplifiedNewton(diffrax.VeryChord):
         return failed | close | diverging, optimistix.RESULTS.where(failed, state.result, result)
 
 
-@verb
+@checked_jit
 def step(
     chain: Chain, state: State, tau: Float[Array, " torques"], dt: Float[Array, ""] | float
 ) -> State:
@@ -165,7 +165,9 @@ def step(
     order; structure, events, other orders and error
     control: `svkc.simulate`. ValueError: tau has another size.
     """
-    return _step(chain, state, joint_torques(chain, tau), jnp.asarray(one("dt", dt), state.q.dtype))
+    return _step(
+        chain, state, joint_torques(chain, tau), jnp.asarray(scalar("dt", dt), state.q.dtype)
+    )
 
 
 @with_lanes_last

@@ -16,14 +16,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from svkc._jax.control_flow import unvmap_any
-from svkc._jax.primitive import operation
-from svkc._jax.pytrees import filled, frozen
+from svkc._jax.primitive import custom_primitive
+from svkc._jax.pytrees import materialise_zeros, stop_gradient_tree
 from svkc.integration.event_adjoint import arrival_tangent, carried
 from svkc.integration.integrate import march
 from svkc.integration.integrators import Motion, Scene
 from svkc.integration.solution import SUCCESSFUL, How, Path, World
 from svkc.integration.vector_field import Field, settle
-from svkc.model.validation import whole
+from svkc.model.validation import integer
 
 # blocks are passed over in groups where the run has no more steps
 GROUP = 64
@@ -41,7 +41,7 @@ class Replay(eqx.Module):
     every: int = eqx.field(static=True, default=16)
 
     def __check_init__(self):
-        whole("every", self.every, 1)
+        integer("every", self.every, 1)
 
 
 def _grid(t0, at, path: Path):
@@ -92,8 +92,8 @@ def _integrated_jvp(primals, tangents):
         (jnp.stack([t0, t]), jax.tree.map(lambda *x: jnp.stack(x), start, end)),
     )
     at_start, at_end = (jax.tree.map(lambda x, i=i: x[i], rates) for i in range(2))
-    grid, place = _grid(*frozen((t0, at, path)))
-    d_start = filled(start, d_start)
+    grid, place = _grid(*stop_gradient_tree((t0, at, path)))
+    d_start = materialise_zeros(start, d_start)
     if d_t0 is not None:
         start, d_start = _from_fixed(start, d_start, at_start, (t0, d_t0), (world, d_world))
     d_end, d_saved, d_kept = _through(
@@ -110,7 +110,7 @@ def _integrated_jvp(primals, tangents):
     )
     late = _late(path, stop)
     d_late = None if d_stop is None else jnp.where(path.result == SUCCESSFUL, d_stop, 0)
-    arriving = (path.t, path.end, late, world.scene, guards, frozen(path.found))
+    arriving = (path.t, path.end, late, world.scene, guards, stop_gradient_tree(path.found))
     return (path, t, end), (
         d_path,
         *arrival_tangent(
@@ -227,7 +227,7 @@ def _where(pred, new, old):
 # integrated(start, times, world, how, guards or field) -> Path, t, Motion: where the run went, with
 # the time of its end fixed in derivatives; and its end, whose time is a guard's zero or the
 # scheduled one
-integrated = operation("integrated", _integrated, _integrated_jvp)
+integrated = custom_primitive("integrated", _integrated, _integrated_jvp)
 
 
 def staged(solver: diffrax.AbstractSolver, kind: str | None) -> diffrax.AbstractSolver:

@@ -4,7 +4,7 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from svkc.integration.integrators import Scene
-from svkc.model.validation import one, whole
+from svkc.model.validation import integer, scalar
 
 
 class AbstractStabilization(eqx.Module):
@@ -23,7 +23,7 @@ class Projection(AbstractStabilization):
     iterations: int = eqx.field(static=True, default=2)
 
     def __check_init__(self):
-        whole("iterations", self.iterations, 0)
+        integer("iterations", self.iterations, 0)
 
 
 class CoordinatePartitioning(Projection):
@@ -39,7 +39,7 @@ class Baumgarte(AbstractStabilization):
     rate: Float[Array, ""] | float = 20.0
 
     def __check_init__(self):
-        one("rate", self.rate)
+        scalar("rate", self.rate)
 
 
 class NoStabilization(AbstractStabilization):

@@ -19,7 +19,7 @@ from svkc.loops.forward_dynamics import moving, moving_in_lanes
 from svkc.loops.projection import settle_by_bodies, settle_loops
 from svkc.model.chain import Chain, State, active_dofs
 from svkc.model.checked_jit import joint_torques
-from svkc.model.validation import numbers
+from svkc.model.validation import real_array
 from svkc.tree.configuration import normalize, rates
 from svkc.tree.inverse_dynamics import limit_forces
 from svkc.tree.traversal import LEVELS_UNROLLED
@@ -87,7 +87,7 @@ class Field(eqx.Module):
         if self.control is not None:
             # traced once for all the places that call it
             asked = eqx.filter_jit(self.control)(t, State(y.q, y.v, scene.structure), scene.args)
-            tau = tau + joint_torques(chain, numbers("control", asked, y.v.dtype))
+            tau = tau + joint_torques(chain, real_array("control", asked, y.v.dtype))
         if chain.limit is not None:
             tau = tau + limit_forces(chain, y.q, y.v)
         if y.work is None:

@@ -8,14 +8,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.eager import eager_jit
-from svkc._jax.pytrees import concrete, frozen
+from svkc._jax.pytrees import is_concrete, stop_gradient_tree
 from svkc.loops.constraint import loop_kinematics, scales
 from svkc.loops.coordinates import constrained, open_coordinates
 from svkc.loops.forward_dynamics import constraint_forces
 from svkc.loops.pivoting import Selection, select, select_with_rank, solve_positive
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import check_state
-from svkc.model.validation import arrayed, numbers
+from svkc.model.validation import as_array, real_array
 from svkc.tree.inverse_dynamics import generalized_forces, over_all_dofs, passive_forces
 from svkc.tree.kinematics import kinematics, twists
 
@@ -64,7 +64,7 @@ def actuation(
     dampers are counted. ValueError: wrong sizes, weights that are not positive, crossed bounds.
     """
     check_state(chain, state)
-    independent, vdot_G = None, numbers("vdot_G", vdot_G, state.v.dtype)
+    independent, vdot_G = None, real_array("vdot_G", vdot_G, state.v.dtype)
     if vdot_G.shape != (chain.dofs,):
         independent = (
             np.asarray(_coordinates(chain, state)[0].independent)
@@ -81,9 +81,11 @@ def actuation(
             )
         vdot_G = jnp.zeros(chain.dofs, vdot_G.dtype).at[np.flatnonzero(independent)].set(vdot_G)
     weight = _per_dof(chain, "weight", weight, 1.0, state)
-    if concrete(weight) and not np.all((np.asarray(weight) > 0) & np.isfinite(np.asarray(weight))):
+    if is_concrete(weight) and not np.all(
+        (np.asarray(weight) > 0) & np.isfinite(np.asarray(weight))
+    ):
         raise ValueError(f"weight: expected positive numbers, got {np.asarray(weight)}")
-    actuated = chain.actuated if actuated is None else arrayed(actuated)
+    actuated = chain.actuated if actuated is None else as_array(actuated)
     if actuated.shape != (chain.dofs,) or actuated.dtype != bool:
         raise ValueError(
             f"actuated: expected {chain.dofs} Booleans, got {actuated.dtype} of shape"
@@ -98,7 +100,7 @@ def actuation(
 
 
 def _per_dof(chain: Chain, name: str, value, default, state: State) -> Float[Array, " dofs"]:
-    value = numbers(name, default if value is None else value, state.v.dtype)
+    value = real_array(name, default if value is None else value, state.v.dtype)
     if value.shape not in ((), (chain.dofs,)):
         raise ValueError(f"{name}: got shape {value.shape}, expected a number or ({chain.dofs},)")
     return jnp.broadcast_to(value, (chain.dofs,))
@@ -109,7 +111,7 @@ def _limits(chain: Chain, bounds, state: State) -> list[Float[Array, " dofs"]]:
     if not isinstance(bounds, tuple | list | np.ndarray | jax.Array) or len(bounds) != 2:
         raise ValueError(f"bounds: expected (lower, upper), got {bounds!r}")
     limits = [_per_dof(chain, "bounds", b, 0.0, state) for b in bounds]
-    if concrete(limits) and not np.all(np.asarray(limits[0]) <= np.asarray(limits[1])):
+    if is_concrete(limits) and not np.all(np.asarray(limits[0]) <= np.asarray(limits[1])):
         lower, upper = np.asarray(limits)
         raise ValueError(f"bounds: expected lower at or below upper, got {lower} and {upper}")
     return limits
@@ -208,7 +210,7 @@ def _within(problem, weight, lower, upper) -> tuple[Float[Array, " dofs"], Float
     """
     B, wanted, column = problem
     root, small = jnp.sqrt(weight), jnp.finfo(B.dtype).eps ** 0.25
-    scaled = frozen((B * (column / root)[None], wanted, root * lower, root * upper))
+    scaled = stop_gradient_tree((B * (column / root)[None], wanted, root * lower, root * upper))
     target = _target(*scaled) / jax.lax.stop_gradient(root)
     nearest, drives = jnp.clip(target, lower, upper), jnp.any(B != 0, 0)
     free = drives & (lower < target) & (target < upper)

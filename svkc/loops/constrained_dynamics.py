@@ -10,13 +10,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from svkc._jax.batched_lapack import factor_positive, solve_triangle
+from svkc._jax.batched_lapack import batched_solve_triangular, cholesky_solver
 from svkc.loops.constraint import LoopKinematics, scales
 from svkc.loops.coordinates import Coordinates, constrain
 from svkc.loops.delassus import by_loop_forces
 from svkc.loops.pivoting import Selection, square
 from svkc.model.chain import Chain, Structure, active_dofs
-from svkc.model.validation import one
+from svkc.model.validation import scalar
 from svkc.tree.articulated_body import accelerations, articulate
 from svkc.tree.inverse_dynamics import inertia_times, over_all_dofs
 from svkc.tree.kinematics import Kinematics
@@ -34,7 +34,7 @@ def reduced_inertia(
 class AbstractDynamics(eqx.Module):
     """How accelerations are computed. All ways agree; they differ in what they cost.
 
-    uses_pivots: whether dependent coordinates are chosen. Where they are not, `svkc.Projection()`
+    uses_pivots: whether dependent coordinates are chosen. Where they are not, `svkc.stabilization.Projection()`
     puts steps back onto the loops without pivots too.
     hold: dependent coordinates are chosen at every evaluation (None), or held until, at the end of
     a step, the least |R_kk| / |R_11| of their columns is below this part of what a new choice has
@@ -117,7 +117,7 @@ class AbstractInertiaMatrix(AbstractDynamics):
         if structure.locked is not None:
             free = ~structure.locked
             M = jnp.where(free[:, None] & free[None], M, jnp.eye(chain.nv, dtype=M.dtype))
-        return _implicit_open_solve(chain, structure, kin, factor_positive(M))
+        return _implicit_open_solve(chain, structure, kin, cholesky_solver(M))
 
 
 class CompositeBodies(AbstractInertiaMatrix):
@@ -144,7 +144,7 @@ def default_dynamics(chain: Chain) -> AbstractDynamics:
 
 
 def by_bodies(chain: Chain, kin: Kinematics):
-    """Names articulated bodies in the older spelling, `svkc.Dynamics(inertia=svkc.by_bodies)`."""
+    """Names articulated bodies in the older spelling, `svkc.dynamics.ArticulatedBodies()`."""
     return articulate(chain, kin)
 
 
@@ -182,7 +182,7 @@ class Dynamics(eqx.Module):
 
 
 def _check_hold(hold) -> None:
-    if hold is not None and not 0 <= one("dynamics.hold", hold) <= 1:
+    if hold is not None and not 0 <= scalar("dynamics.hold", hold) <= 1:
         raise ValueError(f"dynamics.hold: got {hold}, expected None or a part between 0 and 1")
 
 
@@ -230,14 +230,16 @@ def _by_independent(
     nv, (_, column) = chain.nv, scales(chain)
     co = constrain(chain, structure, chosen, J, jnp.zeros(J.shape[0], J.dtype))
     tree, W = inertia(chain, kin), co.W
-    A_inverse = factor_positive(reduced_inertia(chain, co, tree))
+    A_inverse = cholesky_solver(reduced_inertia(chain, co, tree))
     _, JS = square(chosen, J)
 
     def solve(force, rate):
-        x = column * (chosen.P.T @ solve_triangle(JS, rate))
+        x = column * (chosen.P.T @ batched_solve_triangular(JS, rate))
         x = x + W @ A_inverse(W.T @ (force - over_all_dofs(chain, tree @ x[:nv])))
         rest = column * (force - over_all_dofs(chain, tree @ x[:nv]))
-        return x, jnp.where(chosen.used, solve_triangle(JS, chosen.P @ rest, trans=True), rate)
+        return x, jnp.where(
+            chosen.used, batched_solve_triangular(JS, chosen.P @ rest, trans=True), rate
+        )
 
     return solve
 

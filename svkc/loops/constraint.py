@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from svkc._jax.static_gather import take
+from svkc._jax.static_gather import static_take
 from svkc.model.chain import Chain, State, Structure, active_dofs
-from svkc.model.checked_jit import verb
+from svkc.model.checked_jit import checked_jit
 from svkc.model.topology import FREE, SLIDE, Topology
 from svkc.tree.kinematics import Kinematics, bias_accelerations, kinematics
 from svkc.tree.spatial import (
@@ -50,8 +50,8 @@ class Ends(eqx.Module):
 def _coordinates(chain: Chain, q: Float[Array, " q"]):
     """Turns [L 3], slides [L 3] and quaternions [L 4] of the virtual joints."""
     table, end = chain.topology.links, chain.topology.nq_all
-    quat = take(q, np.minimum(table.quat, end)) + (table.quat > end).astype(q.dtype)
-    return take(q, table.angle), take(q, table.slide), quat_normalize(quat)
+    quat = static_take(q, np.minimum(table.quat, end)) + (table.quat > end).astype(q.dtype)
+    return static_take(q, table.angle), static_take(q, table.slide), quat_normalize(quat)
 
 
 def _turns(top: Topology, angle: Float[Array, "links 3"], ball: Float[Array, "links 4"]):
@@ -133,7 +133,7 @@ def loop_jacobian(
     """J_C (paper (11)): six rows a virtual link, zero where not connected; columns of coordinates
     that cannot move are zero."""
     top = chain.topology
-    above = jnp.asarray(top.ancestor[:, top.dof_row])
+    above = jnp.asarray(top.ancestor_mask[:, top.dof_row])
     sign = above[structure.parent].astype(kin.r.dtype) - above[structure.real].astype(kin.r.dtype)
     # the joint's place as seen from the root of each coordinate's tree
     of_parent = above[structure.parent][:, :, None]
@@ -144,7 +144,7 @@ def loop_jacobian(
     # of each link and coordinate the row in `own`, which is followed by zeros
     source = np.full((count, top.dofs + 1), 6 * count)
     np.put_along_axis(source, top.links.dof, np.arange(6 * count).reshape(-1, 6), 1)
-    virtual = take(own.reshape(-1, 6), source[:, top.nv : top.dofs])
+    virtual = static_take(own.reshape(-1, 6), source[:, top.nv : top.dofs])
     J = jnp.concatenate([tree, virtual], 1)
     moving = structure.connected[:, None, None] & active_dofs(chain, structure)[None, :, None]
     J = jnp.where(moving, J, 0)
@@ -163,7 +163,9 @@ def loop_bias(
     """Jdot_C v (paper (21)): the difference of the two ends' velocity-product accelerations. V,
     A: twists and, with vdot = 0, accelerations of the tree."""
     top = chain.topology
-    rate = jnp.where(structure.connected[:, None] & structure.freedoms, take(v, top.links.dof), 0)
+    rate = jnp.where(
+        structure.connected[:, None] & structure.freedoms, static_take(v, top.links.dof), 0
+    )
     parts = _virtual_axes(chain, structure, end) * rate[:, :, None]
     slide = jnp.sum(parts[:, 3:], 1)
     V_parent = shift_motion(V[structure.parent], end.from_parent_root)
@@ -186,7 +188,7 @@ def scales(chain: Chain) -> tuple[Float[Array, " rows"], Float[Array, " dofs"]]:
     rows = jnp.tile(jnp.where(np.arange(6) < 3, 1, 1 / chain.length), len(top.link_names))
     linear = np.zeros(top.dofs, bool)
     linear[: top.nv] = np.array(top.kind)[top.dof_row] == SLIDE
-    for i in top.rows_of(FREE):
+    for i in top.rows_of_kind(FREE):
         linear[top.v_start[i] : top.v_start[i] + 3] = True
     slides = top.links.dof[:, 3:]
     linear[slides[slides < top.dofs]] = True
@@ -268,14 +270,14 @@ def largest_gaps(chain: Chain, state: State) -> tuple[Float[Array, "2"], Float[A
     return largest(gaps), largest(rates)
 
 
-@verb(eager=True)
+@checked_jit(eager=True)
 def loop_gaps(chain: Chain, state: State) -> Float[Array, "links 6"]:
     """How far each connected loop is open: rotation vector (rad), then distance (m), in the world;
     zero where not connected."""
     return gaps_and_rates(chain, state)[0]
 
 
-@verb(eager=True)
+@checked_jit(eager=True)
 def jacobian(
     chain: Chain, state: State
 ) -> tuple[Float[Array, "links 3 dofs"], Float[Array, "links 3 dofs"]]:
@@ -288,7 +290,7 @@ def jacobian(
     return J[:, 3:], J[:, :3]
 
 
-@verb(eager=True)
+@checked_jit(eager=True)
 def velocity_gaps(chain: Chain, state: State) -> Float[Array, "links 6"]:
     """J_C v: relative twist (rad/s, m/s) across each connected virtual link."""
     return gaps_and_rates(chain, state)[1]

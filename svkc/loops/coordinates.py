@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from svkc.loops.constraint import LoopKinematics, loop_kinematics, loop_rates, scales
 from svkc.loops.pivoting import Selection, choose, solve_frozen, square
 from svkc.model.chain import Chain, State, Structure, active_dofs
-from svkc.model.checked_jit import check_state, verb
+from svkc.model.checked_jit import check_state, checked_jit
 from svkc.tree.kinematics import twists
 
 
@@ -115,7 +115,7 @@ def open_coordinates(chain: Chain, structure: Structure) -> Coordinates:
     )
 
 
-@verb(eager=True)
+@checked_jit(eager=True)
 def coordinates(chain: Chain, state: State) -> Coordinates:
     """H, W, S (without units, rad or m per rad or m), Hdot v (rad/s^2, m/s^2) and the selection, as
     the paper names them (section II)."""

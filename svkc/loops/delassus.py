@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from svkc._jax.batched_lapack import factor_positive
-from svkc._jax.static_gather import take
+from svkc._jax.batched_lapack import cholesky_solver
+from svkc._jax.static_gather import static_take
 from svkc.model.chain import Chain
 from svkc.tree.articulated_body import accelerations, articulate, seen_by
 from svkc.tree.kinematics import Kinematics
@@ -58,12 +58,14 @@ class Joints(eqx.Module):
 
     def of(self, x: Float[Array, " virtual"]) -> Float[Array, "links d"]:
         """What stands for each freedom of each link; zero for those that are none."""
-        return take(x, np.minimum(self.place, self.count))
+        return static_take(x, np.minimum(self.place, self.count))
 
     def order(self, rates: Float[Array, "links d"]) -> Float[Array, " virtual"]:
         """The same in the order of the coordinates."""
         flat = self.place.ravel()
-        return take(rates.ravel(), np.argsort(flat, kind="stable")[: np.sum(flat < self.count)])
+        return static_take(
+            rates.ravel(), np.argsort(flat, kind="stable")[: np.sum(flat < self.count)]
+        )
 
 
 class Rows(NamedTuple):
@@ -76,7 +78,7 @@ class Rows(NamedTuple):
 
     def fill(self, x: Float[Array, " kept"]) -> Float[Array, " rows"]:
         """All rows of J, zero where they are not in D."""
-        return take(x, self.back)
+        return static_take(x, self.back)
 
 
 def rows_held(chain: Chain, locked: bool) -> Rows:
@@ -125,7 +127,7 @@ def _nearly_inverse(D: Float[Array, "kept kept"]) -> Callable:
     little = jnp.finfo(D.dtype).eps ** 0.625 * jnp.where(most > 0, most, 1)
     raised = D + little * jnp.eye(D.shape[0], dtype=D.dtype)
     if D.shape[0] >= LARGE:
-        return factor_positive(raised)
+        return cholesky_solver(raised)
     inverse = inverse_positive(raised)
     return lambda x: rotate(inverse, x)
 
@@ -147,14 +149,14 @@ def by_loop_forces(
     )
     some, six = own.part(held.whole), 6 * len(held.whole)
     across = lambda x: jnp.concatenate([some.across(x[..., :six]), x[..., six:]], -1) if six else x
-    D = across(across(seen_by(top, bodies, take(tree, held.kept))).T)
+    D = across(across(seen_by(top, bodies, static_take(tree, held.kept))).T)
     nearly = _nearly_inverse(D)
 
     def solve(force, rate):
         # what acts on virtual joints is carried by the loops
         carried = -rotate(own.S, rotate(own.inverse, own.of(force[nv:]))).ravel()
         alone = accelerations(top, bodies, force[:nv] + carried @ tree)
-        left = across(take(rate - tree @ alone, held.kept))
+        left = across(static_take(rate - tree @ alone, held.kept))
         z = nearly(left)
         for _ in range(REFINEMENTS):
             z = z + nearly(left - D @ z)

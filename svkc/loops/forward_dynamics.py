@@ -25,7 +25,7 @@ from svkc.loops.pivoting import (
     weakest,
 )
 from svkc.model.chain import Chain, State, Structure, active_dofs
-from svkc.model.checked_jit import joint_torques, verb
+from svkc.model.checked_jit import checked_jit, joint_torques
 from svkc.tree.inverse_dynamics import generalized_forces, over_all_dofs, passive_forces
 from svkc.tree.kinematics import kinematics, twists
 
@@ -88,7 +88,7 @@ def acceleration(
     return moving(chain, structure, q, v, tau, dynamics=dynamics)[1]
 
 
-@verb
+@checked_jit
 def forward_dynamics(
     chain: Chain, state: State, tau: Float[Array, " torques"]
 ) -> Float[Array, " dofs"]:
@@ -129,7 +129,7 @@ class LoopForces(eqx.Module):
         return iter((self.force, self.torque))
 
 
-@verb(eager=True)
+@checked_jit(eager=True)
 def loop_forces(chain: Chain, state: State, tau: Float[Array, " torques"]) -> LoopForces:
     """Force (N) and torque (N m) that each connected virtual link carries for the joint torques
     tau: on `real` from `parent`, at the joint, in world axes, and whether the motion alone decides

@@ -10,7 +10,7 @@ from svkc.loops.constraint import loop_kinematics
 from svkc.loops.coordinates import coordinates
 from svkc.loops.pivoting import count_rank, select, weakest
 from svkc.model.chain import Chain, State, active_dofs
-from svkc.model.checked_jit import verb
+from svkc.model.checked_jit import checked_jit
 
 
 class Mobility(eqx.Module):
@@ -47,7 +47,7 @@ class Mobility(eqx.Module):
         return "\n".join(lines)
 
 
-@verb(eager=True)
+@checked_jit(eager=True)
 def mobility(chain: Chain, state: State) -> Mobility:
     """Freedoms of the structure that the state is under, with the rank its phase decided on."""
     active = active_dofs(chain, state.structure)

@@ -11,9 +11,9 @@ import numpy as np
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
-from svkc._jax.batched_lapack import factor_positive, solve_triangle
+from svkc._jax.batched_lapack import batched_solve_triangular, cholesky_solver
 from svkc._jax.control_flow import unvmap_any
-from svkc._jax.primitive import operation
+from svkc._jax.primitive import custom_primitive
 from svkc.model.chain import Structure
 
 
@@ -145,7 +145,7 @@ def _following_jvp(primals, tangents):
 
 
 # Q and size of J with the pivots P, as they were found
-_following = operation("following", lambda J, Q, P, size: (Q, size), _following_jvp)
+_following = custom_primitive("following", lambda J, Q, P, size: (Q, size), _following_jvp)
 
 
 def count_rank(size: Float[Array, " steps"]) -> Int[Array, ""]:
@@ -187,15 +187,15 @@ def solve_frozen(
     return jax.lax.custom_linear_solve(
         lambda y: (B.T if trans else B) @ y,
         x,
-        solve=lambda _, y: solve_triangle(triangle, y, trans),
-        transpose_solve=lambda _, y: solve_triangle(triangle, y, not trans),
+        solve=lambda _, y: batched_solve_triangular(triangle, y, trans),
+        transpose_solve=lambda _, y: batched_solve_triangular(triangle, y, not trans),
     )
 
 
 def solve_positive(A: Float[Array, "n n"], x: Float[Array, "n *m"]) -> Float[Array, "n *m"]:
     """A^-1 x by Cholesky for a symmetric positive A; the derivative is one more solve with the same
     factor."""
-    inverse = factor_positive(jax.lax.stop_gradient(A))
+    inverse = cholesky_solver(jax.lax.stop_gradient(A))
     return jax.lax.custom_linear_solve(
         lambda y: A @ y, x, solve=lambda _, y: inverse(y), symmetric=True
     )

@@ -4,13 +4,13 @@ import dataclasses
 
 import numpy as np
 
-from svkc.mjcf.unsupported import plain_motors
+from svkc.mjcf.unsupported import is_torque_motor
 from svkc.model.topology import BALL, FIXED, FREE, HINGE, Q_SIZE, SLIDE, V_SIZE, Topology
 
 # rad/s: a joint outside its range is an oscillator of this frequency, critically damped, at its
 # load-pose inertia
 _LIMIT_RATE = 50.0
-KINDS = {0: FREE, 1: BALL, 2: SLIDE, 3: HINGE}  # mjtJoint
+JOINT_KINDS = {0: FREE, 1: BALL, 2: SLIDE, 3: HINGE}  # mjtJoint
 
 
 def name_of(model, kind: str, index: int) -> str:
@@ -21,7 +21,7 @@ def name_of(model, kind: str, index: int) -> str:
     return name or (f"{kind}_{index}" if index or kind != "body" else "world")
 
 
-def matrix(quat) -> np.ndarray:
+def rotation_matrix(quat) -> np.ndarray:
     """The rotation matrix [3 3] of a quaternion, in numpy."""
     import mujoco
 
@@ -31,7 +31,7 @@ def matrix(quat) -> np.ndarray:
 
 
 @dataclasses.dataclass(frozen=True)
-class Joint:
+class TreeJoint:
     """A joint of the tree and where its coordinates stand; `joint` is -1 for the free joint that a
     body gets whose own joints may be cut."""
 
@@ -43,7 +43,7 @@ class Joint:
     v: int
 
 
-def joints_of(model, cut_bodies) -> list[Joint]:
+def tree_joints(model, cut_bodies) -> list[TreeJoint]:
     """The joints of the tree in the model's order; a body in `cut_bodies` (body -> name) hangs on
     the base by a free joint (paper, Fig. 15)."""
     out, q, v, seen = [], 0, 0, set()
@@ -51,19 +51,19 @@ def joints_of(model, cut_bodies) -> list[Joint]:
         body = int(model.jnt_bodyid[j])
         if body in seen:
             continue
-        kind, name, joint = KINDS[int(model.jnt_type[j])], name_of(model, "joint", j), j
+        kind, name, joint = JOINT_KINDS[int(model.jnt_type[j])], name_of(model, "joint", j), j
         if body in cut_bodies:
             seen.add(body)
             kind, name, joint = FREE, f"{cut_bodies[body]}_free", -1
-        out.append(Joint(name=name, kind=kind, body=body, joint=joint, q=q, v=v))
+        out.append(TreeJoint(name=name, kind=kind, body=body, joint=joint, q=q, v=v))
         q, v = q + Q_SIZE[kind], v + V_SIZE[kind]
     return out
 
 
-def rows_of(model, cut_bodies) -> tuple[list[tuple[int, int]], Topology]:
+def tree_rows(model, cut_bodies) -> tuple[list[tuple[int, int]], Topology]:
     """One row a joint, sorted by level: [(body, joint or -1)] and the topology without virtual
     links."""
-    joints = joints_of(model, cut_bodies)
+    joints = tree_joints(model, cut_bodies)
     order, depth, last, own = [(0, -1, -1)], [0], {0: 0}, {0: None}
     for body in range(1, model.nbody):
         parent = 0 if body in cut_bodies else last[int(model.body_parentid[body])]
@@ -94,7 +94,7 @@ def rows_of(model, cut_bodies) -> tuple[list[tuple[int, int]], Topology]:
     return [order[i][:2] for i in rank], topology
 
 
-def bodies_of(model, topology, rows) -> dict[str, np.ndarray]:
+def body_arrays(model, topology, rows) -> dict[str, np.ndarray]:
     """Of each row: frame in the parent, joint axis and anchor, mass, centre of mass, inertia."""
     n = len(rows)
     out = {
@@ -122,11 +122,11 @@ def bodies_of(model, topology, rows) -> dict[str, np.ndarray]:
 
 def _inertia(model, body):
     """About the centre of mass, in body axes."""
-    R = matrix(model.body_iquat[body])
+    R = rotation_matrix(model.body_iquat[body])
     return R @ np.diag(model.body_inertia[body]) @ R.T
 
 
-def joint_forces_of(model, ignored, topology) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def springs_and_limits(model, ignored, topology) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Stiffness [dofs], range [2 dofs] (infinite where there is none) and its spring and damper [2
     dofs]."""
     n, place = topology.dofs, np.array(topology.model_v, int)
@@ -134,7 +134,7 @@ def joint_forces_of(model, ignored, topology) -> tuple[np.ndarray, np.ndarray, n
     for j in range(model.njnt):
         own = slice(
             int(model.jnt_dofadr[j]),
-            int(model.jnt_dofadr[j]) + V_SIZE[KINDS[int(model.jnt_type[j])]],
+            int(model.jnt_dofadr[j]) + V_SIZE[JOINT_KINDS[int(model.jnt_type[j])]],
         )
         dofs = place[own]
         if "spring" not in ignored:
@@ -150,7 +150,7 @@ def joint_forces_of(model, ignored, topology) -> tuple[np.ndarray, np.ndarray, n
     return stiffness, limit, spring
 
 
-def armature_of(model, ignored, without: tuple[str, ...]) -> np.ndarray:
+def joint_armature(model, ignored, without: tuple[str, ...]) -> np.ndarray:
     """The model's armature [nv], zero for joints in `without`; ValueError: no such joint."""
     names = [name_of(model, "joint", j) for j in range(model.njnt)]
     armature = np.zeros(model.nv) if "armature" in ignored else np.array(model.dof_armature)
@@ -162,16 +162,16 @@ def armature_of(model, ignored, without: tuple[str, ...]) -> np.ndarray:
     return armature
 
 
-def by_dof(topology, values) -> np.ndarray:
+def scatter_to_dofs(topology, values) -> np.ndarray:
     """[dofs] from the model's own [nv]: zero for virtual joints that are none of its."""
     out = np.zeros(topology.dofs)
     out[np.array(topology.model_v, int)] = np.ravel(values)
     return out
 
 
-def motors_of(model, ignored, topology):
+def actuator_arrays(model, ignored, topology):
     """Gear matrix and ranges of the actuators that are plain torques on joints."""
-    count = 0 if {"actuator", "all"} & ignored and not plain_motors(model).all() else model.nu
+    count = 0 if {"actuator", "all"} & ignored and not is_torque_motor(model).all() else model.nu
     place = np.array(topology.model_v, int)
     gear, control, force = (
         np.zeros((count, topology.dofs)),
@@ -180,7 +180,7 @@ def motors_of(model, ignored, topology):
     )
     for i in range(count):
         joint = int(model.actuator_trnid[i, 0])
-        size, start = V_SIZE[KINDS[int(model.jnt_type[joint])]], int(model.jnt_dofadr[joint])
+        size, start = V_SIZE[JOINT_KINDS[int(model.jnt_type[joint])]], int(model.jnt_dofadr[joint])
         gear[i, place[start : start + size]] = (
             model.actuator_gear[i, :size] * model.actuator_gainprm[i, 0]
         )

@@ -4,20 +4,20 @@ import os
 
 import numpy as np
 
-from svkc.mjcf.bodies import matrix, name_of
+from svkc.mjcf.bodies import name_of, rotation_matrix
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import check_chain, check_state
 from svkc.model.virtual_link import JOINTS
 
 
-def _equalities(chain: Chain) -> list[tuple[int, int]]:
+def _links_with_equality(chain: Chain) -> list[tuple[int, int]]:
     """(virtual link, MuJoCo's <equality>) of each link that was one."""
     model, names = chain.model.model, {name: i for i, name in enumerate(chain.link_names)}
     found = [(name_of(model, "equality", i), i) for i in range(model.neq)]
     return [(names[name], i) for name, i in found if name in names]
 
 
-def text_of(spec) -> str:
+def mjcf_text(spec) -> str:
     """MJCF of a mujoco.MjSpec as it was written, to the last digit; makes the directories of its
     files absolute."""
     spec.compiler.savecompiled = spec.compiler.savecanonical = False
@@ -45,12 +45,12 @@ def to_mjcf(chain: Chain) -> str:
         raise ValueError(
             f"to_mjcf: MuJoCo cannot read what it writes of this MjSpec: {error}"
         ) from error
-    own, top, notes = dict(_equalities(chain)), chain.topology, []
+    own, top, notes = dict(_links_with_equality(chain)), chain.topology, []
     for link, name in enumerate(chain.link_names):
         if link in own:
             spec.equalities[own[link]].active = bool(chain.structure.connected[link])
         elif not top.link_spare[link] and not (top.link_child and top.link_child[link] >= 0):
-            notes += _as_equality(chain, spec, link, name)
+            notes += _add_equality(chain, spec, link, name)
     slots = [name for name, spare in zip(chain.link_names, top.link_spare, strict=True) if spare]
     cuttable = [name for name, _, _ in top.cut_joints]
     notes += (
@@ -67,10 +67,10 @@ def to_mjcf(chain: Chain) -> str:
     spec.comment = "\n".join(
         filter(None, [spec.comment, *(note.replace("--", "- -") for note in notes)])
     )
-    return text_of(spec)
+    return mjcf_text(spec)
 
 
-def _as_equality(chain: Chain, spec, link: int, name: str) -> list[str]:
+def _add_equality(chain: Chain, spec, link: int, name: str) -> list[str]:
     """Adds a virtual link between two new sites; returns what has to be said of it."""
     import mujoco
 
@@ -86,7 +86,7 @@ def _as_equality(chain: Chain, spec, link: int, name: str) -> list[str]:
     )
     ends = ", ".join(repr(top.body_names[body]) for body in bodies)
     call = (
-        f"svkc.VirtualLink({name!r}, {ends}, {_joint_of(free)!r}, {given}, connected={active},"
+        f"svkc.VirtualLink({name!r}, {ends}, {_joint_argument(free)!r}, {given}, connected={active},"
         f" actuated={top.link_actuated[link]})"
     )
     turns = sum(free[:3])
@@ -95,7 +95,7 @@ def _as_equality(chain: Chain, spec, link: int, name: str) -> list[str]:
     kind = mujoco.mjtEq.mjEQ_CONNECT if turns else mujoco.mjtEq.mjEQ_WELD
     places = {name: np.zeros(3)}
     if turns == 1:
-        places[_unlike(f"{name}_axis", chain.link_names)] = float(chain.length) * np.array(
+        places[_unique_name(f"{name}_axis", chain.link_names)] = float(chain.length) * np.array(
             free[:3], float
         )
     for label, place in places.items():
@@ -103,9 +103,12 @@ def _as_equality(chain: Chain, spec, link: int, name: str) -> list[str]:
         for body, side, pos, quat in zip(
             bodies, ("parent", "real"), frames[::2], frames[1::2], strict=True
         ):
-            sites.append(_unlike(f"{label}_{side}", [site.name for site in spec.sites]))
+            sites.append(_unique_name(f"{label}_{side}", [site.name for site in spec.sites]))
             spec.bodies[body].add_site(
-                name=sites[-1], pos=np.array(pos) + matrix(quat) @ place, quat=quat, group=3
+                name=sites[-1],
+                pos=np.array(pos) + rotation_matrix(quat) @ place,
+                quat=quat,
+                group=3,
             )
         spec.add_equality(
             name=label,
@@ -122,19 +125,19 @@ def _as_equality(chain: Chain, spec, link: int, name: str) -> list[str]:
     )
 
 
-def _unlike(name: str, taken) -> str:
+def _unique_name(name: str, taken) -> str:
     """The name, longer where another has it."""
     while name in taken:
         name += "_"
     return name
 
 
-def _joint_of(freedoms: tuple[bool, ...]):
+def _joint_argument(freedoms: tuple[bool, ...]):
     """The joint as it is declared."""
     return next((joint for joint, those in JOINTS.items() if those == freedoms), freedoms)
 
 
-def _checked(chain: Chain, data) -> None:
+def _check_sizes(chain: Chain, data) -> None:
     nq, nv = len(chain.topology.model_q), len(chain.topology.model_v)
     sizes = [np.asarray(getattr(data, name, None)).shape for name in ("qpos", "qvel")]
     if sizes != [(nq,), (nv,)]:
@@ -153,10 +156,10 @@ def to_mujoco(chain: Chain, state: State, data) -> None:
     model's.
     """
     check_state(chain, state)
-    _checked(chain, data)
+    _check_sizes(chain, data)
     data.qpos[:] = np.asarray(state.q)[np.array(chain.topology.model_q, int)]
     data.qvel[:] = np.asarray(state.v)[np.array(chain.topology.model_v, int)]
-    for link, equality in _equalities(chain):
+    for link, equality in _links_with_equality(chain):
         data.eq_active[equality] = bool(state.structure.connected[link])
 
 
@@ -165,8 +168,8 @@ def from_mujoco(chain: Chain, data) -> State:
     velocities made consistent, as by `chain.state`; links that were <equality> hold where it says
     so, others as in the chain. ValueError: the data is another model's, a loop cannot be closed."""
     check_chain(chain)
-    _checked(chain, data)
+    _check_sizes(chain, data)
     connected = np.array(chain.structure.connected)
-    for link, equality in _equalities(chain):
+    for link, equality in _links_with_equality(chain):
         connected[link] = bool(data.eq_active[equality])
     return chain.state(np.array(data.qpos), np.array(data.qvel), connected)

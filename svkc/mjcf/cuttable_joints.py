@@ -5,16 +5,16 @@ import dataclasses
 
 import numpy as np
 
-from svkc.mjcf.bodies import KINDS, matrix, name_of
+from svkc.mjcf.bodies import JOINT_KINDS, name_of, rotation_matrix
 from svkc.model.topology import BALL, FREE, HINGE, SLIDE, V_SIZE, Topology
 from svkc.model.virtual_link import VirtualLink
 
 # place of the coordinates of each kind among the six freedoms of a virtual joint
-_FREEDOMS = {"hinge": (2,), "slide": (5,), "ball": (0, 1, 2), "universal": (0, 1)}
+_FREEDOM_INDICES = {"hinge": (2,), "slide": (5,), "ball": (0, 1, 2), "universal": (0, 1)}
 
 
 @dataclasses.dataclass(frozen=True)
-class Cut:
+class CuttableJoint:
     """One cuttable joint: the virtual link that takes its place, the body it carries, and the
     model's joints in it."""
 
@@ -24,33 +24,33 @@ class Cut:
 
     @property
     def freedoms(self) -> tuple[int, ...]:
-        return _FREEDOMS[self.link.joint]
+        return _FREEDOM_INDICES[self.link.joint]
 
 
-def cuts_of(model, cuttable) -> list[Cut]:
+def cuttable_joints(model, cuttable) -> list[CuttableJoint]:
     """The cuts asked for by joint names; ValueError: unknown names, joints that no virtual joint is
     like."""
     names = [name_of(model, "joint", j) for j in range(model.njnt)]
-    cuts: dict[int, Cut] = {}
+    cuts: dict[int, CuttableJoint] = {}
     for name in cuttable:
         if name not in names:
             raise ValueError(f"cuttable: no joint {name!r}; joints: {', '.join(names) or 'none'}")
         body = int(model.jnt_bodyid[names.index(name)])
-        cuts.setdefault(body, _cut(model, name, body))
+        cuts.setdefault(body, _cuttable_joint(model, name, body))
     return list(cuts.values())
 
 
-def _cut(model, name: str, body: int) -> Cut:
+def _cuttable_joint(model, name: str, body: int) -> CuttableJoint:
     joints = tuple(
         range(
             int(model.body_jntadr[body]),
             int(model.body_jntadr[body]) + int(model.body_jntnum[body]),
         )
     )
-    kinds = [KINDS[int(model.jnt_type[j])] for j in joints]
+    kinds = [JOINT_KINDS[int(model.jnt_type[j])] for j in joints]
     frame, axis = np.eye(3), model.jnt_axis[joints[0]]
     ref = [float(model.qpos0[model.jnt_qposadr[j]]) for j in joints]
-    pos, turned = np.array(model.body_pos[body]), matrix(model.body_quat[body])
+    pos, turned = np.array(model.body_pos[body]), rotation_matrix(model.body_quat[body])
     anchor = np.array(model.jnt_pos[joints[0]])
     if (
         kinds == [HINGE, HINGE]
@@ -73,18 +73,18 @@ def _cut(model, name: str, body: int) -> Cut:
     base = turned @ frame
     # the coordinate reads the joint's own: `ref` in the load pose
     if joint == "hinge":
-        base = base @ _about(axis, -ref[0])
+        base = base @ _rotation_about(axis, -ref[0])
     place = pos + turned @ anchor - (turned @ axis * ref[0] if joint == "slide" else 0)
     link = VirtualLink(
         name, name_of(model, "body", int(model.body_parentid[body])), name_of(model, "body", body),
-        joint, pos=tuple(place), quat=tuple(_quat(base)), real_pos=tuple(anchor),
-        real_quat=tuple(_quat(frame)),
+        joint, pos=tuple(place), quat=tuple(_quaternion(base)), real_pos=tuple(anchor),
+        real_quat=tuple(_quaternion(frame)),
         axis=tuple((0.0, 0.0, 1.0) if joint in ("ball", "universal") else axis), connected=True,
     )  # fmt: skip
-    return Cut(link, body, joints)
+    return CuttableJoint(link, body, joints)
 
 
-def check_rotors(model, cuts: list[Cut], armature: np.ndarray) -> None:
+def check_armature(model, cuts: list[CuttableJoint], armature: np.ndarray) -> None:
     """ValueError where a joint that may be cut has armature [nv], as virtual joints have no
     inertia."""
     turning = set(np.asarray(model.dof_jntid)[armature != 0])
@@ -96,7 +96,9 @@ def check_rotors(model, cuts: list[Cut], armature: np.ndarray) -> None:
         )
 
 
-def placed_in(model, topology: Topology, cuts: list[Cut], first: int) -> Topology:
+def with_cuttable_joints(
+    model, topology: Topology, cuts: list[CuttableJoint], first: int
+) -> Topology:
     """The topology with the cuts' tables: their links start at slot `first`; where the model's own
     qpos and qvel are to be found."""
     slots = {cut.body: (first + i, cut) for i, cut in enumerate(cuts)}
@@ -111,7 +113,7 @@ def placed_in(model, topology: Topology, cuts: list[Cut], first: int) -> Topolog
     )
     table, seen = topology.links, set()
     for j in range(model.njnt):
-        body, kind = int(model.jnt_bodyid[j]), KINDS[int(model.jnt_type[j])]
+        body, kind = int(model.jnt_bodyid[j]), JOINT_KINDS[int(model.jnt_type[j])]
         if body in slots:
             slot, cut = slots[body]
             if body not in seen:
@@ -140,7 +142,7 @@ def placed_in(model, topology: Topology, cuts: list[Cut], first: int) -> Topolog
     )
 
 
-def _quat(R) -> np.ndarray:
+def _quaternion(R) -> np.ndarray:
     import mujoco
 
     quat = np.zeros(4)
@@ -148,9 +150,9 @@ def _quat(R) -> np.ndarray:
     return quat / np.linalg.norm(quat)
 
 
-def _about(axis, angle) -> np.ndarray:
+def _rotation_about(axis, angle) -> np.ndarray:
     import mujoco
 
     quat = np.zeros(4)
     mujoco.mju_axisAngle2Quat(quat, np.asarray(axis, float), angle)
-    return matrix(quat)
+    return rotation_matrix(quat)

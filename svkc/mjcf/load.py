@@ -11,21 +11,26 @@ import jax
 import numpy as np
 
 from svkc.mjcf.bodies import (
-    armature_of,
-    bodies_of,
-    by_dof,
-    joint_forces_of,
-    motors_of,
+    actuator_arrays,
+    body_arrays,
+    joint_armature,
     name_of,
-    rows_of,
+    scatter_to_dofs,
+    springs_and_limits,
+    tree_rows,
 )
-from svkc.mjcf.convert import text_of
-from svkc.mjcf.cuttable_joints import Cut, check_rotors, cuts_of, placed_in
-from svkc.mjcf.unsupported import what_is_left_out
-from svkc.mjcf.virtual_links import floats, links_of, structure_of
+from svkc.mjcf.convert import mjcf_text
+from svkc.mjcf.cuttable_joints import (
+    CuttableJoint,
+    check_armature,
+    cuttable_joints,
+    with_cuttable_joints,
+)
+from svkc.mjcf.unsupported import left_out_elements
+from svkc.mjcf.virtual_links import declared_links, float_array, load_structure
 from svkc.model.chain import Chain
 from svkc.model.topology import Topology
-from svkc.model.validation import texts, whole
+from svkc.model.validation import integer, names
 from svkc.model.virtual_link import VirtualLink, joint_freedoms
 
 
@@ -61,19 +66,19 @@ def load(source, *, virtual_links=(), cuttable=(), spare=0, ignore=(), ignore_ar
     ValueError: the source does not parse, elements not supported, unknown names.
     """
     declared = tuple(virtual_links) if np.iterable(virtual_links) else (virtual_links,)
-    model, text = _compiled(source)
-    cuttable = texts("cuttable", cuttable)
-    cuts = cuts_of(model, cuttable)
-    ignore, spare = texts("ignore", ignore), whole("spare", spare, 0, 1000)
-    left_out = what_is_left_out(model, ignore)
-    ignore_armature = texts("ignore_armature", ignore_armature)
-    armature = armature_of(model, ignore, ignore_armature)
-    check_rotors(model, cuts, armature)
-    rows, topology = _tree_of(model, cuts)
-    links = links_of(model, declared, [cut.link for cut in cuts], spare)
-    topology = _with_links(topology, links, spare)
-    topology = placed_in(model, topology, cuts, first=len(links) - spare - len(cuts))
-    structure = structure_of(model, topology, links)
+    model, text = _compile(source)
+    cuttable = names("cuttable", cuttable)
+    cuts = cuttable_joints(model, cuttable)
+    ignore, spare = names("ignore", ignore), integer("spare", spare, 0, 1000)
+    left_out = left_out_elements(model, ignore)
+    ignore_armature = names("ignore_armature", ignore_armature)
+    armature = joint_armature(model, ignore, ignore_armature)
+    check_armature(model, cuts, armature)
+    rows, topology = _tree_without(model, cuts)
+    links = declared_links(model, declared, [cut.link for cut in cuts], spare)
+    topology = _with_virtual_links(topology, links, spare)
+    topology = with_cuttable_joints(model, topology, cuts, first=len(links) - spare - len(cuts))
+    structure = load_structure(model, topology, links)
     arguments = {
         "virtual_links": declared,
         "cuttable": cuttable,
@@ -84,22 +89,22 @@ def load(source, *, virtual_links=(), cuttable=(), spare=0, ignore=(), ignore_ar
     # here and not where it is compared: a MjModel may be changed after the chain is made
     digest = _digest(model, text, arguments)
     kept = Source(model=model, text=text, arguments=arguments, digest=digest)
-    return _finite(_chain(kept, topology, rows, structure, armature, left_out))
+    return _check_finite(_build_chain(kept, topology, rows, structure, armature, left_out))
 
 
-def _tree_of(model, cuts: list[Cut]) -> tuple[list[tuple[int, int]], Topology]:
+def _tree_without(model, cuts: list[CuttableJoint]) -> tuple[list[tuple[int, int]], Topology]:
     """Return `rows_of` the tree that is left when the cuts are made; ValueError where nothing can
     move, or names of bodies or joints do not differ."""
-    rows, topology = rows_of(model, {cut.body: cut.link.name for cut in cuts})
+    rows, topology = tree_rows(model, {cut.body: cut.link.name for cut in cuts})
     if not topology.joint_names:
         raise ValueError("source: the model has no joints, so that nothing in it can move")
-    _told_apart("bodies", topology.body_names)
+    _check_unique("bodies", topology.body_names)
     cut_joints = [name_of(model, "joint", j) for cut in cuts for j in cut.joints]
-    _told_apart("joints", [*topology.joint_names, *cut_joints])
+    _check_unique("joints", [*topology.joint_names, *cut_joints])
     return rows, topology
 
 
-def _with_links(topology: Topology, links: list[VirtualLink], spare: int) -> Topology:
+def _with_virtual_links(topology: Topology, links: list[VirtualLink], spare: int) -> Topology:
     """Return the topology with these virtual links, the last of them spare."""
     return dataclasses.replace(
         topology,
@@ -120,7 +125,7 @@ def _digest(model, text: str | None, arguments: dict[str, Any]) -> str:
 
     image = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, image)
-    links = tuple(map(_written_out, arguments["virtual_links"]))
+    links = tuple(map(_canonical_link, arguments["virtual_links"]))
     sets = (sorted(set(arguments[name])) for name in ("ignore", "ignore_armature"))
     rest = arguments["cuttable"], arguments["spare"], *sets
     digest = hashlib.sha256(image)
@@ -128,7 +133,7 @@ def _digest(model, text: str | None, arguments: dict[str, Any]) -> str:
     return digest.hexdigest()
 
 
-def _written_out(link: VirtualLink) -> tuple:
+def _canonical_link(link: VirtualLink) -> tuple:
     """Return the fields of a virtual link as plain numbers, the joint by its freedoms."""
     places = (link.pos, link.quat, link.real_pos, link.real_quat, link.axis)
     numbers = (None if x is None else np.asarray(x, float).tolist() for x in places)
@@ -136,7 +141,7 @@ def _written_out(link: VirtualLink) -> tuple:
     return link.name, link.parent, link.real, joint_freedoms(link.joint), *numbers, *flags
 
 
-def _told_apart(what: str, names) -> None:
+def _check_unique(what: str, names) -> None:
     """ValueError where a name that svkc gives to what has none is one that the model uses."""
     if len(set(names)) < len(names):
         raise ValueError(
@@ -145,7 +150,7 @@ def _told_apart(what: str, names) -> None:
         )
 
 
-def _finite(chain: Chain) -> Chain:
+def _check_finite(chain: Chain) -> Chain:
     """The chain; ValueError for numbers that are not finite in the precision it is kept in."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(chain):
         name, leaf = jax.tree_util.keystr(path), np.asarray(leaf)
@@ -159,7 +164,7 @@ def _finite(chain: Chain) -> Chain:
     return chain
 
 
-def _compiled(source) -> tuple[Any, str | None]:
+def _compile(source) -> tuple[Any, str | None]:
     """Return the mujoco.MjModel of any source and its text, None for a MjModel; ValueError with
     MuJoCo's own words where it does not parse."""
     import mujoco
@@ -175,15 +180,15 @@ def _compiled(source) -> tuple[Any, str | None]:
     if "<" not in text and not os.path.isfile(text):
         raise ValueError(f"source: no such file: {text!r}")
     try:
-        spec = source.copy() if isinstance(source, mujoco.MjSpec) else _read(text)
+        spec = source.copy() if isinstance(source, mujoco.MjSpec) else _read_spec(text)
         model = spec.compile()
         with warnings.catch_warnings(action="ignore"):
-            return model, text_of(spec)
+            return model, mjcf_text(spec)
     except (ValueError, OSError, mujoco.FatalError) as error:
         raise ValueError(f"source: the model cannot be read: {error}") from error
 
 
-def _read(text: str):
+def _read_spec(text: str):
     """MJCF or URDF, by text or path. URDF keeps the links that fixed joints hold, whose names are
     wanted for grips; ROS's package:// is looked up."""
     import mujoco
@@ -193,11 +198,13 @@ def _read(text: str):
     if "<robot" in (text if inline else pathlib.Path(text).read_text(errors="replace")):
         spec.compiler.fusestatic = False
         for mesh in spec.meshes:
-            mesh.file = _found(mesh.file, pathlib.Path("." if inline else text).resolve().parent)
+            mesh.file = _resolve_package_uri(
+                mesh.file, pathlib.Path("." if inline else text).resolve().parent
+            )
     return spec
 
 
-def _found(file: str, folder: pathlib.Path) -> str:
+def _resolve_package_uri(file: str, folder: pathlib.Path) -> str:
     """A file of package://NAME/...: in a folder NAME above, or beside what stands above, or else by
     its last name in `folder`; others as they are."""
     if not file.startswith("package://"):
@@ -236,7 +243,7 @@ def _gravity(model) -> np.ndarray:
     return np.zeros(3) if off else model.opt.gravity
 
 
-def _length(bodies: dict[str, np.ndarray], topology: Topology) -> float:
+def _characteristic_length(bodies: dict[str, np.ndarray], topology: Topology) -> float:
     """Return the root mean square offset (m) of joints and centres of mass, 1 where all are
     zero."""
     below_roots = bodies["pos"][np.array(topology.parent) > 0]
@@ -245,43 +252,47 @@ def _length(bodies: dict[str, np.ndarray], topology: Topology) -> float:
     return np.sqrt(np.mean(offsets**2)) if len(offsets) else 1.0
 
 
-def _passive(model, ignored: set[str], topology: Topology, q_load) -> dict[str, Any]:
+def _passive_forces(model, ignored: set[str], topology: Topology, q_load) -> dict[str, Any]:
     """Return the chain's fields on dampers, springs and ranges; None for those that act on no
     joint."""
-    stiffness, limit, spring = joint_forces_of(model, ignored, topology)
-    damping = by_dof(topology, 0 * model.dof_damping if "damping" in ignored else model.dof_damping)
+    stiffness, limit, spring = springs_and_limits(model, ignored, topology)
+    damping = scatter_to_dofs(
+        topology, 0 * model.dof_damping if "damping" in ignored else model.dof_damping
+    )
     q_spring = np.array(q_load)
     q_spring[np.array(topology.model_q, int)] = model.qpos_spring
     sprung, limited = stiffness.any(), np.isfinite(limit).any()
     return {
-        "damping": floats(damping) if damping.any() else None,
-        "stiffness": floats(stiffness) if sprung else None,
-        "q_spring": floats(q_spring) if sprung else None,
-        "limit": floats(limit) if limited else None,
-        "limit_spring": floats(spring) if limited else None,
+        "damping": float_array(damping) if damping.any() else None,
+        "stiffness": float_array(stiffness) if sprung else None,
+        "q_spring": float_array(q_spring) if sprung else None,
+        "limit": float_array(limit) if limited else None,
+        "limit_spring": float_array(spring) if limited else None,
     }
 
 
-def _chain(source: Source, topology, rows, structure, armature, left_out) -> Chain:
+def _build_chain(source: Source, topology, rows, structure, armature, left_out) -> Chain:
     """Return the chain with the numbers of the model."""
     model, ignored = source.model, set(source.arguments["ignore"])
-    bodies = bodies_of(model, topology, rows)
-    gear, control, force = motors_of(model, ignored, topology)
+    bodies = body_arrays(model, topology, rows)
+    gear, control, force = actuator_arrays(model, ignored, topology)
     q_load = _load_pose(model, topology)
     own = ("pos", "quat", "axis", "mass", "com", "inertia")
     return Chain(
         topology=topology,
-        **{name: floats(bodies[name]) for name in own},
-        gravity=floats(_gravity(model)),
-        q_load=floats(q_load),
-        length=floats(_length(bodies, topology)),
-        gear=floats(gear),
-        control_range=floats(control),
-        force_range=floats(force),
+        **{name: float_array(bodies[name]) for name in own},
+        gravity=float_array(_gravity(model)),
+        q_load=float_array(q_load),
+        length=float_array(_characteristic_length(bodies, topology)),
+        gear=float_array(gear),
+        control_range=float_array(control),
+        force_range=float_array(force),
         structure=structure,
-        anchor=floats(bodies["anchor"]) if bodies["anchor"].any() else None,
-        armature=floats(by_dof(topology, armature)[: topology.nv]) if armature.any() else None,
-        **_passive(model, ignored, topology, q_load),
+        anchor=float_array(bodies["anchor"]) if bodies["anchor"].any() else None,
+        armature=float_array(scatter_to_dofs(topology, armature)[: topology.nv])
+        if armature.any()
+        else None,
+        **_passive_forces(model, ignored, topology, q_load),
         model=source,
         left_out=left_out,
     )

@@ -3,7 +3,7 @@
 import numpy as np
 
 
-def plain_motors(model) -> np.ndarray:
+def is_torque_motor(model) -> np.ndarray:
     """[nu] Boolean: the actuator is a torque on a joint, gear times control."""
     import mujoco
 
@@ -22,28 +22,28 @@ def plain_motors(model) -> np.ndarray:
 
 
 # in the order in which they are reported
-KINDS = (
+UNSUPPORTED_KINDS = (
     "tendon actuator equality friction contact gravcomp fluid polynomial plastic actuatorforce"
     " actuatorgravcomp actuatordamping balllimit flex mocap plugin".split()
 )
 
 
-def _any(model, *names: str) -> bool:
+def _any_nonzero(model, *names: str) -> bool:
     """Return whether one of these arrays of the model, as far as MuJoCo has them, is not zero."""
     return any(np.any(getattr(model, name, 0)) for name in names)
 
 
-def _in_actuators(model) -> dict[str, tuple]:
+def _unsupported_in_actuators(model) -> dict[str, tuple]:
     """Look at tendons and actuators: kind -> (what was found, how to say it)."""
     import mujoco
 
     tendon = [
         n
         for n in ("stiffness", "damping", "limited", "frictionloss", "armature")
-        if _any(model, f"tendon_{n}")
+        if _any_nonzero(model, f"tendon_{n}")
     ]
     pulled = np.any(model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_TENDON))
-    complex_motors = np.sum(~plain_motors(model))
+    complex_motors = np.sum(~is_torque_motor(model))
     return {
         "tendon": (
             tendon or pulled,
@@ -54,35 +54,38 @@ def _in_actuators(model) -> dict[str, tuple]:
             f"{complex_motors} actuators that are not a torque on a joint (motor with gear)",
         ),
         "actuatordamping": (
-            _any(model, "actuator_damping", "actuator_armature"),
+            _any_nonzero(model, "actuator_damping", "actuator_armature"),
             "damping or armature of actuators",
         ),
     }
 
 
-def _in_joints(model) -> dict[str, tuple]:
+def _unsupported_in_joints(model) -> dict[str, tuple]:
     """Look at joints, as `_in_actuators` at actuators."""
     import mujoco
 
     ball = model.jnt_type == int(mujoco.mjtJoint.mjJNT_BALL)
     balls = np.sum(ball & (model.jnt_limited != 0))
     return {
-        "friction": (_any(model, "dof_frictionloss"), "joint friction loss"),
+        "friction": (_any_nonzero(model, "dof_frictionloss"), "joint friction loss"),
         "polynomial": (
-            _any(model, "jnt_stiffnesspoly", "dof_dampingpoly"),
+            _any_nonzero(model, "jnt_stiffnesspoly", "dof_dampingpoly"),
             "polynomial stiffness or damping of joints",
         ),
-        "plastic": (_any(model, "nplastic"), "plastic joint springs"),
+        "plastic": (_any_nonzero(model, "nplastic"), "plastic joint springs"),
         "actuatorforce": (
-            model.nu and _any(model, "jnt_actfrclimited"),
+            model.nu and _any_nonzero(model, "jnt_actfrclimited"),
             "joint limits on actuator force",
         ),
-        "actuatorgravcomp": (_any(model, "jnt_actgravcomp"), "gravity compensation by actuators"),
+        "actuatorgravcomp": (
+            _any_nonzero(model, "jnt_actgravcomp"),
+            "gravity compensation by actuators",
+        ),
         "balllimit": (balls, f"{balls} ball joints with a range"),
     }
 
 
-def _in_bodies(model) -> dict[str, tuple]:
+def _unsupported_in_bodies(model) -> dict[str, tuple]:
     """Look at bodies, what is between them and what is around them, as `_in_actuators` at
     actuators."""
     import mujoco
@@ -98,7 +101,7 @@ def _in_bodies(model) -> dict[str, tuple]:
             f"equality constraints: {', '.join(other)} (connect and weld are supported)",
         ),
         "contact": (model.npair, f"{model.npair} explicit contact pairs"),
-        "gravcomp": (_any(model, "body_gravcomp"), "gravity compensation"),
+        "gravcomp": (_any_nonzero(model, "body_gravcomp"), "gravity compensation"),
         "fluid": (
             density != 0 or viscosity != 0,
             f"fluid forces (density {density:g}, viscosity {viscosity:g})",
@@ -109,20 +112,24 @@ def _in_bodies(model) -> dict[str, tuple]:
     }
 
 
-def _findings(model) -> list[tuple[str, str]]:
+def _unsupported_elements(model) -> list[tuple[str, str]]:
     """(kind, what was found) for everything that would change the motion and is not simulated."""
-    seen = _in_actuators(model) | _in_joints(model) | _in_bodies(model)
-    return [(kind, seen[kind][1]) for kind in KINDS if seen[kind][0]]
+    seen = (
+        _unsupported_in_actuators(model)
+        | _unsupported_in_joints(model)
+        | _unsupported_in_bodies(model)
+    )
+    return [(kind, seen[kind][1]) for kind in UNSUPPORTED_KINDS if seen[kind][0]]
 
 
-def what_is_left_out(model, ignore) -> tuple[str, ...]:
+def left_out_elements(model, ignore) -> tuple[str, ...]:
     """What the chain will lack, by name; ValueError listing every element that is neither simulated
     nor ignored."""
-    known = {"all", "limit", "spring", "damping", "armature", "collision", *KINDS}
+    known = {"all", "limit", "spring", "damping", "armature", "collision", *UNSUPPORTED_KINDS}
     unknown = [name for name in ignore if name not in known]
     if unknown:
         raise ValueError(f"ignore: got {unknown}, expected some of {', '.join(sorted(known))}")
-    found = _findings(model)
+    found = _unsupported_elements(model)
     missing = [(kind, text) for kind, text in found if "all" not in ignore and kind not in ignore]
     if missing:
         lines = "".join(f"\n  {kind}: {text}" for kind, text in missing)

@@ -12,7 +12,7 @@ from svkc.model.topology import Topology
 from svkc.model.virtual_link import VirtualLink, joint_freedoms
 
 
-def equalities(model) -> list[VirtualLink]:
+def links_from_equalities(model) -> list[VirtualLink]:
     """<equality> connect and weld as virtual links: ball and weld, child of the first body, under
     their own names."""
     import mujoco
@@ -39,19 +39,19 @@ def equalities(model) -> list[VirtualLink]:
                 real=name_of(model, "body", ends[1]),
                 joint="weld" if weld else "ball",
                 pos=tuple(places[0][0]),
-                quat=_unit(places[0][1]),
+                quat=_normalize(places[0][1]),
                 real_pos=tuple(places[1][0]),
-                real_quat=None if places[1][1] is None or not weld else _unit(places[1][1]),
+                real_quat=None if places[1][1] is None or not weld else _normalize(places[1][1]),
                 connected=bool(model.eq_active0[i]),
             )
         )
     return links
 
 
-def links_of(model, declared, cuttable: list[VirtualLink], spare: int) -> list[VirtualLink]:
+def declared_links(model, declared, cuttable: list[VirtualLink], spare: int) -> list[VirtualLink]:
     """Return the virtual links in the order of their slots: <equality>, declared, cuttable joints,
     spare; ValueError for what is no link, and for names that do not differ."""
-    links = [*equalities(model), *declared]
+    links = [*links_from_equalities(model), *declared]
     for link in links:
         if not isinstance(link, VirtualLink):
             raise ValueError(f"virtual_links: expected svkc.VirtualLink objects, got {link!r}")
@@ -63,7 +63,7 @@ def links_of(model, declared, cuttable: list[VirtualLink], spare: int) -> list[V
     return links
 
 
-def _unit(quat) -> tuple[float, ...]:
+def _normalize(quat) -> tuple[float, ...]:
     return tuple(np.asarray(quat, float) / np.linalg.norm(quat))
 
 
@@ -85,7 +85,7 @@ def _rotate(quat, x) -> np.ndarray:
     return out
 
 
-def _on_bodies(model, link: VirtualLink, ids: dict[str, int]) -> VirtualLink:
+def _resolve_sites(model, link: VirtualLink, ids: dict[str, int]) -> VirtualLink:
     """The link from body to body: an end that names a site is the site's body, its placement is in
     the site's frame, at the site where none is given."""
     sites = {name_of(model, "site", i): i for i in range(model.nsite)}
@@ -103,7 +103,7 @@ def _on_bodies(model, link: VirtualLink, ids: dict[str, int]) -> VirtualLink:
         place = _rotate(frame, (0, 0, 0) if getattr(link, pos) is None else getattr(link, pos))
         changed = {side: body, pos: tuple(model.site_pos[site] + place)}
         if getattr(link, quat) is not None:
-            changed[quat] = _unit(_multiply(frame, getattr(link, quat)))
+            changed[quat] = _normalize(_multiply(frame, getattr(link, quat)))
         link = dataclasses.replace(link, **changed)
     return link
 
@@ -115,7 +115,7 @@ def _joint_frames(data, link: VirtualLink, parent: int, real: int) -> dict[str, 
 
     to_z = np.zeros(4)
     mujoco.mju_quatZ2Vec(to_z, np.asarray(link.axis, float) / np.linalg.norm(link.axis))
-    quat = _unit(_multiply(_unit(link.quat), to_z))
+    quat = _normalize(_multiply(_normalize(link.quat), to_z))
     back = data.xquat[real] * np.array([1, -1, -1, -1])
     world = data.xpos[parent] + _rotate(data.xquat[parent], link.pos)
     frames = {
@@ -124,26 +124,26 @@ def _joint_frames(data, link: VirtualLink, parent: int, real: int) -> dict[str, 
         "real_pos": _rotate(back, world - data.xpos[real])
         if link.real_pos is None
         else link.real_pos,
-        "real_quat": _unit(
+        "real_quat": _normalize(
             _multiply(back, _multiply(data.xquat[parent], quat))
             if link.real_quat is None
-            else _multiply(_unit(link.real_quat), to_z)
+            else _multiply(_normalize(link.real_quat), to_z)
         ),
     }
     return {name: np.asarray(value, float) for name, value in frames.items()}
 
 
-def structure_of(model, topology: Topology, links: list[VirtualLink]) -> Structure:
+def load_structure(model, topology: Topology, links: list[VirtualLink]) -> Structure:
     """Return the structure of the load pose, with the links where they are declared."""
     import mujoco
 
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     ids = {name: i for i, name in enumerate(topology.body_names)}
-    links = [_on_bodies(model, link, ids) for link in links]
+    links = [_resolve_sites(model, link, ids) for link in links]
     ends = [(ids[link.parent], ids[link.real]) for link in links]
     frames = [_joint_frames(data, link, *both) for link, both in zip(links, ends, strict=True)]
-    stacked = lambda name, size: floats(
+    stacked = lambda name, size: float_array(
         np.array([frame[name] for frame in frames]).reshape(len(links), size)
     )
     rows = lambda end: jnp.asarray(np.array([topology.body_row[e[end]] for e in ends], np.int32))
@@ -162,6 +162,6 @@ def structure_of(model, topology: Topology, links: list[VirtualLink]) -> Structu
     )
 
 
-def floats(x):
+def float_array(x):
     """The default float type's array: float64 where jax has it enabled, else float32."""
     return jnp.asarray(np.asarray(x, np.float64), dtype=jnp.result_type(float))

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc.model.topology import FREE, Topology
-from svkc.model.validation import numbers
+from svkc.model.validation import real_array
 
 
 class Structure(eqx.Module):
@@ -153,10 +153,10 @@ class Chain(eqx.Module):
                     np.array(top.kind)[top.dof_row] != FREE, np.zeros(top.dofs - top.nv, bool)
                 )
             )
-            driven = driven | self._own(np.array(top.link_child, int) >= 0)
-        return driven | self._own(np.array(top.link_actuated, bool))
+            driven = driven | self._link_dof_mask(np.array(top.link_child, int) >= 0)
+        return driven | self._link_dof_mask(np.array(top.link_actuated, bool))
 
-    def _own(self, links: np.ndarray) -> np.ndarray:
+    def _link_dof_mask(self, links: np.ndarray) -> np.ndarray:
         """[dofs] the own coordinates of some virtual links."""
         table, mask = self.topology.links.dof[links], np.zeros(self.dofs, bool)
         mask[table[table < self.dofs]] = True
@@ -165,7 +165,7 @@ class Chain(eqx.Module):
     def motors(self, u) -> Float[Array, " dofs"]:
         """Joint torques (N m, N) of the model's actuators for the controls u: gear times u, each
         clipped to its range."""
-        u = numbers("u", u, self.gear.dtype)
+        u = real_array("u", u, self.gear.dtype)
         if u.shape != self.gear.shape[:1]:
             raise ValueError(
                 f"u: got shape {u.shape}, the model has {self.gear.shape[0]} actuators"

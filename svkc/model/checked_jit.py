@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from svkc._jax.eager import eager_jit
 from svkc.model.chain import Chain, State, Structure
-from svkc.model.validation import numbers
+from svkc.model.validation import real_array
 
 
 def check_chain(chain) -> None:
@@ -38,7 +38,7 @@ def check_state(chain, state) -> None:
                 " svkc.rollout"
             )
     for value in (state.q, state.v):
-        dtype = numbers("state", value).dtype
+        dtype = real_array("state", value).dtype
         if dtype != chain.q_load.dtype:
             raise ValueError(
                 f"state.q is {dtype}, the chain is {chain.q_load.dtype}; load and state must be"
@@ -46,7 +46,7 @@ def check_state(chain, state) -> None:
             )
 
 
-def _looked_at(given: dict) -> dict:
+def _validated(given: dict) -> dict:
     """The arguments by name, arrays made of what is one; ValueError for what cannot be right."""
     chain = given["chain"]
     check_chain(chain)
@@ -54,15 +54,15 @@ def _looked_at(given: dict) -> dict:
         check_state(chain, given["state"])
     sizes = dict.fromkeys(("q", "q1", "q2"), chain.topology.nq_all) | {"dv": chain.dofs}
     return given | {
-        name: vector(chain, name, given[name], sizes.get(name))
+        name: float_vector(chain, name, given[name], sizes.get(name))
         for name in given.keys() - {"chain", "state"}
     }
 
 
-def vector(chain: Chain, name: str, value, size: int | None = None):
+def float_vector(chain: Chain, name: str, value, size: int | None = None):
     """An array of real numbers, of this size (None: of any), in the chain's float type where it is
     in none; ValueError for another."""
-    array = numbers(name, value)
+    array = real_array(name, value)
     if size is not None and array.shape != (size,):
         raise ValueError(f"{name}: got shape {array.shape}, expected ({size},); for many use vmap")
     return (
@@ -72,19 +72,19 @@ def vector(chain: Chain, name: str, value, size: int | None = None):
     )
 
 
-def verb(fn: Callable | None = None, *, eager: bool = False) -> Callable:
+def checked_jit(fn: Callable | None = None, *, eager: bool = False) -> Callable:
     """`jax.jit` for a function of a chain, a state and arrays; ValueError where one of them cannot
     be right.
 
     eager: called outside of every transformation it is compiled for compile time (`eager_jit`).
     """
     if fn is None:
-        return functools.partial(verb, eager=eager)
+        return functools.partial(checked_jit, eager=eager)
     signature = inspect.signature(fn)
 
     @functools.wraps(fn)
     def looked_at(*args, **options):
-        return fn(**_looked_at(signature.bind(*args, **options).arguments))
+        return fn(**_validated(signature.bind(*args, **options).arguments))
 
     compiled = eager_jit(looked_at) if eager else jax.jit(looked_at)
 
@@ -94,7 +94,7 @@ def verb(fn: Callable | None = None, *, eager: bool = False) -> Callable:
             return compiled(*args, **options)
         except (TypeError, OverflowError):
             # jax could not take an argument in: say which
-            _looked_at(signature.bind(*args, **options).arguments)
+            _validated(signature.bind(*args, **options).arguments)
             raise
 
     return call

@@ -5,7 +5,7 @@ import numpy as np
 
 from svkc.model.chain import Chain
 from svkc.model.topology import V_SIZE
-from svkc.model.validation import arrayed
+from svkc.model.validation import as_array
 
 
 def connection_mask(chain: Chain, connected) -> np.ndarray | jax.Array:
@@ -15,7 +15,7 @@ def connection_mask(chain: Chain, connected) -> np.ndarray | jax.Array:
     names = (connected,) if isinstance(connected, str) else connected
     if isinstance(names, (tuple, list, set, frozenset)) and all(isinstance(n, str) for n in names):
         return np.isin(chain.link_names, [chain.link_names[link_index(chain, n)] for n in names])
-    mask = arrayed(connected)
+    mask = as_array(connected)
     if mask.shape != (len(chain.link_names),) or mask.dtype != bool:
         raise ValueError(
             f"connected: expected names of virtual links or {len(chain.link_names)} Booleans, got"
@@ -33,14 +33,14 @@ def link_index(chain: Chain, name: str) -> int:
     return chain.link_names.index(name)
 
 
-def joint_slice(chain: Chain, name: str, sizes, start) -> slice:
+def joint_slice(chain: Chain, name: str, joint_sizes, joint_starts) -> slice:
     """Where a joint of the tree, or one that may be cut, stands in q (sizes=Q_SIZE) or v;
     ValueError naming those there are."""
     top = chain.topology
     for joint, link, freedom in top.cut_joints:
         if joint == name:
             ball = sum(top.link_freedoms[link][:3]) == 3
-            if sizes is V_SIZE:
+            if joint_sizes is V_SIZE:
                 first = top.links.dof[link, freedom]
                 return slice(int(first), int(first) + (3 if ball else 1))
             first = (
@@ -52,10 +52,10 @@ def joint_slice(chain: Chain, name: str, sizes, start) -> slice:
     if not isinstance(name, str) or name not in top.joint_names:
         raise ValueError(f"no joint {name!r}; joints: {', '.join(top.joint_names)}")
     row = top.joint_row[top.joint_names.index(name)]
-    return slice(start[row], start[row] + sizes[top.kind[row]])
+    return slice(joint_starts[row], joint_starts[row] + joint_sizes[top.kind[row]])
 
 
-def rows_of(chain: Chain, *bodies: str) -> list[int]:
+def body_rows(chain: Chain, *bodies: str) -> list[int]:
     """Rows of bodies by name; ValueError naming those there are."""
     for body in bodies:
         if not isinstance(body, str) or body not in chain.body_names:

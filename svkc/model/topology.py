@@ -74,14 +74,14 @@ class Topology:
         return row
 
     @functools.cached_property
-    def ancestor(self) -> np.ndarray:
+    def ancestor_mask(self) -> np.ndarray:
         """[rows, rows] Boolean: the column is the row itself or one of its ancestors."""
         table = np.eye(len(self.parent), dtype=bool)
         for i in range(1, len(table)):
             table[i] |= table[self.parent[i]]
         return table
 
-    def rows_of(self, *kinds: int) -> np.ndarray:
+    def rows_of_kind(self, *kinds: int) -> np.ndarray:
         """The rows whose joint is one of these kinds."""
         return np.flatnonzero(np.isin(self.kind, kinds))
 
@@ -101,11 +101,11 @@ class Topology:
         return self.links.dofs
 
     @functools.cached_property
-    def quaternions(self) -> tuple[np.ndarray, np.ndarray]:
+    def quaternion_starts(self) -> tuple[np.ndarray, np.ndarray]:
         """(first index in q, first index in v) of every rotation kept as a quaternion, virtual
         links' included."""
         offset_q, offset_v = (0, 0, 0, 0, 3), (0, 0, 0, 0, 3)
-        rows = self.rows_of(BALL, FREE)
+        rows = self.rows_of_kind(BALL, FREE)
         q = [self.q_start[i] + offset_q[self.kind[i]] for i in rows] + [
             int(i[0]) for i in self.links.quat if i[0] < self.nq_all
         ]
@@ -139,9 +139,9 @@ class Topology:
         return tuple(names)
 
     @functools.cached_property
-    def scalars(self) -> tuple[np.ndarray, np.ndarray]:
+    def scalar_coordinates(self) -> tuple[np.ndarray, np.ndarray]:
         """(index in q, index in v) of every coordinate whose rate is its velocity."""
-        quat_q, quat_v = self.quaternions
+        quat_q, quat_v = self.quaternion_starts
         q = np.setdiff1d(np.arange(self.nq_all), (quat_q[:, None] + np.arange(4)).ravel())
         v = np.setdiff1d(np.arange(self.dofs), (quat_v[:, None] + np.arange(3)).ravel())
         return q, v

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from svkc.model.validation import numbers, yes_or_no
+from svkc.model.validation import boolean, real_array
 
 # the freedoms of the named joints: rotations about x, y, z, then translations along x, y, z; the
 # axis of the joint is z
@@ -72,12 +72,12 @@ class VirtualLink:
                 )
         joint_freedoms(self.joint)
         for name in ("connected", "actuated"):
-            yes_or_no(f"virtual link {self.name!r}: {name}", getattr(self, name))
+            boolean(f"virtual link {self.name!r}: {name}", getattr(self, name))
         for name, size in (("pos", 3), ("quat", 4), ("real_pos", 3), ("real_quat", 4), ("axis", 3)):
             value = getattr(self, name)
             if value is None and name.startswith("real"):
                 continue
-            value = np.asarray(numbers(f"virtual link {self.name!r}: {name}", value), float)
+            value = np.asarray(real_array(f"virtual link {self.name!r}: {name}", value), float)
             if value.shape != (size,) or not np.isfinite(value).all():
                 raise ValueError(
                     f"virtual link {self.name!r}: {name} must be {size} finite numbers, got {value}"

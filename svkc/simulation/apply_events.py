@@ -11,10 +11,10 @@ from svkc.integration.integrators import Motion, finite
 from svkc.model.chain import Chain, State, Structure
 from svkc.simulation.phase import Run, Solved
 from svkc.simulation.records import RESULTS, Events
-from svkc.transitions.impact import Change
+from svkc.transitions.impact import StructureChange
 from svkc.transitions.plan import Plan
-from svkc.transitions.spare_links import emptied, grip
-from svkc.transitions.transition import change, connect_tolerance, release
+from svkc.transitions.spare_links import bind_grip, cleared
+from svkc.transitions.transition import CONNECT_TOLERANCE, change_structure, release_constraints
 
 
 def reevaluated(made: Plan) -> np.ndarray:
@@ -30,7 +30,7 @@ def apply_events(
     each of them."""
     happened, full, emptying = jnp.any(fired), jnp.zeros((), bool), None
     masks = _masks(chain, ended.structure, fired, made)
-    if made.binds:
+    if made.has_binds:
         structure, gripped, full, emptying = _bound(chain, ended.structure, fired, made)
         ended = State(ended.q, ended.v, structure)
         masks["connected"] = (masks["connected"] | gripped) & ~emptying
@@ -40,7 +40,7 @@ def apply_events(
         done = _change(chain, ended, masks, made)
         if emptying is None:
             return done
-        structure = emptied(done.state.structure, emptying)
+        structure = cleared(done.state.structure, emptying)
         return eqx.tree_at(lambda d: d.state.structure, done, structure)
 
     def same():
@@ -48,13 +48,15 @@ def apply_events(
 
     done = jax.lax.cond(unvmap_any(happened), changed, same)
     # what a change makes of numbers that are not is not taken
-    sound = finite(Motion(done.state.q, done.state.v)) & ~jnp.isnan(done.gap)
+    sound = finite(Motion(done.state.q, done.state.v)) & ~jnp.isnan(done.initial_gap)
     after = jax.tree.map(lambda new, old: jnp.where(happened & sound, new, old), done.state, ended)
-    mine = made.table(chain, "connect") | made.table_of_grips(chain)
+    mine = made.table(chain, "connect") | made.grip_mask(chain)
     events, overflow = _recorded(run.events, solved.t, fired, mine, done)
     stops = jnp.any(fired & np.array([a.stop for a in made.actions], bool))
     result = RESULTS.where(stops, RESULTS.stopped, solved.result)
-    result = RESULTS.where(happened & (done.gap > connect_tolerance), RESULTS.not_in_place, result)
+    result = RESULTS.where(
+        happened & (done.initial_gap > CONNECT_TOLERANCE), RESULTS.not_in_place, result
+    )
     result = RESULTS.where(sound, result, RESULTS.non_finite)
     result = RESULTS.where(full, RESULTS.no_slot, result)
     result = RESULTS.where(overflow, RESULTS.max_events, result)
@@ -67,16 +69,18 @@ def _masks(chain: Chain, structure: Structure, fired: Bool[Array, " events"], ma
     any_of = lambda what: jnp.any(fired[:, None] & made.table(chain, what), 0)
     return {
         "connected": (structure.connected | any_of("connect")) & ~any_of("cut"),
-        "locked": (structure.locked | any_of("lock")) & ~any_of("unlock") if made.locks else None,
-        "here": any_of("here") if made.table(chain, "here").any() or made.binds else None,
+        "locked": (structure.locked | any_of("lock")) & ~any_of("unlock")
+        if made.has_locks
+        else None,
+        "here": any_of("here") if made.table(chain, "here").any() or made.has_binds else None,
     }
 
 
-def _change(chain: Chain, ended: State, masks: dict, made: Plan) -> Change:
+def _change(chain: Chain, ended: State, masks: dict, made: Plan) -> StructureChange:
     """Change the structure: with an impact, where an event of the plan can make one."""
-    if made.joins(chain):
-        return change(chain, ended, masks["connected"], masks["locked"], masks["here"])
-    return release(chain, ended, masks["connected"], masks["locked"])
+    if made.needs_impact(chain):
+        return change_structure(chain, ended, masks["connected"], masks["locked"], masks["here"])
+    return release_constraints(chain, ended, masks["connected"], masks["locked"])
 
 
 def _recorded(
@@ -84,7 +88,7 @@ def _recorded(
     t,
     fired: Bool[Array, " events"],
     mine: Bool[np.ndarray, "events links"],
-    done: Change,
+    done: StructureChange,
 ) -> tuple[Events, Bool[Array, ""]]:
     """Return the records with a row for each event that fired, and whether there were too few rows.
 
@@ -110,13 +114,13 @@ def _recorded(
 def _bound(chain: Chain, structure: Structure, fired: Bool[Array, " events"], made: Plan):
     """The structure with the slots that the events of this instant bind, the slots to connect,
     whether one was lacking, and the slots to empty."""
-    emptying = jnp.any(fired[:, None] & made.unbound(chain, structure), 0)
+    emptying = jnp.any(fired[:, None] & made.slots_to_unbind(chain, structure), 0)
     gripped, full = jnp.zeros(len(chain.link_names), bool), jnp.zeros((), bool)
     for event, wishes in enumerate(made.grips):
         for wish in wishes:
             # slots given to others at this instant are no longer free
             taken = eqx.tree_at(lambda s: s.connected, structure, structure.connected | gripped)
-            bound, slot, lacking = grip(chain, taken, wish)
+            bound, slot, lacking = bind_grip(chain, taken, wish)
             bound = eqx.tree_at(lambda s: s.connected, bound, structure.connected)
             structure = jax.tree.map(
                 lambda new, old, e=event: jnp.where(fired[e], new, old), bound, structure

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from svkc._jax.pytrees import frozen
+from svkc._jax.pytrees import stop_gradient_tree
 from svkc.loops.constraint import ends, gap, largest, loop_jacobian, scales
 from svkc.loops.pivoting import rank_tolerance, select, weakest
 from svkc.model.chain import Chain, State, Structure, active_dofs
@@ -41,7 +41,7 @@ def certificate(
     rows = records.start.shape[0]
     first, last, saved_checks = _check_states(chain, records, saved)
     written = jnp.arange(rows, dtype=jnp.int32) < count
-    margin = frozen(jnp.minimum(first.margin, last.margin))
+    margin = stop_gradient_tree(jnp.minimum(first.margin, last.margin))
     lost = written & (margin < rank_tolerance(margin.dtype))
     lost_at = jnp.where(jnp.any(lost), jnp.argmax(lost).astype(jnp.int32), rows)
     phases = _phases(chain, records, count, (first, last), stages)
@@ -82,7 +82,7 @@ def _phases(
         lambda s: (_free(chain, s), jnp.sum(active_dofs(chain, s), dtype=jnp.int32))
     )(r.structure)
     # no derivative is promised of the certificate's worst values
-    margin, gap, gap_rate, drift = frozen(
+    margin, gap, gap_rate, drift = stop_gradient_tree(
         (
             jnp.minimum(first.margin, last.margin),
             jnp.maximum(first.gap, last.gap),
@@ -128,11 +128,13 @@ def _check_state(chain: Chain, state: State, at_end: Bool[Array, ""]) -> Checked
         energy, *momenta = energy_and_momentum(chain, state, kin)
         row, column = scales(chain)
         margin = (
-            weakest(select(frozen(row[:, None] * J * column[None]), state.structure.rank))
+            weakest(
+                select(stop_gradient_tree(row[:, None] * J * column[None]), state.structure.rank)
+            )
             if looped
             else jnp.ones((), dtype)
         )
-        return energy, *frozen(tuple(momenta)), margin
+        return energy, *stop_gradient_tree(tuple(momenta)), margin
 
     none = jnp.zeros((), dtype), jnp.zeros(3, dtype), jnp.zeros(3, dtype), jnp.ones((), dtype)
     energy, linear, angular, margin = jax.lax.cond(at_end, whole, lambda: none)

@@ -11,7 +11,7 @@ import numpy as np
 import optimistix
 from jaxtyping import Array, Float
 
-from svkc._jax.pytrees import concrete
+from svkc._jax.pytrees import is_concrete
 from svkc.integration.integrators import FixedSteps, SimplifiedNewton, motion_norm
 from svkc.integration.replay import Replay
 from svkc.integration.stabilization import AbstractStabilization, Projection
@@ -20,9 +20,9 @@ from svkc.loops.constrained_dynamics import AbstractDynamics, Dynamics, default_
 from svkc.loops.constraint import gap_tolerance
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import check_state
-from svkc.model.validation import finite, function, one, positive, whole
-from svkc.transitions.events import At, listed
-from svkc.transitions.plan import Plan, plan
+from svkc.model.validation import check_function, finite_array, integer, positive_scalar, scalar
+from svkc.transitions.events import At, as_events
+from svkc.transitions.plan import Plan, make_plan
 
 
 class Options(eqx.Module):
@@ -69,7 +69,7 @@ def tolerances(dtype, rtol=None, atol=None) -> tuple[Float[Array, ""], Float[Arr
     if atol is None:
         atol = (
             max(float(rtol) * 1e-2, 8 * eps)
-            if concrete(rtol)
+            if is_concrete(rtol)
             else jnp.maximum(rtol * 1e-2, 8 * eps)
         )
     return jnp.asarray(rtol, dtype), jnp.asarray(atol, dtype)
@@ -81,17 +81,17 @@ def checked(
 ) -> tuple[Options, Float[Array, " times"], Plan]:  # fmt: skip
     """The call's options, save times and plan of events; ValueError for what cannot be right."""
     _check_state(chain, state)
-    dtype, events = state.q.dtype, listed(events)
+    dtype, events = state.q.dtype, as_events(events)
     _check_times(t0, t1, ts, events)
     _check_steps(dt, rtol, atol, stepsize_controller)
-    function("control", control)
+    check_function("control", control)
     _check_kind("stepsize_controller", stepsize_controller, diffrax.AbstractStepSizeController)
     _check_kind("progress_meter", progress_meter, diffrax.AbstractProgressMeter)
-    made = plan(chain, events, dtype)
+    made = make_plan(chain, events, dtype)
     # on the host where nothing is traced: each operation that jax is given eagerly is a program of
     # its own
-    of = lambda x: np.asarray(x, dtype) if concrete(x) else jnp.asarray(x, dtype)
-    host = np if concrete(t0, t1) else jnp
+    of = lambda x: np.asarray(x, dtype) if is_concrete(x) else jnp.asarray(x, dtype)
+    host = np if is_concrete(t0, t1) else jnp
     span = of(t1) - of(t0)
     controller = stepsize_controller
     if controller is None:
@@ -129,7 +129,7 @@ def _check_steps(dt, rtol, atol, stepsize_controller) -> None:
     """Check that steps are asked for in one way."""
     for name, value in (("dt", dt), ("rtol", rtol), ("atol", atol)):
         if value is not None:
-            positive(name, value)
+            positive_scalar(name, value)
     tolerance = rtol is not None or atol is not None
     if dt is not None and (tolerance or stepsize_controller is not None):
         raise ValueError(
@@ -223,10 +223,12 @@ def _adjoint(adjoint, controller) -> diffrax.AbstractAdjoint | Replay:
     if adjoint is None:
         return Replay() if meets else diffrax.RecursiveCheckpointAdjoint()
     if not isinstance(adjoint, Replay | diffrax.AbstractAdjoint):
-        raise ValueError(f"adjoint: expected svkc.Replay or a diffrax adjoint, got {adjoint!r}")
+        raise ValueError(
+            f"adjoint: expected svkc.integrators.Replay or a diffrax adjoint, got {adjoint!r}"
+        )
     if isinstance(adjoint, Replay) and not meets:
         raise ValueError(
-            "adjoint: svkc.Replay needs dt or an adaptive stepsize_controller; give a diffrax"
+            "adjoint: svkc.integrators.Replay needs dt or an adaptive stepsize_controller; give a diffrax"
             " adjoint with this one"
         )
     return adjoint
@@ -235,15 +237,15 @@ def _adjoint(adjoint, controller) -> diffrax.AbstractAdjoint | Replay:
 def _capacity(max_events, made: Plan) -> int:
     if max_events is None:
         return len(made.timed) + 4 * len(made.guarded)
-    most = whole("max_events", max_events, 0)
+    most = integer("max_events", max_events, 0)
     return most if made.actions else 0
 
 
 def _step_bound(max_steps, span, dt) -> int:
     if max_steps is not None:
-        return whole("max_steps", max_steps, 1)
+        return integer("max_steps", max_steps, 1)
     # room for every fixed step, and for those that save times and events make shorter
-    if dt is None or not concrete(span, dt):
+    if dt is None or not is_concrete(span, dt):
         return 65536
     steps = float(np.max(np.asarray(span / dt)))
     if not steps < 1e9:
@@ -261,7 +263,7 @@ def _check_state(chain: Chain, state: State):
             "state and chain are float64, but jax_enable_x64 is off now; make them in the precision"
             " that simulate is to compute in"
         )
-    if concrete(state) and not (
+    if is_concrete(state) and not (
         np.isfinite(np.asarray(state.q)).all() and np.isfinite(np.asarray(state.v)).all()
     ):
         raise ValueError("state: q and v must be finite")
@@ -269,13 +271,13 @@ def _check_state(chain: Chain, state: State):
 
 def _check_times(t0, t1, ts, events):
     for name, value in (("t0", t0), ("t1", t1)):
-        one(name, value)
-    times = None if ts is None else finite("ts", ts)
-    if not concrete(t0, t1):
+        scalar(name, value)
+    times = None if ts is None else finite_array("ts", ts)
+    if not is_concrete(t0, t1):
         return
     if not t1 >= t0 or not np.isfinite(t1) or not np.isfinite(t0):
         raise ValueError(f"t1: got {t1}, expected a time at or after t0 = {t0}")
-    if ts is not None and concrete(ts):
+    if ts is not None and is_concrete(ts):
         times = np.asarray(times)
         if (
             times.ndim != 1
@@ -289,7 +291,7 @@ def _check_times(t0, t1, ts, events):
     for event in events:
         if (
             isinstance(event, At)
-            and concrete(event.time)
+            and is_concrete(event.time)
             and not np.all((np.asarray(event.time) >= t0) & np.isfinite(np.asarray(event.time)))
         ):
             raise ValueError(f"at: got time {event.time}, before the start of the run at {t0}")

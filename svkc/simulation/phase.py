@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from svkc._jax.pytrees import frozen
+from svkc._jax.pytrees import stop_gradient_tree
 from svkc.integration.diffrax_adjoint import solve_by_diffrax
 from svkc.integration.event_adjoint import arrived
 from svkc.integration.event_location import Reading, Watched
@@ -72,12 +72,14 @@ def solve(run: Run, stop, ts, made: Plan, options: Options, scene: Scene) -> Sol
     watched = (
         None
         if guards is None
-        else frozen(Watched(guards, run.guards, made.watched(scene.chain, scene.structure)))
+        else stop_gradient_tree(
+            Watched(guards, run.guards, made.armed(scene.chain, scene.structure))
+        )
     )
     start = Motion(run.state.q, run.state.v, run.work)
     # a save time within the phase, its ends included, moves by itself; what is saved of the others
     # counts in another phase
-    begun, ended = frozen((run.t, jnp.maximum(stop, run.t)))
+    begun, ended = stop_gradient_tree((run.t, jnp.maximum(stop, run.t)))
     at = jnp.where(ts < begun, begun, jnp.where(ts > ended, ended, ts))
     reading = options.field if guards is None else guards
     path, found, t, motion = _path(
@@ -90,7 +92,7 @@ def solve(run: Run, stop, ts, made: Plan, options: Options, scene: Scene) -> Sol
         fired=jnp.zeros(0, bool),
         guards=None,
         saved=path.saved,
-        path=frozen(path),
+        path=stop_gradient_tree(path),
         result=result,
         derivative=RESULTS.successful,
     )
@@ -115,7 +117,7 @@ def _path(
     The derivative is that of the replayed steps, or that of the diffrax adjoint asked for.
     """
     adjoint, replayed = options.adjoint, isinstance(options.adjoint, Replay)
-    solver, looked_for, (controller, first_step) = frozen(
+    solver, looked_for, (controller, first_step) = stop_gradient_tree(
         (staged(options.solver, "lax"), watched, options.steps())
     )
     how = How(
@@ -130,12 +132,12 @@ def _path(
     )
     if replayed:
         path, t, motion = integrated(start, times, world, how, reading)
-        return path, frozen(path.found), t, motion
+        return path, stop_gradient_tree(path.found), t, motion
     t0, stop, at = times
     found = None
     if watched is not None:
         # an event is located once, before the differentiated solve, which then ends at its time
-        begin, fixed_times, still = frozen((start, times, world))
+        begin, fixed_times, still = stop_gradient_tree((start, times, world))
         first = march(begin, fixed_times, still, how)
         stop = jnp.where(first.found.hit, first.t, stop)
         at, found = jnp.where(at > stop, stop, at), first.found

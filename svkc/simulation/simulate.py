@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from svkc._jax.eager import eager_jit
-from svkc._jax.functions import shared
-from svkc._jax.primitive import Closed
-from svkc._jax.pytrees import frozen
+from svkc._jax.functions import call_with_comparable
+from svkc._jax.primitive import ClosureConverted
+from svkc._jax.pytrees import stop_gradient_tree
 from svkc.integration.event_location import Reading, event_tolerance
 from svkc.integration.integrators import Motion, Scene
 from svkc.model.chain import Chain, State
@@ -68,7 +68,7 @@ def simulate(
     run = lambda control, events: _run(
         *given, _with(made, guards=events), _with(options, control=control), args
     )
-    run = shared(run, control=options.control, events=made.guards)
+    run = call_with_comparable(run, control=options.control, events=made.guards)
     certified = _certified_once if len(save_at) <= FEW_STATES else _certified
     traj = certified(chain, run, save_at, given[3], options.gap, stages(options.solver))
     return _raised(chain, traj) if throw else traj
@@ -149,7 +149,7 @@ def _converted(
     state = _lockable(chain, state, made)
     guards = tuple(g.closure_convert(t0, state, args) for g in made.guards)
     control = options.control
-    control = None if control is None else Closed.over(control, t0, state, args)
+    control = None if control is None else ClosureConverted.from_function(control, t0, state, args)
     return _with(made, guards=guards), _with(options, control=control)
 
 
@@ -158,7 +158,7 @@ def _with(node, **changed):
 
 
 def _lockable(chain: Chain, state: State, made: Plan) -> State:
-    if not made.locks or state.structure.locked is not None:
+    if not made.has_locks or state.structure.locked is not None:
         return state
     return eqx.tree_at(
         lambda s: s.structure.locked,
@@ -272,8 +272,8 @@ def _with_guards(chain: Chain, run: Run, made: Plan, options: Options, args) -> 
     if not made.guards or not reevaluated(made).any():
         return run
     scene = Scene(chain, run.state.structure, args)
-    now = frozen(Reading(made, options.field))(
-        *frozen((run.t, Motion(run.state.q, run.state.v), scene))
+    now = stop_gradient_tree(Reading(made, options.field))(
+        *stop_gradient_tree((run.t, Motion(run.state.q, run.state.v), scene))
     )
     return dataclasses.replace(run, guards=jnp.where(run.stale, now, run.guards))
 

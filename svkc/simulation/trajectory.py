@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.eager import eager_jit
 from svkc.model.chain import State
-from svkc.model.validation import one
+from svkc.model.validation import scalar
 from svkc.simulation.records import RESULTS, Events, Phases
 
 
@@ -60,10 +60,12 @@ class Trajectory(eqx.Module):
         return plot(self, chain)
 
     def report(self, halved=None) -> "Report":
-        """The run's certificate. halved: an error estimated by another run, such as `svkc.halved`
+        """The run's certificate. halved: an error estimated by another run, such as `svkc.accuracy.estimate_error`
         gives, to be told with it."""
         made = _report(self)
-        return made if halved is None else dataclasses.replace(made, halved=one("halved", halved))
+        return (
+            made if halved is None else dataclasses.replace(made, halved=scalar("halved", halved))
+        )
 
 
 @functools.partial(eager_jit, jit=eqx.filter_jit)

@@ -17,7 +17,7 @@ from svkc.integration.stabilization import NoStabilization, Projection
 from svkc.loops.constrained_dynamics import ArticulatedBodies
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import check_state
-from svkc.model.validation import one, positive, whole
+from svkc.model.validation import integer, positive_scalar, scalar
 from svkc.simulation.options import tolerances
 from svkc.simulation.records import RESULTS
 from svkc.simulation.simulate import simulate
@@ -147,7 +147,11 @@ def tune(
     is not positive, or no reference that holds.
     """
     check_state(chain, state)
-    target, t1, repeats = positive("target", target), one("t1", t1), whole("repeats", repeats, 1)
+    target, t1, repeats = (
+        positive_scalar("target", target),
+        scalar("t1", t1),
+        integer("repeats", repeats, 1),
+    )
     dtype, span = state.q.dtype, float(t1) - float(call.get("t0", 0.0))
     tight = float(max(target * 1e-3, 50 * np.finfo(dtype).eps))
     call = {"ts": jnp.linspace(call.get("t0", 0.0), t1, 11, dtype=dtype), **call, "throw": False}

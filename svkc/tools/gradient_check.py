@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from svkc.model.validation import function, positive, whole
+from svkc.model.validation import check_function, integer, positive_scalar
 
 
 class Check(eqx.Module):
@@ -52,9 +52,9 @@ def check_grad(
     float64, or the differences are worth little.
     ValueError: no floats in x, an unknown mode, or f not finite.
     """
-    function("f", f, optional=False)
-    whole("directions", directions, 1)
-    positive("step", step)
+    check_function("f", f, optional=False)
+    integer("directions", directions, 1)
+    positive_scalar("step", step)
     if mode not in ("forward", "reverse", "both"):
         raise ValueError(f"mode: got {mode!r}, expected 'forward', 'reverse' or 'both'")
     free, rest = eqx.partition(

@@ -16,11 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
-from svkc._jax.functions import shared
+from svkc._jax.functions import call_with_comparable
 from svkc.integration.replay import Replay
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import check_chain
-from svkc.model.validation import finite, function, one, whole
+from svkc.model.validation import check_function, finite_array, integer, scalar
 from svkc.simulation.archive import load_trajectory
 from svkc.simulation.simulate import simulate
 from svkc.simulation.trajectory import Trajectory
@@ -54,8 +54,8 @@ def rollout(
     """
     check_chain(chain)
     lanes = _count(states, data, cost)
-    one("t1", t1)
-    function("lane", lane)
+    scalar("t1", t1)
+    check_function("lane", lane)
     devices, chunk = _checked_devices(devices, chunk, lanes)
     size = chunk * len(devices)
     order = np.arange(lanes) if cost is None else np.argsort(np.asarray(cost), kind="stable")
@@ -78,7 +78,7 @@ def _checked_devices(devices, chunk: int | None, lanes: int) -> tuple[list[jax.D
     """Return the devices and how many lanes each takes at once. ValueError: no device or no count
     of lanes."""
     if chunk is not None:
-        chunk = whole("chunk", chunk, 1)
+        chunk = integer("chunk", chunk, 1)
     if devices is None:
         devices = jax.local_devices()
     devices = list(devices) if np.iterable(devices) else [devices]
@@ -110,7 +110,7 @@ def _program(chain: Chain, t1, lane: Callable | None, options: dict, devices) ->
 
     def run(lanes):
         piece = lambda lane, **own: _piece((chain, t1, common | own, lane), lanes, mesh)
-        return shared(piece, lane=lane, **functions)
+        return call_with_comparable(piece, lane=lane, **functions)
 
     return run
 
@@ -127,7 +127,7 @@ def _count(states, data, cost) -> int:
             "states, data, cost: expected one leading axis of lanes, got sizes"
             f" {sorted(map(str, sizes))} and q of shape {states.q.shape}"
         )
-    if cost is not None and finite("cost", cost).ndim != 1:
+    if cost is not None and finite_array("cost", cost).ndim != 1:
         raise ValueError(f"cost: got shape {np.shape(cost)}, expected one number for each lane")
     return lanes
 

@@ -6,7 +6,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from svkc.model.validation import numbers, texts, yes_or_no
+from svkc.model.validation import boolean, names, real_array
 from svkc.transitions.spare_links import Grip
 
 
@@ -19,7 +19,7 @@ class Action(eqx.Module):
     cut: tuple[str, ...] = eqx.field(static=True, default=())
     lock: tuple[str, ...] = eqx.field(static=True, default=())
     unlock: tuple[str, ...] = eqx.field(static=True, default=())
-    here: tuple[str, ...] = eqx.field(static=True, default=())
+    at_current_pose: tuple[str, ...] = eqx.field(static=True, default=())
     stop: bool = eqx.field(static=True, default=False)
     unbind: tuple = eqx.field(static=True, default=())
     bind: tuple[Grip, ...] = ()
@@ -41,16 +41,16 @@ class When(eqx.Module):
     direction: bool | None = eqx.field(static=True, default=None)
 
 
-def _several(value) -> tuple:
+def _as_tuple(value) -> tuple:
     """One thing, or what holds several."""
     return tuple(value) if isinstance(value, Iterable) and not isinstance(value, str) else (value,)
 
 
-def _action(*, connect, cut, lock, unlock, here, stop, bind, unbind) -> Action:
-    bind = _several(bind)
+def _make_action(*, connect, cut, lock, unlock, here, stop, bind, unbind) -> Action:
+    bind = _as_tuple(bind)
     if not all(isinstance(g, Grip) for g in bind):
         raise ValueError(f"bind: expected svkc.Grip objects, got {bind!r}")
-    unbind = _several(unbind)
+    unbind = _as_tuple(unbind)
     if (
         len(unbind) == 2
         and all(isinstance(u, str) for u in unbind)
@@ -62,18 +62,18 @@ def _action(*, connect, cut, lock, unlock, here, stop, bind, unbind) -> Action:
             "unbind: expected names of spare slots or pairs of body names (parent, real), got"
             f" {unbind!r}"
         )
-    connect = texts("connect", connect)
-    here = (connect if here else ()) if isinstance(here, bool | np.bool_) else texts("here", here)
+    connect = names("connect", connect)
+    here = (connect if here else ()) if isinstance(here, bool | np.bool_) else names("here", here)
     if not set(here) <= set(connect):
         raise ValueError(f"here: {here} must be among the links to connect, {connect}")
-    cut, lock, unlock = texts("cut", cut), texts("lock", lock), texts("unlock", unlock)
+    cut, lock, unlock = names("cut", cut), names("lock", lock), names("unlock", unlock)
     return Action(
         connect=connect,
         cut=cut,
         lock=lock,
         unlock=unlock,
-        here=here,
-        stop=yes_or_no("stop", stop),
+        at_current_pose=here,
+        stop=boolean("stop", stop),
         unbind=unbind,
         bind=bind,
     )
@@ -89,8 +89,8 @@ def at(
     make with spare slots, where the bodies are; where all are taken the run ends with a code.
     unbind: spare slots by name, or all between a pair (parent, real) of bodies, cut and emptied.
     """
-    numbers("time", time)
-    action = _action(
+    real_array("time", time)
+    action = _make_action(
         connect=connect, cut=cut, lock=lock, unlock=unlock, here=here, stop=stop, bind=bind,
         unbind=unbind,
     )  # fmt: skip
@@ -126,14 +126,14 @@ def when(
     if direction is not None and not isinstance(direction, bool | np.bool_):
         raise ValueError(f"when: direction must be True, False or None, got {direction!r}")
     direction = None if direction is None else bool(direction)
-    action = _action(
+    action = _make_action(
         connect=connect, cut=cut, lock=lock, unlock=unlock, here=here, stop=stop, bind=bind,
         unbind=unbind,
     )  # fmt: skip
     return When(guard, action, direction)
 
 
-def listed(events) -> tuple:
+def as_events(events) -> tuple:
     """The events of a list; ValueError for anything that is not one."""
     events = tuple(events) if isinstance(events, Iterable) else (events,)
     for event in events:

@@ -10,13 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from svkc._jax.primitive import Closed
+from svkc._jax.primitive import ClosureConverted
 from svkc.loops.constraint import ends
 from svkc.loops.forward_dynamics import loop_forces
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import check_chain, joint_torques
 from svkc.model.names import link_index
-from svkc.model.validation import finite, one, positive
+from svkc.model.validation import finite_array, positive_scalar, scalar
 from svkc.tree.kinematics import kinematics
 from svkc.tree.spatial import quat_conjugate, quat_rotate
 
@@ -55,7 +55,7 @@ class UserGuard(AbstractGuard):
         return self.function(t, state, args)
 
     def closure_convert(self, t, state, args):
-        return UserGuard(Closed.over(self.function, t, state, args))
+        return UserGuard(ClosureConverted.from_function(self.function, t, state, args))
 
 
 class LinkGuard(AbstractGuard):
@@ -154,7 +154,7 @@ def touch(chain: Chain, link: str, distance=0.01, axes: str | None = None) -> To
     ):
         raise ValueError(f"touch: axes: expected some of 'xyz', got {axes!r}")
     distance = jnp.asarray(
-        one("touch: distance", finite("touch: distance", distance)), chain.q_load.dtype
+        scalar("touch: distance", finite_array("touch: distance", distance)), chain.q_load.dtype
     )
     kept = tuple("xyz".index(a) for a in axes)
     return Touch(chain=chain, link=slot, distance=distance, axes=kept)
@@ -165,7 +165,7 @@ def leaves(chain: Chain, link: str, axis=(0.0, 0.0, 1.0)) -> Leaves:
     (in the joint's frame in the parent). It falls through zero where the parent would have to pull:
     with direction=False and cut=link the link holds in one direction only."""
     check_chain(chain)
-    axis = np.asarray(finite("leaves: axis", axis), float)
+    axis = np.asarray(finite_array("leaves: axis", axis), float)
     size = float(np.linalg.norm(axis))
     if axis.shape != (3,) or not 0 < size < np.inf:
         raise ValueError(f"leaves: axis: expected three numbers that are not all zero, got {axis}")
@@ -181,7 +181,7 @@ def overload(chain: Chain, link: str, force=None, torque=None) -> Overload:
     check_chain(chain)
     given = (("overload: force", force), ("overload: torque", torque))
     limits = [
-        jnp.asarray(np.inf if x is None else positive(name, x), chain.q_load.dtype)
+        jnp.asarray(np.inf if x is None else positive_scalar(name, x), chain.q_load.dtype)
         for name, x in given
     ]
     return Overload(chain, link_index(chain, link), *limits)

@@ -30,7 +30,7 @@ def velocity_after_impact(
     return v + jump, -constraint_forces(chain, selection, loops.J, impulse), jump @ impulse / 2
 
 
-class Change(eqx.Module):
+class StructureChange(eqx.Module):
     """What a change of structure did: the state after it, impulses on the real links from their
     parents, at the joints, and energy lost (J).
 
@@ -42,8 +42,8 @@ class Change(eqx.Module):
     impulse: Float[Array, "links 3"]
     angular_impulse: Float[Array, "links 3"]
     energy_lost: Float[Array, ""]
-    gap: Float[Array, ""]
-    left: Float[Array, " links"]
+    initial_gap: Float[Array, ""]
+    residual_gaps: Float[Array, " links"]
 
 
 def lock_projection(chain: Chain, structure: Structure, q, v):

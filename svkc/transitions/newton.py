@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from svkc._jax.primitive import operation
+from svkc._jax.primitive import custom_primitive
 from svkc.loops.constraint import LoopKinematics, loop_kinematics, scales
 from svkc.loops.pivoting import (
     Selection,
@@ -31,18 +31,18 @@ from svkc.transitions.placement import joint_coordinates, with_coordinates
 from svkc.tree.configuration import integrate, normalize
 
 # kinds of iterations
-READ = 0  # set the coordinates of virtual joints to what the poses of their bodies say
+READ_COORDINATES = 0  # set the coordinates of virtual joints to what the poses of their bodies say
 # a Newton step that closes the loops by the least change of scaled coordinates; held coordinates
 # stay, or not
 CLOSE_HELD, CLOSE = 1, 2
 # look at q and move a copy of it a few degrees away; close its loops; decide the rank
-PERTURB, RECLOSE, COUNT = 3, 4, 5
+PERTURB, CLOSE_PERTURBED, DECIDE_RANK = 3, 4, 5
 # project the velocity by its least change; held velocities stay, or not
-VELOCITY_HELD, VELOCITY = 6, 7
+PROJECT_VELOCITY_HELD, PROJECT_VELOCITY = 6, 7
 IMPACT = 8  # project the velocity in the metric of the inertia
 
-RANK = (PERTURB, *(RECLOSE,) * 12, COUNT)
-CONNECT = (CLOSE, CLOSE, IMPACT)
+RANK_SEARCH = (PERTURB, *(CLOSE_PERTURBED,) * 12, DECIDE_RANK)
+CONNECTION = (CLOSE, CLOSE, IMPACT)
 
 
 class Schedule(eqx.Module):
@@ -51,12 +51,12 @@ class Schedule(eqx.Module):
     kinds: tuple[int, ...] = eqx.field(static=True)
 
     @property
-    def unranked(self) -> int:
+    def steps_before_rank(self) -> int:
         """Return how many iterations come before the rank is known, in which every row counts."""
         return self.kinds.index(PERTURB) if PERTURB in self.kinds else 0
 
 
-class Held(eqx.Module):
+class HeldCoordinates(eqx.Module):
     """Coordinates and velocities that stay in held iterations, and links whose coordinates are
     read. None: there are none."""
 
@@ -65,7 +65,7 @@ class Held(eqx.Module):
     read: Bool[Array, " links"] | None = None
 
 
-class Newton(eqx.Module):
+class NewtonState(eqx.Module):
     """The state of the iteration: the motion, the rank of the structure with its margin, and what
     has been found.
 
@@ -81,60 +81,60 @@ class Newton(eqx.Module):
     rank: Int[Array, ""]
     margin: Float[Array, ""]
     probe: Float[Array, " q"]
-    size: Float[Array, "2 steps"]
-    open: Float[Array, "2 links"]
-    left: Float[Array, " links"]
-    wrench: Float[Array, "links 6"]
-    lost: Float[Array, ""]
+    search_diag_R: Float[Array, "2 steps"]
+    search_gaps: Float[Array, "2 links"]
+    residual_gaps: Float[Array, " links"]
+    spatial_impulse: Float[Array, "links 6"]
+    energy_lost: Float[Array, ""]
 
     @classmethod
     def init(cls, chain: Chain, structure: Structure, q, v) -> "Newton":
         """Return the state before the first iteration."""
         links, dtype, q = len(chain.link_names), q.dtype, normalize(chain, q)
         gaps, zero = jnp.zeros((2, links), dtype), jnp.zeros((), dtype)
-        size = jnp.zeros((2, min(6 * links, chain.dofs)), dtype)
+        diag_R = jnp.zeros((2, min(6 * links, chain.dofs)), dtype)
         return cls(
             q=q,
             v=v,
             rank=structure.rank,
             margin=structure.margin,
             probe=q,
-            size=size,
-            open=gaps,
-            left=gaps[0],
-            wrench=jnp.zeros((links, 6), dtype),
-            lost=zero,
+            search_diag_R=diag_R,
+            search_gaps=gaps,
+            residual_gaps=gaps[0],
+            spatial_impulse=jnp.zeros((links, 6), dtype),
+            energy_lost=zero,
         )
 
-    def searched(self, kind, size, gaps) -> "Newton":
+    def record_rank_search(self, kind, diag_R, gaps) -> "Newton":
         """Record both ends of the search for the rank, and decide the rank at its end."""
-        places = jnp.stack([kind == PERTURB, kind == COUNT])[:, None]
-        seen = dataclasses.replace(
+        places = jnp.stack([kind == PERTURB, kind == DECIDE_RANK])[:, None]
+        recorded = dataclasses.replace(
             self,
-            size=jnp.where(places, size[None], self.size),
-            open=jnp.where(places, gaps[None], self.open),
+            search_diag_R=jnp.where(places, diag_R[None], self.search_diag_R),
+            search_gaps=jnp.where(places, gaps[None], self.search_gaps),
         )
-        rank, margin = seen.decided()
+        rank, margin = recorded.rank_and_margin()
         return dataclasses.replace(
-            seen,
-            rank=jnp.where(kind == COUNT, rank, self.rank),
-            margin=jnp.where(kind == COUNT, margin, self.margin),
+            recorded,
+            rank=jnp.where(kind == DECIDE_RANK, rank, self.rank),
+            margin=jnp.where(kind == DECIDE_RANK, margin, self.margin),
         )
 
-    def decided(self) -> tuple[Int[Array, ""], Float[Array, ""]]:
+    def rank_and_margin(self) -> tuple[Int[Array, ""], Float[Array, ""]]:
         """Return the larger rank m of both ends, and |R_mm| / |R_11| there. The second end does not
         count where its loops are open."""
-        size, eps = self.size, jnp.finfo(self.size.dtype)
-        closed = jnp.max(self.open[1]) < eps.eps**0.75
+        diag_R, eps = self.search_diag_R, jnp.finfo(self.search_diag_R.dtype)
+        closed = jnp.max(self.search_gaps[1]) < eps.eps**0.75
         rank = jnp.where(
-            closed, jnp.maximum(count_rank(size[0]), count_rank(size[1])), count_rank(size[0])
+            closed, jnp.maximum(count_rank(diag_R[0]), count_rank(diag_R[1])), count_rank(diag_R[0])
         )
-        last = jnp.arange(size.shape[1], dtype=jnp.int32) == rank - 1
-        margin = jnp.sum(jnp.where(last, size, 0), 1) / jnp.maximum(size[:, 0], eps.tiny)
+        last = jnp.arange(diag_R.shape[1], dtype=jnp.int32) == rank - 1
+        margin = jnp.sum(jnp.where(last, diag_R, 0), 1) / jnp.maximum(diag_R[:, 0], eps.tiny)
         return rank, jnp.where(closed, jnp.max(margin), margin[0])
 
 
-def _among(kind, *kinds: int) -> Bool[Array, ""]:
+def _is_any_of(kind, *kinds: int) -> Bool[Array, ""]:
     return functools.reduce(jnp.logical_or, [kind == k for k in kinds])
 
 
@@ -146,124 +146,176 @@ class _Iteration(eqx.Module):
 
     chain: Chain
     structure: Structure
-    held: Held
-    away: Float[Array, " dofs"]
+    held: HeldCoordinates
+    perturbation: Float[Array, " dofs"]
     kinds: tuple[int, ...] = eqx.field(static=True)
 
-    def __call__(self, now: Newton, kind, ranked) -> Newton:
+    def __call__(self, current: NewtonState, kind, rank_known) -> NewtonState:
         """Return the state after one more iteration. ranked: whether only as many rows count as the
         rank of `now`."""
         chain, structure = self.chain, self.structure
-        at = now.q
-        if COUNT in self.kinds:
-            at = jnp.where(_among(kind, RECLOSE, COUNT), now.probe, now.q)
-        loops = loop_kinematics(chain, structure, at)
-        J = self._without_held(loops.J, kind)
-        full, selection = self._select(J, now, kind, ranked)
-        of_v, residual = _among(kind, VELOCITY_HELD, VELOCITY), loops.gap
-        if VELOCITY in self.kinds:
-            residual = jnp.where(of_v, loops.J @ (now.v / scales(chain)[1]), residual)
-        step = -least_change(chain, selection, J, residual[:, None])[:, 0]
-        left = jnp.max(jnp.abs(loops.gap).reshape(-1, 6), 1)
-        if COUNT in self.kinds:
-            now = now.searched(kind, full.size, left)
-        v, wrench, lost = now.v + jnp.where(of_v, step, 0), now.wrench, now.lost
-        if IMPACT in self.kinds:
-            v, wrench, lost = jax.lax.cond(
-                kind == IMPACT,
-                lambda: velocity_after_impact(chain, structure, loops, selection, now.v),
-                lambda: (v, wrench, lost),
+        q_eval = current.q
+        if DECIDE_RANK in self.kinds:
+            q_eval = jnp.where(
+                _is_any_of(kind, CLOSE_PERTURBED, DECIDE_RANK), current.probe, current.q
             )
-        q, probe = self._moved(loops, at, kind, step), now.probe
-        if COUNT in self.kinds:
-            searching = _among(kind, *RANK)
-            q, probe = jnp.where(searching, now.q, q), jnp.where(searching, q, probe)
-        return dataclasses.replace(now, q=q, v=v, probe=probe, wrench=wrench, lost=lost, left=left)
+        loops = loop_kinematics(chain, structure, q_eval)
+        J = self._zero_held_columns(loops.J, kind)
+        all_pivots, selection = self._select(J, current, kind, rank_known)
+        is_velocity_step, residual = (
+            _is_any_of(kind, PROJECT_VELOCITY_HELD, PROJECT_VELOCITY),
+            loops.gap,
+        )
+        if PROJECT_VELOCITY in self.kinds:
+            residual = jnp.where(
+                is_velocity_step, loops.J @ (current.v / scales(chain)[1]), residual
+            )
+        step = -least_change(chain, selection, J, residual[:, None])[:, 0]
+        residual_gaps = jnp.max(jnp.abs(loops.gap).reshape(-1, 6), 1)
+        if DECIDE_RANK in self.kinds:
+            current = current.record_rank_search(kind, all_pivots.search_diag_R, residual_gaps)
+        v, spatial_impulse, energy_lost = (
+            current.v + jnp.where(is_velocity_step, step, 0),
+            current.spatial_impulse,
+            current.energy_lost,
+        )
+        if IMPACT in self.kinds:
+            v, spatial_impulse, energy_lost = jax.lax.cond(
+                kind == IMPACT,
+                lambda: velocity_after_impact(chain, structure, loops, selection, current.v),
+                lambda: (v, spatial_impulse, energy_lost),
+            )
+        q, probe = self._updated_configuration(loops, q_eval, kind, step), current.probe
+        if DECIDE_RANK in self.kinds:
+            in_rank_search = _is_any_of(kind, *RANK_SEARCH)
+            q, probe = jnp.where(in_rank_search, current.q, q), jnp.where(in_rank_search, q, probe)
+        return dataclasses.replace(
+            current,
+            q=q,
+            v=v,
+            probe=probe,
+            spatial_impulse=spatial_impulse,
+            energy_lost=energy_lost,
+            residual_gaps=residual_gaps,
+        )
 
-    def _without_held(self, J, kind) -> Float[Array, "rows dofs"]:
+    def _zero_held_columns(self, J, kind) -> Float[Array, "rows dofs"]:
         """Return J with the columns of coordinates zero that this iteration holds."""
-        for which, mask in ((CLOSE_HELD, self.held.q), (VELOCITY_HELD, self.held.v)):
+        for which, mask in ((CLOSE_HELD, self.held.q), (PROJECT_VELOCITY_HELD, self.held.v)):
             if mask is not None and which in self.kinds:
                 J = jnp.where(mask[None] & (kind == which), 0, J)
         return J
 
-    def _select(self, J, now: Newton, kind, ranked) -> tuple[Selection, Selection]:
+    def _select(self, J, current: NewtonState, kind, rank_known) -> tuple[Selection, Selection]:
         """Return the pivots of J, and those among them that are large enough to divide by."""
-        wanted, every, dtype = None, min(J.shape), J.dtype
+        independent, max_rank, dtype = None, min(J.shape), J.dtype
         if self.structure.independent is not None and IMPACT in self.kinds:
-            wanted = self.structure.independent & (kind == IMPACT)
-        full = select(J, jnp.where(ranked, now.rank, every), wanted)
-        weak = jnp.where(ranked, held_part(dtype) * now.margin, 0)
+            independent = self.structure.independent & (kind == IMPACT)
+        all_pivots = select(J, jnp.where(rank_known, current.rank, max_rank), independent)
+        weak_threshold = jnp.where(rank_known, held_part(dtype) * current.margin, 0)
         # along weaker steps a gap is of second order, and dividing by them would only amplify
         # round-off
-        least = jnp.where(kind == IMPACT, weak, jnp.maximum(rank_tolerance(dtype), weak))
-        return full, without_weak(full, least)
+        threshold = jnp.where(
+            kind == IMPACT, weak_threshold, jnp.maximum(rank_tolerance(dtype), weak_threshold)
+        )
+        return all_pivots, without_weak(all_pivots, threshold)
 
-    def _moved(self, loops: LoopKinematics, at, kind, step) -> Float[Array, " q"]:
+    def _updated_configuration(self, loops: LoopKinematics, q, kind, step) -> Float[Array, " q"]:
         """Return the configuration after this iteration, moved from the one at which it was."""
         chain = self.chain
-        closing = jnp.where(_among(kind, CLOSE_HELD, CLOSE, RECLOSE), step, 0)
-        moved = integrate(chain, at, jnp.where(kind == PERTURB, self.away, closing))
-        if READ not in self.kinds:
-            return moved
+        delta = jnp.where(_is_any_of(kind, CLOSE_HELD, CLOSE, CLOSE_PERTURBED), step, 0)
+        q_next = integrate(chain, q, jnp.where(kind == PERTURB, self.perturbation, delta))
+        if READ_COORDINATES not in self.kinds:
+            return q_next
 
         def read():
-            coordinates = joint_coordinates(chain, self.structure, loops.kin, at)
-            return with_coordinates(chain, self.held.read, coordinates, at)
+            coordinates = joint_coordinates(chain, self.structure, loops.kin, q)
+            return with_coordinates(chain, self.held.read, coordinates, q)
 
-        return jax.lax.cond(kind == READ, read, lambda: moved)
+        return jax.lax.cond(kind == READ_COORDINATES, read, lambda: q_next)
 
 
 def _iterate(
-    chain: Chain, structure: Structure, q, v, held: Held, schedule: Schedule, *, unranked: int
-) -> Newton:
+    chain: Chain,
+    structure: Structure,
+    q,
+    v,
+    held: HeldCoordinates,
+    schedule: Schedule,
+    *,
+    steps_before_rank: int,
+) -> NewtonState:
     """Take the iterations of a schedule. unranked: how many of them take every row, whatever the
     rank of the structure."""
     kinds, active = schedule.kinds, active_dofs(chain, structure)
     # a fixed direction without pattern, as q itself may be singular
-    away = 0.05 * np.sin(1.0 + 2.3 * np.arange(chain.dofs)) * scales(chain)[1]
-    away = jnp.where(active, away, 0).astype(q.dtype)
-    iteration = _Iteration(chain, structure, held=held, away=away, kinds=kinds)
+    perturbation = 0.05 * np.sin(1.0 + 2.3 * np.arange(chain.dofs)) * scales(chain)[1]
+    perturbation = jnp.where(active, perturbation, 0).astype(q.dtype)
+    iteration = _Iteration(chain, structure, held=held, perturbation=perturbation, kinds=kinds)
 
     @functools.partial(jax.checkpoint, prevent_cse=False)
-    def one(now: Newton, x) -> tuple[Newton, None]:
-        return iteration(now, *x), None
+    def scan_body(current: NewtonState, x) -> tuple[NewtonState, None]:
+        return iteration(current, *x), None
 
-    xs = jnp.asarray(np.array(kinds, np.int32)), jnp.asarray(np.arange(len(kinds)) >= unranked)
-    return jax.lax.scan(one, Newton.init(chain, structure, q, jnp.where(active, v, 0)), xs)[0]
+    xs = (
+        jnp.asarray(np.array(kinds, np.int32)),
+        jnp.asarray(np.arange(len(kinds)) >= steps_before_rank),
+    )
+    return jax.lax.scan(
+        scan_body, NewtonState.init(chain, structure, q, jnp.where(active, v, 0)), xs
+    )[0]
 
 
-def _solve(chain: Chain, structure: Structure, q, v, held: Held, schedule: Schedule) -> Newton:
+def _solve(
+    chain: Chain, structure: Structure, q, v, held: HeldCoordinates, schedule: Schedule
+) -> NewtonState:
     # until the search has ended every row counts, in the search too
-    unranked = schedule.unranked + len(RANK) if COUNT in schedule.kinds else 0
-    return _iterate(chain, structure, q, v, held, schedule, unranked=unranked)
+    steps_before_rank = (
+        schedule.steps_before_rank + len(RANK_SEARCH) if DECIDE_RANK in schedule.kinds else 0
+    )
+    return _iterate(chain, structure, q, v, held, schedule, steps_before_rank=steps_before_rank)
 
 
 def _solve_jvp(primals, tangents):
     """Return the tangent of the iterations that move q or v, with the rank that was found; the
     search for the rank has no part in derivatives."""
-    found = solve_structure(*primals)
+    solution = solve_structure(*primals)
     chain, structure, q, v, held, schedule = primals
-    ranked = eqx.tree_at(
-        lambda s: (s.rank, s.margin), structure, (found.rank, jax.lax.stop_gradient(found.margin))
+    with_rank = eqx.tree_at(
+        lambda s: (s.rank, s.margin),
+        structure,
+        (solution.rank, jax.lax.stop_gradient(solution.margin)),
     )
-    moving = Schedule(tuple(kind for kind in schedule.kinds if kind not in RANK))
+    without_rank_search = Schedule(
+        tuple(kind for kind in schedule.kinds if kind not in RANK_SEARCH)
+    )
 
     @eqx.filter_checkpoint
-    def moved(chain, structure, q, v):
-        there = _iterate(chain, structure, q, v, held, moving, unranked=schedule.unranked)
-        return there.q, there.v, there.wrench, there.lost
+    def iterate(chain, structure, q, v):
+        end = _iterate(
+            chain,
+            structure,
+            q,
+            v,
+            held,
+            without_rank_search,
+            steps_before_rank=schedule.steps_before_rank,
+        )
+        return end.q, end.v, end.spatial_impulse, end.energy_lost
 
-    along = eqx.filter_jvp(moved, (chain, ranked, q, v), tangents[:4])[1]
-    none = jax.tree.map(lambda x: None, found)
-    return found, eqx.tree_at(
-        lambda t: (t.q, t.v, t.wrench, t.lost), none, along, is_leaf=lambda x: x is None
+    tangent_out = eqx.filter_jvp(iterate, (chain, with_rank, q, v), tangents[:4])[1]
+    none = jax.tree.map(lambda x: None, solution)
+    return solution, eqx.tree_at(
+        lambda t: (t.q, t.v, t.spatial_impulse, t.energy_lost),
+        none,
+        tangent_out,
+        is_leaf=lambda x: x is None,
     )
 
 
 # solve_structure(chain, structure, q, v, held, schedule) -> Newton: the state of the iteration
 # after a schedule
-solve_structure = operation("solve_structure", _solve, _solve_jvp)
+solve_structure = custom_primitive("solve_structure", _solve, _solve_jvp)
 
 
 @jax.jit
@@ -272,6 +324,8 @@ def decide_rank(chain: Chain, structure: Structure, q: Float[Array, " q"]) -> St
     configuration nearby, as q itself may be singular."""
     if not len(chain.topology.link_names):
         return structure
-    frozen = jax.lax.stop_gradient((chain, structure, q))
-    found = _solve(*frozen, jnp.zeros(chain.dofs, q.dtype), Held(), Schedule(RANK))
-    return eqx.tree_at(lambda s: (s.rank, s.margin), structure, (found.rank, found.margin))
+    constants = jax.lax.stop_gradient((chain, structure, q))
+    solution = _solve(
+        *constants, jnp.zeros(chain.dofs, q.dtype), HeldCoordinates(), Schedule(RANK_SEARCH)
+    )
+    return eqx.tree_at(lambda s: (s.rank, s.margin), structure, (solution.rank, solution.margin))

@@ -34,7 +34,7 @@ def joint_coordinates(
     slide = jnp.where(
         structure.freedoms[:, 3:], quat_rotate(quat_conjugate(base.base_quat), base.real - start), 0
     )
-    angle = _angles(turn, structure.freedoms)
+    angle = _euler_angles(turn, structure.freedoms)
     masked = quat_normalize(
         jnp.concatenate([turn[:, :1], jnp.where(structure.freedoms[:, :3], turn[:, 1:], 0)], -1)
     )
@@ -57,7 +57,7 @@ def with_coordinates(
     return q
 
 
-def _angles(
+def _euler_angles(
     turn: Float[Array, "links 4"], freedoms: Bool[Array, "links 6"]
 ) -> Float[Array, "links 3"]:
     """Turns about x, y, z in sequence; those not free are taken as zero, the others solved from the
@@ -80,7 +80,7 @@ def _angles(
     return jnp.stack([x, y, z], -1)
 
 
-def gripped_here(
+def place_at_current_pose(
     chain: Chain, structure: Structure, q, here: Bool[Array, " links"], kin: Kinematics
 ) -> Structure:
     """Placements of the links in `here` taken from where the bodies are: the point is the real

@@ -8,13 +8,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from svkc._jax.pytrees import concrete
+from svkc._jax.pytrees import is_concrete
 from svkc.model.chain import Chain, Structure
-from svkc.model.names import joint_slice, link_index, rows_of, spare_slot
+from svkc.model.names import body_rows, joint_slice, link_index, spare_slot
 from svkc.model.topology import V_SIZE
 from svkc.transitions.events import Action, At, When
 from svkc.transitions.guards import AbstractGuard, UserGuard
-from svkc.transitions.spare_links import Grip, checked_freedoms, holding, placed, to_axis
+from svkc.transitions.spare_links import (
+    Grip,
+    as_placement,
+    bound_between,
+    rotation_to_axis,
+    spare_link_freedoms,
+)
 
 
 class Plan(eqx.Module):
@@ -29,10 +35,10 @@ class Plan(eqx.Module):
     grips: tuple[tuple[Grip, ...], ...] = ()
 
     @property
-    def binds(self) -> bool:
+    def has_binds(self) -> bool:
         return any(self.grips) or any(a.unbind for a in self.actions)
 
-    def unbound(self, chain: Chain, structure: Structure) -> Bool[Array, "events links"]:
+    def slots_to_unbind(self, chain: Chain, structure: Structure) -> Bool[Array, "events links"]:
         """Spare slots that each event would empty now."""
         none = jnp.zeros(len(chain.link_names), bool)
         rows = []
@@ -42,21 +48,21 @@ class Plan(eqx.Module):
                 slots = (
                     np.array(chain.link_names) == what
                     if isinstance(what, str)
-                    else holding(chain, structure, *what)
+                    else bound_between(chain, structure, *what)
                 )
                 row = row | slots
             rows.append(row)
         return jnp.stack(rows)
 
-    def joins(self, chain: Chain) -> bool:
+    def needs_impact(self, chain: Chain) -> bool:
         """Return whether any event connects a link or locks a joint. If none does, no impact is
         compiled."""
         return bool(
-            self.binds or self.table(chain, "connect").any() or self.table(chain, "lock").any()
+            self.has_binds or self.table(chain, "connect").any() or self.table(chain, "lock").any()
         )
 
     @property
-    def locks(self) -> bool:
+    def has_locks(self) -> bool:
         return any(a.lock or a.unlock for a in self.actions)
 
     def table(self, chain: Chain, what: str) -> np.ndarray:
@@ -72,31 +78,32 @@ class Plan(eqx.Module):
             row[[link_index(chain, name) for name in getattr(action, what)]] = True
         return table
 
-    def table_of_grips(self, chain: Chain) -> np.ndarray:
+    def grip_mask(self, chain: Chain) -> np.ndarray:
         """[events, links] Boolean of the spare slots an event may bind."""
         return (
             np.array([bool(g) for g in self.grips], bool)[:, None]
             & np.array(chain.topology.link_spare, bool)[None]
         )
 
-    def watched(self, chain: Chain, structure: Structure) -> Bool[Array, " guards"]:
+    def armed(self, chain: Chain, structure: Structure) -> Bool[Array, " guards"]:
         """Guards whose action would change something now, or that have none."""
         rows = list(self.guarded)
         on, off = (self.table(chain, what)[rows] for what in ("connect", "cut"))
         c = structure.connected[None]
         change = jnp.any(on & ~c, 1) | jnp.any(off & c, 1)
-        if self.locks:
+        if self.has_locks:
             on, off = (self.table(chain, what)[rows] for what in ("lock", "unlock"))
             change = (
                 change
                 | jnp.any(on & ~structure.locked[None], 1)
                 | jnp.any(off & structure.locked[None], 1)
             )
-        if self.binds:
+        if self.has_binds:
             empties = jnp.any(
-                self.unbound(chain, structure)[np.array(rows)] & structure.connected[None], 1
+                self.slots_to_unbind(chain, structure)[np.array(rows)] & structure.connected[None],
+                1,
             )
-            held = lambda g: jnp.any(holding(chain, structure, g.parent, g.real))
+            held = lambda g: jnp.any(bound_between(chain, structure, g.parent, g.real))
             grips = [
                 (
                     jnp.any(~jnp.stack([held(g) for g in self.grips[i]]))
@@ -123,7 +130,7 @@ class Plan(eqx.Module):
         return jnp.where(either, up | down, jnp.where(upward, up, down))
 
 
-def plan(chain: Chain, events: tuple, dtype) -> Plan:
+def make_plan(chain: Chain, events: tuple, dtype) -> Plan:
     """Tables of the events; ValueError for names the chain does not have."""
     timed = tuple(i for i, e in enumerate(events) if isinstance(e, At))
     guarded = tuple(i for i, e in enumerate(events) if isinstance(e, When))
@@ -133,10 +140,10 @@ def plan(chain: Chain, events: tuple, dtype) -> Plan:
     # on the host where nothing is traced, as a program of its own would be compiled to stack them
     times = (
         np.array(times, dtype)
-        if concrete(*times)
+        if is_concrete(*times)
         else jnp.stack([jnp.asarray(t, dtype) for t in times])
     )
-    made = Plan(
+    plan = Plan(
         times=jnp.asarray(times, dtype),
         guards=tuple(_as_guard(events[i].guard) for i in guarded),
         timed=timed,
@@ -146,14 +153,14 @@ def plan(chain: Chain, events: tuple, dtype) -> Plan:
         actions=tuple(
             dataclasses.replace(e.action, bind=()) if e.action.bind else e.action for e in events
         ),
-        grips=tuple(tuple(_checked_grip(chain, g, dtype) for g in e.action.bind) for e in events),
+        grips=tuple(tuple(_validate_grip(chain, g, dtype) for g in e.action.bind) for e in events),
     )
     for what in ("connect", "cut", "lock", "unlock"):
-        made.table(chain, what)
-    for action in made.actions:
+        plan.table(chain, what)
+    for action in plan.actions:
         for what in action.unbind:
-            spare_slot(chain, what) if isinstance(what, str) else rows_of(chain, *what)
-    return made
+            spare_slot(chain, what) if isinstance(what, str) else body_rows(chain, *what)
+    return plan
 
 
 def _as_guard(guard: Callable) -> AbstractGuard:
@@ -161,12 +168,12 @@ def _as_guard(guard: Callable) -> AbstractGuard:
     return guard if isinstance(guard, AbstractGuard) else UserGuard(guard)
 
 
-def _checked_grip(chain: Chain, wish: Grip, dtype) -> Grip:
-    rows_of(chain, wish.parent, wish.real)
-    checked_freedoms(wish.joint)
-    to_axis(wish.axis)
-    if wish.slot is not None:
-        spare_slot(chain, wish.slot)
+def _validate_grip(chain: Chain, grip: Grip, dtype) -> Grip:
+    body_rows(chain, grip.parent, grip.real)
+    spare_link_freedoms(grip.joint)
+    rotation_to_axis(grip.axis)
+    if grip.slot is not None:
+        spare_slot(chain, grip.slot)
     elif not any(chain.topology.link_spare):
         raise ValueError("bind: the chain has no spare slots; load it with spare=n")
-    return dataclasses.replace(wish, real_pos=placed("real_pos", wish.real_pos, dtype))
+    return dataclasses.replace(grip, real_pos=as_placement("real_pos", grip.real_pos, dtype))

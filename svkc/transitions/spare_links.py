@@ -9,12 +9,12 @@ from jaxtyping import Array, Bool
 
 from svkc.model.chain import Chain, State, Structure
 from svkc.model.checked_jit import check_state
-from svkc.model.names import rows_of, spare_slot
-from svkc.model.validation import finite
+from svkc.model.names import body_rows, spare_slot
+from svkc.model.validation import finite_array
 from svkc.model.virtual_link import joint_freedoms
 
 
-def _listed(x):
+def _hashable(x):
     return tuple(x) if np.iterable(x) else x
 
 
@@ -30,12 +30,12 @@ class Grip(eqx.Module):
     parent: str = eqx.field(static=True)
     real: str = eqx.field(static=True)
     joint: Any = eqx.field(static=True, default="weld")
-    axis: Any = eqx.field(static=True, default=(0.0, 0.0, 1.0), converter=_listed)
+    axis: Any = eqx.field(static=True, default=(0.0, 0.0, 1.0), converter=_hashable)
     real_pos: Any = (0.0, 0.0, 0.0)
     slot: str | None = eqx.field(static=True, default=None)
 
 
-def checked_freedoms(joint) -> tuple[bool, ...]:
+def spare_link_freedoms(joint) -> tuple[bool, ...]:
     """The joint's six Booleans; ValueError for those a spare slot has no coordinates for."""
     freedoms = joint_freedoms(joint)
     if sum(freedoms[:3]) == 2:
@@ -45,9 +45,9 @@ def checked_freedoms(joint) -> tuple[bool, ...]:
     return freedoms
 
 
-def to_axis(axis) -> np.ndarray:
+def rotation_to_axis(axis) -> np.ndarray:
     """The shortest turn of z onto an axis, wxyz; ValueError for no axis."""
-    axis = np.asarray(finite("bind: axis", axis), float)
+    axis = np.asarray(finite_array("bind: axis", axis), float)
     if axis.shape != (3,) or not 0 < np.linalg.norm(axis) < np.inf:
         raise ValueError(f"bind: axis: expected three numbers that are not all zero, got {axis}")
     x, y, z = axis / np.linalg.norm(axis)
@@ -55,15 +55,15 @@ def to_axis(axis) -> np.ndarray:
     return quat / np.linalg.norm(quat)
 
 
-def placed(name: str, value, dtype):
+def as_placement(name: str, value, dtype):
     """A place: three numbers, finite where that can be seen."""
-    place = finite(f"bind: {name}", value, dtype)
+    place = finite_array(f"bind: {name}", value, dtype)
     if place.shape != (3,):
         raise ValueError(f"bind: {name}: expected three numbers (m), got shape {place.shape}")
     return place
 
 
-def put(
+def set_links(
     structure: Structure, at: Bool[Array, " links"], *, rows, freedoms, quat, pos, real_pos
 ) -> Structure:
     """The structure with the links in the mask `at` between two rows, by such a joint, at such a
@@ -84,9 +84,11 @@ def put(
     )
 
 
-def holding(chain: Chain, structure: Structure, parent: str, real: str) -> Bool[Array, " links"]:
+def bound_between(
+    chain: Chain, structure: Structure, parent: str, real: str
+) -> Bool[Array, " links"]:
     """Spare slots that are bound between these two bodies and connected."""
-    p, r = rows_of(chain, parent, real)
+    p, r = body_rows(chain, parent, real)
     return (
         jnp.asarray(np.array(chain.topology.link_spare, bool))
         & structure.connected
@@ -95,36 +97,36 @@ def holding(chain: Chain, structure: Structure, parent: str, real: str) -> Bool[
     )
 
 
-def grip(
-    chain: Chain, structure: Structure, wish: Grip
+def bind_grip(
+    chain: Chain, structure: Structure, grip: Grip
 ) -> tuple[Structure, Bool[Array, " links"], Bool[Array, ""]]:
     """The structure with a slot bound as wished, the slot to connect (none where the two bodies are
     held already), and whether none was free."""
     spare = jnp.asarray(np.array(chain.topology.link_spare, bool))
-    rows = rows_of(chain, wish.parent, wish.real)
-    if wish.slot is None:
+    rows = body_rows(chain, grip.parent, grip.real)
+    if grip.slot is None:
         free = spare & ~structure.connected & (structure.parent == 0) & (structure.real == 0)
         slot = free & (jnp.cumsum(free, dtype=jnp.int32) == 1)
     else:
-        slot = (jnp.arange(spare.shape[0]) == spare_slot(chain, wish.slot)) & ~structure.connected
-    held = jnp.any(holding(chain, structure, wish.parent, wish.real))
+        slot = (jnp.arange(spare.shape[0]) == spare_slot(chain, grip.slot)) & ~structure.connected
+    held = jnp.any(bound_between(chain, structure, grip.parent, grip.real))
     slot = slot & ~held
-    bound = put(
+    bound = set_links(
         structure,
         slot,
         rows=rows,
-        freedoms=checked_freedoms(wish.joint),
-        quat=to_axis(wish.axis),
+        freedoms=spare_link_freedoms(grip.joint),
+        quat=rotation_to_axis(grip.axis),
         pos=jnp.zeros(3, structure.pos.dtype),
-        real_pos=wish.real_pos,
+        real_pos=grip.real_pos,
     )
     return bound, slot, ~held & ~jnp.any(slot)
 
 
-def emptied(structure: Structure, slots: Bool[Array, " links"]) -> Structure:
+def cleared(structure: Structure, slots: Bool[Array, " links"]) -> Structure:
     """The structure with these slots bound to nothing."""
     zero = jnp.zeros(3, structure.pos.dtype)
-    return put(
+    return set_links(
         structure,
         slots,
         rows=(0, 0),
@@ -157,14 +159,14 @@ def bind(
     check_state(chain, state)
     at = jnp.asarray(np.arange(len(chain.link_names)) == spare_slot(chain, name))
     pos, real_pos = (
-        placed(what, x, state.q.dtype) for what, x in (("pos", pos), ("real_pos", real_pos))
+        as_placement(what, x, state.q.dtype) for what, x in (("pos", pos), ("real_pos", real_pos))
     )
-    structure = put(
+    structure = set_links(
         state.structure,
         at,
-        rows=rows_of(chain, parent, real),
-        freedoms=checked_freedoms(joint),
-        quat=to_axis(axis),
+        rows=body_rows(chain, parent, real),
+        freedoms=spare_link_freedoms(joint),
+        quat=rotation_to_axis(axis),
         pos=pos,
         real_pos=real_pos,
     )

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from svkc._jax.lanes_last import sum_by_few
-from svkc._jax.static_gather import take
+from svkc._jax.lanes_last import sum_in_chunks
+from svkc._jax.static_gather import static_take
 from svkc.model.chain import Chain
 from svkc.model.topology import Topology
 from svkc.tree.kinematics import Kinematics
@@ -51,7 +51,10 @@ def articulate(
         return A - jnp.sum(U[:, :, :, None] * along[:, :, None, :], 1), Body(s, U, inverse)
 
     given = beside(
-        top, lambda x: take(own, x.rows), lambda x: take(S, x.dofs), lambda x: take(more, x.dofs)
+        top,
+        lambda x: static_take(own, x.rows),
+        lambda x: static_take(S, x.dofs),
+        lambda x: static_take(more, x.dofs),
     )
     return sweep(step, zeros(top, 6, 6, dtype=S.dtype), given, reverse=True)
 
@@ -75,7 +78,7 @@ def _carried(top: Topology, bodies, f: Float[Array, "nv *k"]):
     return sweep(
         step,
         zeros(top, 6, *f.shape[1:], dtype=f.dtype),
-        paired(beside(top, lambda x: take(f, x.dofs)), bodies),
+        paired(beside(top, lambda x: static_take(f, x.dofs)), bodies),
         reverse=True,
     )
 
@@ -88,7 +91,7 @@ def seen_by(top: Topology, bodies, J: Float[Array, "rows nv"]) -> Float[Array, "
     u, x = (jnp.concatenate([part[i].reshape(-1, J.shape[0]) for part in parts]) for i in (0, 1))
     # sums, not a `dot`, which XLA's CPU backend would not put into one kernel with what is around
     # it
-    return sum_by_few(u[:, :, None] * x[:, None], (0,))
+    return sum_in_chunks(u[:, :, None] * x[:, None], (0,))
 
 
 def accelerations(top: Topology, bodies, f: Float[Array, " nv"]) -> Float[Array, " nv"]:
@@ -97,7 +100,7 @@ def accelerations(top: Topology, bodies, f: Float[Array, " nv"]) -> Float[Array,
     def step(above, given):
         (level, body), (_, x) = given
         if above is not None:
-            a = take(above, level.parent)
+            a = static_take(above, level.parent)
             x = x - jnp.sum(body.inverse * jnp.sum(body.U * a[:, None], -1)[:, None], -1)
         moved = jnp.sum(body.S * x[..., None], 1)
         return moved if above is None else a + moved, x
@@ -111,4 +114,6 @@ def accelerations(top: Topology, bodies, f: Float[Array, " nv"]) -> Float[Array,
         if isinstance(found, list)
         else (x.ravel(), [found.dofs])
     )
-    return take(x, np.argsort(np.concatenate([y.ravel() for y in order]), kind="stable")[: top.nv])
+    return static_take(
+        x, np.argsort(np.concatenate([y.ravel() for y in order]), kind="stable")[: top.nv]
+    )

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from svkc.model.chain import Chain, State, active_dofs
-from svkc.model.checked_jit import verb
+from svkc.model.checked_jit import checked_jit
 from svkc.tree.configuration import difference
 from svkc.tree.kinematics import Kinematics, kinematics, twists
 from svkc.tree.spatial import cross, rotate
@@ -40,19 +40,19 @@ def _both(chain: Chain, state: State) -> tuple[Float[Array, ""], Float[Array, ""
     return _energies(chain, state, kin, _bodies(chain, kin, state.v))
 
 
-@verb(eager=True)
+@checked_jit(eager=True)
 def kinetic_energy(chain: Chain, state: State) -> Float[Array, ""]:
     """Kinetic energy (J), armature included: v^T M v / 2."""
     return _both(chain, state)[0]
 
 
-@verb(eager=True)
+@checked_jit(eager=True)
 def potential_energy(chain: Chain, state: State) -> Float[Array, ""]:
     """Gravity's potential (J), zero at the world's origin, and that of the joints' springs."""
     return _both(chain, state)[1]
 
 
-@verb(eager=True)
+@checked_jit(eager=True)
 def energy(chain: Chain, state: State) -> Float[Array, ""]:
     """Mechanical energy (J): kinetic, gravity's and the joint springs' (Featherstone section
     2.13)."""
@@ -73,7 +73,7 @@ def energy_and_momentum(
     return kinetic + potential, jnp.sum(p, 0), jnp.sum(spin + cross(place - centre[None], p), 0)
 
 
-@verb(eager=True)
+@checked_jit(eager=True)
 def momentum(chain: Chain, state: State) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
     """Linear momentum (N s) and angular momentum about the world's origin (N m s), in world axes
     (Featherstone section 2.12)."""

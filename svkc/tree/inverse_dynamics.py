@@ -4,9 +4,9 @@ and joint limits."""
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from svkc._jax.static_gather import take
+from svkc._jax.static_gather import static_take
 from svkc.model.chain import Chain, State
-from svkc.model.checked_jit import verb
+from svkc.model.checked_jit import checked_jit
 from svkc.tree.configuration import difference
 from svkc.tree.kinematics import Kinematics, kinematics, twists, velocity_products
 from svkc.tree.spatial import cross, halves, rotate
@@ -37,7 +37,7 @@ def newton_euler(
         moment = moment + cross(w, spin(w))
     force = chain.mass[:, None] * acceleration
     F = up(chain.topology, jnp.concatenate([moment + cross(c, force), force], -1))
-    return jnp.sum(kin.S * take(F, chain.topology.dof_row), -1)
+    return jnp.sum(kin.S * static_take(F, chain.topology.dof_row), -1)
 
 
 def generalized_forces(
@@ -94,15 +94,15 @@ def limit_forces(
     if chain.limit is None:
         return tau
     k, c = chain.limit_spring
-    at_q, at_v = chain.topology.scalars
+    at_q, at_v = chain.topology.scalar_coordinates
     lower, upper = chain.limit[:, at_v]
-    x = take(q, at_q)
+    x = static_take(q, at_q)
     out = jnp.maximum(x - upper, 0) - jnp.maximum(lower - x, 0)
     onset = jnp.where(out != 0, jnp.exp(-0.02 / jnp.where(out != 0, jnp.abs(out), 1)), 0)
-    return put(tau, at_v, -(k[at_v] * out + c[at_v] * take(v, at_v)) * onset)
+    return put(tau, at_v, -(k[at_v] * out + c[at_v] * static_take(v, at_v)) * onset)
 
 
-@verb
+@checked_jit
 def bias_force(chain: Chain, state: State) -> Float[Array, " nv"]:
     """Velocity-product and gravity forces (N, N m) of the tree: ID(q, v, 0) (MuJoCo's qfrc_bias;
     Featherstone section 6.1)."""
@@ -111,7 +111,7 @@ def bias_force(chain: Chain, state: State) -> Float[Array, " nv"]:
     return generalized_forces(chain, kin, V, state.v, jnp.zeros(chain.nv, state.v.dtype))
 
 
-@verb
+@checked_jit
 def inverse_dynamics(
     chain: Chain, state: State, vdot: Float[Array, " accelerations"]
 ) -> Float[Array, " nv"]:

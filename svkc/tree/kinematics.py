@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from svkc._jax.static_gather import take
+from svkc._jax.static_gather import static_take
 from svkc.model.chain import Chain, State
-from svkc.model.checked_jit import verb
+from svkc.model.checked_jit import checked_jit
 from svkc.model.topology import BALL, FREE, HINGE, SLIDE, Topology
 from svkc.tree.spatial import (
     cross,
@@ -42,28 +42,32 @@ def _joint_poses(chain: Chain, q: Float[Array, " q"]):
     offset along the slide [rows]."""
     top, start = chain.topology, np.array(chain.topology.q_start)
     quat, fixed, slide = chain.quat, chain.quat, None
-    hinges, balls, slides = top.rows_of(HINGE), top.rows_of(BALL), top.rows_of(SLIDE)
+    hinges, balls, slides = top.rows_of_kind(HINGE), top.rows_of_kind(BALL), top.rows_of_kind(SLIDE)
     turn = []
     if len(hinges):
         turn.append(
             (
                 hinges,
                 quat_about(
-                    take(chain.axis, hinges),
-                    take(q, start[hinges]) - take(chain.q_load, start[hinges]),
+                    static_take(chain.axis, hinges),
+                    static_take(q, start[hinges]) - static_take(chain.q_load, start[hinges]),
                 ),
             )
         )
     if len(balls):
-        turn.append((balls, quat_normalize(take(q, start[balls][:, None] + np.arange(4)))))
+        turn.append((balls, quat_normalize(static_take(q, start[balls][:, None] + np.arange(4)))))
     for rows, joint in turn:
-        quat = put(quat, rows, quat_multiply(take(fixed, rows), joint))
-    free = top.rows_of(FREE)
+        quat = put(quat, rows, quat_multiply(static_take(fixed, rows), joint))
+    free = top.rows_of_kind(FREE)
     if len(free):
-        quat = put(quat, free, quat_normalize(take(q, start[free][:, None] + np.arange(3, 7))))
+        quat = put(
+            quat, free, quat_normalize(static_take(q, start[free][:, None] + np.arange(3, 7)))
+        )
     if len(slides):
-        along = take(q, start[slides]) - take(chain.q_load, start[slides])
-        slide = put(jnp.zeros_like(chain.axis), slides, along[:, None] * take(chain.axis, slides))
+        along = static_take(q, start[slides]) - static_take(chain.q_load, start[slides])
+        slide = put(
+            jnp.zeros_like(chain.axis), slides, along[:, None] * static_take(chain.axis, slides)
+        )
     return quat, fixed, slide
 
 
@@ -75,13 +79,15 @@ def _compose(top: Topology, quat: Float[Array, "rows 4"]) -> Float[Array, "rows 
         above = np.maximum(parent, 0)
         for _ in range(int(np.ceil(np.log2(len(top.levels))))):
             quat, above = (
-                jnp.concatenate([quat[:1], quat_multiply(take(quat, above), quat)[1:]]),
+                jnp.concatenate([quat[:1], quat_multiply(static_take(quat, above), quat)[1:]]),
                 above[above],
             )
         return quat
     levels = [quat[:1]]
     for (start, _), (first, last) in zip(top.levels[:-1], top.levels[1:], strict=True):
-        levels.append(quat_multiply(take(levels[-1], parent[first:last] - start), quat[first:last]))
+        levels.append(
+            quat_multiply(static_take(levels[-1], parent[first:last] - start), quat[first:last])
+        )
     return jnp.concatenate(levels)
 
 
@@ -93,7 +99,7 @@ def kinematics(chain: Chain, q: Float[Array, " q"]) -> Kinematics:
     quat = quat_normalize(_compose(top, local))
     R = quat_matrix(quat)
     parent = np.maximum(np.array(top.parent), 0)
-    above = take(R, parent)
+    above = static_take(R, parent)
     step = rotate(above, chain.pos)
     if slide is not None:
         step = step + rotate(above, rotate(quat_matrix(fixed), slide))
@@ -102,12 +108,12 @@ def kinematics(chain: Chain, q: Float[Array, " q"]) -> Kinematics:
         step = (
             step + rotate(above, rotate(quat_matrix(fixed), chain.anchor)) - rotate(R, chain.anchor)
         )
-    free = top.rows_of(FREE)
+    free = top.rows_of_kind(FREE)
     if len(free):
-        step = put(step, free, take(q, np.array(top.q_start)[free][:, None] + np.arange(3)))
+        step = put(step, free, static_take(q, np.array(top.q_start)[free][:, None] + np.arange(3)))
     roots = np.array(top.parent) <= 0
     r = down(top, jnp.where(roots[:, None], 0, step))
-    return Kinematics(R=R, quat=quat, r=r, root=take(step, top.root), S=_axes(chain, R, r))
+    return Kinematics(R=R, quat=quat, r=r, root=static_take(step, top.root), S=_axes(chain, R, r))
 
 
 def _axes(chain: Chain, R, r) -> Float[Array, "nv 6"]:
@@ -118,20 +124,22 @@ def _axes(chain: Chain, R, r) -> Float[Array, "nv 6"]:
     parts, order = [], []
 
     def turning(rows, axes):
-        return jnp.concatenate([axes, cross(take(point, rows), axes)], -1)
+        return jnp.concatenate([axes, cross(static_take(point, rows), axes)], -1)
 
-    hinges, slides = top.rows_of(HINGE), top.rows_of(SLIDE)
+    hinges, slides = top.rows_of_kind(HINGE), top.rows_of_kind(SLIDE)
     if len(hinges):
-        parts.append(turning(hinges, rotate(take(R, hinges), take(chain.axis, hinges))))
+        parts.append(
+            turning(hinges, rotate(static_take(R, hinges), static_take(chain.axis, hinges)))
+        )
         order.append(np.array(top.v_start)[hinges])
     if len(slides):
-        along = rotate(take(R, slides), take(chain.axis, slides))
+        along = rotate(static_take(R, slides), static_take(chain.axis, slides))
         parts.append(jnp.concatenate([jnp.zeros_like(along), along], -1))
         order.append(np.array(top.v_start)[slides])
     for kind, offset in ((BALL, 0), (FREE, 3)):
-        rows = top.rows_of(kind)
+        rows = top.rows_of_kind(kind)
         for k in range(3) if len(rows) else ():
-            parts.append(turning(rows, take(R, rows)[..., k]))
+            parts.append(turning(rows, static_take(R, rows)[..., k]))
             order.append(np.array(top.v_start)[rows] + offset + k)
             if kind == FREE:
                 parts.append(
@@ -142,7 +150,7 @@ def _axes(chain: Chain, R, r) -> Float[Array, "nv 6"]:
                 order.append(np.array(top.v_start)[rows] + k)
     if not parts:
         return jnp.zeros((0, 6), R.dtype)
-    return take(jnp.concatenate(parts), np.argsort(np.concatenate(order)))
+    return static_take(jnp.concatenate(parts), np.argsort(np.concatenate(order)))
 
 
 def twists(chain: Chain, kin: Kinematics, v: Float[Array, " dofs"]) -> Float[Array, "rows 6"]:
@@ -157,7 +165,7 @@ def velocity_products(
     have axes fixed in the world."""
     top = chain.topology
     moving = np.ones(chain.nv, bool)
-    free = top.rows_of(FREE)
+    free = top.rows_of_kind(FREE)
     moving[(np.array(top.v_start)[free][:, None] + np.arange(3)).ravel()] = False
     return motion_cross(V, to_rows(top, kin.S * jnp.where(moving, v[: chain.nv], 0)[:, None]))
 
@@ -169,7 +177,7 @@ def bias_accelerations(
     return down(chain.topology, velocity_products(chain, kin, V, v))
 
 
-@verb
+@checked_jit
 def poses(chain: Chain, state: State) -> tuple[Float[Array, "bodies 3"], Float[Array, "bodies 4"]]:
     """Positions (m) and quaternions (wxyz, body to world) of the body frames in the world; row 0 is
     the world (Featherstone section 4.4)."""
@@ -178,7 +186,7 @@ def poses(chain: Chain, state: State) -> tuple[Float[Array, "bodies 3"], Float[A
     return (kin.root + kin.r)[rows], kin.quat[rows]
 
 
-@verb
+@checked_jit
 def velocities(
     chain: Chain, state: State
 ) -> tuple[Float[Array, "bodies 3"], Float[Array, "bodies 3"]]:

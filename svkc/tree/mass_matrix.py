@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from svkc._jax.static_gather import take
+from svkc._jax.static_gather import static_take
 from svkc.model.chain import Chain, State
-from svkc.model.checked_jit import verb
+from svkc.model.checked_jit import checked_jit
 from svkc.tree.inverse_dynamics import inertia_times
 from svkc.tree.kinematics import Kinematics, kinematics
 from svkc.tree.spatial import cross, halves, rotate, skew
@@ -39,18 +39,18 @@ def inertia_by_composites(chain: Chain, kin: Kinematics) -> Float[Array, "nv nv"
         - c[:, :, None] * c[:, None, :]
     )
     I = central + m[:, :, None] * square
-    total = take(up(top, jnp.concatenate([m, m * c, I.reshape(-1, 9)], -1)), top.dof_row)
+    total = static_take(up(top, jnp.concatenate([m, m * c, I.reshape(-1, 9)], -1)), top.dof_row)
     m, h, I = total[:, :1], total[:, 1:4], total[:, 4:].reshape(-1, 3, 3)
     w, u = halves(kin.S)
     # momentum of everything a joint carries, for a unit of its velocity
     F = jnp.concatenate([rotate(I, w) + cross(h, u), m * u + cross(w, h)], -1)
-    related = top.ancestor[top.dof_row][:, top.dof_row]
+    related = top.ancestor_mask[top.dof_row][:, top.dof_row]
     M = jnp.where(related, F @ kin.S.T, 0)
     M = jnp.where(related.T & ~related, M.T, M)
     return M if chain.armature is None else M + jnp.diag(chain.armature)
 
 
-@verb
+@checked_jit
 def mass_matrix(chain: Chain, state: State) -> Float[Array, "nv nv"]:
     """Joint-space inertia of the tree (kg, kg m, kg m^2), armature included, by composite bodies
     (Featherstone section 6.2)."""

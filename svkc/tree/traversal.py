@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from svkc._jax.static_gather import take
+from svkc._jax.static_gather import static_take
 from svkc.model.topology import BALL, FREE, HINGE, SLIDE, V_SIZE, Topology
 
 # deeper trees sum by doubling along the ancestors: compile time would grow with every level
@@ -23,11 +23,11 @@ def down(top: Topology, x: Float[Array, "rows *n"]) -> Float[Array, "rows *n"]:
     """Sum of x over each row and its ancestors, level by level."""
     if len(top.levels) > LEVELS_UNROLLED:
         for above, _ in _doublings(top):
-            x = x + take(x, above)
+            x = x + static_take(x, above)
         return x
     parent, levels = np.array(top.parent), [x[:1]]
     for (start, _), (first, last) in zip(top.levels[:-1], top.levels[1:], strict=True):
-        levels.append(x[first:last] + take(levels[-1], parent[first:last] - start))
+        levels.append(x[first:last] + static_take(levels[-1], parent[first:last] - start))
     return jnp.concatenate(levels)
 
 
@@ -35,9 +35,9 @@ def up(top: Topology, x: Float[Array, "rows *n"]) -> Float[Array, "rows *n"]:
     """Sum of x over each row and its descendants, level by level."""
     if len(top.levels) > LEVELS_UNROLLED:
         if any(below.shape[1] > WIDEST for _, below in _doublings(top)):
-            return jnp.tensordot(jnp.asarray(top.ancestor.T, x.dtype), x, 1)
+            return jnp.tensordot(jnp.asarray(top.ancestor_mask.T, x.dtype), x, 1)
         for _, below in _doublings(top):
-            x = x + jnp.sum(take(x, below), 1)
+            x = x + jnp.sum(static_take(x, below), 1)
         return x
     sums, below = [], None
     for level, (first, last) in reversed(list(zip(levels(top), top.levels[1:], strict=True))):
@@ -72,23 +72,23 @@ def put(
     whole body only where there is none.)"""
     source = np.arange(len(x))
     source[rows] = len(x) + np.arange(len(rows))
-    return take(jnp.concatenate([x, values]), source)
+    return static_take(jnp.concatenate([x, values]), source)
 
 
 def to_rows(top: Topology, x: Float[Array, "nv *n"]) -> Float[Array, "rows *n"]:
     """Sum of x over the coordinates of each row's joint."""
     parts, order = [], []
     for kinds, size in (((HINGE, SLIDE), 1), ((BALL,), 3), ((FREE,), 6)):
-        rows = top.rows_of(*kinds)
+        rows = top.rows_of_kind(*kinds)
         if len(rows):
             start = np.array(top.v_start)[rows]
-            parts.append(sum(take(x, start + k) for k in range(size)))
+            parts.append(sum(static_take(x, start + k) for k in range(size)))
             order.append(rows)
     fixed = np.setdiff1d(
         np.arange(len(top.parent)), np.concatenate(order) if order else np.zeros(0, int)
     )
     parts.append(jnp.zeros((len(fixed), *x.shape[1:]), x.dtype))
-    return take(jnp.concatenate(parts), np.argsort(np.concatenate([*order, fixed])))
+    return static_take(jnp.concatenate(parts), np.argsort(np.concatenate([*order, fixed])))
 
 
 class Level(NamedTuple):
@@ -167,7 +167,7 @@ def from_rows(
     children: Int[Array, "m c"] | np.ndarray, below: Float[Array, "n *k"]
 ) -> Float[Array, "m *k"]:
     """For each row of a level, the sum of its children's in the level below."""
-    return jnp.sum(take(below, children), 1)
+    return jnp.sum(static_take(below, children), 1)
 
 
 def beside(top: Topology, *given: Callable):

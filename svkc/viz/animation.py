@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from svkc.mjcf.bodies import matrix
+from svkc.mjcf.bodies import rotation_matrix
 from svkc.model.chain import Chain
 from svkc.simulation.trajectory import Trajectory
 from svkc.viz.shapes import color, happened, held, world_poses
@@ -115,7 +115,7 @@ def _place_bodies(model, data, positions: np.ndarray, R: np.ndarray):
     for bodies, pos, quat, xpos, xmat in (geoms, cameras):
         for k, body in enumerate(bodies):
             xpos[k] = positions[body] + R[body] @ pos[k]
-            xmat[k] = (R[body] @ matrix(quat[k])).ravel()
+            xmat[k] = (R[body] @ rotation_matrix(quat[k])).ravel()
 
 
 def _camera(model, positions, *, camera, lookat, distance, azimuth, elevation):

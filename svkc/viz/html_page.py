@@ -39,7 +39,7 @@ class Page:
 
 def show(chain: Chain, traj: Trajectory, *, title: str = "svkc", height: int = 480) -> Page:
     """The page of a run; as the last line of a notebook's cell it is shown below it:
-    `svkc.page.show(chain, traj)`. `svkc.render(chain, traj, "run.html")` writes the same page to a
+    `svkc.show(chain, traj)`. `svkc.render(chain, traj, "run.html")` writes the same page to a
     file.
 
     Bodies move in straight lines and turn at constant rates between the saved times: save 40 a

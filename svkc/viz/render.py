@@ -5,7 +5,7 @@ import pathlib
 
 from svkc.model.chain import Chain
 from svkc.model.checked_jit import check_chain
-from svkc.model.validation import one, positive, several, texts, whole
+from svkc.model.validation import integer, names, positive_scalar, scalar, vector
 from svkc.simulation.trajectory import Trajectory
 from svkc.viz.html_page import write_page
 from svkc.viz.shapes import one_run
@@ -30,7 +30,7 @@ def render(
     """Writes a picture of the run by the ending of `path`: .png a strobe of `frames` poses seen
     from the side; .gif and .mp4 an animation of `fps` frames a second of size (width, height) in
     pixels, with a strip below that names the time, what holds and the events; .html a page of its
-    own to turn, play and go through (`svkc.page.show` in a notebook).
+    own to turn, play and go through (`svkc.show` in a notebook).
 
     Of animations: trails: names of bodies whose paths are drawn; camera: the model's own of that
     name, else lookat (m), distance (m), azimuth and elevation (deg) place one. ValueError: another
@@ -42,17 +42,17 @@ def render(
     check_chain(chain)
     one_run(traj)
     frames, fps, path = (
-        whole("frames", frames, 1),
-        positive("fps", fps),
+        integer("frames", frames, 1),
+        positive_scalar("fps", fps),
         pathlib.Path(os.fspath(path)),
     )
     size, trails = (
-        tuple(whole("size", n, 16, 8192) for n in several("size", size, 2)),
-        texts("trails", trails),
+        tuple(integer("size", n, 16, 8192) for n in vector("size", size, 2)),
+        names("trails", trails),
     )
-    lookat = lookat if lookat is None else several("lookat", lookat, 3)
-    distance = distance if distance is None else positive("distance", distance)
-    azimuth, elevation = one("azimuth", azimuth), one("elevation", elevation)
+    lookat = lookat if lookat is None else vector("lookat", lookat, 3)
+    distance = distance if distance is None else positive_scalar("distance", distance)
+    azimuth, elevation = scalar("azimuth", azimuth), scalar("elevation", elevation)
     if path.suffix != ".html":
         _installed()
     if path.suffix == ".png":

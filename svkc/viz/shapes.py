@@ -4,7 +4,7 @@ holds, what happened and when."""
 import jax
 import numpy as np
 
-from svkc.mjcf.bodies import matrix
+from svkc.mjcf.bodies import rotation_matrix
 from svkc.model.chain import Chain, State
 from svkc.simulation.trajectory import Trajectory
 from svkc.tree.kinematics import poses
@@ -37,7 +37,7 @@ def segments(chain: Chain) -> list[tuple[int, np.ndarray, np.ndarray, float]]:
     model, out = chain.model.model, []
     for g in range(model.ngeom):
         kind, size = mujoco.mjtGeom(int(model.geom_type[g])), model.geom_size[g]
-        R = matrix(model.geom_quat[g])
+        R = rotation_matrix(model.geom_quat[g])
         axis = R[:, 2]
         if kind in (mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER):
             half, radius = axis * size[1], size[0]

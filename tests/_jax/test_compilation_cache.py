@@ -47,7 +47,7 @@ def test_a_folder_of_the_users_own(tmp_path, monkeypatch):
         "win32": tmp_path / "usual",
     }.items():
         monkeypatch.setattr(sys, "platform", system)
-        assert cache._top() == place / "svkc"
+        assert cache._root_folder() == place / "svkc"
 
 
 def test_another_folder_or_none(tmp_path, monkeypatch):
@@ -84,7 +84,7 @@ def test_a_folder_that_others_can_write_to_is_refused(tmp_path, monkeypatch, cap
         assert cache.use_cache() is None
     assert jax.config.jax_compilation_cache_dir is None
     cache.use_cache().chmod(0o777)
-    assert cache._own(tmp_path / "shared")
+    assert cache._make_private(tmp_path / "shared")
     jax.config.update("jax_compilation_cache_dir", None)
     assert cache.use_cache() is None
 
@@ -101,10 +101,10 @@ def test_processors_and_their_features_differ(tmp_path):
     names = set()
     for told in ("Some CPU @ 2 GHz", "sse avx"), ("Some CPU @ 2 GHz", "sse"), ("Other", "sse avx"):
         (tmp_path / "cpuinfo").write_text(text.format(*told))
-        names.add(cache.processor(str(tmp_path / "cpuinfo")))
+        names.add(cache.processor_id(str(tmp_path / "cpuinfo")))
     assert len(names) == 3
     assert sum(name.startswith("Some-CPU-2-GHz-") for name in names) == 2
-    assert cache.processor(str(tmp_path / "nothing"))
+    assert cache.processor_id(str(tmp_path / "nothing"))
 
 
 def test_entries_are_whole(tmp_path):
@@ -112,14 +112,14 @@ def test_entries_are_whole(tmp_path):
     nothing is said."""
     entries = lru_cache.LRUCache(str(tmp_path), max_size=-1)
     (tmp_path / "program-cache").write_bytes(b"ha")
-    cache._put(entries, "program", b"half and half")
+    cache._write_entry(entries, "program", b"half and half")
     assert entries.get("program") == b"half and half"
     assert [path.name for path in tmp_path.iterdir()] == ["program-cache"]
-    cache._put(lru_cache.LRUCache(str(tmp_path / "gone"), max_size=-1), "program", b"")
+    cache._write_entry(lru_cache.LRUCache(str(tmp_path / "gone"), max_size=-1), "program", b"")
     (tmp_path / "gone" / "program-cache").unlink()
     (tmp_path / "gone").rmdir()
     entries.path = tmp_path / "gone"
-    cache._put(entries, "program", b"")
+    cache._write_entry(entries, "program", b"")
 
 
 def test_the_oldest_go(tmp_path, monkeypatch):
@@ -149,18 +149,18 @@ def test_preferences_are_not_complaints(monkeypatch, capfd):
             raise ValueError("damaged")
         return key
 
-    assert cache._without_preferences(load)("key") == "key"
+    assert cache._without_false_warnings(load)("key") == "key"
     assert capfd.readouterr().err == said[1]
     with pytest.raises(ValueError, match="damaged"):
-        cache._without_preferences(load)(None)
+        cache._without_false_warnings(load)(None)
     assert capfd.readouterr().err == said[1]
     monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "0")
-    cache._without_preferences(load)("key")
+    cache._without_false_warnings(load)("key")
     assert capfd.readouterr().err == "".join(said)
 
 
 def test_jax_calls_what_is_put_in_its_place(tmp_path, monkeypatch):
     monkeypatch.setenv("SVKC_CACHE_DIR", str(tmp_path))
     cache.use_cache()
-    assert lru_cache.LRUCache.put is cache._put
+    assert lru_cache.LRUCache.put is cache._write_entry
     assert compilation_cache.get_executable_and_time.__module__ == "svkc._jax.compilation_cache"

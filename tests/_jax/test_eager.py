@@ -97,7 +97,7 @@ def test_options_that_jaxlib_does_not_know_are_left_out(monkeypatch):
         eager, "_OPTIONS", {"xla_no_such_option": 1, "xla_backend_optimization_level": 0}
     )
     assert float(eager.eager_jit(lambda x: 2 * x)(jnp.asarray(3.0))) == 6
-    assert eager._OPTIONS == {"xla_backend_optimization_level": 0}
+    assert eager._FAST_COMPILE_OPTIONS == {"xla_backend_optimization_level": 0}
 
 
 def test_other_errors_are_raised():
@@ -119,7 +119,7 @@ def test_options_are_given_to_the_outermost_call_alone():
     assert float(jax.jit(double)(3.0)) == float(jax.jit(lambda: double(3.0))()) == 6
     assert asked == [{}]
     assert float(double(3.0)) == 6
-    assert asked[1:] == [{"compiler_options": eager._OPTIONS}]
+    assert asked[1:] == [{"compiler_options": eager._FAST_COMPILE_OPTIONS}]
 
 
 @pytest.mark.slow

@@ -17,10 +17,10 @@ import pytest
 from tolerances import ROUND_OFF
 
 import svkc
-from svkc._jax.function_values import Function
+from svkc._jax.function_values import FunctionPytree
 from svkc._jax.functions import comparable
 
-DT = {"dt": 0.05, "solver": svkc.SemiImplicitEuler(), "max_events": 1, "max_steps": 8}
+DT = {"dt": 0.05, "solver": svkc.integrators.SymplecticEuler(), "max_events": 1, "max_steps": 8}
 GAIN, LIST = 1.0, []
 
 
@@ -64,7 +64,7 @@ def static(function):
 
 def same(one, other) -> bool:
     """Whether both are one program."""
-    return isinstance(comparable(one), Function) and static(one) == static(other)
+    return isinstance(comparable(one), FunctionPytree) and static(one) == static(other)
 
 
 def torque(gain):

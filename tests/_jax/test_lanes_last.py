@@ -94,7 +94,7 @@ def test_no_operation_of_a_step_goes_the_other_way(monkeypatch):
     """All that `svkc.step` is made of has a rule: what has none would put its lanes first and last
     again."""
     seen = []
-    as_jax_does = rules._as_jax_does
+    as_jax_does = rules._apply_vmap
     monkeypatch.setattr(
         rules,
         "_as_jax_does",
@@ -152,7 +152,7 @@ def test_runs_by_articulated_bodies():
             state,
             0.3,
             events=events,
-            dynamics=svkc.Dynamics(inertia=svkc.by_bodies),
+            dynamics=svkc.dynamics.ArticulatedBodies(),
             rtol=1e-12,
         )
         return traj.final.q, traj.final.v, traj.phases.energy_drift, jnp.max(jnp.abs(traj.gaps))

@@ -12,7 +12,7 @@ import svkc
 
 pytestmark = pytest.mark.slow
 
-BODIES = {"dynamics": svkc.Dynamics(inertia=svkc.by_bodies)}
+BODIES = {"dynamics": svkc.dynamics.ArticulatedBodies()}
 
 
 def lowered(function, *args) -> str:

@@ -50,7 +50,7 @@ def test_a_release_against_differences():
             events=events,
             args=x["sine"],
             max_events=1,
-            adjoint=svkc.Replay(),
+            adjoint=svkc.integrators.Replay(),
             **parameters.TIGHT,
         )
         # (without the event its time is infinite, and so is this)
@@ -266,7 +266,7 @@ def test_gradients_in_the_tangent():
     def height(q):
         return svkc.potential_energy(chain, svkc.State(q, state.v, state.structure))
 
-    slope = svkc.tangent(chain, state.q, jax.grad(height)(state.q))
+    slope = svkc.tangent_gradient(chain, state.q, jax.grad(height)(state.q))
     assert slope.shape == (3,)
     found = svkc.check_grad(
         lambda dv: height(svkc.integrate(chain, state.q, dv)), jnp.zeros(3), step=0.2

@@ -21,7 +21,7 @@ from svkc.loops.forward_dynamics import acceleration as accelerated
 def test_articulated_bodies_carry_what_acts_on_virtual_joints(name):
     """The accelerations of composite ones, with torques at the joints of the loops and with a joint
     of the tree locked; and their derivatives by masses and along the loops, on each side."""
-    chain, state, tau = cases.CASES[name].moving()
+    chain, state, tau = cases.CASES[name].random_motion()
     locked = (
         svkc.lock(chain, state, chain.joint_names[-1])
         if name in ("stewart", "two_hands")

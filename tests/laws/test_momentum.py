@@ -10,14 +10,14 @@ import pytest
 from tolerances import ROUND_OFF
 
 import svkc
-from svkc.transitions.transition import change
+from svkc.transitions.transition import change_structure
 from svkc.tree.configuration import rates
 
 
 @pytest.mark.parametrize("name", cases.params("afloat"))
 def test_its_rate(name):
     """That of the weight and of the loop forces: joint torques change neither of the two."""
-    chain, state, tau = cases.CASES[name].moving()
+    chain, state, tau = cases.CASES[name].random_motion()
     # the base is moved by none, and no grip is driven
     tau = tau.at[:6].set(0).at[chain.nv :].set(0)
     vdot = svkc.forward_dynamics(chain, state, tau)
@@ -46,7 +46,7 @@ def caught():
     chain, state = cases.flight()
 
     def hands(state):
-        done = change(chain, state, jnp.array([True, True]))
+        done = change_structure(chain, state, jnp.array([True, True]))
         moment = np.cross(chain.structure.pos, done.impulse) + np.asarray(done.angular_impulse)
         lost = svkc.kinetic_energy(chain, state) - svkc.kinetic_energy(chain, done.state)
         np.testing.assert_allclose(done.energy_lost, lost, rtol=1e-10)

@@ -155,7 +155,7 @@ def test_adjoints_pass_through(pendulum):
         traj = held(pendulum, x, ts=jnp.array([0.5, 0.9]), dt=0.01, adjoint=adjoint, max_steps=300)
         return traj.final.q[0] + jnp.sum(traj.states.q)
 
-    expected = jax.grad(loss)(x, svkc.Replay(every=5))
+    expected = jax.grad(loss)(x, svkc.integrators.Replay(every=5))
     np.testing.assert_allclose(
         jax.grad(loss)(x, diffrax.RecursiveCheckpointAdjoint()), expected, atol=1e-7
     )

@@ -108,7 +108,7 @@ def test_missing(five_bar):
     direction = undriven[:, np.any(undriven, 0)][:, 0]
     assert np.abs(direction[motors]).max() < ROUND_OFF
     there = svkc.State(state.q, jnp.asarray(direction), state.structure)
-    assert float(jnp.abs(svkc.velocity_gaps(chain, there)).max()) < ROUND_OFF
+    assert float(jnp.abs(svkc.loop_gap_rates(chain, there)).max()) < ROUND_OFF
     # what can be reached is: with an acceleration that the one motor makes, nothing is left
     possible = svkc.forward_dynamics(chain, state, jnp.where(motors, 3.0, 0.0))
     exact = svkc.actuation(chain, state, possible, actuated=motors)
@@ -138,7 +138,7 @@ def test_over_constrained():
     assert reached(chain, state, vdot, found) < 1e-10 * float(jnp.abs(vdot).max())
     assert not svkc.loop_forces(chain, state, found.tau).unique.any()
     # seven self-stresses: wrenches of both pins that no joint feels
-    linear, angular = (np.asarray(x) for x in svkc.jacobian(chain, state))
+    linear, angular = (np.asarray(x) for x in svkc.loop_jacobian(chain, state))
     force, torque = np.asarray(found.stress_force), np.asarray(found.stress_torque)
     felt = np.einsum("lkd,lkr->dr", linear, force) + np.einsum("lkd,lkr->dr", angular, torque)
     stresses = np.concatenate([force, torque], 1).reshape(12, -1)
@@ -206,7 +206,7 @@ def test_open_chain_and_derivative(five_bar):
         found.tau, svkc.inverse_dynamics(tree, state, vdot), rtol=1e-10, atol=ROUND_OFF
     )
     chain, state, vdot, _ = five_bar
-    state = svkc.prefer(chain, state, "left_arm", "right_arm")
+    state = svkc.with_independent(chain, state, "left_arm", "right_arm")
     along = svkc.coordinates(chain, state).W @ jnp.where(
         svkc.coordinates(chain, state).independent, 1.0, 0.0
     )

@@ -62,7 +62,7 @@ def test_the_table_names_things():
     assert "independent coordinates: " in text
     assert "pin1: not connected" in str(svkc.mobility(chain, chain.state(connected=["pin2"])))
     for name in ("leg0", "plate"):
-        chosen = svkc.mobility(chain, svkc.prefer(chain, state, name)).independent
+        chosen = svkc.mobility(chain, svkc.with_independent(chain, state, name)).independent
         assert chain.dof_names[int(jnp.argmax(chosen))] == name
 
 
@@ -81,7 +81,7 @@ def test_loop_forces_are_the_multipliers(name):
     )
     carried = svkc.loop_forces(chain, state, tau)
     assert carried.unique.tolist() == list(case.unique)
-    linear, angular = (np.asarray(x) for x in svkc.jacobian(chain, state))
+    linear, angular = (np.asarray(x) for x in svkc.loop_jacobian(chain, state))
     J = np.concatenate([angular, linear / float(chain.length)], 1).reshape(-1, chain.dofs)
     vdot = acceleration(chain, state, tau)
     excess = np.zeros(chain.dofs)

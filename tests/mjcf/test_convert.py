@@ -41,7 +41,7 @@ def test_there_and_back(cuttable):
         {"a": 1.0, "c": rng.normal(size=3), "b": rng.normal(size=6)},
     )
     data = mujoco.MjData(chain.model.model)
-    svkc.to_mujoco(chain, state, data)
+    svkc.interop.to_mujoco(chain, state, data)
     mujoco.mj_forward(chain.model.model, data)
     places, quats = svkc.poses(chain, state)
     np.testing.assert_allclose(data.xpos, places, atol=1e-14)
@@ -55,14 +55,14 @@ def test_there_and_back(cuttable):
         velocity[3:], svkc.velocities(chain, state)[0][chain.body_names.index("b")], atol=1e-13
     )
     assert data.eq_active.tolist() == [0]
-    again = svkc.from_mujoco(chain, data)
+    again = svkc.interop.from_mujoco(chain, data)
     np.testing.assert_allclose(again.q, state.q, atol=1e-14)
     np.testing.assert_allclose(again.v, state.v, atol=1e-14)
     data.eq_active[0] = 1
     data.qpos[:] = chain.model.model.qpos0
-    held = svkc.from_mujoco(chain, data)
+    held = svkc.interop.from_mujoco(chain, data)
     assert bool(held.structure.connected[chain.link_names.index("w")])
-    svkc.to_mujoco(chain, held, data)
+    svkc.interop.to_mujoco(chain, held, data)
     assert data.eq_active.tolist() == [1]
 
 
@@ -72,9 +72,11 @@ def test_scalar_last():
     ball, free = turns.as_quat(scalar_first=True)
     q = chain.state({"a": 0.4, "c": ball, "b": [1, 2, 3, *free]}).q
     last = turns.as_quat()
-    np.testing.assert_allclose(svkc.xyzw(chain, q), [0.4, *last[0], 1, 2, 3, *last[1]], atol=1e-15)
+    np.testing.assert_allclose(
+        svkc.interop.quaternions_xyzw(chain, q), [0.4, *last[0], 1, 2, 3, *last[1]], atol=1e-15
+    )
     plain = svkc.load(models.ARM)
-    np.testing.assert_array_equal(svkc.xyzw(plain, jnp.array([0.7])), [0.7])
+    np.testing.assert_array_equal(svkc.interop.quaternions_xyzw(plain, jnp.array([0.7])), [0.7])
 
 
 def test_an_equality_without_a_name():
@@ -82,9 +84,9 @@ def test_an_equality_without_a_name():
     chain = svkc.load(XML.replace('name="w" ', ""))
     assert chain.link_names == ("equality_0",)
     data = mujoco.MjData(chain.model.model)
-    svkc.to_mujoco(chain, chain.state(connected="equality_0"), data)
+    svkc.interop.to_mujoco(chain, chain.state(connected="equality_0"), data)
     assert data.eq_active.tolist() == [1]
-    assert bool(svkc.from_mujoco(chain, data).structure.connected[0])
+    assert bool(svkc.interop.from_mujoco(chain, data).structure.connected[0])
 
 
 TWO = (
@@ -146,7 +148,7 @@ SCENES = {
 def residual(chain, state):
     """The largest of MuJoCo's own equality residuals at a state."""
     data = mujoco.MjData(chain.model.model)
-    svkc.to_mujoco(chain, state, data)
+    svkc.interop.to_mujoco(chain, state, data)
     mujoco.mj_forward(chain.model.model, data)
     gaps = data.efc_pos[data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY]
     assert len(gaps)

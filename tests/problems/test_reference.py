@@ -113,7 +113,7 @@ def forty_windows():
         state,
         20.0,
         ts=jnp.array([0.0, 1.0, 20.0]),
-        dynamics=svkc.Dynamics(hold=None),
+        dynamics=svkc.dynamics.CompositeBodies(hold=None),
         **tight(1e-8),
     )
     np.testing.assert_allclose(2 * places(chain, traj, "vert0")[1, :2], case["B0"][1], atol=1e-6)

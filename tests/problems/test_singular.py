@@ -163,7 +163,7 @@ def test_without_pivots_a_singular_configuration_may_end_the_run():
     )
     state = chain.state({"crank": -np.pi / 4, "rod": np.pi / 2}, {"crank": 3.0})
     run = lambda **kw: svkc.simulate(chain, state, 3.0, throw=False, **kw)
-    through, not_through = run(), run(dynamics=svkc.Dynamics(inertia=svkc.by_bodies))
+    through, not_through = run(), run(dynamics=svkc.dynamics.ArticulatedBodies())
     assert through.result == svkc.RESULTS.successful
     assert float(through.final.q[0]) > 3 * np.pi
     assert not_through.result == svkc.RESULTS.step_too_small

@@ -147,7 +147,11 @@ simulations = dict(
     rtol=or_anything(st.sampled_from([1e-3, jnp.asarray(1e-3)])),
     atol=or_anything(st.just(1e-6)),
     solver=one_of_these(
-        diffrax.Tsit5, lambda: diffrax.Tsit5, diffrax.Euler, svkc.RodriguesEuler, diffrax.Kvaerno3
+        diffrax.Tsit5,
+        lambda: diffrax.Tsit5,
+        diffrax.Euler,
+        svkc.integrators.RodriguesEuler,
+        diffrax.Kvaerno3,
     ),
     stepsize_controller=one_of_these(
         lambda: diffrax.PIDController(rtol=1e-3, atol=1e-6),
@@ -155,24 +159,24 @@ simulations = dict(
         lambda: diffrax.StepTo(jnp.linspace(0, 1, 3)),
     ),
     stabilization=one_of_these(
-        svkc.Projection,
+        svkc.stabilization.Projection,
         svkc.stabilization.CoordinatePartitioning,
         svkc.stabilization.NoStabilization,
-        svkc.Baumgarte,
-        lambda: svkc.Baumgarte("a"),
-        lambda: svkc.Projection(-1),
+        svkc.stabilization.Baumgarte,
+        lambda: svkc.stabilization.Baumgarte("a"),
+        lambda: svkc.stabilization.Projection(-1),
     ),
     dynamics=one_of_these(
-        svkc.Dynamics,
-        lambda: svkc.Dynamics(svkc.by_bodies),
-        lambda: svkc.Dynamics(3),
-        lambda: svkc.Dynamics(hold="a"),
-        lambda: svkc.Dynamics(hold=math.nan),
+        svkc.dynamics.CompositeBodies,
+        svkc.dynamics.ArticulatedBodies,
+        lambda: svkc.dynamics.CompositeBodies(3),
+        lambda: svkc.dynamics.CompositeBodies(hold="a"),
+        lambda: svkc.dynamics.CompositeBodies(hold=math.nan),
     ),
     adjoint=one_of_these(
-        svkc.Replay,
-        lambda: svkc.Replay(every=0),
-        lambda: svkc.Replay(every="a"),
+        svkc.integrators.Replay,
+        lambda: svkc.integrators.Replay(every=0),
+        lambda: svkc.integrators.Replay(every="a"),
         diffrax.ForwardMode,
         diffrax.DirectAdjoint,
         diffrax.RecursiveCheckpointAdjoint,
@@ -273,13 +277,13 @@ def test_other_calls(only_traced, place, call, value, other):
         for name in SEEN
     }
     made = {
-        "tune": lambda: svkc.tune(chain, state, value, target=other),
-        "halved": lambda: svkc.halved(chain, state, value, dt=other),
+        "tune": lambda: svkc.accuracy.tune(chain, state, value, target=other),
+        "halved": lambda: svkc.accuracy.estimate_error(chain, state, value, dt=other),
         "check_grad": lambda: svkc.check_grad(
             jnp.sin if isinstance(value, float) else value, other
         ),
-        "to_mujoco": lambda: svkc.to_mujoco(chain, state, value),
-        "from_mujoco": lambda: svkc.from_mujoco(chain, value),
+        "to_mujoco": lambda: svkc.interop.to_mujoco(chain, state, value),
+        "from_mujoco": lambda: svkc.interop.from_mujoco(chain, value),
         "render": lambda: svkc.render(chain, value, other if isinstance(other, str) else "x.png"),
         "motors": lambda: chain.motors(value),
         "bounds": lambda: svkc.actuation(

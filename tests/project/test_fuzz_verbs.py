@@ -72,7 +72,7 @@ def test_states(data):
     state = outcome(lambda: chain.state(**given))
     if state is not NOTHING:
         assert all_finite(state)
-        starts, _ = chain.topology.quaternions
+        starts, _ = chain.topology.quaternion_starts
         norms = np.linalg.norm(np.asarray(state.q)[starts[:, None] + np.arange(4)], axis=1)
         np.testing.assert_allclose(norms, 1, atol=1e-12)
         # (lengths up to 1e300 m are let through: what is closed is so in their round-off)
@@ -192,7 +192,7 @@ def test_changes_of_structure(data):
         "transition": lambda: svkc.transition(
             chain, given, data.draw(or_anything(st.just("pin"), 2))
         ),
-        "prefer": lambda: svkc.prefer(chain, given, data.draw(name)),
+        "prefer": lambda: svkc.with_independent(chain, given, data.draw(name)),
         "bind": lambda: svkc.bind(
             chain,
             given,

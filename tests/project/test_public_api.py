@@ -1,10 +1,36 @@
-"""The public names, and what importing them costs."""
+"""The public names: which there are, how they are documented, and what importing them costs."""
 
-import types
+import importlib
+import inspect
+import pathlib
+import re
+import typing
 
+import pytest
 from processes import run
 
 import svkc
+from svkc import _deprecated as deprecated
+
+ROOT = pathlib.Path(__file__).parents[2]
+NAMESPACES = ("accuracy", "dynamics", "integrators", "interop", "stabilization", "types")
+# the contract's nouns: their public methods are public names too
+CLASSES = (svkc.Chain, svkc.State, svkc.Trajectory, svkc.types.Report)
+# what these name is said by the annotation and the name
+EXPLAINED = {"self", "chain", "state", "args", "kwargs"}
+
+
+def public_objects() -> dict[str, object]:
+    """Return every documented object by its path below `svkc`."""
+    out = {name: getattr(svkc, name) for name in svkc.__all__ if name not in NAMESPACES}
+    for space in NAMESPACES:
+        module = getattr(svkc, space)
+        out |= {f"{space}.{name}": x for name, x in vars(module).items() if name[0] != "_"}
+    for cls in CLASSES:
+        for name, x in vars(cls).items():
+            if name[0] != "_" and (inspect.isfunction(x) or isinstance(x, property)):
+                out[f"{cls.__name__}.{name}"] = x
+    return out
 
 
 def test_importing_loads_nothing_heavy():
@@ -18,34 +44,63 @@ def test_importing_loads_nothing_heavy():
     assert done.returncode == 0, done.stderr
 
 
-def test_every_public_name_says_what_it_is():
-    for name in dir(svkc):
-        thing = getattr(svkc, name)
-        if name.startswith("_") or type(thing).__name__ == "module":
-            continue
-        assert thing.__doc__, name
+def test_the_flat_names_are_those_of_all():
+    names = {
+        name for name in vars(svkc) if name[0] != "_" and not inspect.ismodule(vars(svkc)[name])
+    }
+    assert names | set(NAMESPACES) == set(svkc.__all__)
+    assert len(svkc.__all__) == len(set(svkc.__all__)) <= 60
 
 
-NAMES = """
-Baumgarte Chain Check Drift Dynamics Exact Grip Projection RESULTS Replay RodriguesEuler
-SemiImplicitEuler State Structure Trajectory VirtualLink actuation at bias_force bind by_bodies
-check_grad connect coordinates cut difference energy error_between forward_dynamics from_mujoco
-halved inertia_by_composites inertia_by_unit_vectors integrate inverse_dynamics jacobian
-kinetic_energy leaves load load_chain load_trajectory lock loop_forces loop_gaps mass_matrix
-mobility momentum overload plot poses potential_energy prefer render rollout simulate step tangent
-to_mujoco touch transition tune unbind unlock velocities velocity_gaps when xyzw
-"""
-
-
-def test_the_public_names_are_those_listed():
-    names = [
-        name
-        for name in dir(svkc)
-        if not name.startswith("_") and not isinstance(getattr(svkc, name), types.ModuleType)
+@pytest.mark.parametrize("name", public_objects())
+def test_every_public_object_is_documented(name):
+    """The first sentence ends with a period. That of a function starts with a verb. Every parameter
+    that its name does not explain is named, and is annotated or described."""
+    thing = public_objects()[name]
+    text = inspect.getdoc(thing)
+    assert text, name
+    first = text.split("\n\n")[0]
+    assert re.search(r"[.:]$", first.strip()), first
+    if not inspect.isfunction(inspect.unwrap(thing)):
+        return
+    assert not re.match(r"(The|A|An|This|It|What|How|Which|Whether)\b", first), first
+    assert not re.match(r"\w+[^s]s\b", first), f"not an imperative verb: {first}"
+    missing = [
+        parameter
+        for parameter in inspect.signature(thing).parameters
+        if parameter not in EXPLAINED and not re.search(rf"\b{parameter}\b", text)
     ]
-    assert sorted(names) == sorted(NAMES.split())
+    assert not missing, f"{name} does not name {missing}"
 
 
-def test_old_names_of_stabilizations():
-    assert svkc.Exact is svkc.stabilization.CoordinatePartitioning
-    assert svkc.Drift is svkc.stabilization.NoStabilization
+def test_public_functions_say_what_they_return():
+    for name, thing in public_objects().items():
+        function = inspect.unwrap(thing)
+        if inspect.isfunction(function):
+            assert "return" in typing.get_type_hints(function) or "return" in vars(function).get(
+                "__annotations__", {}
+            ), f"{name} has no return annotation"
+
+
+def test_the_readme_lists_the_public_names():
+    page = (ROOT / "README.md").read_text()
+    assert not [name for name in svkc.__all__ if not re.search(rf"\b{name}\b", page)]
+
+
+@pytest.mark.parametrize("name", [*deprecated.RENAMED, *deprecated.SUPERSEDED])
+def test_every_old_name_warns_and_works(name):
+    module, _, attribute = f"svkc.{name}".rpartition(".")
+    use = f"svkc.{deprecated.RENAMED[name]}" if name in deprecated.RENAMED else "svkc.dynamics"
+    with pytest.warns(DeprecationWarning, match=rf"svkc.{name} is deprecated.*{re.escape(use)}"):
+        old = getattr(importlib.import_module(module), attribute)
+    assert callable(old)
+    if name in deprecated.RENAMED:
+        module, _, attribute = use.rpartition(".")
+        assert old is getattr(importlib.import_module(module), attribute)
+
+
+def test_unknown_names_are_attribute_errors():
+    with pytest.raises(AttributeError, match=r"module 'svkc' has no attribute 'nothing'"):
+        svkc.nothing
+    with pytest.raises(AttributeError, match=r"module 'svkc.page' has no attribute 'nothing'"):
+        importlib.import_module("svkc.page").nothing

@@ -90,7 +90,9 @@ def springs(chain, problem):
         return total
 
     def control(t, state, args):
-        torque = -svkc.tangent(chain, state.q, jax.grad(potential)(state.q, state.structure))
+        torque = -svkc.tangent_gradient(
+            chain, state.q, jax.grad(potential)(state.q, state.structure)
+        )
         for force in (force for force in problem["forces"] if force["type"] == "torque"):
             torque = torque.at[chain.dof_names.index(force["body"])].add(force["world"][2])
         return torque

@@ -11,7 +11,8 @@ import pytest
 from tolerances import REFERENCE, ROUND_OFF
 
 import svkc
-from svkc.loops.constrained_dynamics import default_dynamics
+from svkc import _deprecated as deprecated
+from svkc.loops.constrained_dynamics import Dynamics, default_dynamics
 from svkc.loops.projection import settle_loops
 from svkc.tools.accuracy import Candidate, candidates
 
@@ -38,8 +39,8 @@ def arm():
 @pytest.mark.parametrize(
     ("solver", "order", "dt"),
     [
-        pytest.param(svkc.RodriguesEuler(), 1, 2e-3, marks=pytest.mark.slow),
-        pytest.param(svkc.SemiImplicitEuler(), 1, 2e-3, marks=pytest.mark.slow),
+        pytest.param(svkc.integrators.RodriguesEuler(), 1, 2e-3, marks=pytest.mark.slow),
+        pytest.param(svkc.integrators.SymplecticEuler(), 1, 2e-3, marks=pytest.mark.slow),
         pytest.param(diffrax.Heun(), 2, 4e-3, marks=pytest.mark.slow),
         pytest.param(diffrax.Bosh3(), 3, 0.01, marks=pytest.mark.slow),
         pytest.param(diffrax.Tsit5(), 5, 0.02, marks=pytest.mark.slow),
@@ -79,11 +80,11 @@ def test_symplectic_euler_keeps_energy():
     )
     state, ts = chain.state({"rod": 0.5}), jnp.linspace(0, 160.0, 161)
     found = {}
-    for solver in (svkc.SemiImplicitEuler(), svkc.RodriguesEuler()):
+    for solver in (svkc.integrators.SymplecticEuler(), svkc.integrators.RodriguesEuler()):
         traj = svkc.simulate(chain, state, 160.0, ts=ts, dt=0.026, solver=solver)
         energy = jax.vmap(lambda s: svkc.energy(chain, s))(traj.states)
         found[type(solver)] = np.abs(energy - energy[0])
-    kept, lost = found[svkc.SemiImplicitEuler], found[svkc.RodriguesEuler]
+    kept, lost = found[svkc.integrators.SymplecticEuler], found[svkc.integrators.RodriguesEuler]
     assert kept[80:].max() < 1.1 * kept[:80].max()
     assert lost[-1] > 20 * kept.max()
 
@@ -91,7 +92,7 @@ def test_symplectic_euler_keeps_energy():
 @pytest.mark.parametrize(
     "stabilization",
     [
-        svkc.Projection(),
+        svkc.stabilization.Projection(),
         pytest.param(svkc.stabilization.CoordinatePartitioning(), marks=pytest.mark.slow),
     ],
 )
@@ -134,11 +135,12 @@ def test_only_dependent_coordinates_move():
     closed = svkc.State(q, v, rough.structure)
     assert np.abs(svkc.loop_gaps(chain, rough)).max() > 1e-6
     assert np.abs(svkc.loop_gaps(chain, closed)).max() < 1e-13
-    assert np.abs(svkc.velocity_gaps(chain, closed)).max() < ROUND_OFF
+    assert np.abs(svkc.loop_gap_rates(chain, closed)).max() < ROUND_OFF
     # in the metric of the inertia they move too
     assert np.abs(moved(False)[0][independent] - rough.q[independent]).max() > 1e-9
 
 
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_the_older_spelling_of_dynamics():
     closed, tree = (
         models.four_bar(),
@@ -149,13 +151,13 @@ def test_the_older_spelling_of_dynamics():
         assert default_dynamics(chain) == usual()
         for inertia, kind in (
             (None, usual),
-            (svkc.by_bodies, new.ArticulatedBodies),
-            (svkc.inertia_by_composites, new.CompositeBodies),
-            (svkc.inertia_by_unit_vectors, new.UnitVectors),
+            (deprecated.resolve("by_bodies"), new.ArticulatedBodies),
+            (deprecated.resolve("inertia_by_composites"), new.CompositeBodies),
+            (deprecated.resolve("inertia_by_unit_vectors"), new.UnitVectors),
         ):
             for hold in (None, 0.0, 0.3):
-                assert svkc.Dynamics(inertia, hold).resolved(chain) == kind(hold)
-        assert type(svkc.Dynamics().resolved(chain)) is usual
+                assert Dynamics(inertia, hold).resolved(chain) == kind(hold)
+        assert type(Dynamics().resolved(chain)) is usual
 
 
 def test_the_certificate():
@@ -163,7 +165,7 @@ def test_the_certificate():
     lanes."""
     chain = models.four_bar()
     control = lambda t, s, args: jnp.zeros(chain.dofs).at[0].set(3.0)
-    new = svkc.Dynamics(hold=None)
+    new = svkc.dynamics.CompositeBodies(hold=None)
     run = jax.jit(
         lambda dt: svkc.simulate(
             chain,
@@ -182,7 +184,7 @@ def test_the_certificate():
         float(
             jnp.max(
                 jnp.linalg.norm(
-                    jax.vmap(lambda s: svkc.velocity_gaps(chain, s))(states)[..., 3:], axis=-1
+                    jax.vmap(lambda s: svkc.loop_gap_rates(chain, s))(states)[..., 3:], axis=-1
                 )
             )
         )
@@ -326,7 +328,7 @@ def test_tune(capsys):
     chain = models.four_bar()
     state = chain.state(v={"crank": 4.0})
     given = [
-        Candidate("rough", {"dt": 0.02, "solver": svkc.SemiImplicitEuler()}),
+        Candidate("rough", {"dt": 0.02, "solver": svkc.integrators.SymplecticEuler()}),
         Candidate("fine", {"rtol": 1e-8, "atol": 1e-10}),
         Candidate(
             "loose",
@@ -337,7 +339,7 @@ def test_tune(capsys):
             },
         ),
     ]
-    found = svkc.tune(chain, state, 0.5, target=1e-6, options=given, repeats=1)
+    found = svkc.accuracy.tune(chain, state, 0.5, target=1e-6, options=given, repeats=1)
     assert str(found) in capsys.readouterr().out
     assert found.best is given[1].options
     assert found.table[0].name == "fine"
@@ -348,7 +350,9 @@ def test_tune(capsys):
         assert word in str(found)
     again = svkc.simulate(chain, state, 0.5, ts=jnp.linspace(0, 0.5, 11), **found.best)
     assert int(again.report().accepted + again.report().rejected) == found.table[0].steps
-    none = svkc.tune(chain, state, 0.5, target=1e-9, options=given[:1], repeats=1, show=False)
+    none = svkc.accuracy.tune(
+        chain, state, 0.5, target=1e-9, options=given[:1], repeats=1, show=False
+    )
     assert none.best is None
     assert not capsys.readouterr().out
     assert "no candidate holds the target" in str(none)
@@ -360,11 +364,11 @@ def test_errors_by_halving(arm, exact):
     """The difference of a run and a finer one is what the run errs by."""
     chain, state = arm
     for options in ({"dt": 0.02, "solver": diffrax.Heun()}, {"rtol": 1e-5, "atol": 1e-7}):
-        estimate = svkc.halved(chain, state, 0.4, **options)
+        estimate = svkc.accuracy.estimate_error(chain, state, 0.4, **options)
         run = svkc.simulate(chain, state, 0.4, **options)
         if "dt" in options:
             finer = svkc.simulate(chain, state, 0.4, **options | {"dt": options["dt"] / 2})
-            assert svkc.error_between(chain, run, finer) == estimate
+            assert svkc.accuracy.configuration_error(chain, run, finer) == estimate
         error = float(np.sqrt(np.mean(svkc.difference(chain, exact.q, run.final.q) ** 2)))
         assert 0.5 * error < estimate < 2 * error
         assert f"by a finer run {estimate:.2e}" in str(run.report(halved=estimate))

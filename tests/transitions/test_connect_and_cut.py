@@ -66,7 +66,7 @@ def test_both_forms_of_it_agree_between_free_bodies(joint):
     chain, rng = models.two_boxes(joint), np.random.default_rng(1)
     state = chain.state(v=rng.normal(size=12))
     after = svkc.connect(chain, state, "grip")
-    assert float(jnp.abs(svkc.velocity_gaps(chain, after)).max()) < ROUND_OFF
+    assert float(jnp.abs(svkc.loop_gap_rates(chain, after)).max()) < ROUND_OFF
     v, _ = paper.velocity_by_impulse(chain, state, "grip")
     np.testing.assert_allclose(after.v, v, atol=1e-10)
 
@@ -97,7 +97,7 @@ def test_lock_and_unlock(high_bar):
     assert int(svkc.mobility(chain, locked).freedoms) == 11
     vdot = svkc.forward_dynamics(chain, locked, jnp.zeros(chain.dofs))
     assert float(vdot[knee]) == 0
-    assert float(jnp.abs(svkc.velocity_gaps(chain, locked)).max()) < ROUND_OFF
+    assert float(jnp.abs(svkc.loop_gap_rates(chain, locked)).max()) < ROUND_OFF
     free = svkc.unlock(chain, locked, "right_knee")
     assert int(svkc.mobility(chain, free).freedoms) == 12
     assert float(svkc.forward_dynamics(chain, free, jnp.zeros(chain.dofs))[knee]) != 0

@@ -15,6 +15,7 @@ import svkc
 from svkc.loops.forward_dynamics import acceleration
 from svkc.tree.configuration import rates
 from svkc.tree.kinematics import kinematics
+from svkc.tree.mass_matrix import inertia_by_unit_vectors
 
 # MuJoCo says it of gymnasium's half_cheetah.xml
 pytestmark = pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass' is deprecated")
@@ -52,7 +53,7 @@ def everything(chain, state, tau):
         "linear": linear,
         "angular": angular,
         "mass": svkc.mass_matrix(chain, state),
-        "mass by unit vectors": svkc.inertia_by_unit_vectors(chain, kin),
+        "mass by unit vectors": inertia_by_unit_vectors(chain, kin),
         "bias": svkc.bias_force(chain, state),
         "acceleration": vdot,
         "acceleration by unit vectors": paper.forward_dynamics_by_unit_vectors(chain, state, tau),

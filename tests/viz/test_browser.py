@@ -71,7 +71,7 @@ def picture(page):
         "() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
     )
     return np.asarray(
-        Image.open(io.BytesIO(page.locator("canvas").screenshot())).convert("RGB"), int
+        Image.search_gaps(io.BytesIO(page.locator("canvas").screenshot())).convert("RGB"), int
     )
 
 
@@ -263,7 +263,7 @@ def test_names_stay_names_in_the_browser(pendulum, visit, tmp_path):
 @pytest.mark.slow
 def test_a_notebook_shows_it(release, visit, tmp_path):
     """As a frame in its own document."""
-    shown = svkc.page.show(*release, height=400)
+    shown = svkc.show(*release, height=400)
     cell = shown._repr_html_()
     assert html.unescape(re.search(r'srcdoc="([^"]*)"', cell).group(1)) == shown.text
     (tmp_path / "cell.html").write_text(

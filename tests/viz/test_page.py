@@ -153,7 +153,7 @@ def test_every_kind_of_geom(tmp_path):
 def test_nothing_of_it_is_read_before_it_is_asked_for():
     code = (
         "import sys; opened = []; sys.addaudithook(lambda name, args: opened.append(str(args[0]))"
-        " if name == 'open' else None);import svkc.page; assert any('render' in path for path in"
+        " if name == 'open' else None);import svkc.viz.html_page; assert any('render' in path for path in"
         " opened); assert not [path for path in opened if 'three.min' in path or 'page.html' in"
         " path]"
     )

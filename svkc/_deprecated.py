@@ -1,0 +1,69 @@
+"""Names of version 0.1, kept for one release. Each warns and names its replacement."""
+
+import importlib
+import warnings
+
+# the old name, below `svkc.`: the new one
+RENAMED = {
+    "Baumgarte": "stabilization.Baumgarte",
+    "Check": "types.GradientCheck",
+    "Drift": "stabilization.NoStabilization",
+    "Exact": "stabilization.CoordinatePartitioning",
+    "Projection": "stabilization.Projection",
+    "Replay": "integrators.Replay",
+    "RodriguesEuler": "integrators.RodriguesEuler",
+    "SemiImplicitEuler": "integrators.SymplecticEuler",
+    "error_between": "accuracy.configuration_error",
+    "from_mujoco": "interop.from_mujoco",
+    "halved": "accuracy.estimate_error",
+    "jacobian": "loop_jacobian",
+    "page.show": "show",
+    "prefer": "with_independent",
+    "tangent": "tangent_gradient",
+    "to_mujoco": "interop.to_mujoco",
+    "tune": "accuracy.tune",
+    "velocity_gaps": "loop_gap_rates",
+    "xyzw": "interop.quaternions_xyzw",
+}
+# the old name: the file and name of the object that still serves it, and what to use now
+SUPERSEDED = {
+    "Dynamics": (
+        "loops.constrained_dynamics.Dynamics",
+        "an object of svkc.dynamics: ArticulatedBodies(), CompositeBodies(hold=...), UnitVectors()",
+    ),
+    "by_bodies": (
+        "loops.constrained_dynamics.by_bodies",
+        "svkc.dynamics.ArticulatedBodies()",
+    ),
+    "inertia_by_composites": (
+        "tree.mass_matrix.inertia_by_composites",
+        "svkc.dynamics.CompositeBodies()",
+    ),
+    "inertia_by_unit_vectors": (
+        "tree.mass_matrix.inertia_by_unit_vectors",
+        "svkc.dynamics.UnitVectors()",
+    ),
+}
+
+
+def resolve(name: str):
+    """Return the object of a deprecated name `svkc.<name>`, with a `DeprecationWarning`.
+
+    Raises AttributeError if the name is not one of them.
+    """
+    if name == "page":
+        return importlib.import_module("svkc.page")
+    if name in RENAMED:
+        path, use = RENAMED[name], f"svkc.{RENAMED[name]}"
+    elif name in SUPERSEDED:
+        path, use = SUPERSEDED[name]
+    else:
+        module, _, attribute = f"svkc.{name}".rpartition(".")
+        raise AttributeError(f"module {module!r} has no attribute {attribute!r}")
+    warnings.warn(
+        f"svkc.{name} is deprecated and leaves with the next release; use {use}",
+        DeprecationWarning,
+        stacklevel=3,
+    )
+    module, _, attribute = f"svkc.{path}".rpartition(".")
+    return getattr(importlib.import_module(module), attribute)

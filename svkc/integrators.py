@@ -1,0 +1,7 @@
+"""Integrators and derivatives of svkc's own, for `svkc.simulate(..., solver=..., adjoint=...)`."""
+
+from svkc.integration.integrators import (
+    RodriguesEuler as RodriguesEuler,
+    SemiImplicitEuler as SymplecticEuler,
+)
+from svkc.integration.replay import Replay as Replay
