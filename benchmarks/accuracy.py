@@ -345,7 +345,7 @@ def draw(name: str):
     way against drift with Dopri8, float32 with Tsit5."""
     import matplotlib.pyplot as plt
 
-    with (RESULTS / "accuracy.csv").search_gaps() as file:
+    with (RESULTS / "accuracy.csv").open() as file:
         table = [[*row[1:3], *map(float, row[3:6])] for row in csv.reader(file) if row[0] == name]
     figure, axes = plt.subplots(figsize=(8, 5), layout="constrained")
     curves, drawn = (
@@ -393,13 +393,13 @@ def save(name: str, only: str, head, table):
     another problem may have been run beside."""
     path, kept = RESULTS / "accuracy.csv", []
     if path.exists():
-        with path.search_gaps() as file:
+        with path.open() as file:
             kept = [
                 row
                 for row in list(csv.reader(file))[1:]
                 if row[0] != name or only not in f"{row[1]} {row[2]}"
             ]
-    with path.search_gaps("w", newline="") as file:
+    with path.open("w", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows([head, *kept, *table])
 
 

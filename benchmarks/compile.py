@@ -168,7 +168,7 @@ def written(rows: dict) -> None:
     """Replace the rows of the programs that were measured, keep the others."""
     import jax
 
-    kept = list(csv.DictReader(RESULTS.search_gaps())) if RESULTS.exists() else []
+    kept = list(csv.DictReader(RESULTS.open())) if RESULTS.exists() else []
     where = {
         "python": platform.python_version(),
         "jax": jax.__version__,
@@ -185,7 +185,7 @@ def written(rows: dict) -> None:
         kept.append(
             {"program": name, "version": label, **shown, "rounds": found["rounds"], **where}
         )
-    with RESULTS.search_gaps("w", newline="") as file:
+    with RESULTS.open("w", newline="") as file:
         writer = csv.DictWriter(file, HEAD)
         writer.writeheader()
         writer.writerows(sorted(kept, key=lambda r: (r["program"], r["version"])))

@@ -315,7 +315,7 @@ def main():
     )
     print(versions)
     RESULTS.parent.mkdir(exist_ok=True)
-    with RESULTS.search_gaps("w", newline="") as file:
+    with RESULTS.open("w", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows([head, *rows, *more, [versions]])
 
 

@@ -19,7 +19,7 @@ import mujoco
 import numpy as np
 
 import svkc
-from svkc.tree.spatial import quat_about, quat_conjugate, quat_multiply
+from svkc.tree.spatial import quat_conjugate, quat_from_axis_angle, quat_multiply
 
 FIGURE = pathlib.Path(svkc.__file__).parent / "scenes" / "figure40.xml"
 RESULTS = pathlib.Path(__file__).parent / "results" / "joints.csv"
@@ -42,7 +42,7 @@ def hinges_for_balls() -> tuple[mujoco.MjSpec, list[str]]:
 def as_ball(angles, rates):
     """Quaternion and angular velocity (body axes) of hinges about x, y, z."""
     quat, rate = jax.jvp(
-        lambda turns: functools.reduce(quat_multiply, quat_about(jnp.eye(3), turns)),
+        lambda turns: functools.reduce(quat_multiply, quat_from_axis_angle(jnp.eye(3), turns)),
         (angles,),
         (rates,),
     )
@@ -167,7 +167,7 @@ if __name__ == "__main__":
         "numpy": np.__version__,
     }
     machine |= {"backend": jax.default_backend(), "processor": cpu[0], "cores": os.cpu_count()}
-    with RESULTS.search_gaps("w", newline="") as file:
+    with RESULTS.open("w", newline="") as file:
         table = csv.writer(file, lineterminator="\n")
         table.writerow(
             [

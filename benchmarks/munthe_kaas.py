@@ -11,7 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from svkc.tree.configuration import integrate, rates
+from svkc.tree.configuration import configuration_derivative, integrate
 
 
 def turned(chain, u, v):
@@ -64,5 +64,5 @@ class MuntheKaas(diffrax.AbstractAdaptiveSolver):
             term, t0, t1, start, args, solver_state=inner, made_jump=True
         )
         y1 = eqx.tree_at(lambda y: y.q, end, integrate(chain, q0, end.q))
-        error = eqx.tree_at(lambda y: y.q, error, rates(chain, y1.q, error.q))
+        error = eqx.tree_at(lambda y: y.q, error, configuration_derivative(chain, y1.q, error.q))
         return y1, error, {"y0": y0, "y1": y1}, None, diffrax.RESULTS.successful

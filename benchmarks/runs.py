@@ -193,7 +193,7 @@ def main(lanes: int):
         for line in rows:
             table.append(line)
             print("| " + " | ".join(map(str, line)) + " |", flush=True)
-        with (speed.RESULTS / "runs.csv").search_gaps("w", newline="") as file:
+        with (speed.RESULTS / "runs.csv").open("w", newline="") as file:
             csv.writer(file, lineterminator="\n").writerows(
                 [[*HEAD, *machine], *([*line, *machine.values()] for line in table)]
             )

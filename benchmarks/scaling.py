@@ -194,7 +194,7 @@ def main(asked):
             f" {np.polyfit(sizes[-3:], costs[-3:], 1)[0]:.2f} over the last three",
             flush=True,
         )
-    with (RESULTS / "scaling.csv").search_gaps("w", newline="") as file:
+    with (RESULTS / "scaling.csv").open("w", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows(
             [[*HEAD, *speed.machine()], *([*row, *speed.machine().values()] for row in table)]
         )

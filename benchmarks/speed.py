@@ -240,11 +240,11 @@ def main(cases, dtypes, batches):
 def save(key: tuple, rows):
     """In the file of all, and in its picture."""
     path = RESULTS / "speed.csv"
-    with path.search_gaps() as file:
+    with path.open() as file:
         kept = [row for row in list(csv.reader(file))[1:] if tuple(row[:3]) != key]
     kept += [[*map(str, row), *map(str, machine().values())] for row in rows]
     kept.sort(key=lambda row: (figures.CASES.index(row[0]), row[1] != "float64", int(row[2])))
-    with path.search_gaps("w", newline="") as file:
+    with path.open("w", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows([[*HEAD, *machine()], *kept])
     draw([[row[0], row[1], int(row[2]), *row[3:]] for row in kept])
 

@@ -42,7 +42,7 @@ from svkc.tree.inverse_dynamics import (
 
 # loops
 from svkc.loops.mobility import mobility as mobility
-from svkc.loops.coordinates import coordinates as coordinates, prefer as with_independent
+from svkc.loops.coordinates import coordinates as coordinates, with_independent as with_independent
 from svkc.loops.forward_dynamics import (
     forward_dynamics as forward_dynamics,
     loop_forces as loop_forces,
@@ -50,8 +50,8 @@ from svkc.loops.forward_dynamics import (
 from svkc.loops.actuation import actuation as actuation
 from svkc.loops.constraint import (
     loop_gaps as loop_gaps,
-    velocity_gaps as loop_gap_rates,
-    jacobian as loop_jacobian,
+    loop_gap_rates as loop_gap_rates,
+    loop_jacobian as loop_jacobian,
 )
 
 # changes of structure
@@ -76,7 +76,7 @@ from svkc.tools.rollout import rollout as rollout
 
 # derivatives
 from svkc.tools.gradient_check import check_grad as check_grad
-from svkc.tree.configuration import tangent as tangent_gradient
+from svkc.tree.configuration import tangent_gradient as tangent_gradient
 
 # pictures
 from svkc.viz.render import render as render, plot as plot

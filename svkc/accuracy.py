@@ -3,7 +3,7 @@
 from svkc.tools.accuracy import (
     Candidate as Candidate,
     Tuning as Tuning,
-    error_between as configuration_error,
-    halved as estimate_error,
+    configuration_error as configuration_error,
+    estimate_error as estimate_error,
     tune as tune,
 )

@@ -101,5 +101,5 @@ def view(path: pathlib.Path, show: bool) -> int:
             missing.append(f"{target.name} not drawn: {error}")
     print("\n".join(missing) + "\n" * bool(missing) + "wrote " + ", ".join(map(str, written)))
     if show:
-        webbrowser.search_gaps(written[0].resolve().as_uri())
+        webbrowser.open(written[0].resolve().as_uri())
     return 0

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from svkc._jax.lanes_last import with_lanes_last
 from svkc.loops.constrained_dynamics import ArticulatedBodies
-from svkc.loops.forward_dynamics import moving
+from svkc.loops.forward_dynamics import velocity_and_acceleration
 from svkc.model.chain import Chain, State, Structure, active_dofs
 from svkc.model.checked_jit import checked_jit, joint_torques
 from svkc.model.validation import scalar
@@ -173,7 +173,7 @@ def step(
 @with_lanes_last
 def _step(chain: Chain, state: State, tau: Float[Array, " dofs"], dt: Float[Array, ""]) -> State:
     tau = tau + limit_forces(chain, state.q, state.v)
-    v, vdot = moving(
+    v, vdot = velocity_and_acceleration(
         chain,
         state.structure,
         state.q,

@@ -15,12 +15,15 @@ from svkc.integration.stabilization import (
     projects,
 )
 from svkc.loops.constrained_dynamics import AbstractDynamics, ArticulatedBodies
-from svkc.loops.forward_dynamics import moving, moving_in_lanes
-from svkc.loops.projection import settle_by_bodies, settle_loops
+from svkc.loops.forward_dynamics import (
+    velocity_and_acceleration,
+    velocity_and_acceleration_lanes_last,
+)
+from svkc.loops.projection import project, project_by_loop_forces
 from svkc.model.chain import Chain, State, active_dofs
 from svkc.model.checked_jit import joint_torques
 from svkc.model.validation import real_array
-from svkc.tree.configuration import normalize, rates
+from svkc.tree.configuration import configuration_derivative, normalize
 from svkc.tree.inverse_dynamics import limit_forces
 from svkc.tree.traversal import LEVELS_UNROLLED
 
@@ -53,9 +56,9 @@ class Field(eqx.Module):
             isinstance(held, Projection) and not self.pivotless,
         )
         if self._in_lanes(chain) and not agree:
-            v, vdot = moving_in_lanes(chain, structure, y.q, y.v, tau, rate)
+            v, vdot = velocity_and_acceleration_lanes_last(chain, structure, y.q, y.v, tau, rate)
         else:
-            v, vdot = moving(
+            v, vdot = velocity_and_acceleration(
                 chain,
                 structure,
                 y.q,
@@ -63,11 +66,13 @@ class Field(eqx.Module):
                 tau,
                 dynamics=self.dynamics,
                 baumgarte=rate,
-                agree=agree,
+                project_velocity=agree,
                 pivots=scene.pivots,
             )
         return Motion(
-            rates(chain, y.q, jnp.where(active_dofs(chain, structure), v, 0)), vdot, power
+            configuration_derivative(chain, y.q, jnp.where(active_dofs(chain, structure), v, 0)),
+            vdot,
+            power,
         )
 
     def _in_lanes(self, chain: Chain) -> bool:
@@ -131,7 +136,7 @@ def settle(field: Field, scene: Scene, y: Motion) -> tuple[Motion, Seen | None]:
     if not projects(held, scene):
         return eqx.tree_at(lambda y: y.q, y, normalize(chain, y.q)), None
     if field.pivotless:
-        q, v, *seen = settle_by_bodies(
+        q, v, *seen = project_by_loop_forces(
             chain,
             structure,
             y.q,
@@ -140,13 +145,13 @@ def settle(field: Field, scene: Scene, y: Motion) -> tuple[Motion, Seen | None]:
             differentiated=field.differentiated,
         )
     else:
-        q, v, *seen = settle_loops(
+        q, v, *seen = project(
             chain,
             structure,
             y.q,
             y.v,
             iterations=held.iterations,
-            dependent=isinstance(held, CoordinatePartitioning),
+            dependent_only=isinstance(held, CoordinatePartitioning),
             pivots=scene.pivots,
             hold=field.dynamics.hold or 0.0,
         )

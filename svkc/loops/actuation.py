@@ -9,14 +9,14 @@ from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.eager import eager_jit
 from svkc._jax.pytrees import is_concrete, stop_gradient_tree
-from svkc.loops.constraint import loop_kinematics, scales
-from svkc.loops.coordinates import constrained, open_coordinates
+from svkc.loops.constraint import jacobian_scales, loop_kinematics
+from svkc.loops.coordinates import closed_coordinates, open_coordinates
 from svkc.loops.forward_dynamics import constraint_forces
-from svkc.loops.pivoting import Selection, select, select_with_rank, solve_positive
+from svkc.loops.pivoting import PivotedQR, pivoted_qr, pivoted_qr_with_rank, solve_positive
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import check_state
 from svkc.model.validation import as_array, real_array
-from svkc.tree.inverse_dynamics import generalized_forces, over_all_dofs, passive_forces
+from svkc.tree.inverse_dynamics import append_virtual_joints, passive_forces, rnea
 from svkc.tree.kinematics import kinematics, twists
 
 
@@ -67,7 +67,7 @@ def actuation(
     independent, vdot_G = None, real_array("vdot_G", vdot_G, state.v.dtype)
     if vdot_G.shape != (chain.dofs,):
         independent = (
-            np.asarray(_coordinates(chain, state)[0].independent)
+            np.asarray(_coordinates_and_twists(chain, state)[0].independent)
             if not isinstance(state.q, jax.core.Tracer)
             else None
         )
@@ -92,10 +92,10 @@ def actuation(
             f" {actuated.shape}"
         )
     actuated = jnp.asarray(actuated)
-    done, problem = _solve(chain, state, vdot_G, weight, actuated)
+    done, problem = _solve_unbounded(chain, state, vdot_G, weight, actuated)
     if bounds is None:
         return done
-    tau, residual = _within(problem, weight, *_limits(chain, bounds, state))
+    tau, residual = _solve_bounded(problem, weight, *_limits(chain, bounds, state))
     return eqx.tree_at(lambda d: (d.tau, d.residual), done, (tau, residual))
 
 
@@ -118,57 +118,57 @@ def _limits(chain: Chain, bounds, state: State) -> list[Float[Array, " dofs"]]:
 
 
 @eager_jit
-def _coordinates(chain: Chain, state: State):
+def _coordinates_and_twists(chain: Chain, state: State):
     if not chain.link_names:
         kin = kinematics(chain, state.q)
         return open_coordinates(chain, state.structure), kin, twists(chain, kin, state.v)
     loops = loop_kinematics(chain, state.structure, state.q)
     V = twists(chain, loops.kin, state.v)
-    return constrained(chain, state.structure, state.v, loops, V), loops.kin, V
+    return closed_coordinates(chain, state.structure, state.v, loops, V), loops.kin, V
 
 
-def _basis(
+def _null_space_basis(
     B: Float[Array, "rows dofs"], rank=None
-) -> tuple[Selection, Int[Array, ""], Float[Array, "dofs dofs"]]:
+) -> tuple[PivotedQR, Int[Array, ""], Float[Array, "dofs dofs"]]:
     """Pivots of B, its rank (None: to be found), and a basis of its null space: for each column
     that is no pivot a one there, balanced by the pivots."""
-    chosen, rank = select_with_rank(B) if rank is None else (select(B, rank), rank)
+    chosen, rank = pivoted_qr_with_rank(B) if rank is None else (pivoted_qr(B, rank), rank)
     P = chosen.P
     Bm = chosen.Q @ B
-    R = Bm @ P.T + jnp.diag(jnp.where(chosen.used, 0, 1).astype(B.dtype))
+    R = Bm @ P.T + jnp.diag(jnp.where(chosen.active, 0, 1).astype(B.dtype))
     others = jnp.eye(B.shape[1], dtype=B.dtype) - P.T @ jnp.linalg.solve(R, Bm)
     return chosen, rank, jnp.where(jnp.any(P > 0, 0)[None], 0, others)
 
 
-def _reach(chosen: Selection, B, wanted, cost):
+def _least_cost_solution(chosen: PivotedQR, B, wanted, cost):
     """The y of least sum(cost y^2) that makes |B y - wanted| least, by an orthonormal basis Z of
     B's range."""
     Z = chosen.Q.T
     ZB = Z.T @ B
     over_cost = ZB.T / cost[:, None]
-    G = ZB @ over_cost + jnp.diag(jnp.where(chosen.used, 0, 1).astype(B.dtype))
+    G = ZB @ over_cost + jnp.diag(jnp.where(chosen.active, 0, 1).astype(B.dtype))
     y = over_cost @ jnp.linalg.solve(G, Z.T @ wanted)
     # once more for what round-off left
     return y + over_cost @ jnp.linalg.solve(G, Z.T @ (wanted - B @ y))
 
 
 @eager_jit
-def _solve(chain: Chain, state: State, vdot_G, weight, actuated: Bool[Array, " dofs"]):
+def _solve_unbounded(chain: Chain, state: State, vdot_G, weight, actuated: Bool[Array, " dofs"]):
     nv = chain.nv
-    co, kin, V = _coordinates(chain, state)
-    _, column = scales(chain)
+    co, kin, V = _coordinates_and_twists(chain, state)
+    _, column = jacobian_scales(chain)
     vdot = co.W @ jnp.where(co.independent, vdot_G, 0) + co.bias
-    forces = over_all_dofs(
-        chain, generalized_forces(chain, kin, V, state.v, vdot[:nv])
-    ) - passive_forces(chain, state.q, state.v)
+    forces = append_virtual_joints(chain, rnea(chain, kin, V, state.v, vdot[:nv])) - passive_forces(
+        chain, state.q, state.v
+    )
     wanted = co.W.T @ forces
     # without units: torques over metres, as the columns of J_C
     S = jnp.where(actuated[:, None], co.W, 0)
     B = column[:, None] * S.T / column[None]
     # the null spaces of S^T and S, which are of one size, by one program
-    both, ranks, bases = jax.lax.map(_basis, jnp.stack([B, B.T]))
+    both, ranks, bases = jax.lax.map(_null_space_basis, jnp.stack([B, B.T]))
     chosen, rank, null = jax.tree.map(lambda x: x[0], (both, ranks, bases))
-    y = _reach(chosen, B, column * wanted, weight / column**2)
+    y = _least_cost_solution(chosen, B, column * wanted, weight / column**2)
     null = column[:, None] ** -1 * jnp.where(actuated[None], null, 0)
     reachable = actuated & jnp.any(co.W != 0, 1)
     undriven = co.W @ (column[:, None] * jnp.where(co.independent[None], bases[1], 0))
@@ -176,8 +176,8 @@ def _solve(chain: Chain, state: State, vdot_G, weight, actuated: Bool[Array, " d
         carried = jax.vmap(
             lambda tau: constraint_forces(chain, co.selection, co.J, tau), in_axes=1, out_axes=-1
         )(null)
-        _, _, stress = _basis(co.J.T, state.structure.rank)
-        row, _ = scales(chain)
+        _, _, stress = _null_space_basis(co.J.T, state.structure.rank)
+        row, _ = jacobian_scales(chain)
         holds = jnp.repeat(state.structure.connected, 6)
         stress = jnp.where(holds[None], row[:, None] * stress, 0).reshape(-1, 6, row.shape[0])
     else:
@@ -202,7 +202,9 @@ def _solve(chain: Chain, state: State, vdot_G, weight, actuated: Bool[Array, " d
 
 
 @eager_jit
-def _within(problem, weight, lower, upper) -> tuple[Float[Array, " dofs"], Float[Array, " dofs"]]:
+def _solve_bounded(
+    problem, weight, lower, upper
+) -> tuple[Float[Array, " dofs"], Float[Array, " dofs"]]:
     """Return the least weighted torques of least residual within the bounds, and that residual.
 
     The active bounds are found on frozen numbers. The free torques then follow from one linear
@@ -211,12 +213,14 @@ def _within(problem, weight, lower, upper) -> tuple[Float[Array, " dofs"], Float
     B, wanted, column = problem
     root, small = jnp.sqrt(weight), jnp.finfo(B.dtype).eps ** 0.25
     scaled = stop_gradient_tree((B * (column / root)[None], wanted, root * lower, root * upper))
-    target = _target(*scaled) / jax.lax.stop_gradient(root)
+    target = _bounded_target(*scaled) / jax.lax.stop_gradient(root)
     nearest, drives = jnp.clip(target, lower, upper), jnp.any(B != 0, 0)
     free = drives & (lower < target) & (target < upper)
     held = jnp.where(drives & ~free, jnp.where(target <= lower, lower, upper), 0)
     part = jnp.where(free[None], B, 0)
-    y = _reach(select_with_rank(part)[0], part, wanted - B @ (column * held), weight / column**2)
+    y = _least_cost_solution(
+        pivoted_qr_with_rank(part)[0], part, wanted - B @ (column * held), weight / column**2
+    )
     solved = jnp.where(free, y / column, nearest)
     tau = jnp.clip(solved, lower, upper)
     # the iterate, should a free torque leave its bounds by more than round-off
@@ -227,7 +231,7 @@ def _within(problem, weight, lower, upper) -> tuple[Float[Array, " dofs"], Float
     return tau, (wanted - B @ (column * tau)) / column
 
 
-def _target(A, b, lower, upper):
+def _bounded_target(A, b, lower, upper):
     """Return the z for which clip(z, lower, upper) is the x of least norm in the box among those
     that make |A x - b| least.
 
@@ -240,7 +244,7 @@ def _target(A, b, lower, upper):
         held, target = carry
         rest = b - A @ jnp.where(held, jnp.clip(target, lower, upper), 0)
         part = jnp.where(held[None], 0, A)
-        Z = select_with_rank(part)[0].Q
+        Z = pivoted_qr_with_rank(part)[0].Q
         part, rest = Z @ part, Z @ rest
         target = jnp.where(held, target, _multiplier(part, rest, lower, upper) @ part)
         press = (rest - part @ jnp.clip(target, lower, upper)) @ part

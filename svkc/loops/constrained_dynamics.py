@@ -11,19 +11,19 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from svkc._jax.batched_lapack import batched_solve_triangular, cholesky_solver
-from svkc.loops.constraint import LoopKinematics, scales
-from svkc.loops.coordinates import Coordinates, constrain
-from svkc.loops.delassus import by_loop_forces
-from svkc.loops.pivoting import Selection, square
+from svkc.loops.constraint import LoopKinematics, jacobian_scales
+from svkc.loops.coordinates import Coordinates, partition_coordinates
+from svkc.loops.delassus import loop_force_solver
+from svkc.loops.pivoting import PivotedQR, pivot_blocks
 from svkc.model.chain import Chain, Structure, active_dofs
 from svkc.model.validation import scalar
-from svkc.tree.articulated_body import accelerations, articulate
-from svkc.tree.inverse_dynamics import inertia_times, over_all_dofs
+from svkc.tree.articulated_body import articulated_inertias, solve_mass_matrix
+from svkc.tree.inverse_dynamics import append_virtual_joints, mass_matrix_product
 from svkc.tree.kinematics import Kinematics
-from svkc.tree.mass_matrix import inertia_by_composites, inertia_by_unit_vectors
+from svkc.tree.mass_matrix import mass_matrix_crba, mass_matrix_unit_vectors
 
 
-def reduced_inertia(
+def reduced_mass_matrix(
     chain: Chain, co: Coordinates, M: Float[Array, "nv nv"]
 ) -> Float[Array, "dofs dofs"]:
     """A = W^T M W (23), ones on the diagonal of coordinates that are not independent."""
@@ -55,7 +55,7 @@ class AbstractDynamics(eqx.Module):
         chain: Chain,
         structure: Structure,
         loops: LoopKinematics,
-        selection: Selection | None = None,
+        selection: PivotedQR | None = None,
     ) -> Callable:
         """Return solve: (force [dofs], bias [rows]) -> the x with M x = force + J_C^T lambda and
         J_C x + bias = 0 (paper, section III-B).
@@ -80,9 +80,9 @@ class ArticulatedBodies(AbstractDynamics):
     uses_pivots: ClassVar[bool] = False
 
     def prepare(self, chain, structure, loops, selection=None):
-        column, active = scales(chain)[1], active_dofs(chain, structure)
+        column, active = jacobian_scales(chain)[1], active_dofs(chain, structure)
         rows, frozen, static = jax.lax.stop_gradient((loops.J, (chain, loops.kin), structure))
-        solve = by_loop_forces(
+        solve = loop_force_solver(
             *frozen,
             jnp.where(active[None], rows / column[None], 0),
             None if static.locked is None else active[: chain.nv],
@@ -93,12 +93,12 @@ class ArticulatedBodies(AbstractDynamics):
 
     def prepare_open(self, chain, structure, kin):
         free = None if structure.locked is None else ~structure.locked
-        bodies = articulate(*jax.lax.stop_gradient((chain, kin)), free)
-        solve = lambda force: accelerations(chain.topology, bodies, force)
+        bodies = articulated_inertias(*jax.lax.stop_gradient((chain, kin)), free)
+        solve = lambda force: solve_mass_matrix(chain.topology, bodies, force)
         return _implicit_open_solve(chain, structure, kin, solve)
 
 
-class AbstractInertiaMatrix(AbstractDynamics):
+class AbstractMassMatrix(AbstractDynamics):
     """The tree's inertia matrix, reduced to the independent coordinates, as the paper has it."""
 
     @abc.abstractmethod
@@ -109,8 +109,10 @@ class AbstractInertiaMatrix(AbstractDynamics):
         chosen, rows, frozen, static = jax.lax.stop_gradient(
             (selection, loops.J, (chain, loops.kin), structure)
         )
-        solve = _by_independent(*frozen, static, chosen, rows, self.inertia)
-        return _implicit_solve(chain, structure, loops, solve, lambda x: chosen.Q @ x, chosen.used)
+        solve = _solve_by_partitioning(*frozen, static, chosen, rows, self.inertia)
+        return _implicit_solve(
+            chain, structure, loops, solve, lambda x: chosen.Q @ x, chosen.active
+        )
 
     def prepare_open(self, chain, structure, kin):
         M = self.inertia(*jax.lax.stop_gradient((chain, kin)))
@@ -120,22 +122,22 @@ class AbstractInertiaMatrix(AbstractDynamics):
         return _implicit_open_solve(chain, structure, kin, cholesky_solver(M))
 
 
-class CompositeBodies(AbstractInertiaMatrix):
+class CompositeBodies(AbstractMassMatrix):
     """The inertia matrix by composite bodies (Featherstone section 6.2)."""
 
     uses_pivots: ClassVar[bool] = True
 
     def inertia(self, chain, kin):
-        return inertia_by_composites(chain, kin)
+        return mass_matrix_crba(chain, kin)
 
 
-class UnitVectors(AbstractInertiaMatrix):
+class UnitVectors(AbstractMassMatrix):
     """The inertia matrix column by column from inverse dynamics: the paper's own way."""
 
     uses_pivots: ClassVar[bool] = True
 
     def inertia(self, chain, kin):
-        return inertia_by_unit_vectors(chain, kin)
+        return mass_matrix_unit_vectors(chain, kin)
 
 
 def default_dynamics(chain: Chain) -> AbstractDynamics:
@@ -143,15 +145,15 @@ def default_dynamics(chain: Chain) -> AbstractDynamics:
     return CompositeBodies() if chain.topology.link_names else ArticulatedBodies()
 
 
-def by_bodies(chain: Chain, kin: Kinematics):
+def articulated_bodies(chain: Chain, kin: Kinematics):
     """Names articulated bodies in the older spelling, `svkc.dynamics.ArticulatedBodies()`."""
-    return articulate(chain, kin)
+    return articulated_inertias(chain, kin)
 
 
-OLDER = (
-    (by_bodies, ArticulatedBodies),
-    (inertia_by_composites, CompositeBodies),
-    (inertia_by_unit_vectors, UnitVectors),
+DEPRECATED_SPELLINGS = (
+    (articulated_bodies, ArticulatedBodies),
+    (mass_matrix_crba, CompositeBodies),
+    (mass_matrix_unit_vectors, UnitVectors),
 )
 
 
@@ -167,7 +169,9 @@ class Dynamics(eqx.Module):
     hold: float | None = eqx.field(static=True, default=0.3)
 
     def __check_init__(self):
-        if self.inertia is not None and not any(self.inertia is old for old, _ in OLDER):
+        if self.inertia is not None and not any(
+            self.inertia is old for old, _ in DEPRECATED_SPELLINGS
+        ):
             raise ValueError(
                 f"dynamics.inertia: got {self.inertia!r}, expected None, svkc.by_bodies,"
                 " svkc.inertia_by_composites or svkc.inertia_by_unit_vectors"
@@ -178,7 +182,7 @@ class Dynamics(eqx.Module):
         """Return the object of `svkc.dynamics` that this one stands for."""
         if self.inertia is None:
             return type(default_dynamics(chain))(hold=self.hold)
-        return next(new for old, new in OLDER if old is self.inertia)(hold=self.hold)
+        return next(new for old, new in DEPRECATED_SPELLINGS if old is self.inertia)(hold=self.hold)
 
 
 def _check_hold(hold) -> None:
@@ -200,14 +204,17 @@ def _implicit_solve(
     A derivative is one more solve with the same factors: recursions for M and the search for pivots
     have no part in it. pick: the rows that are solved for, of all. used: which of them count.
     """
-    nv, column = chain.nv, scales(chain)[1]
+    nv, column = chain.nv, jacobian_scales(chain)[1]
     active = active_dofs(chain, structure)
 
     def equations(unknown):
         x, mu = unknown
         held = pick(loops.J) / column[None]
         moving = jnp.where(active, x, 0)
-        force = over_all_dofs(chain, inertia_times(chain, loops.kin, moving[:nv])) + held.T @ mu
+        force = (
+            append_virtual_joints(chain, mass_matrix_product(chain, loops.kin, moving[:nv]))
+            + held.T @ mu
+        )
         return jnp.where(active, force, x), held @ x + jnp.where(used, 0, mu)
 
     def solve(force: Float[Array, " dofs"], bias: Float[Array, " rows"]) -> Float[Array, " dofs"]:
@@ -223,22 +230,22 @@ def _implicit_solve(
     return solve
 
 
-def _by_independent(
-    chain: Chain, kin: Kinematics, structure: Structure, chosen: Selection, J, inertia: Callable
+def _solve_by_partitioning(
+    chain: Chain, kin: Kinematics, structure: Structure, chosen: PivotedQR, J, inertia: Callable
 ) -> Callable:
     """The solution through W, A and b, as the paper has it."""
-    nv, (_, column) = chain.nv, scales(chain)
-    co = constrain(chain, structure, chosen, J, jnp.zeros(J.shape[0], J.dtype))
+    nv, (_, column) = chain.nv, jacobian_scales(chain)
+    co = partition_coordinates(chain, structure, chosen, J, jnp.zeros(J.shape[0], J.dtype))
     tree, W = inertia(chain, kin), co.W
-    A_inverse = cholesky_solver(reduced_inertia(chain, co, tree))
-    _, JS = square(chosen, J)
+    A_inverse = cholesky_solver(reduced_mass_matrix(chain, co, tree))
+    _, JS = pivot_blocks(chosen, J)
 
     def solve(force, rate):
         x = column * (chosen.P.T @ batched_solve_triangular(JS, rate))
-        x = x + W @ A_inverse(W.T @ (force - over_all_dofs(chain, tree @ x[:nv])))
-        rest = column * (force - over_all_dofs(chain, tree @ x[:nv]))
+        x = x + W @ A_inverse(W.T @ (force - append_virtual_joints(chain, tree @ x[:nv])))
+        rest = column * (force - append_virtual_joints(chain, tree @ x[:nv]))
         return x, jnp.where(
-            chosen.used, batched_solve_triangular(JS, chosen.P @ rest, trans=True), rate
+            chosen.active, batched_solve_triangular(JS, chosen.P @ rest, trans=True), rate
         )
 
     return solve
@@ -252,7 +259,7 @@ def _implicit_open_solve(
     free = jnp.ones(chain.nv, bool) if locked is None else ~locked
 
     def equations(x):
-        return jnp.where(free, inertia_times(chain, kin, jnp.where(free, x, 0)), x)
+        return jnp.where(free, mass_matrix_product(chain, kin, jnp.where(free, x, 0)), x)
 
     def solve(force: Float[Array, " nv"]) -> Float[Array, " nv"]:
         return jax.lax.custom_linear_solve(

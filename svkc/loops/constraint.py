@@ -17,20 +17,20 @@ from svkc.model.checked_jit import checked_jit
 from svkc.model.topology import FREE, SLIDE, Topology
 from svkc.tree.kinematics import Kinematics, bias_accelerations, kinematics
 from svkc.tree.spatial import (
+    matvec,
     motion_cross,
-    quat_about,
     quat_conjugate,
+    quat_from_axis_angle,
     quat_log,
     quat_matrix,
     quat_multiply,
     quat_normalize,
     quat_rotate,
-    rotate,
     shift_motion,
 )
 
 
-class Ends(eqx.Module):
+class LoopFrames(eqx.Module):
     """Both ends of each virtual link. `base`: the joint's frame in the parent, `virtual`: the
     virtual link, `real`: its real link's end.
 
@@ -40,21 +40,23 @@ class Ends(eqx.Module):
 
     base_quat: Float[Array, "links 4"]
     virtual_quat: Float[Array, "links 4"]
-    virtual: Float[Array, "links 3"]
+    virtual_position: Float[Array, "links 3"]
     real_quat: Float[Array, "links 4"]
-    real: Float[Array, "links 3"]
+    real_position: Float[Array, "links 3"]
     from_parent_root: Float[Array, "links 3"]
     axes: Float[Array, "links 6 3"]
 
 
-def _coordinates(chain: Chain, q: Float[Array, " q"]):
+def _virtual_joint_coordinates(chain: Chain, q: Float[Array, " q"]):
     """Turns [L 3], slides [L 3] and quaternions [L 4] of the virtual joints."""
     table, end = chain.topology.links, chain.topology.nq_all
     quat = static_take(q, np.minimum(table.quat, end)) + (table.quat > end).astype(q.dtype)
     return static_take(q, table.angle), static_take(q, table.slide), quat_normalize(quat)
 
 
-def _turns(top: Topology, angle: Float[Array, "links 3"], ball: Float[Array, "links 4"]):
+def _virtual_joint_rotations(
+    top: Topology, angle: Float[Array, "links 3"], ball: Float[Array, "links 4"]
+):
     """Rotation of each virtual joint and the axes of its three turns, all in the joint's frame;
     only what some joint of the scene has is computed.
 
@@ -69,7 +71,7 @@ def _turns(top: Topology, angle: Float[Array, "links 3"], ball: Float[Array, "li
         axis = jnp.broadcast_to(eye[k], (len(is_ball), 3))
         axes.append(axis if turn is None else quat_rotate(turn, axis))
         if np.any(freedoms[~is_ball, k]):
-            this = quat_about(eye[k : k + 1], angle[:, k])
+            this = quat_from_axis_angle(eye[k : k + 1], angle[:, k])
             turn = this if turn is None else quat_multiply(turn, this)
     axes = jnp.stack(axes, 1)
     if is_ball.any():
@@ -81,43 +83,47 @@ def _turns(top: Topology, angle: Float[Array, "links 3"], ball: Float[Array, "li
 
 
 @jax.jit
-def ends(chain: Chain, structure: Structure, kin: Kinematics, q: Float[Array, " q"]) -> Ends:
+def loop_frames(
+    chain: Chain, structure: Structure, kin: Kinematics, q: Float[Array, " q"]
+) -> LoopFrames:
     """Frames of both ends of every virtual link, the joint's own turn and slide included.
 
     A joint slides along its parent's axes, then turns: about x, then y, then z (universal: x, y),
     or by a quaternion (ball).
     """
     top = chain.topology
-    angle, slide, ball = _coordinates(chain, q)
+    angle, slide, ball = _virtual_joint_coordinates(chain, q)
     p, r = structure.parent, structure.real
     of_parent, of_real = kin.quat[p], kin.quat[r]
     base_quat = quat_normalize(quat_multiply(of_parent, structure.quat))
     base = quat_matrix(base_quat)
-    turn, turning = _turns(top, angle, ball)
+    turn, turning = _virtual_joint_rotations(top, angle, ball)
     axes = jnp.sum(base[:, None] * turning[:, :, None], -1)
     from_parent_root = kin.r[p] + quat_rotate(of_parent, structure.pos)
     if np.any(np.array(top.link_freedoms, bool).reshape(-1, 6)[:, 3:]):
-        from_parent_root = from_parent_root + rotate(base, slide)
-    return Ends(
+        from_parent_root = from_parent_root + matvec(base, slide)
+    return LoopFrames(
         base_quat=base_quat,
         virtual_quat=base_quat if turn is None else quat_multiply(base_quat, turn),
-        virtual=from_parent_root + (kin.root[p] - kin.root[r]),
+        virtual_position=from_parent_root + (kin.root_position[p] - kin.root_position[r]),
         real_quat=quat_normalize(quat_multiply(of_real, structure.real_quat)),
-        real=kin.r[r] + quat_rotate(of_real, structure.real_pos),
+        real_position=kin.r[r] + quat_rotate(of_real, structure.real_pos),
         from_parent_root=from_parent_root,
         axes=jnp.concatenate([axes, jnp.swapaxes(base, -1, -2)], 1),
     )
 
 
-def gap(structure: Structure, end: Ends) -> Float[Array, "links 6"]:
+def frame_gaps(structure: Structure, end: LoopFrames) -> Float[Array, "links 6"]:
     """Rotation vector (rad) and distance (m) from the real link's end to the virtual link, world
     axes; zero where not connected."""
     turn = quat_log(quat_multiply(end.virtual_quat, quat_conjugate(end.real_quat)))
-    gaps = jnp.concatenate([turn, end.virtual - end.real], -1)
+    gaps = jnp.concatenate([turn, end.virtual_position - end.real_position], -1)
     return jnp.where(structure.connected[:, None], gaps, 0)
 
 
-def _virtual_axes(chain: Chain, structure: Structure, end: Ends) -> Float[Array, "links 6 6"]:
+def _virtual_motion_subspaces(
+    chain: Chain, structure: Structure, end: LoopFrames
+) -> Float[Array, "links 6 6"]:
     """Motion of the virtual link for a unit of each of its six freedoms, at its own origin; zero
     for those it has not."""
     zero = jnp.zeros_like(end.axes[:, :3])
@@ -127,8 +133,8 @@ def _virtual_axes(chain: Chain, structure: Structure, end: Ends) -> Float[Array,
     return jnp.where((structure.connected[:, None] & structure.freedoms)[:, :, None], S, 0)
 
 
-def loop_jacobian(
-    chain: Chain, structure: Structure, kin: Kinematics, end: Ends
+def assemble_loop_jacobian(
+    chain: Chain, structure: Structure, kin: Kinematics, end: LoopFrames
 ) -> Float[Array, "rows dofs"]:
     """J_C (paper (11)): six rows a virtual link, zero where not connected; columns of coordinates
     that cannot move are zero."""
@@ -137,9 +143,9 @@ def loop_jacobian(
     sign = above[structure.parent].astype(kin.r.dtype) - above[structure.real].astype(kin.r.dtype)
     # the joint's place as seen from the root of each coordinate's tree
     of_parent = above[structure.parent][:, :, None]
-    place = jnp.where(of_parent, end.from_parent_root[:, None, :], end.real[:, None, :])
+    place = jnp.where(of_parent, end.from_parent_root[:, None, :], end.real_position[:, None, :])
     tree = sign[:, :, None] * shift_motion(kin.S[None], place)
-    own = _virtual_axes(chain, structure, end)
+    own = _virtual_motion_subspaces(chain, structure, end)
     count = len(top.link_names)
     # of each link and coordinate the row in `own`, which is followed by zeros
     source = np.full((count, top.dofs + 1), 6 * count)
@@ -151,10 +157,10 @@ def loop_jacobian(
     return jnp.swapaxes(J, 1, 2).reshape(-1, top.dofs)
 
 
-def loop_bias(
+def loop_jacobian_dot_v(
     chain: Chain,
     structure: Structure,
-    end: Ends,
+    end: LoopFrames,
     v: Float[Array, " dofs"],
     *,
     V: Float[Array, "rows 6"],
@@ -166,7 +172,7 @@ def loop_bias(
     rate = jnp.where(
         structure.connected[:, None] & structure.freedoms, static_take(v, top.links.dof), 0
     )
-    parts = _virtual_axes(chain, structure, end) * rate[:, :, None]
+    parts = _virtual_motion_subspaces(chain, structure, end) * rate[:, :, None]
     slide = jnp.sum(parts[:, 3:], 1)
     V_parent = shift_motion(V[structure.parent], end.from_parent_root)
     V_base = V_parent + slide
@@ -181,7 +187,7 @@ def loop_bias(
     return jnp.where(structure.connected[:, None], A_virtual - A_real, 0).reshape(-1)
 
 
-def scales(chain: Chain) -> tuple[Float[Array, " rows"], Float[Array, " dofs"]]:
+def jacobian_scales(chain: Chain) -> tuple[Float[Array, " rows"], Float[Array, " dofs"]]:
     """Factors of the rows and columns of J_C that leave numbers without units: 1/length for linear
     rows, length for slides."""
     top = chain.topology
@@ -203,7 +209,7 @@ class LoopKinematics(eqx.Module):
     """
 
     kin: Kinematics
-    frames: Ends
+    frames: LoopFrames
     J: Float[Array, "rows dofs"]
     structure: Structure
     row_scale: Float[Array, " rows"]
@@ -213,28 +219,28 @@ class LoopKinematics(eqx.Module):
     @property
     def gap(self) -> Float[Array, " rows"]:
         """Return `gap` of each link without units, row by row."""
-        return self.row_scale * gap(self.structure, self.frames).ravel()
+        return self.row_scale * frame_gaps(self.structure, self.frames).ravel()
 
 
 def loop_kinematics(chain: Chain, structure: Structure, q: Float[Array, " q"]) -> LoopKinematics:
     """Return the kinematics of the tree and of its loops at q."""
     kin = kinematics(chain, q)
-    end = ends(chain, structure, kin, q)
-    row, column = scales(chain)
-    J = row[:, None] * loop_jacobian(chain, structure, kin, end) * column[None]
+    end = loop_frames(chain, structure, kin, q)
+    row, column = jacobian_scales(chain)
+    J = row[:, None] * assemble_loop_jacobian(chain, structure, kin, end) * column[None]
     return LoopKinematics(kin=kin, frames=end, J=J, structure=structure, row_scale=row)
 
 
-def loop_rates(
+def constraint_bias(
     chain: Chain, structure: Structure, v, loops: LoopKinematics, V, baumgarte=None
 ) -> Float[Array, " rows"]:
     """Return Jdot_C v without units. baumgarte: rate (1/s) at which gaps are pulled back."""
-    row, column = scales(chain)
+    row, column = jacobian_scales(chain)
     moving = jnp.where(active_dofs(chain, structure), v, 0)
     A = bias_accelerations(chain, loops.kin, V, v)
-    bias = row * loop_bias(chain, structure, loops.frames, moving, V=V, A=A)
+    bias = row * loop_jacobian_dot_v(chain, structure, loops.frames, moving, V=V, A=A)
     if baumgarte is not None:
-        gaps = gap(structure, loops.frames).ravel()
+        gaps = frame_gaps(structure, loops.frames).ravel()
         bias = bias + 2 * baumgarte * (loops.J @ (moving / column)) + baumgarte**2 * row * gaps
     return bias
 
@@ -244,17 +250,17 @@ def gaps_and_rates(
 ) -> tuple[Float[Array, "links 6"], Float[Array, "links 6"]]:
     """`loop_gaps` and `velocity_gaps` from one pass over the tree."""
     kin = kinematics(chain, state.q)
-    end = ends(chain, state.structure, kin, state.q)
-    rates = loop_jacobian(chain, state.structure, kin, end) @ state.v
-    return gap(state.structure, end), rates.reshape(-1, 6)
+    end = loop_frames(chain, state.structure, kin, state.q)
+    rates = assemble_loop_jacobian(chain, state.structure, kin, end) @ state.v
+    return frame_gaps(state.structure, end), rates.reshape(-1, 6)
 
 
-def sizes(rows: Float[Array, " rows"]) -> Float[Array, "links 2"]:
+def gap_norms(rows: Float[Array, " rows"]) -> Float[Array, "links 2"]:
     """Of each loop's rows: how long its rotation vector is, and how long the distance."""
     return jnp.sqrt(jnp.sum(rows.reshape(-1, 2, 3) ** 2, -1))
 
 
-def largest(x: Float[Array, "links 6"]) -> Float[Array, "2"]:
+def largest_norms(x: Float[Array, "links 6"]) -> Float[Array, "2"]:
     """Return the largest angular and the largest linear part over the loops."""
     if not len(x):
         return jnp.zeros(2, x.dtype)
@@ -267,7 +273,7 @@ def largest(x: Float[Array, "links 6"]) -> Float[Array, "2"]:
 def largest_gaps(chain: Chain, state: State) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
     """The largest over the loops: of the gaps (rad, m) and of their rates (rad/s, m/s)."""
     gaps, rates = gaps_and_rates(chain, state)
-    return largest(gaps), largest(rates)
+    return largest_norms(gaps), largest_norms(rates)
 
 
 @checked_jit(eager=True)
@@ -278,20 +284,20 @@ def loop_gaps(chain: Chain, state: State) -> Float[Array, "links 6"]:
 
 
 @checked_jit(eager=True)
-def jacobian(
+def loop_jacobian(
     chain: Chain, state: State
 ) -> tuple[Float[Array, "links 3 dofs"], Float[Array, "links 3 dofs"]]:
     """J_C (paper (11)): linear (m/s) and angular (rad/s) velocity of each connected virtual link
     relative to its real link, for a unit rate of each joint coordinate, at the joint, in world
     axes."""
     kin = kinematics(chain, state.q)
-    end = ends(chain, state.structure, kin, state.q)
-    J = loop_jacobian(chain, state.structure, kin, end).reshape(-1, 6, chain.dofs)
+    end = loop_frames(chain, state.structure, kin, state.q)
+    J = assemble_loop_jacobian(chain, state.structure, kin, end).reshape(-1, 6, chain.dofs)
     return J[:, 3:], J[:, :3]
 
 
 @checked_jit(eager=True)
-def velocity_gaps(chain: Chain, state: State) -> Float[Array, "links 6"]:
+def loop_gap_rates(chain: Chain, state: State) -> Float[Array, "links 6"]:
     """J_C v: relative twist (rad/s, m/s) across each connected virtual link."""
     return gaps_and_rates(chain, state)[1]
 

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from svkc.loops.constraint import LoopKinematics, loop_kinematics, loop_rates, scales
-from svkc.loops.pivoting import Selection, choose, solve_frozen, square
+from svkc.loops.constraint import LoopKinematics, constraint_bias, jacobian_scales, loop_kinematics
+from svkc.loops.pivoting import PivotedQR, pivot_blocks, select_pivots, solve_pivot_block
 from svkc.model.chain import Chain, State, Structure, active_dofs
 from svkc.model.checked_jit import check_state, checked_jit
 from svkc.tree.kinematics import twists
@@ -33,7 +33,7 @@ class Coordinates(eqx.Module):
     independent: Bool[Array, " dofs"]
     dependent: Bool[Array, " dofs"]
     actuated: Bool[Array, " dofs"]
-    selection: Selection
+    selection: PivotedQR
     J: Float[Array, "rows dofs"]
 
     @property
@@ -52,28 +52,28 @@ class Coordinates(eqx.Module):
         return self.bias
 
 
-def agreeing(
-    chain: Chain, selection: Selection, J: Float[Array, "rows dofs"], v: Float[Array, " dofs"]
+def dependent_velocities(
+    chain: Chain, selection: PivotedQR, J: Float[Array, "rows dofs"], v: Float[Array, " dofs"]
 ) -> Float[Array, " dofs"]:
     """W v_G (16): the dependent velocities as the independent ones ask for."""
-    _, column = scales(chain)
-    Jm, JS = square(selection, J)
-    return v - column * (selection.P.T @ solve_frozen(JS, Jm @ (v / column)))
+    _, column = jacobian_scales(chain)
+    Jm, JS = pivot_blocks(selection, J)
+    return v - column * (selection.P.T @ solve_pivot_block(JS, Jm @ (v / column)))
 
 
-def constrain(
+def partition_coordinates(
     chain: Chain,
     structure: Structure,
-    selection: Selection,
+    selection: PivotedQR,
     J: Float[Array, "rows dofs"],
     bias: Float[Array, " rows"],
 ) -> Coordinates:
     """W and Hdot v from the loops' rows and the choice of pivots: (14)-(21)."""
-    _, column = scales(chain)
-    Jm, JS = square(selection, J)
+    _, column = jacobian_scales(chain)
+    Jm, JS = pivot_blocks(selection, J)
     dependent = jnp.any(selection.P > 0, 0)
     independent = active_dofs(chain, structure) & ~dependent
-    solved = solve_frozen(JS, jnp.concatenate([Jm, (selection.Q @ bias)[:, None]], 1))
+    solved = solve_pivot_block(JS, jnp.concatenate([Jm, (selection.Q @ bias)[:, None]], 1))
     from_pivots = selection.P.T @ solved
     W = jnp.where(independent[None], jnp.eye(len(column), dtype=J.dtype) - from_pivots[:, :-1], 0)
     W = column[:, None] * W / column[None]
@@ -88,12 +88,12 @@ def constrain(
     )
 
 
-def constrained(
+def closed_coordinates(
     chain: Chain, structure: Structure, v: Float[Array, " dofs"], loops: LoopKinematics, V
 ) -> Coordinates:
     """Return `constrain` at one state. V: twists of the tree (`twists`)."""
-    bias = loop_rates(chain, structure, v, loops, V)
-    return constrain(chain, structure, choose(structure, loops.J), loops.J, bias)
+    bias = constraint_bias(chain, structure, v, loops, V)
+    return partition_coordinates(chain, structure, select_pivots(structure, loops.J), loops.J, bias)
 
 
 def open_coordinates(chain: Chain, structure: Structure) -> Coordinates:
@@ -108,8 +108,8 @@ def open_coordinates(chain: Chain, structure: Structure) -> Coordinates:
         independent=free,
         dependent=jnp.zeros(n, bool),
         actuated=chain.actuated,
-        selection=Selection(
-            Q=jnp.zeros((0, 0), dtype), P=none, size=none[:, 0], used=jnp.zeros(0, bool)
+        selection=PivotedQR(
+            Q=jnp.zeros((0, 0), dtype), P=none, diag_R=none[:, 0], active=jnp.zeros(0, bool)
         ),
         J=none,
     )
@@ -123,10 +123,10 @@ def coordinates(chain: Chain, state: State) -> Coordinates:
         return open_coordinates(chain, state.structure)
     loops = loop_kinematics(chain, state.structure, state.q)
     V = twists(chain, loops.kin, state.v)
-    return constrained(chain, state.structure, state.v, loops, V)
+    return closed_coordinates(chain, state.structure, state.v, loops, V)
 
 
-def prefer(chain: Chain, state: State, *names: str) -> State:
+def with_independent(chain: Chain, state: State, *names: str) -> State:
     """The state with these joint coordinates asked to be independent (theta_G), as far as the loops
     let them be; no names: the choice is svkc's again.
 
@@ -134,7 +134,7 @@ def prefer(chain: Chain, state: State, *names: str) -> State:
     depend on it. ValueError: unknown names.
     """
     check_state(chain, state)
-    asked = np.zeros(chain.dofs, bool)
+    mask = np.zeros(chain.dofs, bool)
     for name in names:
         here = np.array(
             [
@@ -146,8 +146,8 @@ def prefer(chain: Chain, state: State, *names: str) -> State:
             raise ValueError(
                 f"no joint coordinate {name!r}; coordinates: {', '.join(chain.dof_names)}"
             )
-        asked |= here
-    wanted = jnp.asarray(asked) if names else None
+        mask |= here
+    wanted = jnp.asarray(mask) if names else None
     return eqx.tree_at(
         lambda s: s.structure.independent, state, wanted, is_leaf=lambda x: x is None
     )

@@ -17,21 +17,21 @@ from jaxtyping import Array, Bool, Float
 from svkc._jax.batched_lapack import cholesky_solver
 from svkc._jax.static_gather import static_take
 from svkc.model.chain import Chain
-from svkc.tree.articulated_body import accelerations, articulate, seen_by
+from svkc.tree.articulated_body import articulated_inertias, delassus_matrix, solve_mass_matrix
 from svkc.tree.kinematics import Kinematics
-from svkc.tree.spatial import inverse_positive, rotate
+from svkc.tree.spatial import inverse_positive, matvec
 
 # of the forces' error, along a row with 1e-6 of the others' inverse inertia, each leaves 1e-4
 # (float64)
 REFINEMENTS = 2
 # the joint that turns as it likes
-BALL = (True, True, True, False, False, False)
+BALL_FREEDOMS = (True, True, True, False, False, False)
 # rows from which LAPACK factors D: the inverse by halves is compiled for each size, and its
 # operations grow with the rows
-LARGE = 36
+LAPACK_MIN_ROWS = 36
 
 
-class Joints(eqx.Module):
+class VirtualJoints(eqx.Module):
     """The virtual joints' own coordinates, link by link, as many as the freest has: their motion S
     [links, row, freedom], and (S^T S)^-1; where each stands among the coordinates of virtual joints
     (`count`: nowhere)."""
@@ -44,17 +44,20 @@ class Joints(eqx.Module):
     def across(self, x: Float[Array, "*n rows"]) -> Float[Array, "*n rows"]:
         """The part of the rows that virtual joints cannot follow."""
         rates = self.along(x)
-        return x - rotate(_led(self.S, rates), rates).reshape(x.shape)
+        return x - matvec(_align_batch_axes(self.S, rates), rates).reshape(x.shape)
 
     def part(self, links: np.ndarray) -> "Joints":
         """Those of some links."""
         S, inverse, place = self.S[links], self.inverse[links], self.place[links]
-        return Joints(S=S, inverse=inverse, place=place, count=self.count)
+        return VirtualJoints(S=S, inverse=inverse, place=place, count=self.count)
 
     def along(self, x: Float[Array, "*n rows"]) -> Float[Array, "*n links d"]:
         """The rates of virtual joints that follow the rows best."""
         x = x.reshape(*x.shape[:-1], -1, 6)
-        return rotate(_led(self.inverse, x), rotate(_led(jnp.swapaxes(self.S, -1, -2), x), x))
+        return matvec(
+            _align_batch_axes(self.inverse, x),
+            matvec(_align_batch_axes(jnp.swapaxes(self.S, -1, -2), x), x),
+        )
 
     def of(self, x: Float[Array, " virtual"]) -> Float[Array, "links d"]:
         """What stands for each freedom of each link; zero for those that are none."""
@@ -68,7 +71,7 @@ class Joints(eqx.Module):
         )
 
 
-class Rows(NamedTuple):
+class DelassusRows(NamedTuple):
     """The rows of J that are in D: all six of `whole` links, then the last three of those with a
     ball; where each row of J is among them (past their end: nowhere)."""
 
@@ -81,13 +84,13 @@ class Rows(NamedTuple):
         return static_take(x, self.back)
 
 
-def rows_held(chain: Chain, locked: bool) -> Rows:
+def delassus_rows(chain: Chain, locked: bool) -> DelassusRows:
     """A declared ball turns freely where none of its coordinates is locked; what a spare slot holds
     is known at run time alone."""
     top = chain.topology
     free = np.array(
         [
-            tuple(f) == BALL and not spare
+            tuple(f) == BALL_FREEDOMS and not spare
             for f, spare in zip(top.link_freedoms, top.link_spare, strict=True)
         ],
         bool,
@@ -97,16 +100,16 @@ def rows_held(chain: Chain, locked: bool) -> Rows:
     kept = np.concatenate([six[~free].ravel(), six[free][:, 3:].ravel()])
     back = np.full(six.size, len(kept))
     back[kept] = np.arange(len(kept))
-    return Rows(np.flatnonzero(~free), kept, back)
+    return DelassusRows(np.flatnonzero(~free), kept, back)
 
 
-def _led(
+def _align_batch_axes(
     A: Float[Array, "links i j"], x: Float[Array, "*n links k"]
 ) -> Float[Array, "*m links i j"]:
     return A.reshape(*(1,) * (x.ndim - 2), *A.shape)
 
 
-def joints(chain: Chain, J: Float[Array, "rows dofs"]) -> Joints:
+def virtual_joints(chain: Chain, J: Float[Array, "rows dofs"]) -> VirtualJoints:
     """From the columns of the virtual joints in J."""
     place, count = np.sort(chain.topology.links.dof - chain.nv, 1), chain.dofs - chain.nv
     place = place[:, : max(1, np.max(np.sum(place < count, 1)))]
@@ -117,22 +120,22 @@ def joints(chain: Chain, J: Float[Array, "rows dofs"]) -> Joints:
         jnp.sum(S[:, :, :, None] * S[:, :, None], 1)
         + still[:, :, None] * np.eye(place.shape[1], dtype=J.dtype)[None]
     )
-    return Joints(S=S, inverse=inverse_positive(G), place=place, count=count)
+    return VirtualJoints(S=S, inverse=inverse_positive(G), place=place, count=count)
 
 
-def _nearly_inverse(D: Float[Array, "kept kept"]) -> Callable:
+def _regularized_inverse(D: Float[Array, "kept kept"]) -> Callable:
     """Return x -> (D + a little)^-1 x."""
     most = jnp.max(jnp.where(np.eye(D.shape[0], dtype=bool), D, 0))
     # (none where no loop is closed)
     little = jnp.finfo(D.dtype).eps ** 0.625 * jnp.where(most > 0, most, 1)
     raised = D + little * jnp.eye(D.shape[0], dtype=D.dtype)
-    if D.shape[0] >= LARGE:
+    if D.shape[0] >= LAPACK_MIN_ROWS:
         return cholesky_solver(raised)
     inverse = inverse_positive(raised)
-    return lambda x: rotate(inverse, x)
+    return lambda x: matvec(inverse, x)
 
 
-def by_loop_forces(
+def loop_force_solver(
     chain: Chain, kin: Kinematics, J: Float[Array, "rows dofs"], free: Bool[Array, " nv"] | None
 ) -> Callable:
     """(force, rate) -> (x, mu) with M x + J^T mu = force and J x = rate, of rows that need not be
@@ -143,25 +146,25 @@ def by_loop_forces(
     """
     top, nv, tree = chain.topology, chain.nv, J[:, : chain.nv]
     bodies, own, held = (
-        articulate(chain, kin, free),
-        joints(chain, J),
-        rows_held(chain, free is not None),
+        articulated_inertias(chain, kin, free),
+        virtual_joints(chain, J),
+        delassus_rows(chain, free is not None),
     )
     some, six = own.part(held.whole), 6 * len(held.whole)
     across = lambda x: jnp.concatenate([some.across(x[..., :six]), x[..., six:]], -1) if six else x
-    D = across(across(seen_by(top, bodies, static_take(tree, held.kept))).T)
-    nearly = _nearly_inverse(D)
+    D = across(across(delassus_matrix(top, bodies, static_take(tree, held.kept))).T)
+    nearly = _regularized_inverse(D)
 
     def solve(force, rate):
         # what acts on virtual joints is carried by the loops
-        carried = -rotate(own.S, rotate(own.inverse, own.of(force[nv:]))).ravel()
-        alone = accelerations(top, bodies, force[:nv] + carried @ tree)
+        carried = -matvec(own.S, matvec(own.inverse, own.of(force[nv:]))).ravel()
+        alone = solve_mass_matrix(top, bodies, force[:nv] + carried @ tree)
         left = across(static_take(rate - tree @ alone, held.kept))
         z = nearly(left)
         for _ in range(REFINEMENTS):
             z = z + nearly(left - D @ z)
         mu = carried + held.fill(across(z))
-        x = accelerations(top, bodies, force[:nv] + mu @ tree)
+        x = solve_mass_matrix(top, bodies, force[:nv] + mu @ tree)
         return jnp.concatenate([x, own.order(own.along(rate - tree @ x))]), -mu
 
     return solve

@@ -13,25 +13,25 @@ from svkc.loops.constrained_dynamics import (
     ArticulatedBodies,
     default_dynamics,
 )
-from svkc.loops.constraint import loop_kinematics, loop_rates, scales
-from svkc.loops.coordinates import agreeing
+from svkc.loops.constraint import constraint_bias, jacobian_scales, loop_kinematics
+from svkc.loops.coordinates import dependent_velocities
 from svkc.loops.pivoting import (
-    NEAR,
-    Selection,
-    choose,
+    NEAR_SINGULAR,
+    PivotedQR,
+    pivot_blocks,
+    pivot_ratio,
     rank_tolerance,
-    solve_frozen,
-    square,
-    weakest,
+    select_pivots,
+    solve_pivot_block,
 )
 from svkc.model.chain import Chain, State, Structure, active_dofs
 from svkc.model.checked_jit import checked_jit, joint_torques
-from svkc.tree.inverse_dynamics import generalized_forces, over_all_dofs, passive_forces
+from svkc.tree.inverse_dynamics import append_virtual_joints, passive_forces, rnea
 from svkc.tree.kinematics import kinematics, twists
 
 
-@functools.partial(jax.jit, static_argnames="agree")
-def moving(
+@functools.partial(jax.jit, static_argnames="project_velocity")
+def velocity_and_acceleration(
     chain: Chain,
     structure: Structure,
     q,
@@ -40,7 +40,7 @@ def moving(
     *,
     dynamics: AbstractDynamics,
     baumgarte=None,
-    agree: bool = False,
+    project_velocity: bool = False,
     pivots=None,
 ) -> tuple[Float[Array, " dofs"], Float[Array, " dofs"]]:
     """Velocity and acceleration: steps 1 to 5 of section III-B. On an open chain W is the identity
@@ -53,39 +53,45 @@ def moving(
     if chain.topology.link_names:
         loops = loop_kinematics(chain, structure, q)
         kin, J = loops.kin, loops.J
-        selection = choose(structure, J, pivots) if agree or dynamics.uses_pivots else None
-        if agree:
-            near = weakest(selection) < NEAR * structure.margin
+        selection = (
+            select_pivots(structure, J, pivots)
+            if project_velocity or dynamics.uses_pivots
+            else None
+        )
+        if project_velocity:
+            near = pivot_ratio(selection) < NEAR_SINGULAR * structure.margin
             v = jnp.where(
                 near,
-                agreeing(chain, selection, J, jnp.where(active_dofs(chain, structure), v, 0)),
+                dependent_velocities(
+                    chain, selection, J, jnp.where(active_dofs(chain, structure), v, 0)
+                ),
                 v,
             )
     else:
         kin, loops = kinematics(chain, q), None
     V = twists(chain, kin, v)
-    bias = generalized_forces(chain, kin, V, v, jnp.zeros(chain.nv, v.dtype))
-    force = tau + passive_forces(chain, q, v) - over_all_dofs(chain, bias)
+    bias = rnea(chain, kin, V, v, jnp.zeros(chain.nv, v.dtype))
+    force = tau + passive_forces(chain, q, v) - append_virtual_joints(chain, bias)
     if loops is None:
         return v, dynamics.prepare_open(chain, structure, kin)(force)
-    rates = loop_rates(chain, structure, v, loops, V, baumgarte)
+    rates = constraint_bias(chain, structure, v, loops, V, baumgarte)
     return v, dynamics.prepare(chain, structure, loops, selection)(force, rates)
 
 
 @with_lanes_last
-def moving_in_lanes(
+def velocity_and_acceleration_lanes_last(
     chain: Chain, structure: Structure, q, v, tau, baumgarte
 ) -> tuple[Float[Array, " dofs"], Float[Array, " dofs"]]:
     """`moving` by articulated bodies, without pivots, under a `vmap` that keeps its lanes last."""
     way = ArticulatedBodies()
-    return moving(chain, structure, q, v, tau, dynamics=way, baumgarte=baumgarte)
+    return velocity_and_acceleration(chain, structure, q, v, tau, dynamics=way, baumgarte=baumgarte)
 
 
 def acceleration(
     chain: Chain, structure: Structure, q, v, tau: Float[Array, " dofs"], dynamics: AbstractDynamics
 ) -> Float[Array, " dofs"]:
     """The acceleration alone, for the velocity as it is."""
-    return moving(chain, structure, q, v, tau, dynamics=dynamics)[1]
+    return velocity_and_acceleration(chain, structure, q, v, tau, dynamics=dynamics)[1]
 
 
 @checked_jit
@@ -103,13 +109,13 @@ def forward_dynamics(
 
 
 def constraint_forces(
-    chain: Chain, selection: Selection, J: Float[Array, "rows dofs"], excess: Float[Array, " dofs"]
+    chain: Chain, selection: PivotedQR, J: Float[Array, "rows dofs"], excess: Float[Array, " dofs"]
 ) -> Float[Array, "links 6"]:
     """Lambda with J_C^T lambda = excess, of least norm where loops are redundant: wrench (N m, N)
     on the virtual link, at the joint."""
-    row, column = scales(chain)
-    _, JS = square(selection, J)
-    mu = solve_frozen(JS, selection.P @ (column * excess), trans=True)
+    row, column = jacobian_scales(chain)
+    _, JS = pivot_blocks(selection, J)
+    mu = solve_pivot_block(JS, selection.P @ (column * excess), trans=True)
     return (row * (selection.Q.T @ mu)).reshape(-1, 6)
 
 
@@ -144,13 +150,13 @@ def loop_forces(chain: Chain, state: State, tau: Float[Array, " torques"]) -> Lo
     kin, J = loops.kin, loops.J
     V = twists(chain, kin, v)
     vdot = acceleration(chain, s, q, v, tau, default_dynamics(chain))
-    needed = over_all_dofs(chain, generalized_forces(chain, kin, V, v, vdot[:nv]))
-    selection = choose(s, J)
+    needed = append_virtual_joints(chain, rnea(chain, kin, V, v, vdot[:nv]))
+    selection = select_pivots(s, J)
     wrench = -constraint_forces(chain, selection, J, needed - passive_forces(chain, q, v) - tau)
     return LoopForces(wrench[:, 3:], wrench[:, :3], ~self_stressed(s, selection))
 
 
-def self_stressed(structure: Structure, selection: Selection) -> Bool[Array, " links"]:
+def self_stressed(structure: Structure, selection: PivotedQR) -> Bool[Array, " links"]:
     """Links that take part in a self-stress: wrenches of all loops together, J_C^T lambda = 0, that
     no motion tells of."""
     # a row's length within the range of J_C: 1 where no vector orthogonal to that range has a part

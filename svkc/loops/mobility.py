@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from svkc.loops.constraint import loop_kinematics
 from svkc.loops.coordinates import coordinates
-from svkc.loops.pivoting import count_rank, select, weakest
+from svkc.loops.pivoting import count_rank, pivot_ratio, pivoted_qr
 from svkc.model.chain import Chain, State, active_dofs
 from svkc.model.checked_jit import checked_jit
 
@@ -71,7 +71,9 @@ def mobility(chain: Chain, state: State) -> Mobility:
     # of the first loop's rows, the first two loops', and so on
     upto = np.arange(6 * links)[None] < 6 * np.arange(1, links + 1)[:, None]
     ranks = jax.lax.map(
-        lambda rows: count_rank(select(jnp.where(rows[:, None], jax.lax.stop_gradient(J), 0)).size),
+        lambda rows: count_rank(
+            pivoted_qr(jnp.where(rows[:, None], jax.lax.stop_gradient(J), 0)).diag_R
+        ),
         jnp.asarray(upto),
     )
     rows = jnp.where(state.structure.connected, 6, 0).astype(jnp.int32)
@@ -83,7 +85,7 @@ def mobility(chain: Chain, state: State) -> Mobility:
         rank=rank,
         redundant=redundant,
         independent=coordinates(chain, state).independent,
-        margin=weakest(select(J, rank)),
+        margin=pivot_ratio(pivoted_qr(J, rank)),
         connected=state.structure.connected,
         link_names=chain.link_names,
         dof_names=chain.dof_names,

@@ -17,7 +17,7 @@ from svkc._jax.primitive import custom_primitive
 from svkc.model.chain import Structure
 
 
-class Selection(eqx.Module):
+class PivotedQR(eqx.Module):
     """Pivoted Gram-Schmidt of a matrix: Q [steps, rows], one-hot pivots P [steps, dofs], |R_kk|,
     and which steps count.
 
@@ -27,8 +27,8 @@ class Selection(eqx.Module):
 
     Q: Float[Array, "steps rows"]
     P: Float[Array, "steps dofs"]
-    size: Float[Array, " steps"]
-    used: Bool[Array, " steps"]
+    diag_R: Float[Array, " steps"]
+    active: Bool[Array, " steps"]
 
 
 def rank_tolerance(dtype) -> float:
@@ -37,32 +37,34 @@ def rank_tolerance(dtype) -> float:
     return float(np.sqrt(np.finfo(dtype).eps))
 
 
-def held_part(dtype) -> float:
+def release_threshold(dtype) -> float:
     """The part of the phase's own margin below which a row of the scaled J_C is let go for as long
     as the mechanism passes a singular configuration: eps^(1/4), 1.2e-4 in float64, 1.9e-2 in
     float32. Nearer to it round-off would steer the motion; what moves goes on as it moves."""
     return float(np.finfo(dtype).eps ** 0.25)
 
 
-def _kept(selection: Selection, keep: Bool[Array, " steps"]) -> Selection:
-    return Selection(
+def _with_active(selection: PivotedQR, keep: Bool[Array, " steps"]) -> PivotedQR:
+    return PivotedQR(
         Q=jnp.where(keep[:, None], selection.Q, 0),
         P=jnp.where(keep[:, None], selection.P, 0),
-        size=selection.size,
-        used=keep,
+        diag_R=selection.diag_R,
+        active=keep,
     )
 
 
-def without_weak(selection: Selection, floor: Float[Array, ""]) -> Selection:
+def drop_below(selection: PivotedQR, floor: Float[Array, ""]) -> PivotedQR:
     """Steps whose |R_kk| / |R_11| is not above the floor left out: their pivots are independent."""
-    return _kept(selection, selection.used & (selection.size > floor * jnp.max(selection.size)))
+    return _with_active(
+        selection, selection.active & (selection.diag_R > floor * jnp.max(selection.diag_R))
+    )
 
 
-def select(
+def pivoted_qr(
     J: Float[Array, "rows dofs"],
     rank: Int[Array, ""] | None = None,
     wanted: Bool[Array, " dofs"] | None = None,
-) -> Selection:
+) -> PivotedQR:
     """min(rows, dofs) steps of column-pivoted Gram-Schmidt, orthogonalised twice; steps from `rank`
     on are inert (None: all are taken).
 
@@ -103,11 +105,11 @@ def select(
         jnp.zeros(steps, J.dtype),
     )
     _, Q, P, size = jax.lax.fori_loop(0, steps, step, start)
-    Q, size = _following(J, Q, P, size)
-    return Selection(Q=Q, P=P, size=size, used=jnp.any(P > 0, 1))
+    Q, size = frozen_qr(J, Q, P, size)
+    return PivotedQR(Q=Q, P=P, diag_R=size, active=jnp.any(P > 0, 1))
 
 
-def select_again(J: Float[Array, "rows dofs"], P: Float[Array, "steps dofs"]) -> Selection:
+def refactor(J: Float[Array, "rows dofs"], P: Float[Array, "steps dofs"]) -> PivotedQR:
     """The same with pivots that were chosen before: only their columns are orthogonalised, nothing
     is searched for."""
     used = jnp.any(P > 0, 1)
@@ -126,15 +128,15 @@ def select_again(J: Float[Array, "rows dofs"], P: Float[Array, "steps dofs"]) ->
 
     none = jnp.zeros((used.shape[0], J.shape[0]), J.dtype), jnp.zeros(used.shape[0], J.dtype)
     Q, size = jax.lax.fori_loop(0, used.shape[0], step, none)
-    Q, size = _following(J, Q, P, size)
-    return Selection(Q=Q, P=P, size=size, used=used & (size > 0))
+    Q, size = frozen_qr(J, Q, P, size)
+    return PivotedQR(Q=Q, P=P, diag_R=size, active=used & (size > 0))
 
 
-def _following_jvp(primals, tangents):
+def _frozen_qr_jvp(primals, tangents):
     """Derivatives of Q = R^-T (J P^T)^T with R frozen, and of the diagonal of the R that J has,
     which is that of Cholesky's factor of Q Q^T times R's."""
     J, _, P, _ = primals
-    Q, size = _following(*primals)
+    Q, size = frozen_qr(*primals)
     unused = jnp.diag(jnp.where(jnp.any(P > 0, 1), 0, 1).astype(J.dtype))
     dQ = solve_triangular(
         jax.lax.stop_gradient(Q @ J @ P.T) + unused, (tangents[0] @ P.T).T, trans=1
@@ -145,7 +147,7 @@ def _following_jvp(primals, tangents):
 
 
 # Q and size of J with the pivots P, as they were found
-_following = custom_primitive("following", lambda J, Q, P, size: (Q, size), _following_jvp)
+frozen_qr = custom_primitive("following", lambda J, Q, P, size: (Q, size), _frozen_qr_jvp)
 
 
 def count_rank(size: Float[Array, " steps"]) -> Int[Array, ""]:
@@ -155,30 +157,32 @@ def count_rank(size: Float[Array, " steps"]) -> Int[Array, ""]:
     ).astype(jnp.int32)
 
 
-def weakest(selection: Selection) -> Float[Array, ""]:
+def pivot_ratio(selection: PivotedQR) -> Float[Array, ""]:
     """|R_mm| / |R_11|, 1 where no row counts."""
-    size, used = selection.size, selection.used
+    size, used = selection.diag_R, selection.active
     return jnp.min(jnp.where(used, size, jnp.inf), initial=1, where=used) / jnp.where(
         jnp.any(used), jnp.max(size), 1
     )
 
 
-def select_with_rank(J: Float[Array, "rows dofs"]) -> tuple[Selection, Int[Array, ""]]:
+def pivoted_qr_with_rank(J: Float[Array, "rows dofs"]) -> tuple[PivotedQR, Int[Array, ""]]:
     """Return the selection of J with its own rank, and the rank, by one search for pivots."""
-    full = select(jax.lax.stop_gradient(J))
-    rank = count_rank(full.size)
+    full = pivoted_qr(jax.lax.stop_gradient(J))
+    rank = count_rank(full.diag_R)
     # later steps do not change earlier ones, and are round-off, which must not be differentiated
-    first = _kept(full, full.used & (jnp.arange(full.used.shape[0], dtype=jnp.int32) < rank))
-    Q, size = _following(J, first.Q, first.P, first.size)
-    return Selection(Q=Q, P=first.P, size=size, used=first.used), rank
+    first = _with_active(
+        full, full.active & (jnp.arange(full.active.shape[0], dtype=jnp.int32) < rank)
+    )
+    Q, size = frozen_qr(J, first.Q, first.P, first.diag_R)
+    return PivotedQR(Q=Q, P=first.P, diag_R=size, active=first.active), rank
 
 
-def too_few(P: Float[Array, "steps dofs"], rank: Int[Array, ""]) -> Bool[Array, ""]:
+def lacks_pivots(P: Float[Array, "steps dofs"], rank: Int[Array, ""]) -> Bool[Array, ""]:
     """Return whether fewer pivots are held than the rank, as before the first choice."""
     return jnp.sum(jnp.any(P > 0, 1), dtype=jnp.int32) < rank
 
 
-def solve_frozen(
+def solve_pivot_block(
     B: Float[Array, "steps steps"], x: Float[Array, "steps *n"], trans: bool = False
 ) -> Float[Array, "steps *n"]:
     """B^-1 x, or B^-T x, for a B that the frozen choice leaves upper triangular in value but not in
@@ -201,37 +205,39 @@ def solve_positive(A: Float[Array, "n n"], x: Float[Array, "n *m"]) -> Float[Arr
     )
 
 
-def square(
-    selection: Selection, J: Float[Array, "rows dofs"]
+def pivot_blocks(
+    selection: PivotedQR, J: Float[Array, "rows dofs"]
 ) -> tuple[Float[Array, "steps dofs"], Float[Array, "steps steps"]]:
     """J_Cm = Q J_C, m independent rows (12), and J_S, its pivot columns in order (14), with ones on
     the unused diagonal."""
     Jm = selection.Q @ J
-    return Jm, Jm @ selection.P.T + jnp.diag(jnp.where(selection.used, 0, 1).astype(J.dtype))
+    return Jm, Jm @ selection.P.T + jnp.diag(jnp.where(selection.active, 0, 1).astype(J.dtype))
 
 
 # part of the phase's own margin below which a configuration is near a singular one; elsewhere the
 # motion depends on no choice of pivots
-NEAR = 0.1
+NEAR_SINGULAR = 0.1
 
 
-def choose(structure: Structure, J: Float[Array, "rows dofs"], pivots=None) -> Selection:
+def select_pivots(structure: Structure, J: Float[Array, "rows dofs"], pivots=None) -> PivotedQR:
     """The pivots of J_C, with the rank of the phase and the coordinates that are asked to be
     independent; without rows that are too weak just now.
 
     pivots [steps, dofs]: one-hot, chosen before (None: to be chosen now); near a singular
     configuration, or where they are too few, new ones are.
     """
-    new = lambda: select(J, structure.rank, structure.independent)
+    new = lambda: pivoted_qr(J, structure.rank, structure.independent)
     if pivots is None:
         selection = new()
     else:
-        held = select_again(J, pivots)
-        near = (weakest(held) < NEAR * structure.margin) | too_few(pivots, structure.rank)
+        held = refactor(J, pivots)
+        near = (pivot_ratio(held) < NEAR_SINGULAR * structure.margin) | lacks_pivots(
+            pivots, structure.rank
+        )
         # (one lane near is enough to choose for all)
         selection = jax.lax.cond(
             unvmap_any(near),
             lambda: jax.tree.map(lambda a, b: jnp.where(near, a, b), new(), held),
             lambda: held,
         )
-    return without_weak(selection, held_part(J.dtype) * structure.margin)
+    return drop_below(selection, release_threshold(J.dtype) * structure.margin)

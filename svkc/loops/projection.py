@@ -8,48 +8,50 @@ from jaxtyping import Array, Bool, Float
 
 from svkc._jax.lanes_last import with_lanes_last
 from svkc.loops.constrained_dynamics import ArticulatedBodies, CompositeBodies
-from svkc.loops.constraint import LoopKinematics, loop_kinematics, scales, sizes
+from svkc.loops.constraint import LoopKinematics, gap_norms, jacobian_scales, loop_kinematics
 from svkc.loops.pivoting import (
-    Selection,
-    held_part,
+    PivotedQR,
+    drop_below,
+    lacks_pivots,
+    pivot_blocks,
+    pivot_ratio,
+    pivoted_qr,
     rank_tolerance,
-    select,
-    select_again,
-    solve_frozen,
+    refactor,
+    release_threshold,
+    solve_pivot_block,
     solve_positive,
-    square,
-    too_few,
-    weakest,
-    without_weak,
 )
 from svkc.model.chain import Chain, Structure, active_dofs
 from svkc.tree.configuration import integrate, normalize
 
 
-def least_change(
-    chain: Chain, selection: Selection, J, x: Float[Array, "rows n"]
+def least_norm_change(
+    chain: Chain, selection: PivotedQR, J, x: Float[Array, "rows n"]
 ) -> Float[Array, "dofs n"]:
     """Return the y (m, rad, or their rates) with J y = x whose sum of squares, in coordinates
     without units, is least."""
-    Jm, _ = square(selection, J)
-    gram = Jm @ Jm.T + jnp.diag(jnp.where(selection.used, 0, 1).astype(J.dtype))
-    return scales(chain)[1][:, None] * (Jm.T @ solve_positive(gram, selection.Q @ x))
+    Jm, _ = pivot_blocks(selection, J)
+    gram = Jm @ Jm.T + jnp.diag(jnp.where(selection.active, 0, 1).astype(J.dtype))
+    return jacobian_scales(chain)[1][:, None] * (Jm.T @ solve_positive(gram, selection.Q @ x))
 
 
 def dependent_change(
-    chain: Chain, selection: Selection, J, x: Float[Array, "rows n"]
+    chain: Chain, selection: PivotedQR, J, x: Float[Array, "rows n"]
 ) -> Float[Array, "dofs n"]:
     """Return the y (m, rad, or their rates) with J y = x that moves dependent coordinates only
     (16)."""
-    _, JS = square(selection, J)
-    return scales(chain)[1][:, None] * (selection.P.T @ solve_frozen(JS, selection.Q @ x))
+    _, JS = pivot_blocks(selection, J)
+    return jacobian_scales(chain)[1][:, None] * (
+        selection.P.T @ solve_pivot_block(JS, selection.Q @ x)
+    )
 
 
-def inertia_change(
+def inertia_metric_change(
     chain: Chain,
     structure: Structure,
     loops: LoopKinematics,
-    selection: Selection,
+    selection: PivotedQR,
     x: Float[Array, "rows n"],
 ) -> Float[Array, "dofs n"]:
     """Return the y (m, rad, or their rates) with J y = x whose y^T M y is least: that of an impulse
@@ -59,26 +61,27 @@ def inertia_change(
     return jax.vmap(lambda x: solve(none, -x), 1, 1)(x)
 
 
-def _solvable(structure: Structure, selection: Selection) -> Selection:
+def _drop_unsolvable(structure: Structure, selection: PivotedQR) -> PivotedQR:
     """Steps below the rank's tolerance dropped, for a gap along them is of second order and
     dividing by them would only amplify round-off; and rows that are let go just now."""
-    return without_weak(
+    return drop_below(
         selection,
         jnp.maximum(
-            rank_tolerance(selection.size.dtype), held_part(selection.size.dtype) * structure.margin
+            rank_tolerance(selection.diag_R.dtype),
+            release_threshold(selection.diag_R.dtype) * structure.margin,
         ),
     )
 
 
-@functools.partial(jax.jit, static_argnames=("iterations", "dependent", "hold"))
-def settle_loops(
+@functools.partial(jax.jit, static_argnames=("iterations", "dependent_only", "hold"))
+def project(
     chain: Chain,
     structure: Structure,
     q,
     v,
     *,
     iterations: int,
-    dependent: bool = False,
+    dependent_only: bool = False,
     pivots=None,
     hold: float = 0.0,
 ) -> tuple[
@@ -102,10 +105,14 @@ def settle_loops(
         q, v = both[:2]
         last = i == iterations
         loops = loop_kinematics(chain, structure, q)
-        full = select(loops.J, structure.rank, structure.independent)
-        held = full.P if pivots is None else _held(structure, loops.J, full, pivots, hold, last)
-        step, open_ = _turn_by_pivots(chain, structure, loops, v, full, dependent)
-        seen = jax.lax.stop_gradient((sizes(open_), weakest(full), held))
+        full = pivoted_qr(loops.J, structure.rank, structure.independent)
+        held = (
+            full.P
+            if pivots is None
+            else _pivots_to_keep(structure, loops.J, full, pivots, hold, last)
+        )
+        step, open_ = _step_by_pivots(chain, structure, loops, v, full, dependent_only)
+        seen = jax.lax.stop_gradient((gap_norms(open_), pivot_ratio(full), held))
         q = integrate(chain, q, jnp.where(last, 0, step[:, 0]))
         return q, jnp.where(last, v + step[:, 1], v), *seen
 
@@ -118,37 +125,38 @@ def settle_loops(
     return jax.lax.fori_loop(0, iterations + 1, turn, (normalize(chain, q), v, *none))
 
 
-def _held(
-    structure: Structure, J, full: Selection, pivots, hold: float, last: Bool[Array, ""]
+def _pivots_to_keep(
+    structure: Structure, J, full: PivotedQR, pivots, hold: float, last: Bool[Array, ""]
 ) -> Float[Array, "steps dofs"]:
     """Return the pivots or, where they are poor in the last turn, those of the new selection
     `full`."""
     poor = lambda: (
-        (weakest(select_again(J, pivots)) < hold * weakest(full)) | too_few(pivots, structure.rank)
+        (pivot_ratio(refactor(J, pivots)) < hold * pivot_ratio(full))
+        | lacks_pivots(pivots, structure.rank)
     )
     return jax.lax.cond(last, lambda: jnp.where(poor(), full.P, pivots), lambda: pivots)
 
 
-def _turn_by_pivots(
-    chain: Chain, structure: Structure, loops: LoopKinematics, v, full: Selection, dependent: bool
+def _step_by_pivots(
+    chain: Chain, structure: Structure, loops: LoopKinematics, v, full: PivotedQR, dependent: bool
 ) -> tuple[Float[Array, "dofs 2"], Float[Array, " rows"]]:
     """Return the changes of q, that close the loops, and of v, that keep them; and the gaps."""
-    moving = jnp.where(active_dofs(chain, structure), v / scales(chain)[1], 0)
-    gap, J, selection = loops.gap, loops.J, _solvable(structure, full)
+    moving = jnp.where(active_dofs(chain, structure), v / jacobian_scales(chain)[1], 0)
+    gap, J, selection = loops.gap, loops.J, _drop_unsolvable(structure, full)
     open_ = jnp.stack([gap, J @ moving], 1)
     if dependent:
         return -dependent_change(chain, selection, J, open_), gap
-    return -inertia_change(chain, structure, loops, selection, open_), gap
+    return -inertia_metric_change(chain, structure, loops, selection, open_), gap
 
 
 @functools.partial(jax.jit, static_argnames=("iterations", "differentiated"))
-def settle_by_bodies(
+def project_by_loop_forces(
     chain: Chain, structure: Structure, q, v, *, iterations: int, differentiated: bool = True
 ) -> tuple[Float[Array, " q"], Float[Array, " dofs"], Float[Array, "links 2"]]:
     """`settle_loops` in the metric of the inertia, by articulated bodies and the forces of the
     loops: no pivots are chosen. And the gaps (rad, `chain.length`s) that each loop is left with.
     differentiated: as `Field`'s."""
-    one_turn = _turn_by_bodies if differentiated else with_lanes_last(_turn_by_bodies)
+    one_turn = _step_by_loop_forces if differentiated else with_lanes_last(_step_by_loop_forces)
 
     @functools.partial(jax.checkpoint, prevent_cse=False)
     def turn(i, both):
@@ -168,15 +176,15 @@ def settle_by_bodies(
     )
 
 
-def _turn_by_bodies(
+def _step_by_loop_forces(
     chain: Chain, structure: Structure, q, v, last: Bool[Array, ""]
 ) -> tuple[Float[Array, " dofs"], Float[Array, "links 2"]]:
     """The least change, in the metric of the inertia, of q that closes the loops or, in the last
     turn, of v that keeps them; and the gaps at q."""
-    column = scales(chain)[1]
+    column = jacobian_scales(chain)[1]
     loops = loop_kinematics(chain, structure, q)
     J, open_, active = loops.J, loops.gap, active_dofs(chain, structure)
     apart = jnp.where(last, J @ jnp.where(active, v / column, 0), open_)
     solve = ArticulatedBodies().prepare(chain, structure, loops)
     step = solve(jnp.zeros(chain.dofs, q.dtype), apart)
-    return step, jax.lax.stop_gradient(sizes(open_))
+    return step, jax.lax.stop_gradient(gap_norms(open_))

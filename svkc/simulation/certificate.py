@@ -8,8 +8,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.pytrees import stop_gradient_tree
-from svkc.loops.constraint import ends, gap, largest, loop_jacobian, scales
-from svkc.loops.pivoting import rank_tolerance, select, weakest
+from svkc.loops.constraint import (
+    assemble_loop_jacobian,
+    frame_gaps,
+    jacobian_scales,
+    largest_norms,
+    loop_frames,
+)
+from svkc.loops.pivoting import pivot_ratio, pivoted_qr, rank_tolerance
 from svkc.model.chain import Chain, State, Structure, active_dofs
 from svkc.model.topology import FREE
 from svkc.simulation.records import Phases, Records
@@ -22,7 +28,7 @@ class Checked(eqx.Module):
     rates, and at the ends of phases energy (J), linear momentum (N s), angular momentum about the
     centre of mass (N m s) and rank margin."""
 
-    gap: Float[Array, "*states 2"]
+    frame_gaps: Float[Array, "*states 2"]
     gap_rate: Float[Array, "*states 2"]
     energy: Float[Array, "*states"]
     linear: Float[Array, "*states 3"]
@@ -120,16 +126,21 @@ def _check_state(chain: Chain, state: State, at_end: Bool[Array, ""]) -> Checked
     gaps = rates = jnp.zeros(2, dtype)
     J = jnp.zeros((0, chain.dofs), dtype)
     if looped:
-        end = ends(chain, state.structure, kin, state.q)
-        J = loop_jacobian(chain, state.structure, kin, end)
-        gaps, rates = largest(gap(state.structure, end)), largest((J @ state.v).reshape(-1, 6))
+        end = loop_frames(chain, state.structure, kin, state.q)
+        J = assemble_loop_jacobian(chain, state.structure, kin, end)
+        gaps, rates = (
+            largest_norms(frame_gaps(state.structure, end)),
+            largest_norms((J @ state.v).reshape(-1, 6)),
+        )
 
     def whole():
         energy, *momenta = energy_and_momentum(chain, state, kin)
-        row, column = scales(chain)
+        row, column = jacobian_scales(chain)
         margin = (
-            weakest(
-                select(stop_gradient_tree(row[:, None] * J * column[None]), state.structure.rank)
+            pivot_ratio(
+                pivoted_qr(
+                    stop_gradient_tree(row[:, None] * J * column[None]), state.structure.rank
+                )
             )
             if looped
             else jnp.ones((), dtype)

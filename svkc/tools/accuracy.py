@@ -101,7 +101,7 @@ def candidates(dtype, span: float) -> list[Candidate]:
     return found
 
 
-def error_between(chain: Chain, run: Trajectory, reference: Trajectory) -> float:
+def configuration_error(chain: Chain, run: Trajectory, reference: Trajectory) -> float:
     """Root mean square, over coordinates and save times, of how far two runs are apart in
     configuration (rad, m); the largest over the save times."""
     apart = jax.vmap(lambda a, b: difference(chain, a, b)[: chain.nv])(
@@ -110,7 +110,7 @@ def error_between(chain: Chain, run: Trajectory, reference: Trajectory) -> float
     return float(jnp.max(jnp.sqrt(jnp.mean(apart**2, 1))))
 
 
-def halved(chain: Chain, state: State, t1, **options) -> float:
+def estimate_error(chain: Chain, state: State, t1, **options) -> float:
     """Integration error of a run, by a second one with half its dt, or with a 32nd of its
     tolerances: `error_between` the two.
 
@@ -123,7 +123,7 @@ def halved(chain: Chain, state: State, t1, **options) -> float:
     else:
         rtol, atol = tolerances(state.q.dtype, options.get("rtol"), options.get("atol"))
         finer = options | {"rtol": rtol / 32, "atol": atol / 32}
-    return error_between(chain, run, simulate(chain, state, t1, **finer))
+    return configuration_error(chain, run, simulate(chain, state, t1, **finer))
 
 
 def tune(
@@ -162,7 +162,7 @@ def tune(
             f"target: {target} cannot be judged, a run at rtol {tight:.1e} ends with:"
             f" {RESULTS[reference.result]}"
         )
-    error = lambda traj: error_between(chain, traj, reference)
+    error = lambda traj: configuration_error(chain, traj, reference)
     tried, best = [], np.inf
     for candidate in candidates(dtype, span) if options is None else options:
         tried.append(_measure(run, candidate, error=error, repeats=repeats, limit=10 * best))

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from svkc._jax.primitive import ClosureConverted
-from svkc.loops.constraint import ends
+from svkc.loops.constraint import loop_frames
 from svkc.loops.forward_dynamics import loop_forces
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import check_chain, joint_torques
@@ -81,10 +81,14 @@ class Touch(LinkGuard):
 
     def value(self, chain, t, state, args, tau):
         s, kin, i = state.structure, kinematics(chain, state.q), self.link
-        end = ends(chain, s, kin, state.q)
+        end = loop_frames(chain, s, kin, state.q)
         p, r = s.parent[i], s.real[i]
-        origin = kin.r[p] + quat_rotate(kin.quat[p], s.pos[i]) + (kin.root[p] - kin.root[r])
-        away = quat_rotate(quat_conjugate(end.base_quat[i]), end.real[i] - origin)[
+        origin = (
+            kin.r[p]
+            + quat_rotate(kin.quat[p], s.pos[i])
+            + (kin.root_position[p] - kin.root_position[r])
+        )
+        away = quat_rotate(quat_conjugate(end.base_quat[i]), end.real_position[i] - origin)[
             np.array(self.axes)
         ]
         if len(self.axes) == 1:
@@ -105,7 +109,7 @@ class Leaves(LinkGuard):
     def value(self, chain, t, state, args, tau):
         s, i = state.structure, self.link
         kin = kinematics(chain, state.q)
-        normal = quat_rotate(ends(chain, s, kin, state.q).base_quat[i], self.axis)
+        normal = quat_rotate(loop_frames(chain, s, kin, state.q).base_quat[i], self.axis)
         push = jnp.sum(loop_forces(chain, state, tau).force[i] * normal)
         # a link that is not connected counts as pressed, so that one that would have to pull from
         # the first is seen to leave

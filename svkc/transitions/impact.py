@@ -5,16 +5,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from svkc.loops.constrained_dynamics import ArticulatedBodies, CompositeBodies
-from svkc.loops.constraint import LoopKinematics, scales
+from svkc.loops.constraint import LoopKinematics, jacobian_scales
 from svkc.loops.forward_dynamics import constraint_forces
-from svkc.loops.pivoting import Selection
+from svkc.loops.pivoting import PivotedQR
 from svkc.model.chain import Chain, State, Structure
-from svkc.tree.inverse_dynamics import inertia_times, over_all_dofs
+from svkc.tree.inverse_dynamics import append_virtual_joints, mass_matrix_product
 from svkc.tree.kinematics import kinematics
 
 
 def velocity_after_impact(
-    chain: Chain, structure: Structure, loops: LoopKinematics, selection: Selection, v
+    chain: Chain, structure: Structure, loops: LoopKinematics, selection: PivotedQR, v
 ):
     """Return v+ = W (W^T M W)^-1 W^T M v-, the impulse of each loop on its real link, and the
     energy lost: the paper's (29)-(38) in one formula.
@@ -23,8 +23,8 @@ def velocity_after_impact(
     structure allows. Redundant loops need no special case.
     """
     solve = CompositeBodies().prepare(chain, structure, loops, selection)
-    jump = solve(jnp.zeros_like(v), loops.J @ (v / scales(chain)[1]))
-    impulse = over_all_dofs(chain, inertia_times(chain, loops.kin, jump[: chain.nv]))
+    jump = solve(jnp.zeros_like(v), loops.J @ (v / jacobian_scales(chain)[1]))
+    impulse = append_virtual_joints(chain, mass_matrix_product(chain, loops.kin, jump[: chain.nv]))
     # v- and v+ differ by a vector orthogonal to v+, so that the loss is a square and cannot be
     # negative
     return v + jump, -constraint_forces(chain, selection, loops.J, impulse), jump @ impulse / 2
@@ -52,6 +52,8 @@ def lock_projection(chain: Chain, structure: Structure, q, v):
     if structure.locked is None:
         return v, jnp.zeros((), v.dtype)
     kin = kinematics(chain, q)
-    after = ArticulatedBodies().prepare_open(chain, structure, kin)(inertia_times(chain, kin, v))
+    after = ArticulatedBodies().prepare_open(chain, structure, kin)(
+        mass_matrix_product(chain, kin, v)
+    )
     jump = after - v
-    return after, jump @ inertia_times(chain, kin, jump) / 2
+    return after, jump @ mass_matrix_product(chain, kin, jump) / 2

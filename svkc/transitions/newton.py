@@ -15,16 +15,16 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.primitive import custom_primitive
-from svkc.loops.constraint import LoopKinematics, loop_kinematics, scales
+from svkc.loops.constraint import LoopKinematics, jacobian_scales, loop_kinematics
 from svkc.loops.pivoting import (
-    Selection,
+    PivotedQR,
     count_rank,
-    held_part,
+    drop_below,
+    pivoted_qr,
     rank_tolerance,
-    select,
-    without_weak,
+    release_threshold,
 )
-from svkc.loops.projection import least_change
+from svkc.loops.projection import least_norm_change
 from svkc.model.chain import Chain, Structure, active_dofs
 from svkc.transitions.impact import velocity_after_impact
 from svkc.transitions.placement import joint_coordinates, with_coordinates
@@ -168,12 +168,12 @@ class _Iteration(eqx.Module):
         )
         if PROJECT_VELOCITY in self.kinds:
             residual = jnp.where(
-                is_velocity_step, loops.J @ (current.v / scales(chain)[1]), residual
+                is_velocity_step, loops.J @ (current.v / jacobian_scales(chain)[1]), residual
             )
-        step = -least_change(chain, selection, J, residual[:, None])[:, 0]
+        step = -least_norm_change(chain, selection, J, residual[:, None])[:, 0]
         residual_gaps = jnp.max(jnp.abs(loops.gap).reshape(-1, 6), 1)
         if DECIDE_RANK in self.kinds:
-            current = current.record_rank_search(kind, all_pivots.search_diag_R, residual_gaps)
+            current = current.record_rank_search(kind, all_pivots.diag_R, residual_gaps)
         v, spatial_impulse, energy_lost = (
             current.v + jnp.where(is_velocity_step, step, 0),
             current.spatial_impulse,
@@ -206,19 +206,19 @@ class _Iteration(eqx.Module):
                 J = jnp.where(mask[None] & (kind == which), 0, J)
         return J
 
-    def _select(self, J, current: NewtonState, kind, rank_known) -> tuple[Selection, Selection]:
+    def _select(self, J, current: NewtonState, kind, rank_known) -> tuple[PivotedQR, PivotedQR]:
         """Return the pivots of J, and those among them that are large enough to divide by."""
         independent, max_rank, dtype = None, min(J.shape), J.dtype
         if self.structure.independent is not None and IMPACT in self.kinds:
             independent = self.structure.independent & (kind == IMPACT)
-        all_pivots = select(J, jnp.where(rank_known, current.rank, max_rank), independent)
-        weak_threshold = jnp.where(rank_known, held_part(dtype) * current.margin, 0)
+        all_pivots = pivoted_qr(J, jnp.where(rank_known, current.rank, max_rank), independent)
+        weak_threshold = jnp.where(rank_known, release_threshold(dtype) * current.margin, 0)
         # along weaker steps a gap is of second order, and dividing by them would only amplify
         # round-off
         threshold = jnp.where(
             kind == IMPACT, weak_threshold, jnp.maximum(rank_tolerance(dtype), weak_threshold)
         )
-        return all_pivots, without_weak(all_pivots, threshold)
+        return all_pivots, drop_below(all_pivots, threshold)
 
     def _updated_configuration(self, loops: LoopKinematics, q, kind, step) -> Float[Array, " q"]:
         """Return the configuration after this iteration, moved from the one at which it was."""
@@ -249,7 +249,7 @@ def _iterate(
     rank of the structure."""
     kinds, active = schedule.kinds, active_dofs(chain, structure)
     # a fixed direction without pattern, as q itself may be singular
-    perturbation = 0.05 * np.sin(1.0 + 2.3 * np.arange(chain.dofs)) * scales(chain)[1]
+    perturbation = 0.05 * np.sin(1.0 + 2.3 * np.arange(chain.dofs)) * jacobian_scales(chain)[1]
     perturbation = jnp.where(active, perturbation, 0).astype(q.dtype)
     iteration = _Iteration(chain, structure, held=held, perturbation=perturbation, kinds=kinds)
 

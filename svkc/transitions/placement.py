@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from svkc.loops.constraint import ends
+from svkc.loops.constraint import loop_frames
 from svkc.model.chain import Chain, Structure
 from svkc.tree.kinematics import Kinematics
 from svkc.tree.spatial import (
@@ -23,16 +23,18 @@ def joint_coordinates(
     """Q with the coordinates of every virtual joint read off from where its two bodies are: what
     the joint's freedoms can express of it."""
     top = chain.topology
-    base = ends(chain, structure, kin, q)
+    base = loop_frames(chain, structure, kin, q)
     turn = quat_multiply(quat_conjugate(base.base_quat), base.real_quat)
     p = structure.parent
     start = (
         kin.r[p]
         + quat_rotate(kin.quat[p], structure.pos)
-        + (kin.root[p] - kin.root[structure.real])
+        + (kin.root_position[p] - kin.root_position[structure.real])
     )
     slide = jnp.where(
-        structure.freedoms[:, 3:], quat_rotate(quat_conjugate(base.base_quat), base.real - start), 0
+        structure.freedoms[:, 3:],
+        quat_rotate(quat_conjugate(base.base_quat), base.real_position - start),
+        0,
     )
     angle = _euler_angles(turn, structure.freedoms)
     masked = quat_normalize(
@@ -89,10 +91,14 @@ def place_at_current_pose(
     So a palm grips the bar where it touches it, about the bar's direction; floats of the placement
     stay differentiable.
     """
-    end = ends(chain, structure, kin, q)
+    end = loop_frames(chain, structure, kin, q)
     p = structure.parent
     to_parent = quat_conjugate(kin.quat[p])
-    place = end.real - kin.r[p] - (kin.root[p] - kin.root[structure.real])
+    place = (
+        end.real_position
+        - kin.r[p]
+        - (kin.root_position[p] - kin.root_position[structure.real])
+    )
     pos = quat_rotate(to_parent, place)
     real_quat = quat_multiply(quat_conjugate(kin.quat[structure.real]), end.base_quat)
     take = here[:, None]

@@ -16,12 +16,19 @@ from svkc._jax.static_gather import static_take
 from svkc.model.chain import Chain
 from svkc.model.topology import Topology
 from svkc.tree.kinematics import Kinematics
-from svkc.tree.mass_matrix import body_inertias
+from svkc.tree.mass_matrix import spatial_inertias
 from svkc.tree.spatial import inverse_positive
-from svkc.tree.traversal import beside, from_rows, levels, paired, sweep, zeros
+from svkc.tree.traversal import (
+    initial_carry,
+    level_tables,
+    scan_levels,
+    sum_children,
+    with_level_data,
+    zip_levels,
+)
 
 
-class Body(NamedTuple):
+class ArticulatedLevel(NamedTuple):
     """What `accelerations` needs of the bodies of one level: joint axes S, U = S I^A, (S I^A
     S^T)^-1."""
 
@@ -30,12 +37,12 @@ class Body(NamedTuple):
     inverse: Float[Array, "*levels n d d"]
 
 
-def articulate(
+def articulated_inertias(
     chain: Chain, kin: Kinematics, free: Bool[Array, " nv"] | None = None
-) -> list[Body] | Body:
+) -> list[ArticulatedLevel] | ArticulatedLevel:
     """Articulated inertias from the leaves to the roots. free: coordinates that are not locked
     (None: all)."""
-    top, own = chain.topology, body_inertias(chain, kin)
+    top, own = chain.topology, spatial_inertias(chain, kin)
     S = kin.S if free is None else jnp.where(free[:, None], kin.S, 0)
     more = jnp.zeros(chain.nv, S.dtype) if chain.armature is None else chain.armature
     more = more if free is None else jnp.where(free, more, 1)
@@ -43,50 +50,52 @@ def articulate(
 
     def step(below, given):
         level, A, s, m = given
-        A = A if below is None else A + from_rows(level.children, below)
+        A = A if below is None else A + sum_children(level.children, below)
         U = jnp.sum(s[:, :, :, None] * A[:, None], 2)
         D = jnp.sum(U[:, :, None] * s[:, None], -1) + m[:, :, None] * np.eye(s.shape[1])[None]
         inverse = inverse_positive(D)
         along = jnp.sum(inverse[..., None] * U[:, None], 2)
-        return A - jnp.sum(U[:, :, :, None] * along[:, :, None, :], 1), Body(s, U, inverse)
+        return A - jnp.sum(U[:, :, :, None] * along[:, :, None, :], 1), ArticulatedLevel(
+            s, U, inverse
+        )
 
-    given = beside(
+    given = with_level_data(
         top,
         lambda x: static_take(own, x.rows),
         lambda x: static_take(S, x.dofs),
         lambda x: static_take(more, x.dofs),
     )
-    return sweep(step, zeros(top, 6, 6, dtype=S.dtype), given, reverse=True)
+    return scan_levels(step, initial_carry(top, 6, 6, dtype=S.dtype), given, reverse=True)
 
 
-def _apply(A: Float[Array, "n i j"], x: Float[Array, "n j *k"]) -> Float[Array, "n i *k"]:
+def _batched_matvec(A: Float[Array, "n i j"], x: Float[Array, "n j *k"]) -> Float[Array, "n i *k"]:
     return jnp.sum(A.reshape(*A.shape, *(1,) * (x.ndim - 2)) * x[:, None], 2)
 
 
-def _carried(top: Topology, bodies, f: Float[Array, "nv *k"]):
+def _inward_pass(top: Topology, bodies, f: Float[Array, "nv *k"]):
     """For each level the forces that its joints are left with, those from below taken off, and the
     accelerations that these give each joint alone."""
 
     def step(below, given):
         (level, force), body = given
-        p = None if below is None else from_rows(level.children, below)
-        u = force if p is None else force - _apply(body.S, p)
-        x = _apply(body.inverse, u)
-        passed = _apply(jnp.swapaxes(body.U, 1, 2), x)
+        p = None if below is None else sum_children(level.children, below)
+        u = force if p is None else force - _batched_matvec(body.S, p)
+        x = _batched_matvec(body.inverse, u)
+        passed = _batched_matvec(jnp.swapaxes(body.U, 1, 2), x)
         return passed if p is None else passed + p, (u, x)
 
-    return sweep(
+    return scan_levels(
         step,
-        zeros(top, 6, *f.shape[1:], dtype=f.dtype),
-        paired(beside(top, lambda x: static_take(f, x.dofs)), bodies),
+        initial_carry(top, 6, *f.shape[1:], dtype=f.dtype),
+        zip_levels(with_level_data(top, lambda x: static_take(f, x.dofs)), bodies),
         reverse=True,
     )
 
 
-def seen_by(top: Topology, bodies, J: Float[Array, "rows nv"]) -> Float[Array, "rows rows"]:
+def delassus_matrix(top: Topology, bodies, J: Float[Array, "rows nv"]) -> Float[Array, "rows rows"]:
     """J M^-1 J^T. M = L D L^T with a joint's block of D for each (Featherstone section 6.5), so
     that half the way to M^-1 J^T is enough."""
-    parts = _carried(top, bodies, J.T)
+    parts = _inward_pass(top, bodies, J.T)
     parts = parts if isinstance(parts, list) else [parts]
     u, x = (jnp.concatenate([part[i].reshape(-1, J.shape[0]) for part in parts]) for i in (0, 1))
     # sums, not a `dot`, which XLA's CPU backend would not put into one kernel with what is around
@@ -94,7 +103,7 @@ def seen_by(top: Topology, bodies, J: Float[Array, "rows nv"]) -> Float[Array, "
     return sum_in_chunks(u[:, :, None] * x[:, None], (0,))
 
 
-def accelerations(top: Topology, bodies, f: Float[Array, " nv"]) -> Float[Array, " nv"]:
+def solve_mass_matrix(top: Topology, bodies, f: Float[Array, " nv"]) -> Float[Array, " nv"]:
     """M^-1 f: the joints' accelerations at rest, without gravity (Featherstone table 7.1)."""
 
     def step(above, given):
@@ -105,9 +114,11 @@ def accelerations(top: Topology, bodies, f: Float[Array, " nv"]) -> Float[Array,
         moved = jnp.sum(body.S * x[..., None], 1)
         return moved if above is None else a + moved, x
 
-    found = levels(top)
-    x = sweep(
-        step, zeros(top, 6, dtype=f.dtype), paired(paired(found, bodies), _carried(top, bodies, f))
+    found = level_tables(top)
+    x = scan_levels(
+        step,
+        initial_carry(top, 6, dtype=f.dtype),
+        zip_levels(zip_levels(found, bodies), _inward_pass(top, bodies, f)),
     )
     x, order = (
         (jnp.concatenate([y.ravel() for y in x]), [y.dofs for y in found])

@@ -10,21 +10,23 @@ from svkc.model.chain import Chain
 from svkc.model.checked_jit import check_chain, checked_jit, float_vector
 from svkc.tree.spatial import (
     quat_conjugate,
+    quat_derivative,
     quat_exp,
     quat_log,
     quat_multiply,
     quat_normalize,
-    quat_rate,
 )
-from svkc.tree.traversal import put
+from svkc.tree.traversal import replace_rows
 
 
-def rates(chain: Chain, q: Float[Array, " q"], v: Float[Array, " dofs"]) -> Float[Array, " q"]:
+def configuration_derivative(
+    chain: Chain, q: Float[Array, " q"], v: Float[Array, " dofs"]
+) -> Float[Array, " q"]:
     """Qdot for the velocities v: quaternions turn by qdot = q w / 2, everything else is its own
     rate."""
     quat_q, quat_v = chain.topology.quaternion_starts
     scalar_q, scalar_v = chain.topology.scalar_coordinates
-    turn = quat_rate(
+    turn = quat_derivative(
         static_take(q, quat_q[:, None] + np.arange(4)),
         static_take(v, quat_v[:, None] + np.arange(3)),
     )
@@ -77,10 +79,10 @@ def normalize(chain: Chain, q: Float[Array, " q"]) -> Float[Array, " q"]:
     if not len(quat_q):
         return q
     at = quat_q[:, None] + np.arange(4)
-    return put(q, at.ravel(), quat_normalize(static_take(q, at)).ravel())
+    return replace_rows(q, at.ravel(), quat_normalize(static_take(q, at)).ravel())
 
 
-def tangent(chain: Chain, q, gradient) -> Float[Array, " dofs"]:
+def tangent_gradient(chain: Chain, q, gradient) -> Float[Array, " dofs"]:
     """A gradient by q as one in the tangent of the configuration (per m, rad): of
     f(integrate(chain, q, dv)) by dv at dv = 0.
 
@@ -97,7 +99,7 @@ def tangent(chain: Chain, q, gradient) -> Float[Array, " dofs"]:
     ]
 
 
-def xyzw(chain: Chain, q) -> Float[Array, " q"]:
+def quaternions_xyzw(chain: Chain, q) -> Float[Array, " q"]:
     """Q with the scalar of every quaternion last, as Pinocchio, ROS and scipy have it."""
     check_chain(chain)
     q = float_vector(chain, "q", q, chain.topology.nq_all)

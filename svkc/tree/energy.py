@@ -7,16 +7,16 @@ from svkc.model.chain import Chain, State, active_dofs
 from svkc.model.checked_jit import checked_jit
 from svkc.tree.configuration import difference
 from svkc.tree.kinematics import Kinematics, kinematics, twists
-from svkc.tree.spatial import cross, rotate
+from svkc.tree.spatial import cross, matvec
 
 
-def _bodies(chain: Chain, kin: Kinematics, v):
+def _body_motions(chain: Chain, kin: Kinematics, v):
     """Of each row: centre of mass from the root's origin, its velocity, angular velocity, angular
     momentum about it."""
     V = twists(chain, kin, v)
-    c = kin.r + rotate(kin.R, chain.com)
+    c = kin.r + matvec(kin.R, chain.com)
     w = V[:, :3]
-    spin = rotate(kin.R, rotate(chain.rotational, rotate(jnp.swapaxes(kin.R, -1, -2), w)))
+    spin = matvec(kin.R, matvec(chain.rotational, matvec(jnp.swapaxes(kin.R, -1, -2), w)))
     return c, V[:, 3:] + cross(w, c), w, spin
 
 
@@ -27,7 +27,7 @@ def _energies(
     kinetic = jnp.sum(chain.mass * jnp.sum(u * u, -1)) / 2 + jnp.sum(w * spin) / 2
     if chain.armature is not None:
         kinetic = kinetic + jnp.sum(chain.armature * state.v[: chain.nv] ** 2) / 2
-    potential = -jnp.sum(chain.mass * jnp.sum((kin.root + c) * chain.gravity[None], -1))
+    potential = -jnp.sum(chain.mass * jnp.sum((kin.root_position + c) * chain.gravity[None], -1))
     if chain.stiffness is not None:
         stretch = difference(chain, chain.q_spring, state.q)
         stretch = jnp.where(active_dofs(chain, state.structure), stretch, 0)
@@ -35,28 +35,28 @@ def _energies(
     return kinetic, potential
 
 
-def _both(chain: Chain, state: State) -> tuple[Float[Array, ""], Float[Array, ""]]:
+def _kinetic_and_potential(chain: Chain, state: State) -> tuple[Float[Array, ""], Float[Array, ""]]:
     kin = kinematics(chain, state.q)
-    return _energies(chain, state, kin, _bodies(chain, kin, state.v))
+    return _energies(chain, state, kin, _body_motions(chain, kin, state.v))
 
 
 @checked_jit(eager=True)
 def kinetic_energy(chain: Chain, state: State) -> Float[Array, ""]:
     """Kinetic energy (J), armature included: v^T M v / 2."""
-    return _both(chain, state)[0]
+    return _kinetic_and_potential(chain, state)[0]
 
 
 @checked_jit(eager=True)
 def potential_energy(chain: Chain, state: State) -> Float[Array, ""]:
     """Gravity's potential (J), zero at the world's origin, and that of the joints' springs."""
-    return _both(chain, state)[1]
+    return _kinetic_and_potential(chain, state)[1]
 
 
 @checked_jit(eager=True)
 def energy(chain: Chain, state: State) -> Float[Array, ""]:
     """Mechanical energy (J): kinetic, gravity's and the joint springs' (Featherstone section
     2.13)."""
-    kinetic, potential = _both(chain, state)
+    kinetic, potential = _kinetic_and_potential(chain, state)
     return kinetic + potential
 
 
@@ -65,10 +65,10 @@ def energy_and_momentum(
 ) -> tuple[Float[Array, ""], Float[Array, "3"], Float[Array, "3"]]:
     """Return `energy`, linear momentum (N s), and angular momentum about the centre of mass of all
     bodies (N m s), in world axes."""
-    bodies = _bodies(chain, kin, state.v)
+    bodies = _body_motions(chain, kin, state.v)
     kinetic, potential = _energies(chain, state, kin, bodies)
     c, u, _, spin = bodies
-    p, place = chain.mass[:, None] * u, kin.root + c
+    p, place = chain.mass[:, None] * u, kin.root_position + c
     centre = jnp.sum(chain.mass[:, None] * place, 0) / jnp.sum(chain.mass)
     return kinetic + potential, jnp.sum(p, 0), jnp.sum(spin + cross(place - centre[None], p), 0)
 
@@ -78,6 +78,6 @@ def momentum(chain: Chain, state: State) -> tuple[Float[Array, "3"], Float[Array
     """Linear momentum (N s) and angular momentum about the world's origin (N m s), in world axes
     (Featherstone section 2.12)."""
     kin = kinematics(chain, state.q)
-    c, u, _, spin = _bodies(chain, kin, state.v)
+    c, u, _, spin = _body_motions(chain, kin, state.v)
     p = chain.mass[:, None] * u
-    return jnp.sum(p, 0), jnp.sum(spin + cross(kin.root + c, p), 0)
+    return jnp.sum(p, 0), jnp.sum(spin + cross(kin.root_position + c, p), 0)

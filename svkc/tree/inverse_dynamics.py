@@ -9,8 +9,13 @@ from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import checked_jit
 from svkc.tree.configuration import difference
 from svkc.tree.kinematics import Kinematics, kinematics, twists, velocity_products
-from svkc.tree.spatial import cross, halves, rotate
-from svkc.tree.traversal import down, put, to_rows, up
+from svkc.tree.spatial import angular_linear, cross, matvec
+from svkc.tree.traversal import (
+    accumulate_from_root,
+    accumulate_to_root,
+    replace_rows,
+    sum_dofs_per_row,
+)
 
 
 def newton_euler(
@@ -22,45 +27,46 @@ def newton_euler(
     Each body's force is taken at its centre of mass, where gyroscopic terms need no parallel axes,
     and moved to the root's origin.
     """
-    c = kin.r + rotate(kin.R, chain.com)
-    alpha, acceleration = halves(A)
+    c = kin.r + matvec(kin.R, chain.com)
+    alpha, acceleration = angular_linear(A)
     acceleration = acceleration + cross(alpha, c)
     R = kin.R
 
     def spin(w):
-        return rotate(R, rotate(chain.rotational, rotate(jnp.swapaxes(R, -1, -2), w)))
+        return matvec(R, matvec(chain.rotational, matvec(jnp.swapaxes(R, -1, -2), w)))
 
     moment = spin(alpha)
     if V is not None:
-        w, u = halves(V)
+        w, u = angular_linear(V)
         acceleration = acceleration + cross(w, u + cross(w, c))
         moment = moment + cross(w, spin(w))
     force = chain.mass[:, None] * acceleration
-    F = up(chain.topology, jnp.concatenate([moment + cross(c, force), force], -1))
+    F = accumulate_to_root(chain.topology, jnp.concatenate([moment + cross(c, force), force], -1))
     return jnp.sum(kin.S * static_take(F, chain.topology.dof_row), -1)
 
 
-def generalized_forces(
-    chain: Chain, kin: Kinematics, V, v, vdot: Float[Array, " nv"]
-) -> Float[Array, " nv"]:
+def rnea(chain: Chain, kin: Kinematics, V, v, vdot: Float[Array, " nv"]) -> Float[Array, " nv"]:
     """ID(q, v, vdot) of the tree with gravity and armature (paper, section III-A, step 2)."""
-    A = down(
+    A = accumulate_from_root(
         chain.topology,
-        to_rows(chain.topology, kin.S * vdot[:, None]) + velocity_products(chain, kin, V, v),
+        sum_dofs_per_row(chain.topology, kin.S * vdot[:, None])
+        + velocity_products(chain, kin, V, v),
     )
     A = A - jnp.concatenate([jnp.zeros_like(chain.gravity), chain.gravity])[None]
     tau = newton_euler(chain, kin, V, A)
     return tau if chain.armature is None else tau + chain.armature * vdot
 
 
-def inertia_times(chain: Chain, kin: Kinematics, x: Float[Array, " nv"]) -> Float[Array, " nv"]:
+def mass_matrix_product(
+    chain: Chain, kin: Kinematics, x: Float[Array, " nv"]
+) -> Float[Array, " nv"]:
     """M x: ID(q, 0, x) without gravity."""
-    A = down(chain.topology, to_rows(chain.topology, kin.S * x[:, None]))
+    A = accumulate_from_root(chain.topology, sum_dofs_per_row(chain.topology, kin.S * x[:, None]))
     tau = newton_euler(chain, kin, None, A)
     return tau if chain.armature is None else tau + chain.armature * x
 
 
-def over_all_dofs(chain: Chain, force: Float[Array, " nv"]) -> Float[Array, " dofs"]:
+def append_virtual_joints(chain: Chain, force: Float[Array, " nv"]) -> Float[Array, " dofs"]:
     """Return forces of the tree's joints, then a zero for each coordinate of virtual joints, which
     have no inertia."""
     return jnp.concatenate([force, jnp.zeros(chain.dofs - chain.nv, force.dtype)])
@@ -99,7 +105,7 @@ def limit_forces(
     x = static_take(q, at_q)
     out = jnp.maximum(x - upper, 0) - jnp.maximum(lower - x, 0)
     onset = jnp.where(out != 0, jnp.exp(-0.02 / jnp.where(out != 0, jnp.abs(out), 1)), 0)
-    return put(tau, at_v, -(k[at_v] * out + c[at_v] * static_take(v, at_v)) * onset)
+    return replace_rows(tau, at_v, -(k[at_v] * out + c[at_v] * static_take(v, at_v)) * onset)
 
 
 @checked_jit
@@ -108,7 +114,7 @@ def bias_force(chain: Chain, state: State) -> Float[Array, " nv"]:
     Featherstone section 6.1)."""
     kin = kinematics(chain, state.q)
     V = twists(chain, kin, state.v)
-    return generalized_forces(chain, kin, V, state.v, jnp.zeros(chain.nv, state.v.dtype))
+    return rnea(chain, kin, V, state.v, jnp.zeros(chain.nv, state.v.dtype))
 
 
 @checked_jit
@@ -127,5 +133,5 @@ def inverse_dynamics(
         )
     kin = kinematics(chain, state.q)
     V = twists(chain, kin, state.v)
-    tau = generalized_forces(chain, kin, V, state.v, vdot[: chain.nv])
+    tau = rnea(chain, kin, V, state.v, vdot[: chain.nv])
     return tau - passive_forces(chain, state.q, state.v)[: chain.nv]

@@ -16,14 +16,19 @@ from svkc.model.checked_jit import checked_jit
 from svkc.model.topology import BALL, FREE, HINGE, SLIDE, Topology
 from svkc.tree.spatial import (
     cross,
+    matvec,
     motion_cross,
-    quat_about,
+    quat_from_axis_angle,
     quat_matrix,
     quat_multiply,
     quat_normalize,
-    rotate,
 )
-from svkc.tree.traversal import LEVELS_UNROLLED, down, put, to_rows
+from svkc.tree.traversal import (
+    LEVELS_UNROLLED,
+    accumulate_from_root,
+    replace_rows,
+    sum_dofs_per_row,
+)
 
 
 class Kinematics(eqx.Module):
@@ -33,7 +38,7 @@ class Kinematics(eqx.Module):
     R: Float[Array, "rows 3 3"]
     quat: Float[Array, "rows 4"]
     r: Float[Array, "rows 3"]
-    root: Float[Array, "rows 3"]
+    root_position: Float[Array, "rows 3"]
     S: Float[Array, "nv 6"]
 
 
@@ -48,7 +53,7 @@ def _joint_poses(chain: Chain, q: Float[Array, " q"]):
         turn.append(
             (
                 hinges,
-                quat_about(
+                quat_from_axis_angle(
                     static_take(chain.axis, hinges),
                     static_take(q, start[hinges]) - static_take(chain.q_load, start[hinges]),
                 ),
@@ -57,21 +62,21 @@ def _joint_poses(chain: Chain, q: Float[Array, " q"]):
     if len(balls):
         turn.append((balls, quat_normalize(static_take(q, start[balls][:, None] + np.arange(4)))))
     for rows, joint in turn:
-        quat = put(quat, rows, quat_multiply(static_take(fixed, rows), joint))
+        quat = replace_rows(quat, rows, quat_multiply(static_take(fixed, rows), joint))
     free = top.rows_of_kind(FREE)
     if len(free):
-        quat = put(
+        quat = replace_rows(
             quat, free, quat_normalize(static_take(q, start[free][:, None] + np.arange(3, 7)))
         )
     if len(slides):
         along = static_take(q, start[slides]) - static_take(chain.q_load, start[slides])
-        slide = put(
+        slide = replace_rows(
             jnp.zeros_like(chain.axis), slides, along[:, None] * static_take(chain.axis, slides)
         )
     return quat, fixed, slide
 
 
-def _compose(top: Topology, quat: Float[Array, "rows 4"]) -> Float[Array, "rows 4"]:
+def _rotations_in_ground(top: Topology, quat: Float[Array, "rows 4"]) -> Float[Array, "rows 4"]:
     """Rotations in the parent -> rotations in the world: level by level, or by doubling along the
     ancestors in deep trees."""
     parent = np.array(top.parent)
@@ -96,31 +101,39 @@ def kinematics(chain: Chain, q: Float[Array, " q"]) -> Kinematics:
     """Poses of every row and the joint axes at q (Featherstone section 4.4, world axes)."""
     top = chain.topology
     local, fixed, slide = _joint_poses(chain, q)
-    quat = quat_normalize(_compose(top, local))
+    quat = quat_normalize(_rotations_in_ground(top, local))
     R = quat_matrix(quat)
     parent = np.maximum(np.array(top.parent), 0)
     above = static_take(R, parent)
-    step = rotate(above, chain.pos)
+    step = matvec(above, chain.pos)
     if slide is not None:
-        step = step + rotate(above, rotate(quat_matrix(fixed), slide))
+        step = step + matvec(above, matvec(quat_matrix(fixed), slide))
     if chain.anchor is not None:
         # the anchor stays where it is while the row turns about it
         step = (
-            step + rotate(above, rotate(quat_matrix(fixed), chain.anchor)) - rotate(R, chain.anchor)
+            step + matvec(above, matvec(quat_matrix(fixed), chain.anchor)) - matvec(R, chain.anchor)
         )
     free = top.rows_of_kind(FREE)
     if len(free):
-        step = put(step, free, static_take(q, np.array(top.q_start)[free][:, None] + np.arange(3)))
+        step = replace_rows(
+            step, free, static_take(q, np.array(top.q_start)[free][:, None] + np.arange(3))
+        )
     roots = np.array(top.parent) <= 0
-    r = down(top, jnp.where(roots[:, None], 0, step))
-    return Kinematics(R=R, quat=quat, r=r, root=static_take(step, top.root), S=_axes(chain, R, r))
+    r = accumulate_from_root(top, jnp.where(roots[:, None], 0, step))
+    return Kinematics(
+        R=R,
+        quat=quat,
+        r=r,
+        root_position=static_take(step, top.root),
+        S=_motion_subspaces(chain, R, r),
+    )
 
 
-def _axes(chain: Chain, R, r) -> Float[Array, "nv 6"]:
+def _motion_subspaces(chain: Chain, R, r) -> Float[Array, "nv 6"]:
     """Motion subspace of every joint coordinate, in world axes about the root's origin."""
     top = chain.topology
     eye = jnp.eye(3, dtype=R.dtype)
-    point = r if chain.anchor is None else r + rotate(R, chain.anchor)
+    point = r if chain.anchor is None else r + matvec(R, chain.anchor)
     parts, order = [], []
 
     def turning(rows, axes):
@@ -129,11 +142,11 @@ def _axes(chain: Chain, R, r) -> Float[Array, "nv 6"]:
     hinges, slides = top.rows_of_kind(HINGE), top.rows_of_kind(SLIDE)
     if len(hinges):
         parts.append(
-            turning(hinges, rotate(static_take(R, hinges), static_take(chain.axis, hinges)))
+            turning(hinges, matvec(static_take(R, hinges), static_take(chain.axis, hinges)))
         )
         order.append(np.array(top.v_start)[hinges])
     if len(slides):
-        along = rotate(static_take(R, slides), static_take(chain.axis, slides))
+        along = matvec(static_take(R, slides), static_take(chain.axis, slides))
         parts.append(jnp.concatenate([jnp.zeros_like(along), along], -1))
         order.append(np.array(top.v_start)[slides])
     for kind, offset in ((BALL, 0), (FREE, 3)):
@@ -155,7 +168,9 @@ def _axes(chain: Chain, R, r) -> Float[Array, "nv 6"]:
 
 def twists(chain: Chain, kin: Kinematics, v: Float[Array, " dofs"]) -> Float[Array, "rows 6"]:
     """V = sum of S v along the tree (rad/s, m/s), in world axes about the root's origin."""
-    return down(chain.topology, to_rows(chain.topology, kin.S * v[: chain.nv, None]))
+    return accumulate_from_root(
+        chain.topology, sum_dofs_per_row(chain.topology, kin.S * v[: chain.nv, None])
+    )
 
 
 def velocity_products(
@@ -167,14 +182,16 @@ def velocity_products(
     moving = np.ones(chain.nv, bool)
     free = top.rows_of_kind(FREE)
     moving[(np.array(top.v_start)[free][:, None] + np.arange(3)).ravel()] = False
-    return motion_cross(V, to_rows(top, kin.S * jnp.where(moving, v[: chain.nv], 0)[:, None]))
+    return motion_cross(
+        V, sum_dofs_per_row(top, kin.S * jnp.where(moving, v[: chain.nv], 0)[:, None])
+    )
 
 
 def bias_accelerations(
     chain: Chain, kin: Kinematics, V: Float[Array, "rows 6"], v: Float[Array, " dofs"]
 ) -> Float[Array, "rows 6"]:
     """Spatial accelerations with vdot = 0 and no gravity."""
-    return down(chain.topology, velocity_products(chain, kin, V, v))
+    return accumulate_from_root(chain.topology, velocity_products(chain, kin, V, v))
 
 
 @checked_jit

@@ -7,15 +7,15 @@ from jaxtyping import Array, Float
 from svkc._jax.static_gather import static_take
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import checked_jit
-from svkc.tree.inverse_dynamics import inertia_times
+from svkc.tree.inverse_dynamics import mass_matrix_product
 from svkc.tree.kinematics import Kinematics, kinematics
-from svkc.tree.spatial import cross, halves, rotate, skew
-from svkc.tree.traversal import up
+from svkc.tree.spatial import angular_linear, cross, matvec, skew
+from svkc.tree.traversal import accumulate_to_root
 
 
-def inertia_by_unit_vectors(chain: Chain, kin: Kinematics) -> Float[Array, "nv nv"]:
+def mass_matrix_unit_vectors(chain: Chain, kin: Kinematics) -> Float[Array, "nv nv"]:
     """Column i is ID(q, 0, e_i) without gravity: the paper's way (section III-B, step 3)."""
-    return jax.vmap(lambda unit: inertia_times(chain, kin, unit), out_axes=1)(
+    return jax.vmap(lambda unit: mass_matrix_product(chain, kin, unit), out_axes=1)(
         jnp.eye(chain.nv, dtype=kin.r.dtype)
     )
 
@@ -26,10 +26,10 @@ def central_inertias(
     """Of each row: the centre of mass from the root's origin, and the inertia about it, in world
     axes."""
     RI = jnp.sum(kin.R[:, :, :, None] * chain.rotational[:, None, :, :], 2)
-    return kin.r + rotate(kin.R, chain.com), jnp.sum(RI[:, :, None, :] * kin.R[:, None, :, :], -1)
+    return kin.r + matvec(kin.R, chain.com), jnp.sum(RI[:, :, None, :] * kin.R[:, None, :, :], -1)
 
 
-def inertia_by_composites(chain: Chain, kin: Kinematics) -> Float[Array, "nv nv"]:
+def mass_matrix_crba(chain: Chain, kin: Kinematics) -> Float[Array, "nv nv"]:
     """Composite rigid bodies (Featherstone section 6.2): mass, first moment and rotational inertia
     simply add up towards the root."""
     top, (c, central) = chain.topology, central_inertias(chain, kin)
@@ -39,11 +39,13 @@ def inertia_by_composites(chain: Chain, kin: Kinematics) -> Float[Array, "nv nv"
         - c[:, :, None] * c[:, None, :]
     )
     I = central + m[:, :, None] * square
-    total = static_take(up(top, jnp.concatenate([m, m * c, I.reshape(-1, 9)], -1)), top.dof_row)
+    total = static_take(
+        accumulate_to_root(top, jnp.concatenate([m, m * c, I.reshape(-1, 9)], -1)), top.dof_row
+    )
     m, h, I = total[:, :1], total[:, 1:4], total[:, 4:].reshape(-1, 3, 3)
-    w, u = halves(kin.S)
+    w, u = angular_linear(kin.S)
     # momentum of everything a joint carries, for a unit of its velocity
-    F = jnp.concatenate([rotate(I, w) + cross(h, u), m * u + cross(w, h)], -1)
+    F = jnp.concatenate([matvec(I, w) + cross(h, u), m * u + cross(w, h)], -1)
     related = top.ancestor_mask[top.dof_row][:, top.dof_row]
     M = jnp.where(related, F @ kin.S.T, 0)
     M = jnp.where(related.T & ~related, M.T, M)
@@ -54,10 +56,10 @@ def inertia_by_composites(chain: Chain, kin: Kinematics) -> Float[Array, "nv nv"
 def mass_matrix(chain: Chain, state: State) -> Float[Array, "nv nv"]:
     """Joint-space inertia of the tree (kg, kg m, kg m^2), armature included, by composite bodies
     (Featherstone section 6.2)."""
-    return inertia_by_composites(chain, kinematics(chain, state.q))
+    return mass_matrix_crba(chain, kinematics(chain, state.q))
 
 
-def body_inertias(chain: Chain, kin: Kinematics) -> Float[Array, "rows 6 6"]:
+def spatial_inertias(chain: Chain, kin: Kinematics) -> Float[Array, "rows 6 6"]:
     """Spatial inertia of each row in world axes about its root's origin (Featherstone (2.63))."""
     (c, central), m = central_inertias(chain, kin), chain.mass[:, None, None]
     cx = skew(c)

@@ -22,20 +22,20 @@ for i in range(4):
     HAMILTON[0, i, i], HAMILTON[i, i, 0], HAMILTON[i, 0, i] = 1, 1, -1 if i else 1
 # of q* in x -> x q*
 CONJUGATE = np.array([1.0, -1, -1, -1])
-BY_CONJUGATE = CONJUGATE[:, None, None] * HAMILTON.transpose(2, 1, 0)
+RIGHT_CONJUGATE = CONJUGATE[:, None, None] * HAMILTON.transpose(2, 1, 0)
 
 
-def _for(a: Float[Array, "*n i"], table: np.ndarray) -> np.ndarray:
+def _table_like(a: Float[Array, "*n i"], table: np.ndarray) -> np.ndarray:
     """The table with a's precision, and an axis of one for each that a has before its last."""
     return table.astype(a.dtype)[(None,) * (a.ndim - 1)]
 
 
-def _by(table: np.ndarray, a: Float[Array, "*n i"]) -> Float[Array, "*n k j"]:
+def _left_product_matrix(table: np.ndarray, a: Float[Array, "*n i"]) -> Float[Array, "*n k j"]:
     """The matrix of b -> out."""
-    return jnp.sum(a[..., None, None] * _for(a, table), -3)
+    return jnp.sum(a[..., None, None] * _table_like(a, table), -3)
 
 
-def halves(x: Float[Array, "*n 6"]) -> tuple[Float[Array, "*n 3"], Float[Array, "*n 3"]]:
+def angular_linear(x: Float[Array, "*n 6"]) -> tuple[Float[Array, "*n 3"], Float[Array, "*n 3"]]:
     """The angular and the linear part of a 6-vector."""
     # a split, whose transpose is one concatenation; that of two slices would be two paddings and a
     # sum
@@ -45,10 +45,10 @@ def halves(x: Float[Array, "*n 6"]) -> tuple[Float[Array, "*n 3"], Float[Array, 
 
 def cross(a: Float[Array, "*#n 3"], b: Float[Array, "*#n 3"]) -> Float[Array, "*n 3"]:
     """Vector product a x b."""
-    return rotate(_by(SKEW, a), b)
+    return matvec(_left_product_matrix(SKEW, a), b)
 
 
-def rotate(R: Float[Array, "*#n i k"], x: Float[Array, "*#n k"]) -> Float[Array, "*n i"]:
+def matvec(R: Float[Array, "*#n i k"], x: Float[Array, "*#n k"]) -> Float[Array, "*n i"]:
     """R x (of vectors, quaternions, ...), as a product and a sum, which fuse where a small `dot`
     would not."""
     return jnp.sum(R * x[..., None, :], -1)
@@ -56,7 +56,7 @@ def rotate(R: Float[Array, "*#n i k"], x: Float[Array, "*#n k"]) -> Float[Array,
 
 def skew(a: Float[Array, "*n 3"]) -> Float[Array, "*n 3 3"]:
     """The matrix of b -> a x b."""
-    return _by(SKEW, a)
+    return _left_product_matrix(SKEW, a)
 
 
 def inverse_positive(D: Float[Array, "*n k k"]) -> Float[Array, "*n k k"]:
@@ -88,15 +88,15 @@ def inverse_positive(D: Float[Array, "*n k k"]) -> Float[Array, "*n k k"]:
 
 def motion_cross(a: Float[Array, "*#n 6"], b: Float[Array, "*#n 6"]) -> Float[Array, "*n 6"]:
     """A x b of two motion vectors (Featherstone 2.9, eq. 2.31)."""
-    (w, v), (m, n) = halves(a), halves(b)
-    by_w, by_v = _by(SKEW, w), _by(SKEW, v)
-    return jnp.concatenate([rotate(by_w, m), rotate(by_v, m) + rotate(by_w, n)], -1)
+    (w, v), (m, n) = angular_linear(a), angular_linear(b)
+    by_w, by_v = _left_product_matrix(SKEW, w), _left_product_matrix(SKEW, v)
+    return jnp.concatenate([matvec(by_w, m), matvec(by_v, m) + matvec(by_w, n)], -1)
 
 
 def shift_motion(S: Float[Array, "*#n 6"], r: Float[Array, "*#n 3"]) -> Float[Array, "*n 6"]:
     """The motion vector S given about the origin, given about the point r instead (Featherstone
     2.8)."""
-    w, v = halves(S)
+    w, v = angular_linear(S)
     return jnp.concatenate(
         [jnp.broadcast_to(w, jnp.broadcast_shapes(w.shape, r.shape)), v + cross(w, r)], -1
     )
@@ -104,33 +104,35 @@ def shift_motion(S: Float[Array, "*#n 6"], r: Float[Array, "*#n 3"]) -> Float[Ar
 
 def quat_multiply(a: Float[Array, "*#n 4"], b: Float[Array, "*#n 4"]) -> Float[Array, "*n 4"]:
     """Hamilton product."""
-    return rotate(_by(HAMILTON, a), b)
+    return matvec(_left_product_matrix(HAMILTON, a), b)
 
 
 def quat_conjugate(q: Float[Array, "*n 4"]) -> Float[Array, "*n 4"]:
     """The inverse rotation of a unit quaternion."""
-    return q * _for(q, CONJUGATE)
+    return q * _table_like(q, CONJUGATE)
 
 
 def quat_normalize(q: Float[Array, "*n 4"]) -> Float[Array, "*n 4"]:
     """q/|q|; the identity where q is zero."""
     square = jnp.sum(q * q, -1, keepdims=True)
     zero = square == 0
-    return jnp.where(zero, _for(q, np.eye(4)[0]), q / jnp.sqrt(jnp.where(zero, 1, square)))
+    return jnp.where(zero, _table_like(q, np.eye(4)[0]), q / jnp.sqrt(jnp.where(zero, 1, square)))
 
 
 def quat_matrix(q: Float[Array, "*n 4"]) -> Float[Array, "*n 3 3"]:
     """Rotation matrix of a unit quaternion, body to world: the vectors' part of x -> q x q*."""
-    left, right = _by(HAMILTON, q), _by(BY_CONJUGATE, q)
+    left, right = _left_product_matrix(HAMILTON, q), _left_product_matrix(RIGHT_CONJUGATE, q)
     return jnp.sum(left[..., 1:, :, None] * right[..., None, :, 1:], -2)
 
 
 def quat_rotate(q: Float[Array, "*#n 4"], x: Float[Array, "*#n 3"]) -> Float[Array, "*n 3"]:
     """The vector x turned by the unit quaternion q."""
-    return rotate(quat_matrix(q), x)
+    return matvec(quat_matrix(q), x)
 
 
-def quat_about(axis: Float[Array, "*#n 3"], angle: Float[Array, "*#n"]) -> Float[Array, "*n 4"]:
+def quat_from_axis_angle(
+    axis: Float[Array, "*#n 3"], angle: Float[Array, "*#n"]
+) -> Float[Array, "*n 4"]:
     """The rotation by `angle` (rad) about a unit axis."""
     half = angle[..., None] / 2
     s = jnp.sin(half) * axis
@@ -165,6 +167,6 @@ def quat_log(q: Float[Array, "*n 4"]) -> Float[Array, "*n 3"]:
     return factor * q[..., 1:]
 
 
-def quat_rate(q: Float[Array, "*#n 4"], w: Float[Array, "*#n 3"]) -> Float[Array, "*n 4"]:
+def quat_derivative(q: Float[Array, "*#n 4"], w: Float[Array, "*#n 3"]) -> Float[Array, "*n 4"]:
     """Qdot = q (0, w) / 2 with the angular velocity w (rad/s) in body coordinates."""
     return quat_multiply(q, jnp.concatenate([jnp.zeros_like(w[..., :1]), w], -1)) / 2

@@ -16,13 +16,13 @@ from svkc.model.topology import BALL, FREE, HINGE, SLIDE, V_SIZE, Topology
 LEVELS_UNROLLED = 24
 # children's children and so on that a row may have side by side there; with more the table of
 # ancestors is smaller
-WIDEST = 4
+MAX_DESCENDANTS = 4
 
 
-def down(top: Topology, x: Float[Array, "rows *n"]) -> Float[Array, "rows *n"]:
+def accumulate_from_root(top: Topology, x: Float[Array, "rows *n"]) -> Float[Array, "rows *n"]:
     """Sum of x over each row and its ancestors, level by level."""
     if len(top.levels) > LEVELS_UNROLLED:
-        for above, _ in _doublings(top):
+        for above, _ in _doubling_tables(top):
             x = x + static_take(x, above)
         return x
     parent, levels = np.array(top.parent), [x[:1]]
@@ -31,24 +31,24 @@ def down(top: Topology, x: Float[Array, "rows *n"]) -> Float[Array, "rows *n"]:
     return jnp.concatenate(levels)
 
 
-def up(top: Topology, x: Float[Array, "rows *n"]) -> Float[Array, "rows *n"]:
+def accumulate_to_root(top: Topology, x: Float[Array, "rows *n"]) -> Float[Array, "rows *n"]:
     """Sum of x over each row and its descendants, level by level."""
     if len(top.levels) > LEVELS_UNROLLED:
-        if any(below.shape[1] > WIDEST for _, below in _doublings(top)):
+        if any(below.shape[1] > MAX_DESCENDANTS for _, below in _doubling_tables(top)):
             return jnp.tensordot(jnp.asarray(top.ancestor_mask.T, x.dtype), x, 1)
-        for _, below in _doublings(top):
+        for _, below in _doubling_tables(top):
             x = x + jnp.sum(static_take(x, below), 1)
         return x
     sums, below = [], None
-    for level, (first, last) in reversed(list(zip(levels(top), top.levels[1:], strict=True))):
+    for level, (first, last) in reversed(list(zip(level_tables(top), top.levels[1:], strict=True))):
         own = x[first:last]
-        below = own if below is None else own + from_rows(level.children, below)
+        below = own if below is None else own + sum_children(level.children, below)
         sums.append(below)
     return jnp.concatenate([x[:1] + jnp.sum(below, 0, keepdims=True), *sums[::-1]])
 
 
 @functools.cache
-def _doublings(top: Topology) -> list[tuple[np.ndarray, np.ndarray]]:
+def _doubling_tables(top: Topology) -> list[tuple[np.ndarray, np.ndarray]]:
     """For 1, 2, 4, ... generations: each row's ancestor so far up, and its descendants so far down;
     one past the last row where there is none."""
     parent = np.array(top.parent)
@@ -65,7 +65,7 @@ def _doublings(top: Topology) -> list[tuple[np.ndarray, np.ndarray]]:
     return found
 
 
-def put(
+def replace_rows(
     x: Float[Array, "rows *n"], rows: np.ndarray, values: Float[Array, "some *n"]
 ) -> Float[Array, "rows *n"]:
     """X with some of its rows replaced. (No scatter: XLA's CPU backend makes one kernel of a loop's
@@ -75,7 +75,7 @@ def put(
     return static_take(jnp.concatenate([x, values]), source)
 
 
-def to_rows(top: Topology, x: Float[Array, "nv *n"]) -> Float[Array, "rows *n"]:
+def sum_dofs_per_row(top: Topology, x: Float[Array, "nv *n"]) -> Float[Array, "rows *n"]:
     """Sum of x over the coordinates of each row's joint."""
     parts, order = [], []
     for kinds, size in (((HINGE, SLIDE), 1), ((BALL,), 3), ((FREE,), 6)):
@@ -103,7 +103,7 @@ class Level(NamedTuple):
 
 
 @functools.cache
-def levels(top: Topology) -> list[Level] | Level:
+def level_tables(top: Topology) -> list[Level] | Level:
     """One for each level, as small as it can be; in deep trees all as large as the largest,
     stacked, for a loop over them.
 
@@ -145,7 +145,7 @@ def levels(top: Topology) -> list[Level] | Level:
     return Level(*map(np.stack, zip(*found, strict=True))) if deep else found
 
 
-def sweep(step: Callable, start, over, reverse: bool = False):
+def scan_levels(step: Callable, start, over, reverse: bool = False):
     """What `step(carried, level)` leaves level by level: unrolled over a list, a loop over what is
     stacked."""
     if not isinstance(over, list):
@@ -157,22 +157,22 @@ def sweep(step: Callable, start, over, reverse: bool = False):
     return found[::-1] if reverse else found
 
 
-def zeros(top: Topology, *shape: int, dtype) -> Array | None:
+def initial_carry(top: Topology, *shape: int, dtype) -> Array | None:
     """What a sweep starts with where levels are stacked; else it starts with nothing."""
-    found = levels(top)
+    found = level_tables(top)
     return None if isinstance(found, list) else jnp.zeros((found.rows.shape[1], *shape), dtype)
 
 
-def from_rows(
+def sum_children(
     children: Int[Array, "m c"] | np.ndarray, below: Float[Array, "n *k"]
 ) -> Float[Array, "m *k"]:
     """For each row of a level, the sum of its children's in the level below."""
     return jnp.sum(static_take(below, children), 1)
 
 
-def beside(top: Topology, *given: Callable):
+def with_level_data(top: Topology, *given: Callable):
     """Levels, and beside each what the functions give of them."""
-    found = levels(top)
+    found = level_tables(top)
     return (
         [(level, *(f(level) for f in given)) for level in found]
         if isinstance(found, list)
@@ -180,6 +180,6 @@ def beside(top: Topology, *given: Callable):
     )
 
 
-def paired(a, b):
+def zip_levels(a, b):
     """Return pairs of what two functions give, level by level or stacked."""
     return list(zip(a, b, strict=True)) if isinstance(a, list) else (a, b)

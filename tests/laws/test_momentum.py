@@ -11,7 +11,7 @@ from tolerances import ROUND_OFF
 
 import svkc
 from svkc.transitions.transition import change_structure
-from svkc.tree.configuration import rates
+from svkc.tree.configuration import configuration_derivative
 
 
 @pytest.mark.parametrize("name", cases.params("afloat"))
@@ -25,7 +25,9 @@ def test_its_rate(name):
     def both(q, v):
         return jnp.stack(svkc.momentum(chain, svkc.State(q, v, state.structure)))
 
-    value, rate = jax.jvp(both, (state.q, state.v), (rates(chain, state.q, state.v), vdot))
+    value, rate = jax.jvp(
+        both, (state.q, state.v), (configuration_derivative(chain, state.q, state.v), vdot)
+    )
     force, torque = svkc.loop_forces(chain, state, tau)
     weighed = lambda g: svkc.potential_energy(eqx.tree_at(lambda c: c.gravity, chain, g), state)
     # the mass times the place of its centre

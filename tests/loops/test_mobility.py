@@ -10,7 +10,7 @@ from kkt import acceleration
 from tolerances import REFERENCE, ROUND_OFF
 
 import svkc
-from svkc.loops.pivoting import select
+from svkc.loops.pivoting import pivoted_qr
 
 
 @pytest.fixture(params=cases.params("overconstrained"), scope="module")
@@ -104,4 +104,4 @@ def test_of_columns_that_are_equal_the_first_is_chosen():
     rng = np.random.default_rng(0)
     half = rng.normal(size=(6, 8))
     J = np.concatenate([half, -half], 1) * (1 + 1e-13 * rng.normal(size=(6, 16)))
-    assert set(np.argmax(select(jnp.asarray(J)).P, 1).tolist()) <= set(range(8))
+    assert set(np.argmax(pivoted_qr(jnp.asarray(J)).P, 1).tolist()) <= set(range(8))

@@ -78,7 +78,7 @@ def smaller(picture):
     from PIL import Image
 
     file = io.BytesIO()
-    Image.search_gaps(io.BytesIO(base64.b64decode(picture))).convert("RGB").quantize(64).save(
+    Image.open(io.BytesIO(base64.b64decode(picture))).convert("RGB").quantize(64).save(
         file, "PNG", optimize=True
     )
     return base64.b64encode(file.getvalue()).decode()

@@ -9,16 +9,16 @@ import numpy as np
 from jax.scipy.linalg import cho_factor, cho_solve
 from jaxtyping import Array, Float
 
-from svkc.loops.constrained_dynamics import UnitVectors, reduced_inertia
-from svkc.loops.constraint import ends, loop_jacobian, loop_kinematics
-from svkc.loops.coordinates import constrained
+from svkc.loops.constrained_dynamics import UnitVectors, reduced_mass_matrix
+from svkc.loops.constraint import assemble_loop_jacobian, loop_frames, loop_kinematics
+from svkc.loops.coordinates import closed_coordinates
 from svkc.loops.forward_dynamics import acceleration
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import joint_torques
 from svkc.model.names import link_index
 from svkc.transitions.placement import joint_coordinates, with_coordinates
 from svkc.tree.kinematics import twists
-from svkc.tree.mass_matrix import inertia_by_composites
+from svkc.tree.mass_matrix import mass_matrix_crba
 
 
 @jax.jit
@@ -44,7 +44,7 @@ def velocity_by_impulse(
     slot, nv = link_index(chain, name), chain.nv
     loops = loop_kinematics(chain, state.structure, state.q)
     kin = loops.kin
-    before = constrained(chain, state.structure, state.v, loops, twists(chain, kin, state.v))
+    before = closed_coordinates(chain, state.structure, state.v, loops, twists(chain, kin, state.v))
     after = eqx.tree_at(
         lambda s: s.connected, state.structure, state.structure.connected.at[slot].set(True)
     )
@@ -54,11 +54,13 @@ def velocity_by_impulse(
         joint_coordinates(chain, after, kin, state.q),
         state.q,
     )
-    J = loop_jacobian(chain, after, kin, ends(chain, after, kin, q))[6 * slot : 6 * slot + 6]
+    J = assemble_loop_jacobian(chain, after, kin, loop_frames(chain, after, kin, q))[
+        6 * slot : 6 * slot + 6
+    ]
     own = np.array([d for d in chain.topology.links.dof[slot] if d < chain.dofs], int)
     # J_1 - J_2 along theta_G, and the axes of the new joint, on the side where (27) has them
     J_G, J_r = J[:, :nv] @ before.W[:nv], -J[:, own]
-    A = cho_factor(reduced_inertia(chain, before, inertia_by_composites(chain, kin)))
+    A = cho_factor(reduced_mass_matrix(chain, before, mass_matrix_crba(chain, kin)))
     B_inverse = jnp.linalg.inv(J_G @ cho_solve(A, J_G.T))
     C = (
         J_r @ jnp.linalg.solve(J_r.T @ B_inverse @ J_r, J_r.T @ B_inverse)

@@ -13,7 +13,7 @@ from tolerances import REFERENCE, ROUND_OFF
 import svkc
 from svkc import _deprecated as deprecated
 from svkc.loops.constrained_dynamics import Dynamics, default_dynamics
-from svkc.loops.projection import settle_loops
+from svkc.loops.projection import project
 from svkc.tools.accuracy import Candidate, candidates
 
 
@@ -125,8 +125,8 @@ def test_only_dependent_coordinates_move():
         stabilization=svkc.stabilization.NoStabilization(),
         throw=False,
     ).final
-    moved = lambda dependent: settle_loops(
-        chain, rough.structure, rough.q, rough.v, iterations=3, dependent=dependent
+    moved = lambda dependent: project(
+        chain, rough.structure, rough.q, rough.v, iterations=3, dependent_only=dependent
     )[:2]
     independent = np.asarray(svkc.coordinates(chain, rough).independent)
     q, v = moved(True)

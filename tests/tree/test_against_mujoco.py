@@ -13,9 +13,9 @@ from tolerances import REFERENCE, ROUND_OFF
 
 import svkc
 from svkc.loops.forward_dynamics import acceleration
-from svkc.tree.configuration import rates
+from svkc.tree.configuration import configuration_derivative
 from svkc.tree.kinematics import kinematics
-from svkc.tree.mass_matrix import inertia_by_unit_vectors
+from svkc.tree.mass_matrix import mass_matrix_unit_vectors
 
 # MuJoCo says it of gymnasium's half_cheetah.xml
 pytestmark = pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass' is deprecated")
@@ -53,7 +53,7 @@ def everything(chain, state, tau):
         "linear": linear,
         "angular": angular,
         "mass": svkc.mass_matrix(chain, state),
-        "mass by unit vectors": inertia_by_unit_vectors(chain, kin),
+        "mass by unit vectors": mass_matrix_unit_vectors(chain, kin),
         "bias": svkc.bias_force(chain, state),
         "acceleration": vdot,
         "acceleration by unit vectors": paper.forward_dynamics_by_unit_vectors(chain, state, tau),
@@ -65,7 +65,7 @@ def everything(chain, state, tau):
         "power": jax.jvp(
             lambda q, v: svkc.energy(chain, svkc.State(q, v, state.structure)),
             (state.q, state.v),
-            (rates(chain, state.q, state.v), vdot),
+            (configuration_derivative(chain, state.q, state.v), vdot),
         )[1],
     }
 
@@ -119,7 +119,7 @@ def test_integrate_and_difference_are_inverse():
         svkc.difference(chain, q, svkc.integrate(chain, q, dv)), dv, atol=1e-13
     )
     _, rate = jax.jvp(lambda s: svkc.integrate(chain, q, s * dv), (0.0,), (1.0,))
-    np.testing.assert_allclose(rate, rates(chain, q, dv), atol=1e-13)
+    np.testing.assert_allclose(rate, configuration_derivative(chain, q, dv), atol=1e-13)
 
 
 def test_open_chain_has_nothing_of_the_closure():

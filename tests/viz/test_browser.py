@@ -71,7 +71,7 @@ def picture(page):
         "() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
     )
     return np.asarray(
-        Image.search_gaps(io.BytesIO(page.locator("canvas").screenshot())).convert("RGB"), int
+        Image.open(io.BytesIO(page.locator("canvas").screenshot())).convert("RGB"), int
     )
 
 
