@@ -304,7 +304,7 @@ def swing():
     Both sides of the body stay alike up to the first: turned on the plate, the pelvis would open
     the two slides' loops to the second order only.
     """
-    from svkc.scenes.swing import EDGE, swing
+    from svkc.scenes.swing import PLATE_EDGE, swing
 
     chain, seated = swing(ignore="limit")
     back = -jnp.array([jnp.cos(0.6), 0, -jnp.sin(0.6), 0, 0, 0])

@@ -202,8 +202,8 @@ def test_the_page_on_the_architecture_names_what_there_is():
 
 
 def test_the_table_of_the_paper_names_what_there_is():
-    readme = (ROOT.parent / "README.md").read_text()
-    table = readme[readme.index("| paper | where | test |") :].split("\n\n")[0]
+    page = (ROOT.parent / "docs" / "paper.md").read_text()
+    table = page[page.index("| paper | where | test |") :].split("\n\n")[0]
     for file in re.findall(r"`((?:\w+/)+\w+\.\w+)", table):
         assert any((folder / file).exists() for folder in (ROOT, ROOT.parent, TESTS)), file
     for file, test in re.findall(r"`([\w/]+\.py)::(\w+)`", table):
