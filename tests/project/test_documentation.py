@@ -1,0 +1,79 @@
+"""README, pages and changelog: their size, their links, and the paths and versions that they
+name."""
+
+import importlib.metadata
+import pathlib
+import re
+import tomllib
+
+import pytest
+
+import svkc
+
+ROOT = pathlib.Path(__file__).parents[2]
+PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
+PACKAGES = {path.parent.name for path in (ROOT / "svkc").glob("*/__init__.py")}
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+
+
+def anchors(page: pathlib.Path) -> set[str]:
+    """Return the anchors that GitHub makes of a page's headings."""
+    text = re.sub(r"```.*?```", "", page.read_text(), flags=re.S)
+    headings = re.findall(r"^#+ (.*)$", text, re.M)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def test_the_readme_is_read_once():
+    assert len((ROOT / "README.md").read_bytes()) <= 9500
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_links_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
+        if target.startswith("http"):
+            continue
+        path, _, anchor = target.partition("#")
+        file = page.parent / path if path else page
+        assert file.exists(), target
+        assert not anchor or anchor in anchors(file), target
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_paths_exist(page):
+    """Every file of the project that a page names, the changelog's past ones apart."""
+    named = re.findall(r"`((?:svkc|tests|benchmarks|examples|docs)/[\w/.]+\.\w+)", page.read_text())
+    missing = [path for path in named if not (ROOT / path).exists()]
+    assert page.stem == "CHANGELOG" or not missing, missing
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_public_names_exist(page):
+    """Every `svkc.name` in code of a page, those of the changelog's table of old names apart."""
+    if page.stem == "CHANGELOG":
+        return
+    for name in re.findall(r"\bsvkc\.([A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*)", page.read_text()):
+        thing, parts = svkc, name.split(".")
+        if parts[0] in PACKAGES or parts[-1] in ("npz", "xml", "invalid"):
+            continue
+        for part in parts:
+            assert hasattr(thing, part), f"svkc.{name}"
+            thing = getattr(thing, part)
+
+
+def test_one_version_everywhere():
+    version = PROJECT["version"]
+    assert re.search(rf"^## {re.escape(version)}$", (ROOT / "CHANGELOG.md").read_text(), re.M)
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
+
+
+def test_every_dependency_has_a_lower_bound():
+    extras = PROJECT["optional-dependencies"].values()
+    for line in [*PROJECT["dependencies"], *(line for extra in extras for line in extra)]:
+        assert line.startswith("svkc[") or re.search(r">=|~=|==", line), line
+
+
+def test_licences_are_packaged():
+    for file in PROJECT["license-files"]:
+        assert (ROOT / file).exists(), file
+    assert "three.js" in (ROOT / "svkc/viz/web/LICENSE.three").read_text()
+    assert importlib.metadata.metadata("svkc")["Name"] == "svkc"
