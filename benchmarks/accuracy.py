@@ -33,8 +33,8 @@ from munthe_kaas import MuntheKaas
 import svkc
 import svkc.scenes
 
-RESULTS, RUNS, ENOUGH = pathlib.Path(__file__).parent / "results", 5, 4.0
-FIXED, ADAPTIVE, SINGLE = (
+RESULTS, RUNS, MAX_SECONDS = pathlib.Path(__file__).parent / "results", 5, 4.0
+FIXED, ADAPTIVE, SINGLE_PRECISION = (
     (1e-2, 3e-3, 1e-3, 3e-4),
     (1e-3, 1e-5, 1e-7, 1e-9, 1e-11),
     (1e-2, 1e-3, 1e-4, 1e-5),
@@ -51,19 +51,19 @@ INTEGRATORS = {
     "Kvaerno5": (diffrax.Kvaerno5(), ADAPTIVE[:3]),
 }
 # no orientations in space
-LEFT_OUT = {
+SKIPPED = {
     (name, f"{solver}, Munthe-Kaas")
     for name in ("n_four_bar", "andrews")
     for solver in ("Tsit5", "Dopri8")
 }
 # on what has loops: with every integrator, at some of its settings, and in float32 with Tsit5
-DRIFT = {
+STABILIZATIONS = {
     "exact": {"stabilization": svkc.stabilization.CoordinatePartitioning()},
     "Baumgarte": {"stabilization": svkc.stabilization.Baumgarte()},
     "drift": {"stabilization": svkc.stabilization.NoStabilization()},
 }
 # with Dopri8
-WAYS = DRIFT | {
+METHODS = STABILIZATIONS | {
     "pivots never new": {"dynamics": svkc.dynamics.CompositeBodies(hold=0.0)},
     "pivots always new": {"dynamics": svkc.dynamics.CompositeBodies(hold=None)},
     "articulated bodies": {"dynamics": svkc.dynamics.ArticulatedBodies()},
@@ -189,7 +189,7 @@ def high_bar():
 
 def swing():
     """The seat leaves as the thighs slide over its edge, from a swing pushed back."""
-    from svkc.scenes.swing import leaving, swing
+    from svkc.scenes.swing import seat_events, swing
 
     chain, seated = swing(ignore="limit")
     back = -jnp.array([np.cos(0.6), 0, -np.sin(0.6), 0, 0, 0])
@@ -197,7 +197,7 @@ def swing():
         chain,
         chain.state(seated.q[: chain.nq], {"base": back, "pivot": 0.0}),
         0.2,
-        events=leaving(chain),
+        events=seat_events(chain),
     )
 
 
@@ -207,20 +207,20 @@ PROBLEMS = {
 }
 
 
-def timed(run, *args):
+def time_runs(run, *args):
     """What a run gives, and the median of its seconds; no more runs once they have taken long
     enough."""
     out, seconds = jax.block_until_ready(run(*args)), []
     for _ in range(RUNS):
-        begun = time.perf_counter()
+        start = time.perf_counter()
         jax.block_until_ready(run(*args))
-        seconds.append(time.perf_counter() - begun)
-        if sum(seconds) > ENOUGH:
+        seconds.append(time.perf_counter() - start)
+        if sum(seconds) > MAX_SECONDS:
             break
     return out, float(np.median(seconds))
 
 
-def measured(problem: Problem, label: str, solver, settings, way=None):
+def measure_curve(problem: Problem, label: str, solver, settings, method=None):
     """Rows of one curve."""
     dtype, scale = problem.state.q.dtype, min(1.0, problem.end)
 
@@ -230,7 +230,7 @@ def measured(problem: Problem, label: str, solver, settings, way=None):
             if set(settings) <= set(FIXED)
             else {"rtol": setting, "atol": setting / 100}
         )
-        bound = (
+        max_steps = (
             int(1.2 / FIXED[-1] * max(problem.end, 1)) + 100
             if set(settings) <= set(FIXED)
             else 20000
@@ -241,17 +241,17 @@ def measured(problem: Problem, label: str, solver, settings, way=None):
             problem.end,
             solver=solver,
             throw=False,
-            max_steps=bound,
+            max_steps=max_steps,
             **steps,
             **problem.call,
-            **(way or {}),
+            **(method or {}),
         )
 
     run = jax.jit(run)
     for setting in settings:
-        traj, seconds = timed(run, problem.state, jnp.asarray(setting, dtype))
-        report, good = traj.report(), bool(traj.result == svkc.RESULTS.successful)
-        error = problem.error(traj.final.q) if good else np.nan
+        traj, seconds = time_runs(run, problem.state, jnp.asarray(setting, dtype))
+        report, successful = traj.report(), bool(traj.result == svkc.RESULTS.successful)
+        error = problem.error(traj.final.q) if successful else np.nan
         gap, energy = (
             float(jnp.maximum(report.gap, report.angular_gap)),
             abs(float(report.energy_drift)),
@@ -268,14 +268,14 @@ def measured(problem: Problem, label: str, solver, settings, way=None):
         ]
 
 
-def in_mujoco(problem: Problem, name: str):
+def measure_mujoco(problem: Problem, name: str):
     """MuJoCo's integrators on the same model; links are let go when they were in the reference."""
     for integrator in soft_loops.INTEGRATORS:
         for dt in FIXED:
             run = soft_loops.Run(
                 problem, name, integrator=integrator, dt=dt * min(1.0, problem.end)
             )
-            q, seconds = timed(run)
+            q, seconds = time_runs(run)
             failed = "" if np.isfinite(q).all() else "not finite"
             yield [
                 f"MuJoCo {integrator}",
@@ -289,7 +289,7 @@ def in_mujoco(problem: Problem, name: str):
             ]
 
 
-def curves(name: str, loops: bool):
+def list_curves(name: str, loops: bool):
     """(dtype, label, solver, settings, way) of each: every integrator, and each with every way
     against drift at some settings; Dopri8 with all ways."""
     if name == "forty_windows":
@@ -299,44 +299,52 @@ def curves(name: str, loops: bool):
             "Dopri8, pivots always new",
             INTEGRATORS["Dopri8"][0],
             (1e-8,),
-            WAYS["pivots always new"],
+            METHODS["pivots always new"],
         )
         return
-    drift = DRIFT if loops else {}
+    stabilizations = STABILIZATIONS if loops else {}
     for label, (solver, settings) in INTEGRATORS.items():
-        if (name, label) in LEFT_OUT:
+        if (name, label) in SKIPPED:
             continue
         yield "float64", label, solver, settings, {}
         single = (
-            settings[1:3] if settings is FIXED else SINGLE if label == "Tsit5" else SINGLE[1::2]
+            settings[1:3]
+            if settings is FIXED
+            else SINGLE_PRECISION
+            if label == "Tsit5"
+            else SINGLE_PRECISION[1::2]
         )
         yield "float32", label, solver, single, {}
-        for other, way in drift.items():
-            yield "float32", f"{label}, {other}", solver, single, way
+        for other, method in stabilizations.items():
+            yield "float32", f"{label}, {other}", solver, single, method
             if label != "Dopri8":
-                yield "float64", f"{label}, {other}", solver, settings[1:3], way
-    for other, way in (WAYS if loops else {}).items():
-        yield "float64", f"Dopri8, {other}", INTEGRATORS["Dopri8"][0], ADAPTIVE, way
+                yield "float64", f"{label}, {other}", solver, settings[1:3], method
+    for other, method in (METHODS if loops else {}).items():
+        yield "float64", f"Dopri8, {other}", INTEGRATORS["Dopri8"][0], ADAPTIVE, method
 
 
-def rows(name: str, only: str):
+def problem_rows(name: str, only: str):
     """All rows of one problem, or those of curves whose dtype and label have `only` in them."""
     problem = PROBLEMS[name]()
-    for dtype, label, solver, settings, way in curves(name, bool(problem.chain.link_names)):
+    for dtype, label, solver, settings, method in list_curves(name, bool(problem.chain.link_names)):
         if only not in f"{dtype} {label}":
             continue
         with jax.enable_x64(dtype == "float64"):
-            asked = problem
+            case = problem
             if dtype == "float32":
-                asked = PROBLEMS[name]()
-                asked.exact = problem.exact
-            yield from ([dtype, *row] for row in measured(asked, label, solver, settings, way))
+                case = PROBLEMS[name]()
+                case.exact = problem.exact
+            yield from (
+                [dtype, *row] for row in measure_curve(case, label, solver, settings, method)
+            )
         jax.clear_caches()
     if name != "forty_windows" and any(
         only in f"float64 MuJoCo {integrator}" for integrator in soft_loops.INTEGRATORS
     ):
         yield from (
-            ["float64", *row] for row in in_mujoco(problem, name) if only in f"float64 {row[0]}"
+            ["float64", *row]
+            for row in measure_mujoco(problem, name)
+            if only in f"float64 {row[0]}"
         )
 
 
@@ -348,11 +356,11 @@ def draw(name: str):
     with (RESULTS / "accuracy.csv").open() as file:
         table = [[*row[1:3], *map(float, row[3:6])] for row in csv.reader(file) if row[0] == name]
     figure, axes = plt.subplots(figsize=(8, 5), layout="constrained")
-    curves, drawn = (
+    points_of_curve, labels = (
         {},
         {
             *INTEGRATORS,
-            *(f"Dopri8, {way}" for way in DRIFT),
+            *(f"Dopri8, {way}" for way in STABILIZATIONS),
             *(f"MuJoCo {name}" for name in soft_loops.INTEGRATORS),
         },
     )
@@ -360,21 +368,21 @@ def draw(name: str):
         if (
             np.isfinite(error)
             and error > 0
-            and label in drawn
+            and label in labels
             and (dtype == "float64" or label == "Tsit5")
         ):
-            curves.setdefault((dtype, label), []).append((seconds, error))
+            points_of_curve.setdefault((dtype, label), []).append((seconds, error))
     colors = plt.get_cmap("tab20")(np.arange(20))
-    for color, ((dtype, label), points) in zip(colors, curves.items()):
+    for color, ((dtype, label), points) in zip(colors, points_of_curve.items()):
         style = "s:" if "MuJoCo" in label else ("^--" if dtype == "float32" else "o-")
-        name_of = label + (", float32" if dtype == "float32" else "")
+        legend = label + (", float32" if dtype == "float32" else "")
         axes.loglog(
             *zip(*points, strict=True),
             style,
             color=color,
             markersize=4,
             linewidth=1.2,
-            label=name_of,
+            label=legend,
         )
     axes.set(
         xlabel="seconds of computing per simulated second",
@@ -391,16 +399,16 @@ def draw(name: str):
 def save(name: str, only: str, head, table):
     """Rows of a problem in the file of all, in place of its old ones; the file is read only now, as
     another problem may have been run beside."""
-    path, kept = RESULTS / "accuracy.csv", []
+    path, other_rows = RESULTS / "accuracy.csv", []
     if path.exists():
         with path.open() as file:
-            kept = [
+            other_rows = [
                 row
                 for row in list(csv.reader(file))[1:]
                 if row[0] != name or only not in f"{row[1]} {row[2]}"
             ]
     with path.open("w", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows([head, *kept, *table])
+        csv.writer(file, lineterminator="\n").writerows([head, *other_rows, *table])
 
 
 if __name__ == "__main__":
@@ -442,7 +450,7 @@ if __name__ == "__main__":
     print("| " + " | ".join(head) + " |")
     for name in options.problems or PROBLEMS:
         table = []
-        for row in rows(name, options.only):
+        for row in problem_rows(name, options.only):
             table.append(row)
             print(
                 f"| {name} | {row[0]} | {row[1]} | {row[2]:.0e} | {row[3]:.2e} | {row[4]:.1e} |"

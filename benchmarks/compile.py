@@ -34,7 +34,7 @@ HEAD = ["program", "version", *COUNTS, *SECONDS, "rounds", "python", "jax", "mac
 MODELS = ("high bar", "four-bar")
 
 
-def counted(text: str) -> int:
+def count_instructions(text: str) -> int:
     """Count the instructions of an HLO module with every call inlined."""
     size, calls, current = collections.Counter(), collections.defaultdict(collections.Counter), None
     for line in text.splitlines():
@@ -61,7 +61,7 @@ def counted(text: str) -> int:
     return total(entry)
 
 
-def kernels(text: str) -> int:
+def count_kernels(text: str) -> int:
     """Count the fusions of a compiled module: XLA's CPU backend compiles each by itself, in some 20
     ms."""
     return len(re.findall(r" = [^=]*? fusion\(", text))
@@ -74,10 +74,10 @@ def clocks() -> tuple[float, float]:
 
 def measure_program(name: str, run: bool) -> dict:
     """Trace, lower, compile and run one program, in this process."""
-    import compiled
+    import compile_cases
     import jax
 
-    function, args = compiled.PROGRAMS[name]()
+    function, args = compile_cases.PROGRAMS[name]()
     jax.block_until_ready(args)
     marks = [clocks()]
     traced = jax.jit(function).trace(*args)
@@ -93,34 +93,34 @@ def measure_program(name: str, run: bool) -> dict:
         row["first cpu"], row["first wall"] = (
             b - a for a, b in zip(marks[0], marks[-1], strict=True)
         )
-        begun = time.perf_counter()
+        start = time.perf_counter()
         jax.block_until_ready(program(*args))
-        row["again ms"] = 1e3 * (time.perf_counter() - begun)
+        row["again ms"] = 1e3 * (time.perf_counter() - start)
     return {
         name: row
         | {
-            "instructions": counted(lowered.compiler_ir("hlo").as_hlo_text()),
-            "kernels": kernels(program.as_text()),
+            "instructions": count_instructions(lowered.compiler_ir("hlo").as_hlo_text()),
+            "kernels": count_kernels(program.as_text()),
         }
     }
 
 
 def measure_eager(model: str) -> dict:
     """Call the public functions one after another, in this process."""
-    import compiled
+    import compile_cases
     import jax
 
     rows = {}
-    for name, call in compiled.called_eagerly(model).items():
+    for name, call in compile_cases.called_eagerly(model).items():
         before = clocks()
         jax.block_until_ready(call())
         cpu, wall = (b - a for a, b in zip(before, clocks(), strict=True))
-        begun = time.perf_counter()
+        start = time.perf_counter()
         jax.block_until_ready(call())
         rows[f"{model}: {name}"] = {
             "first cpu": cpu,
             "first wall": wall,
-            "again ms": 1e3 * (time.perf_counter() - begun),
+            "again ms": 1e3 * (time.perf_counter() - start),
         }
     return rows
 
@@ -164,41 +164,43 @@ def version(folder: pathlib.Path) -> str:
     ).stdout.strip()
 
 
-def written(rows: dict) -> None:
+def update_results(rows: dict) -> None:
     """Replace the rows of the programs that were measured, keep the others."""
     import jax
 
-    kept = list(csv.DictReader(RESULTS.open())) if RESULTS.exists() else []
-    where = {
+    rows_of_file = list(csv.DictReader(RESULTS.open())) if RESULTS.exists() else []
+    environment = {
         "python": platform.python_version(),
         "jax": jax.__version__,
         "machine": platform.machine(),
     }
-    for (name, label), found in rows.items():
-        kept = [
-            r for r in kept if (r["program"], r["version"], r["jax"]) != (name, label, where["jax"])
+    for (name, label), row in rows.items():
+        rows_of_file = [
+            r
+            for r in rows_of_file
+            if (r["program"], r["version"], r["jax"]) != (name, label, environment["jax"])
         ]
-        shown = {
-            k: "" if k not in found else f"{found[k]:.0f}" if k in COUNTS else f"{found[k]:.3g}"
+        columns = {
+            k: "" if k not in row else f"{row[k]:.0f}" if k in COUNTS else f"{row[k]:.3g}"
             for k in (*COUNTS, *SECONDS)
         }
-        kept.append(
-            {"program": name, "version": label, **shown, "rounds": found["rounds"], **where}
+        rows_of_file.append(
+            {"program": name, "version": label, **columns, "rounds": row["rounds"], **environment}
         )
     with RESULTS.open("w", newline="") as file:
         writer = csv.DictWriter(file, HEAD)
         writer.writeheader()
-        writer.writerows(sorted(kept, key=lambda r: (r["program"], r["version"])))
+        writer.writerows(sorted(rows_of_file, key=lambda r: (r["program"], r["version"])))
 
 
 def main() -> None:
     """Measure what the command line names."""
-    import compiled
+    import compile_cases
 
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("programs", nargs="*", default=[*compiled.PROGRAMS, *MODELS])
+    parser.add_argument("programs", nargs="*", default=[*compile_cases.PROGRAMS, *MODELS])
     parser.add_argument(
         "--beside", type=pathlib.Path, help="another checkout, which takes turns with this one"
     )
@@ -211,19 +213,19 @@ def main() -> None:
         return child(options.child, not options.no_run)
     folders = [HERE.parent] + ([options.beside.resolve()] if options.beside else [])
     labels = [options.label or version(HERE.parent)] + [version(f) for f in folders[1:]]
-    found = collections.defaultdict(list)
+    measured = collections.defaultdict(list)
     print(f"{'program':28}{'version':>10}" + "".join(f"{h:>13}" for h in (*COUNTS, *SECONDS)))
     for name in options.programs:
         for _ in range(options.rounds):
             for folder, label in zip(folders, labels, strict=True):
                 for program, row in in_process(name, folder, not options.no_run).items():
-                    found[program, label].append(row)
-        shown = {
+                    measured[program, label].append(row)
+        new_rows = {
             key: rows
-            for key, rows in found.items()
+            for key, rows in measured.items()
             if key[0] == name or key[0].startswith(f"{name}:")
         }
-        for (program, label), rows in shown.items():
+        for (program, label), rows in new_rows.items():
             median = {k: statistics.median(r[k] for r in rows) for k in rows[0]}
             print(
                 f"{program:28}{label:>10}"
@@ -232,7 +234,7 @@ def main() -> None:
                 ),
                 flush=True,
             )
-            written({(program, label): median | {"rounds": len(rows)}})
+            update_results({(program, label): median | {"rounds": len(rows)}})
 
 
 if __name__ == "__main__":

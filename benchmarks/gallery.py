@@ -132,13 +132,13 @@ ROBOTS = [
 ]
 
 
-def exact(chain, state) -> float | None:
+def mujoco_difference(chain, state) -> float | None:
     """How far svkc's acceleration at rest is from the one that MuJoCo's inertia, forces and
     equality Jacobian give, solved here; relative to the largest."""
-    again = svkc.load(chain.to_mjcf(), ignore="all")
-    if not len(again.link_names):
+    reloaded = svkc.load(chain.to_mjcf(), ignore="all")
+    if not len(reloaded.link_names):
         return None
-    model = again.model.model
+    model = reloaded.model.model
     data = mujoco.MjData(model)
     data.qpos[:] = np.asarray(state.q)[np.array(chain.topology.model_q)]
     mujoco.mj_forward(model, data)
@@ -156,9 +156,9 @@ def exact(chain, state) -> float | None:
         mujoco.mj_mulJacVec(model, data, column, np.eye(n)[k])
         J[:, k] = column
     J = J[rows]
-    whole = np.block([[M, J.T], [J, np.zeros((len(rows), len(rows)))]])
+    kkt_matrix = np.block([[M, J.T], [J, np.zeros((len(rows), len(rows)))]])
     expected = np.linalg.lstsq(
-        whole,
+        kkt_matrix,
         np.concatenate([data.qfrc_passive - data.qfrc_bias, np.zeros(len(rows))]),
         rcond=1e-10,
     )[0][:n]
@@ -214,12 +214,12 @@ def measure(robot: Robot) -> str:
         str(package.locate_file(robot.path)), virtual_links=robot.links, ignore=robot.ignore
     )
     rest = chain.state(robot.q)
-    mobility, difference = svkc.mobility(chain, rest), exact(chain, rest)
+    mobility, difference = svkc.mobility(chain, rest), mujoco_difference(chain, rest)
     state = chain.state(rest.q, {name: robot.v[name] for name in robot.v} if robot.v else None)
     tau = jnp.array([(robot.tau or {}).get(name, 0.0) for name in chain.dof_names])
-    driven = lambda t, state, args: tau
+    control = lambda t, state, args: tau
     run = lambda: jax.block_until_ready(
-        svkc.simulate(chain, state, 1.0, ts=jnp.linspace(0, 1, 41), control=driven)
+        svkc.simulate(chain, state, 1.0, ts=jnp.linspace(0, 1, 41), control=control)
     )
     run()
     start = time.perf_counter()
@@ -256,7 +256,7 @@ Left out: {"; ".join(chain.left_out)}.
 """
 
 
-HEAD = """# Gallery
+HEADER = """# Gallery
 
 Robots with loops that others publish, loaded as they stand in their packages. Written by \
 `python benchmarks/gallery.py`, which needs them installed:
@@ -301,7 +301,7 @@ def main(names) -> None:
     print("\n".join(sections))
     if len(sections) == len(ROBOTS):
         (DOCS / "gallery.md").write_text(
-            HEAD.replace("PACKAGES", " ".join(dict.fromkeys(robot.package for robot in ROBOTS)))
+            HEADER.replace("PACKAGES", " ".join(dict.fromkeys(robot.package for robot in ROBOTS)))
             + "\n".join(sections)
         )
 

@@ -33,7 +33,7 @@ from svkc.scenes import FOLDER, high_bar
 
 RESULTS = pathlib.Path(__file__).parent / "results" / "gradients.csv"
 RUNS, STEPS, DT, LANES = 7, 200, 2e-3, 64
-KUTTA = diffrax.ButcherTableau(
+RUNGE_KUTTA_4 = diffrax.ButcherTableau(
     c=np.array([0.5, 0.5, 1.0]), b_sol=np.array([1, 2, 2, 1]) / 6, b_error=np.zeros(4),
     a_lower=(np.array([0.5]), np.array([0.0, 0.5]), np.array([0.0, 0.0, 1.0])),
 )  # fmt: skip
@@ -42,14 +42,14 @@ KUTTA = diffrax.ButcherTableau(
 class ClassicalRungeKutta(diffrax.AbstractERK):
     """MuJoCo's RK4."""
 
-    tableau = KUTTA
+    tableau = RUNGE_KUTTA_4
     interpolation_cls = diffrax.ThirdOrderHermitePolynomialInterpolation.from_k
 
     def order(self, terms):
         return 4
 
 
-def whole_run(**how):
+def high_bar_loss(**options):
     """The high bar, both hands let go. how: options of `simulate`."""
     chain, state = high_bar()
     ts = jnp.linspace(0, 1.8, 73)
@@ -80,21 +80,21 @@ def whole_run(**how):
             control=control,
             args=p["torque"],
             throw=False,
-            **how,
+            **options,
         )
         return jnp.sum(traj.final.q[:3]) + 0.1 * jnp.sum(traj.states.q[40])
 
     bodies = chain.mass.shape[0]
-    p = {
+    parameters = {
         "mass": jnp.ones(bodies),
         "com": jnp.ones((bodies, 3)),
         "v": jnp.zeros(chain.dofs),
         "times": jnp.array([0.9, 1.15]),
     }
-    return loss, p | {"torque": jnp.full((16, 6), 5.0)}
+    return loss, parameters | {"torque": jnp.full((16, 6), 5.0)}
 
 
-def torques(coefficients, t, pad):
+def joint_torques(coefficients, t, pad):
     """Of the joints, at a time: sines of eleven frequencies."""
     return pad(
         (
@@ -117,13 +117,13 @@ def falling_spec():
     return spec
 
 
-def falling():
+def falling_loss():
     """Open chain, by svkc."""
     chain = svkc.load(falling_spec(), ignore=("limit", "contact"))
     state = chain.state()
 
     def loss(p):
-        control = lambda t, s, a: torques(a, t, jnp.pad)
+        control = lambda t, s, a: joint_torques(a, t, jnp.pad)
         start = svkc.State(state.q, p["v"], state.structure)
         traj = svkc.simulate(
             chain,
@@ -141,7 +141,7 @@ def falling():
     return loss, {"v": jnp.zeros(22), "torque": jnp.ones((16, 11))}
 
 
-def falling_by_mjx():
+def falling_loss_mjx():
     """The same steps, by MJX."""
     from mujoco import mjx
 
@@ -152,7 +152,8 @@ def falling_by_mjx():
         def step(data, i):
             return (
                 mjx.step(
-                    model, data.replace(qfrc_applied=torques(p["torque"], (i + 0.5) * DT, jnp.pad))
+                    model,
+                    data.replace(qfrc_applied=joint_torques(p["torque"], (i + 0.5) * DT, jnp.pad)),
                 ),
                 None,
             )
@@ -162,7 +163,7 @@ def falling_by_mjx():
     return loss
 
 
-def falling_by_mujoco():
+def falling_loss_mujoco():
     """The loss, and its gradient by central differences."""
     model = falling_spec().compile()
     data = mujoco.MjData(model)
@@ -171,7 +172,7 @@ def falling_by_mujoco():
         mujoco.mj_resetData(model, data)
         data.qvel[:] = v
         for i in range(STEPS):
-            data.qfrc_applied[:] = torques(u, (i + 0.5) * DT, np.pad)
+            data.qfrc_applied[:] = joint_torques(u, (i + 0.5) * DT, np.pad)
             mujoco.mj_step(model, data)
         return data.qpos[:7].sum()
 
@@ -183,105 +184,107 @@ def falling_by_mujoco():
     return lambda p: loss(np.asarray(p["v"]), np.asarray(p["torque"])), gradient
 
 
-def compiled(function, p):
+def compile_program(function, p):
     """The program, and seconds of tracing with lowering and of compilation, and its temporary
     memory (MB)."""
-    begun = time.perf_counter()
+    start = time.perf_counter()
     lowered = jax.jit(function).lower(p)
-    middle = time.perf_counter()
+    lowered_at = time.perf_counter()
     program = lowered.compile()
     return (
         program,
-        middle - begun,
-        time.perf_counter() - middle,
+        lowered_at - start,
+        time.perf_counter() - lowered_at,
         program.memory_analysis().temp_size_in_bytes / 1e6,
     )
 
 
-def timed(programs, p, runs=RUNS):
+def time_in_turns(programs, p, runs=RUNS):
     """Median seconds of each; they take turns."""
     times = {name: [] for name in programs}
     for _ in range(runs + 1):
         for name, program in programs.items():
-            begun = time.perf_counter()
+            start = time.perf_counter()
             jax.block_until_ready(program(p))
-            times[name].append(time.perf_counter() - begun)
+            times[name].append(time.perf_counter() - start)
     return {name: statistics.median(seconds[1:]) for name, seconds in times.items()}
 
 
-def measured(case, loss, p, peers=()):
+def measure_case(case, loss, p, peers=()):
     """Rows of one case: forward, reverse, forward mode; then those of its peers."""
-    along = jax.tree.map(jnp.ones_like, p)
+    tangent = jax.tree.map(jnp.ones_like, p)
     kinds = {
         "run": loss,
         "gradient": jax.value_and_grad(loss),
-        "directional": lambda p: jax.jvp(loss, (p,), (along,)),
+        "directional": lambda p: jax.jvp(loss, (p,), (tangent,)),
     }
-    made = {("svkc", kind): compiled(f, p) for kind, f in kinds.items()}
-    for peer, its in peers:
-        made |= {
-            (peer, kind): compiled(f, p)
-            for kind, f in (("run", its), ("gradient", jax.value_and_grad(its)))
+    compiled = {("svkc", kind): compile_program(f, p) for kind, f in kinds.items()}
+    for peer, peer_loss in peers:
+        compiled |= {
+            (peer, kind): compile_program(f, p)
+            for kind, f in (("run", peer_loss), ("gradient", jax.value_and_grad(peer_loss)))
         }
-    seconds = timed({name: program for name, (program, *_) in made.items()}, p)
+    seconds = time_in_turns({name: program for name, (program, *_) in compiled.items()}, p)
     rows = []
-    for (who, kind), (_, traced, compile_time, memory) in made.items():
-        ratio = seconds[who, kind] / seconds[who, "run"]
+    for (library, kind), (_, trace_seconds, compile_time, memory) in compiled.items():
+        ratio = seconds[library, kind] / seconds[library, "run"]
         rows.append(
             [
                 case,
-                who,
+                library,
                 kind,
-                f"{1e3 * seconds[who, kind]:.1f}",
+                f"{1e3 * seconds[library, kind]:.1f}",
                 f"{ratio:.2f}",
-                f"{traced:.1f}",
+                f"{trace_seconds:.1f}",
                 f"{compile_time:.1f}",
                 f"{memory:.1f}",
             ]
         )
     return rows, {
-        who: program(p)[1] for (who, kind), (program, *_) in made.items() if kind == "gradient"
+        who: program(p)[1] for (who, kind), (program, *_) in compiled.items() if kind == "gradient"
     }
 
 
-def flat(gradient):
+def as_vector(gradient):
     """As one vector."""
     return np.concatenate([np.ravel(gradient["v"]), np.ravel(gradient["torque"])])
 
 
 def main():
     """Measures, prints, writes."""
-    loss, p = whole_run()
+    loss, p = high_bar_loss()
     count = sum(x.size for x in jax.tree.leaves(p))
-    rows, _ = measured(f"high bar, {count} parameters", loss, p)
-    bodies = whole_run(dynamics=svkc.dynamics.ArticulatedBodies())[0]
-    rows += measured("high bar, by bodies", bodies, p)[0]
-    loss, p = falling()
+    rows, _ = measure_case(f"high bar, {count} parameters", loss, p)
+    articulated = high_bar_loss(dynamics=svkc.dynamics.ArticulatedBodies())[0]
+    rows += measure_case("high bar, by bodies", articulated, p)[0]
+    loss, p = falling_loss()
     count = sum(x.size for x in jax.tree.leaves(p))
     try:
-        peers = [("MJX", falling_by_mjx())]
+        peers = [("MJX", falling_loss_mjx())]
     except ImportError as missing:
         peers = []
         print(f"no MJX: {missing}; pip install 'svkc[bench]'")
-    more, gradients = measured(f"open chain, {count} parameters", loss, p, peers)
-    many = jax.tree.map(
+    open_chain_rows, gradients = measure_case(f"open chain, {count} parameters", loss, p, peers)
+    batch_parameters = jax.tree.map(
         lambda x: x + 0.01 * jax.random.normal(jax.random.key(0), (LANES, *x.shape)), p
     )
-    more += measured(
-        f"open chain, {LANES} lanes", lambda many: jnp.sum(jax.vmap(loss)(many)), many
+    open_chain_rows += measure_case(
+        f"open chain, {LANES} lanes", lambda many: jnp.sum(jax.vmap(loss)(many)), batch_parameters
     )[0]
-    value, by_differences = falling_by_mujoco()
-    once = timed({"run": lambda p: value(p)}, p)["run"]
-    whole = timed({"gradient": lambda p: by_differences(p)}, p, runs=1)["gradient"]
-    gradients = {who: flat(g) for who, g in gradients.items()} | {"MuJoCo": by_differences(p)}
-    for kind, seconds in (("run", once), ("gradient", whole)):
-        more.append(
+    value, by_differences = falling_loss_mujoco()
+    run_seconds = time_in_turns({"run": lambda p: value(p)}, p)["run"]
+    gradient_seconds = time_in_turns({"gradient": lambda p: by_differences(p)}, p, runs=1)[
+        "gradient"
+    ]
+    gradients = {who: as_vector(g) for who, g in gradients.items()} | {"MuJoCo": by_differences(p)}
+    for kind, seconds in (("run", run_seconds), ("gradient", gradient_seconds)):
+        open_chain_rows.append(
             [
                 f"open chain, {count} parameters",
                 "MuJoCo, differences",
                 kind,
                 f"{1e3 * seconds:.1f}",
-                f"{seconds / once:.2f}",
+                f"{seconds / run_seconds:.2f}",
                 "",
                 "",
                 "",
@@ -297,7 +300,7 @@ def main():
         "compile s",
         "temporary MB",
     ]
-    for row in (head, *rows, *more):
+    for row in (head, *rows, *open_chain_rows):
         print(
             "  ".join(
                 cell.ljust(width) for cell, width in zip(row, (28, 20, 12, 10, 14, 18, 10, 12))
@@ -316,7 +319,7 @@ def main():
     print(versions)
     RESULTS.parent.mkdir(exist_ok=True)
     with RESULTS.open("w", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows([head, *rows, *more, [versions]])
+        csv.writer(file, lineterminator="\n").writerows([head, *rows, *open_chain_rows, [versions]])
 
 
 if __name__ == "__main__":

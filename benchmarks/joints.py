@@ -39,7 +39,7 @@ def hinges_for_balls() -> tuple[mujoco.MjSpec, list[str]]:
     return spec, balls
 
 
-def as_ball(angles, rates):
+def ball_state(angles, rates):
     """Quaternion and angular velocity (body axes) of hinges about x, y, z."""
     quat, rate = jax.jvp(
         lambda turns: functools.reduce(quat_multiply, quat_from_axis_angle(jnp.eye(3), turns)),
@@ -49,20 +49,22 @@ def as_ball(angles, rates):
     return quat, 2 * quat_multiply(quat_conjugate(quat), rate)[1:]
 
 
-def same_motion(chains, balls, rng):
+def matching_states(chains, balls, rng):
     """One state in the coordinates of both figures: turns of at most 0.5 rad about each axis, far
     from where three hinges lock."""
     angles, rates = rng.uniform(-0.5, 0.5, (len(balls), 3)), rng.uniform(-1, 1, (len(balls), 3))
-    quats, spins = jax.vmap(as_ball)(angles, rates)
-    bends, names = (
+    quats, angular_velocities = jax.vmap(ball_state)(angles, rates)
+    hinges, names = (
         ["right_elbow", "left_elbow", "right_knee", "left_knee"],
         [f"{name}_{letter}" for name in balls for letter in "xyz"],
     )
     q, v = (
-        dict(zip(bends, rng.uniform(0.5, 1, 4))),
-        {"base": rng.uniform(-1, 1, 6)} | dict(zip(bends, rng.uniform(-1, 1, 4))),
+        dict(zip(hinges, rng.uniform(0.5, 1, 4))),
+        {"base": rng.uniform(-1, 1, 6)} | dict(zip(hinges, rng.uniform(-1, 1, 4))),
     )
-    with_balls = chains["balls"].state(q | dict(zip(balls, quats)), v | dict(zip(balls, spins)))
+    with_balls = chains["balls"].state(
+        q | dict(zip(balls, quats)), v | dict(zip(balls, angular_velocities))
+    )
     return with_balls, chains["hinges"].state(
         q | dict(zip(names, angles.ravel())), v | dict(zip(names, rates.ravel()))
     )
@@ -70,18 +72,18 @@ def same_motion(chains, balls, rng):
 
 def motion_difference(chains, states) -> str:
     """The largest distance and angle between the bodies of the two figures in half a second."""
-    fine = {"rtol": 1e-10, "atol": 1e-12} if jax.config.jax_enable_x64 else {}
+    tolerances = {"rtol": 1e-10, "atol": 1e-12} if jax.config.jax_enable_x64 else {}
     runs = [
-        svkc.simulate(chain, s, 0.5, ts=jnp.linspace(0, 0.5, 11), **fine).states
+        svkc.simulate(chain, s, 0.5, ts=jnp.linspace(0, 0.5, 11), **tolerances).states
         for chain, s in zip(chains.values(), states)
     ]
     (x, a), (y, b) = (
         jax.vmap(svkc.poses, (None, 0))(chain, run) for chain, run in zip(chains.values(), runs)
     )
-    turn = 2 * jnp.linalg.norm(quat_multiply(quat_conjugate(a), b)[..., 1:], axis=-1)
+    angle = 2 * jnp.linalg.norm(quat_multiply(quat_conjugate(a), b)[..., 1:], axis=-1)
     return (
         f"the motions differ by {float(jnp.max(jnp.linalg.norm(x - y, axis=-1))):.1e} m,"
-        f" {float(jnp.max(turn)):.1e} rad in 0.5 s"
+        f" {float(jnp.max(angle)):.1e} rad in 0.5 s"
     )
 
 
@@ -104,14 +106,14 @@ def measure(task, chains, states) -> dict[str, dict[str, list]]:
     times = {unit: {name: [] for name in chains} for unit in ("s to compile", "us a step")}
     for _, (name, chain) in itertools.product(range(COMPILES), chains.items()):
         jax.clear_caches()
-        begin = time.perf_counter()
+        start = time.perf_counter()
         compiled = jax.jit(task).lower(chain, states[name]).compile()
-        times["s to compile"][name].append(time.perf_counter() - begin)
+        times["s to compile"][name].append(time.perf_counter() - start)
         for run in range(RUNS + 1):
-            begin = time.perf_counter()
+            start = time.perf_counter()
             end, _ = jax.block_until_ready(compiled(chain, states[name]))
             if run:
-                times["us a step"][name].append((time.perf_counter() - begin) / STEPS * 1e6)
+                times["us a step"][name].append((time.perf_counter() - start) / STEPS * 1e6)
         assert np.isfinite(end.q).all(), f"{name}: the motion blew up"
     return times
 
@@ -124,14 +126,14 @@ def compare(dtype: str):
         {"balls": svkc.load(str(FIGURE)), "hinges": svkc.load(spec)},
         np.random.default_rng(0),
     )
-    lanes = [same_motion(chains, balls, rng) for _ in range(BATCH)]
+    lanes = [matching_states(chains, balls, rng) for _ in range(BATCH)]
     print(
         dtype,
         [f"{len(chain.topology.parent) - 1} links with {name}" for name, chain in chains.items()],
         motion_difference(chains, lanes[0]),
         flush=True,
     )
-    many = {
+    batched = {
         name: jax.tree.map(lambda *x: jnp.stack(x), *column)
         for name, column in zip(chains, zip(*lanes))
     }
@@ -140,7 +142,9 @@ def compare(dtype: str):
             lambda s, _: step(chain, s), s, None, length=STEPS
         )
         task, states = (
-            (task, dict(zip(chains, lanes[0]))) if batch == 1 else (jax.vmap(task, (None, 0)), many)
+            (task, dict(zip(chains, lanes[0])))
+            if batch == 1
+            else (jax.vmap(task, (None, 0)), batched)
         )
         for unit, times in measure(task, chains, states).items():
             numbers = [f(times[name]) for name in chains for f in (np.median, min, max)]

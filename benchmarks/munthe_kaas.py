@@ -14,22 +14,22 @@ import numpy as np
 from svkc.tree.configuration import configuration_derivative, integrate
 
 
-def turned(chain, u, v):
+def rotation_vector_rate(chain, u, v):
     """The rate of u where q = q0 exp(u) moves with v: the inverse of the exponential's derivative,
     on every ball and free joint."""
-    at = chain.topology.quaternion_starts[1][:, None] + np.arange(3)
-    x, w = u[at], v[at]
-    square = jnp.sum(x * x, -1, keepdims=True)
-    small = square < 1e-4
-    safe = jnp.where(small, 1, square)
-    angle = jnp.sqrt(safe)
-    second = jnp.where(
-        small,
-        1 / 12 + square / 720 + square**2 / 30240,
-        1 / safe - 1 / (2 * angle * jnp.tan(angle / 2)),
+    columns = chain.topology.quaternion_starts[1][:, None] + np.arange(3)
+    x, w = u[columns], v[columns]
+    squared_angle = jnp.sum(x * x, -1, keepdims=True)
+    near_zero = squared_angle < 1e-4
+    nonzero = jnp.where(near_zero, 1, squared_angle)
+    angle = jnp.sqrt(nonzero)
+    coefficient = jnp.where(
+        near_zero,
+        1 / 12 + squared_angle / 720 + squared_angle**2 / 30240,
+        1 / nonzero - 1 / (2 * angle * jnp.tan(angle / 2)),
     )
-    once = jnp.cross(x, w)
-    return v.at[at].set(w + once / 2 + second * jnp.cross(x, once))
+    cross = jnp.cross(x, w)
+    return v.at[columns].set(w + cross / 2 + coefficient * jnp.cross(x, cross))
 
 
 class MuntheKaas(diffrax.AbstractAdaptiveSolver):
@@ -56,7 +56,7 @@ class MuntheKaas(diffrax.AbstractAdaptiveSolver):
 
         def field(t, y, args):
             rate = terms.vf(t, eqx.tree_at(lambda y: y.q, y, integrate(chain, q0, y.q)), args)
-            return eqx.tree_at(lambda y: y.q, rate, turned(chain, y.q, y.v))
+            return eqx.tree_at(lambda y: y.q, rate, rotation_vector_rate(chain, y.q, y.v))
 
         term, start = diffrax.ODETerm(field), eqx.tree_at(lambda y: y.q, y0, jnp.zeros_like(y0.v))
         inner = self.solver.init(term, t0, t1, start, args)

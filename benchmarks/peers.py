@@ -19,16 +19,16 @@ import numpy as np
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent.parent / "tests"))
 
-import figures
-from figures import DT
-from programs import of_lanes
+import speed_cases
+from programs import compile_steps
+from speed_cases import DT
 
 import svkc
 
-FLAGS, PATIENCE = os.environ.get("XLA_FLAGS", ""), 60
+USER_XLA_FLAGS, TIMEOUT = os.environ.get("XLA_FLAGS", ""), 60
 
 
-def by_mujoco(model, q, v, batch: int, steps: int):
+def mujoco_runs(model, q, v, batch: int, steps: int):
     """`mj_step` on one core; `rollout` on all. Both leave their end where the next call begins
     anew."""
     data = mujoco.MjData(model)
@@ -57,33 +57,35 @@ def by_mujoco(model, q, v, batch: int, steps: int):
     )
 
 
-def by_pinocchio(name: str, chain, state, batch: int, steps: int):
+def pinocchio_runs(name: str, chain, state, batch: int, steps: int):
     """Accelerations alone, called from Python one after another on one core: articulated bodies of
     an open chain; with grips `constraintDynamics`, a ball as one point held to another, a hinge as
     two. Its accelerations are svkc's: asserted."""
     import pinocchio
 
-    model = pinocchio.buildModelFromMJCF(figures.path(name))
+    model = pinocchio.buildModelFromMJCF(speed_cases.model_path(name))
     data, calls = model.createData(), steps * batch
-    still = svkc.State(state.q, jnp.zeros_like(state.v), state.structure)
+    at_rest = svkc.State(state.q, jnp.zeros_like(state.v), state.structure)
     q, v, force = (
         np.asarray(svkc.interop.quaternions_xyzw(chain, state.q))[: chain.nq],
         np.zeros(chain.nv),
         np.zeros(chain.nv),
     )
-    held, given = pinocchio.StdVec_RigidConstraintModel(), pinocchio.StdVec_RigidConstraintData()
-    for made in _points(pinocchio, model, chain, state.structure, two="ball" not in name):
-        held.append(made)
-        given.append(made.createData())
-    if not len(held):
+    models, datas = pinocchio.StdVec_RigidConstraintModel(), pinocchio.StdVec_RigidConstraintData()
+    for constraint in _point_constraints(
+        pinocchio, model, chain, state.structure, two="ball" not in name
+    ):
+        models.append(constraint)
+        datas.append(constraint.createData())
+    if not len(models):
         who, run = "Pinocchio, aba alone", lambda: pinocchio.aba(model, data, q, v, force)
     else:
-        pinocchio.initConstraintDynamics(model, data, held, given)
+        pinocchio.initConstraintDynamics(model, data, models, datas)
         proximal = pinocchio.ProximalSettings(1e-10, 1e-8, 10)
         who = "Pinocchio, constraintDynamics alone"
-        grips = {"contact_models": held, "contact_datas": given, "prox_settings": proximal}
+        grips = {"contact_models": models, "contact_datas": datas, "prox_settings": proximal}
         run = lambda: pinocchio.constraintDynamics(model, data, q, v, force, **grips)
-    ours = np.asarray(svkc.forward_dynamics(chain, still, jnp.zeros(chain.nv)))[6 : chain.nv]
+    ours = np.asarray(svkc.forward_dynamics(chain, at_rest, jnp.zeros(chain.nv)))[6 : chain.nv]
     # (the base's own are in other axes)
     assert np.max(np.abs(ours - run()[6:])) < (1e-8 if ours.dtype == np.float64 else 0.1), (
         "Pinocchio's accelerations are not svkc's"
@@ -91,7 +93,7 @@ def by_pinocchio(name: str, chain, state, batch: int, steps: int):
     yield who, lambda: [run() for _ in range(calls)]
 
 
-def _points(pinocchio, model, chain, structure, two: bool):
+def _point_constraints(pinocchio, model, chain, structure, two: bool):
     """What holds the figure: for each link that is connected a point of the body at one of the
     ground, or two, along the joint's axis."""
     frame = lambda quat, pos: pinocchio.SE3(
@@ -100,13 +102,16 @@ def _points(pinocchio, model, chain, structure, two: bool):
     names = {row: name for row, name in zip(chain.topology.body_row, chain.body_names, strict=True)}
     for k in np.flatnonzero(np.asarray(structure.connected)):
         body = model.frames[model.getFrameId(names[int(structure.real[k])])]
-        here, there = (
+        body_placement, ground_placement = (
             frame(structure.real_quat[k], structure.real_pos[k]),
             frame(structure.quat[k], structure.pos[k]),
         )
-        for along in (0.0, 1.0) if two else (0.0,):
-            off = pinocchio.SE3(np.eye(3), np.array([0, 0, along]))
-            one, other = (body.parentJoint, body.placement * here * off), (0, there * off)
+        for offset in (0.0, 1.0) if two else (0.0,):
+            shift = pinocchio.SE3(np.eye(3), np.array([0, 0, offset]))
+            one, other = (
+                (body.parentJoint, body.placement * body_placement * shift),
+                (0, ground_placement * shift),
+            )
             yield pinocchio.RigidConstraintModel(
                 pinocchio.ContactType.CONTACT_3D,
                 model,
@@ -121,7 +126,8 @@ class Process:
 
     def __init__(self, kind: str, name: str, dtype: str, batch: int, steps: int):
         env, case = (
-            os.environ | {"XLA_FLAGS": FLAGS, "JAX_ENABLE_X64": str(int(dtype == "float64"))},
+            os.environ
+            | {"XLA_FLAGS": USER_XLA_FLAGS, "JAX_ENABLE_X64": str(int(dtype == "float64"))},
             (kind, name, dtype, str(batch), str(steps)),
         )
         self.process = subprocess.Popen(
@@ -135,15 +141,15 @@ class Process:
         if "missing" in answer:
             self.process.wait()
             raise ImportError(answer["missing"])
-        self.made = answer["made"]
+        self.compile_stats = answer["compile_stats"]
 
     def __call__(self):
         """All its steps. TimeoutError: it does not answer."""
         self.process.stdin.write("\n")
         self.process.stdin.flush()
-        if not select.select([self.process.stdout], [], [], PATIENCE)[0]:
+        if not select.select([self.process.stdout], [], [], TIMEOUT)[0]:
             self.process.kill()
-            raise TimeoutError(f"a peer did not answer within {PATIENCE} s")
+            raise TimeoutError(f"a peer did not answer within {TIMEOUT} s")
         self.process.stdout.readline()
 
     def close(self):
@@ -152,30 +158,30 @@ class Process:
         self.process.wait()
 
 
-def by_mjx(name: str, batch: int, steps: int):
+def mjx_program(name: str, batch: int, steps: int):
     """The figure, or the high bar's."""
     from mujoco import mjx
 
-    chain, state = figures.case(name)
-    model, q, _ = figures.in_mujoco(name, chain, state)
-    v = jnp.asarray(figures.lanes(chain, state, batch).v[:, : chain.nv])
-    put = mjx.put_model(model)
-    data = mjx.make_data(put)
-    return of_lanes(
-        lambda d: mjx.step(put, d),
+    chain, state = speed_cases.load_case(name)
+    model, q, _ = speed_cases.mujoco_case(name, chain, state)
+    v = jnp.asarray(speed_cases.random_states(chain, state, batch).v[:, : chain.nv])
+    mjx_model = mjx.put_model(model)
+    data = mjx.make_data(mjx_model)
+    return compile_steps(
+        lambda d: mjx.step(mjx_model, d),
         jax.vmap(lambda v: data.replace(qpos=jnp.asarray(q, v.dtype), qvel=v))(v),
         steps,
     )
 
 
-def by_jaxsim(name: str, batch: int, steps: int):
+def jaxsim_program(name: str, batch: int, steps: int):
     """The open figure, three hinges for each ball: JaxSim has no balls, and no joints that close
     loops but welds."""
     import jaxsim.api as js
     import joints
 
     model = js.model.JaxSimModel.build_from_model_description(
-        sdf(joints.hinges_for_balls()[0].compile()), time_step=DT, is_urdf=False
+        hinge_model_as_sdf(joints.hinges_for_balls()[0].compile()), time_step=DT, is_urdf=False
     )
     v = jax.random.normal(jax.random.key(0), (batch, model.dofs())) * 0.5
     # (far above its ground, which nothing of the figure could touch)
@@ -184,16 +190,16 @@ def by_jaxsim(name: str, batch: int, steps: int):
             model, base_position=jnp.array([0, 0, 1e3]), joint_velocities=v
         )
     )(v)
-    return of_lanes(lambda d: js.model.step(model, d), states, steps)
+    return compile_steps(lambda d: js.model.step(model, d), states, steps)
 
 
-def sdf(model: mujoco.MjModel) -> str:
+def hinge_model_as_sdf(model: mujoco.MjModel) -> str:
     """Links on hinges as SDF; of several hinges on a body all but the last carry a tenth of a
     gramme."""
     numbers = lambda *x: " ".join(repr(float(y)) for y in x)
-    out, names = [], {0: None} | {b: model.body(b).name for b in range(1, model.nbody)}
+    elements, names = [], {0: None} | {b: model.body(b).name for b in range(1, model.nbody)}
 
-    beside = lambda parent: f' relative_to="{parent}"'
+    relative_to = lambda parent: f' relative_to="{parent}"'
 
     def link(name, parent, pos, mass, com, inertia):
         tags = "".join(
@@ -202,21 +208,23 @@ def sdf(model: mujoco.MjModel) -> str:
                 ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"), map(float, inertia), strict=True
             )
         )
-        place = f"<pose{'' if parent is None else beside(parent)}>{numbers(*pos, 0, 0, 0)}</pose>"
+        place = (
+            f"<pose{'' if parent is None else relative_to(parent)}>{numbers(*pos, 0, 0, 0)}</pose>"
+        )
         about = (
             f"<pose>{numbers(*com, 0, 0, 0)}</pose><mass>{mass!r}</mass><inertia>{tags}</inertia>"
         )
-        out.append(f'<link name="{name}">{place}<inertial>{about}</inertial></link>')
+        elements.append(f'<link name="{name}">{place}<inertial>{about}</inertial></link>')
 
     for b in range(1, model.nbody):
         parent, pos = names[model.body_parentid[b]], model.body_pos[b]
-        turn = np.zeros(9)
-        mujoco.mju_quat2Mat(turn, model.body_iquat[b])
-        full = turn.reshape(3, 3) * model.body_inertia[b] @ turn.reshape(3, 3).T
-        whole = (
+        rotation = np.zeros(9)
+        mujoco.mju_quat2Mat(rotation, model.body_iquat[b])
+        inertia_in_body = rotation.reshape(3, 3) * model.body_inertia[b] @ rotation.reshape(3, 3).T
+        body_inertia = (
             float(model.body_mass[b]),
             model.body_ipos[b],
-            full[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]],
+            inertia_in_body[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]],
         )
         hinges = [
             j
@@ -230,20 +238,20 @@ def sdf(model: mujoco.MjModel) -> str:
                 child,
                 parent,
                 pos,
-                *(whole if last else (1e-4, np.zeros(3), [1e-6] * 3 + [0.0] * 3)),
+                *(body_inertia if last else (1e-4, np.zeros(3), [1e-6] * 3 + [0.0] * 3)),
             )
             limit = "<limit><lower>-1e9</lower><upper>1e9</upper></limit>"
             axis = f"<axis><xyz>{numbers(*model.jnt_axis[j])}</xyz>{limit}</axis>"
-            out.append(
+            elements.append(
                 f'<joint name="{model.joint(j).name}"'
                 f' type="revolute"><parent>{parent}</parent><child>{child}</child>{axis}</joint>'
             )
             parent, pos = child, np.zeros(3)
         if not hinges:
-            link(names[b], parent, pos, *whole)
+            link(names[b], parent, pos, *body_inertia)
     return (
         '<?xml version="1.0"?><sdf version="1.10"><model'
-        f' name="figure">{"".join(out)}</model></sdf>'
+        f' name="figure">{"".join(elements)}</model></sdf>'
     )
 
 
@@ -252,16 +260,16 @@ def main(kind: str, name: str, dtype: str, batch: int, steps: int):
     # on two cores, and now and then on one, MJX's batches wait for one another for ever (mujoco-mjx
     # 3.17.0, jax 0.10.1)
     os.sched_setaffinity(0, {0})
-    said = os.dup(1)
+    stdout = os.dup(1)
     os.dup2(2, 1)
-    answer = lambda x: os.write(said, (json.dumps(x) + "\n").encode())
+    answer = lambda x: os.write(stdout, (json.dumps(x) + "\n").encode())
     jax.config.update("jax_enable_x64", dtype == "float64")
     try:
-        program = {"mjx": by_mjx, "jaxsim": by_jaxsim}[kind](name, batch, steps)
+        program = {"mjx": mjx_program, "jaxsim": jaxsim_program}[kind](name, batch, steps)
     except ImportError as missing:
         answer({"missing": str(missing)})
         return
-    answer({"made": program.made})
+    answer({"compile_stats": program.compile_stats})
     for _ in sys.stdin:
         program()
         answer("done")

@@ -16,7 +16,7 @@ class Program:
         stages = stages.lower()
         seconds.append(time.perf_counter())
         self.program, self.states = stages.compile(), states
-        self.made = [
+        self.compile_stats = [
             *np.diff([*seconds, time.perf_counter()]).tolist(),
             self.program.memory_analysis().temp_size_in_bytes / 1e6,
         ]
@@ -25,16 +25,16 @@ class Program:
         jax.block_until_ready(self.program(self.states))
 
 
-def scanned(step, steps: int):
+def scan_steps(step, steps: int):
     """Many steps, in a loop that is compiled."""
     return lambda states: jax.lax.scan(lambda s, _: (step(s), None), states, None, length=steps)[0]
 
 
-def of_lanes(step, states, steps: int) -> Program:
+def compile_steps(step, states, steps: int) -> Program:
     """Many steps of many lanes, or of one alone."""
-    one = jax.tree.leaves(states)[0].shape[0] == 1
+    single = jax.tree.leaves(states)[0].shape[0] == 1
     return (
-        Program(scanned(step, steps), jax.tree.map(lambda x: x[0], states))
-        if one
-        else Program(scanned(jax.vmap(step), steps), states)
+        Program(scan_steps(step, steps), jax.tree.map(lambda x: x[0], states))
+        if single
+        else Program(scan_steps(jax.vmap(step), steps), states)
     )

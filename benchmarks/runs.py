@@ -20,21 +20,21 @@ import speed  # first: it tells XLA what to do
 
 # isort: split
 import diffrax
-import figures
 import jax
 import jax.numpy as jnp
 import numpy as np
+import speed_cases
 
 import svkc
 
-BODIES = {"dynamics": svkc.dynamics.ArticulatedBodies()}
+ARTICULATED = {"dynamics": svkc.dynamics.ArticulatedBodies()}
 EULER = {
     "solver": svkc.integrators.SymplecticEuler(),
     "stabilization": svkc.stabilization.Projection(iterations=1),
-    **BODIES,
+    **ARTICULATED,
 }
-TSIT5 = {"solver": diffrax.Tsit5(), "rtol": 1e-4, "atol": 1e-6, **BODIES}
-ALONE = {"default": {}, "articulated bodies": BODIES}
+TSIT5 = {"solver": diffrax.Tsit5(), "rtol": 1e-4, "atol": 1e-6, **ARTICULATED}
+ALONE = {"default": {}, "articulated bodies": ARTICULATED}
 LANES = {
     "symplectic Euler, 2.5 ms": {"dt": 2.5e-3, **EULER},
     "Tsit5, rtol 1e-4": TSIT5,
@@ -52,8 +52,8 @@ HEAD = [
     "steps",
     "rejected",
 ]
-EXACT = {"rtol": 1e-11, "atol": 1e-13, "max_steps": 100000}
-TRIED, ROUNDS, END = 8, 3, 1.8
+REFERENCE = {"rtol": 1e-11, "atol": 1e-13, "max_steps": 100000}
+REFERENCE_LANES, ROUNDS, END = 8, 3, 1.8
 speed.ROUNDS = ROUNDS
 
 
@@ -62,13 +62,13 @@ def events(right, left):
     return [svkc.at(right, cut="right_hand_grip"), svkc.at(left, cut="left_hand_grip")]
 
 
-def apart(chain, traj, exact) -> float:
+def final_error(chain, traj, reference) -> float:
     """Root mean square at the end, over the tree."""
-    moved = svkc.difference(chain, exact.final.q, traj.final.q)[: chain.nv]
-    return float(jnp.sqrt(jnp.mean(moved**2)))
+    difference = svkc.difference(chain, reference.final.q, traj.final.q)[: chain.nv]
+    return float(jnp.sqrt(jnp.mean(difference**2)))
 
 
-def row(label, who, seconds, simulated, error, phases):
+def result_row(label, who, seconds, simulated, error, phases):
     """What a run, or the runs of a batch, took and gave."""
     drift, steps, rejected = (
         np.asarray(x)
@@ -91,25 +91,27 @@ def row(label, who, seconds, simulated, error, phases):
     ]
 
 
-def beside(chain, state, lanes: int, steps: int):
+def mujoco_steps(chain, state, lanes: int, steps: int):
     """MuJoCo's steps, alone or on all cores."""
-    model, q, v = figures.in_mujoco("high bar", chain, state)
+    model, q, v = speed_cases.mujoco_case("high bar", chain, state)
     model.opt.timestep = 5e-3
-    return next(speed.by_mujoco(model, q, np.broadcast_to(v, (lanes, len(v))), lanes, steps))
+    return next(speed.mujoco_runs(model, q, np.broadcast_to(v, (lanes, len(v))), lanes, steps))
 
 
-def alone(chain, state):
+def single_runs(chain, state):
     """10 s at rtol 1e-8."""
-    made = lambda **how: jax.jit(
-        lambda s: svkc.simulate(chain, s, 10.0, events=events(8.0, 9.0), **how)
+    make_run = lambda **options: jax.jit(
+        lambda s: svkc.simulate(chain, s, 10.0, events=events(8.0, 9.0), **options)
     )
-    programs = {who: made(rtol=1e-8, atol=1e-8, **how) for who, how in ALONE.items()}
-    exact = made(**EXACT)(state)
+    programs = {who: make_run(rtol=1e-8, atol=1e-8, **options) for who, options in ALONE.items()}
+    reference = make_run(**REFERENCE)(state)
     runs = {who: (lambda f=f: jax.block_until_ready(f(state))) for who, f in programs.items()}
-    seconds = speed.timed(runs | dict([beside(chain, state, 1, 2000)]))
+    seconds = speed.time_in_turns(runs | dict([mujoco_steps(chain, state, 1, 2000)]))
     for who, f in programs.items():
         traj = f(state)
-        yield row("one", who, seconds[who], 10.0, apart(chain, traj, exact), traj.phases)
+        yield result_row(
+            "one", who, seconds[who], 10.0, final_error(chain, traj, reference), traj.phases
+        )
     yield [
         "one",
         "MuJoCo",
@@ -122,28 +124,30 @@ def alone(chain, state):
     ]
 
 
-def batch(chain, state, lanes: int, ways: dict, peers=()):
+def batch_runs(chain, state, lanes: int, methods: dict, peers=()):
     """Lanes by `svkc.rollout`, whose first call compiles."""
     states = jax.tree.map(lambda x: jnp.broadcast_to(x, (lanes, *x.shape)), state)
     times = 0.3 + 0.6 * jax.random.uniform(jax.random.key(1), (lanes,))
     lane = lambda chain, time: {"events": events(time, time + 0.2)}
     common = {"data": times, "lane": lane, "cost": times, "progress": False, "max_steps": 2048}
-    rolled = {
-        who: (lambda how=how: svkc.rollout(chain, states, END, **common, **how))
-        for who, how in ways.items()
+    rollouts = {
+        who: (lambda options=options: svkc.rollout(chain, states, END, **common, **options))
+        for who, options in methods.items()
     }
-    runs = {who: (lambda f=f: jax.block_until_ready(f())) for who, f in rolled.items()}
-    seconds = speed.timed(runs | dict(peers))
-    exact = jax.jit(lambda time: svkc.simulate(chain, state, END, **lane(chain, time), **EXACT))
-    references = [exact(time) for time in times[:TRIED]]
-    for who, f in rolled.items():
+    runs = {who: (lambda f=f: jax.block_until_ready(f())) for who, f in rollouts.items()}
+    seconds = speed.time_in_turns(runs | dict(peers))
+    reference = jax.jit(
+        lambda time: svkc.simulate(chain, state, END, **lane(chain, time), **REFERENCE)
+    )
+    references = [reference(time) for time in times[:REFERENCE_LANES]]
+    for who, f in rollouts.items():
         traj = f()
         assert bool(jnp.all(traj.result == svkc.RESULTS.successful)), who
         errors = [
-            apart(chain, jax.tree.map(lambda x, i=i: x[i], traj), references[i])
-            for i in range(TRIED)
+            final_error(chain, jax.tree.map(lambda x, i=i: x[i], traj), references[i])
+            for i in range(REFERENCE_LANES)
         ]
-        yield row(lanes, who, seconds[who], lanes * END, np.median(errors), traj.phases)
+        yield result_row(lanes, who, seconds[who], lanes * END, np.median(errors), traj.phases)
     for name, _ in peers:
         x = seconds[name]
         yield [
@@ -158,7 +162,7 @@ def batch(chain, state, lanes: int, ways: dict, peers=()):
         ]
 
 
-def unequal(chain, state, lanes: int):
+def unequal_runs(chain, state, lanes: int):
     """Lanes that end at 0.1 to 1.8 s, as they come and with those alike together."""
     states = jax.tree.map(lambda x: jnp.broadcast_to(x, (lanes, *x.shape)), state)
     ends = 0.1 + 1.7 * jax.random.uniform(jax.random.key(2), (lanes,))
@@ -170,26 +174,30 @@ def unequal(chain, state, lanes: int):
         "Tsit5, rtol 1e-4, as they come": lambda: roll(None),
         "Tsit5, rtol 1e-4, sorted": lambda: roll(ends),
     }
-    seconds = speed.timed(
+    seconds = speed.time_in_turns(
         {who: (lambda f=f: jax.block_until_ready(f())) for who, f in runs.items()}
     )
     for who, f in runs.items():
-        line = row(f"{lanes}, unequal", who, seconds[who], float(jnp.sum(ends)), 0.0, f().phases)
+        line = result_row(
+            f"{lanes}, unequal", who, seconds[who], float(jnp.sum(ends)), 0.0, f().phases
+        )
         yield [*line[:6], "", *line[7:]]
 
 
 def main(lanes: int):
     """Measures, prints, writes."""
-    chain, state = figures.case("high bar")
+    chain, state = speed_cases.load_case("high bar")
     table, machine = [], speed.machine()
     print("| " + " | ".join(HEAD) + " |")
-    ways = (
-        alone(chain, state),
-        batch(chain, state, lanes, LANES, [beside(chain, state, lanes, round(END / 5e-3))]),
-        batch(*svkc.scenes.high_bar(), lanes, RANGED),
-        unequal(chain, state, lanes // 4),
+    tables = (
+        single_runs(chain, state),
+        batch_runs(
+            chain, state, lanes, LANES, [mujoco_steps(chain, state, lanes, round(END / 5e-3))]
+        ),
+        batch_runs(*svkc.scenes.high_bar(), lanes, RANGED),
+        unequal_runs(chain, state, lanes // 4),
     )
-    for rows in ways:
+    for rows in tables:
         for line in rows:
             table.append(line)
             print("| " + " | ".join(map(str, line)) + " |", flush=True)

@@ -12,12 +12,12 @@ import sys
 import speed  # first: it tells XLA what to do, and where the tests' models are
 
 # isort: split
-import figures
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from programs import Program, scanned
+import speed_cases
+from programs import Program, scan_steps
 from speed import RESULTS
 
 import svkc
@@ -50,16 +50,16 @@ def chain_of(count: int, balls: bool = False) -> str:
         )
         text = LINK.format(i, -0.1 if i else 0, kind, axis, text)
     return (
-        f'<mujoco><option timestep="{figures.DT}"><flag'
+        f'<mujoco><option timestep="{speed_cases.DT}"><flag'
         f' contact="disable"/></option><worldbody>{text}</worldbody></mujoco>'
     )
 
 
-def stepping(chain, state, batch: int = 1):
+def step_program(chain, state, batch: int = 1):
     """Steps in one call, and the program of them."""
     steps, tau = speed.steps_for(batch), jnp.zeros(chain.nv)
-    step = lambda s: svkc.step(chain, s, tau, figures.DT)
-    return steps * batch, Program(scanned(step if batch == 1 else jax.vmap(step), steps), state)
+    step = lambda s: svkc.step(chain, s, tau, speed_cases.DT)
+    return steps * batch, Program(scan_steps(step if batch == 1 else jax.vmap(step), steps), state)
 
 
 def links():
@@ -67,7 +67,7 @@ def links():
     for count in (5, 10, 20, 50, 100, 200):
         chain = svkc.load(chain_of(count))
         state = chain.state(np.full(count, 0.1))
-        steps, program = stepping(chain, state)
+        steps, program = step_program(chain, state)
         model, data = chain.model.model, mujoco.MjData(chain.model.model)
 
         def peer(model=model, data=data, state=state, steps=steps):
@@ -81,29 +81,29 @@ def links():
 def loops():
     """Forty bars on balls, 1 to 20 of them held to the ground by a ball each."""
     for count in (1, 2, 5, 10, 20):
-        held = [
+        pins = [
             svkc.VirtualLink(
                 f"pin{i}", "world", f"b{40 * (i + 1) // count - 1}", "ball", real_pos=(0, 0, -0.1)
             )
             for i in range(count)
         ]
-        chain = svkc.load(chain_of(40, balls=True), virtual_links=held)
+        chain = svkc.load(chain_of(40, balls=True), virtual_links=pins)
         state = svkc.connect(chain, chain.state(connected=()), *chain.link_names, here=True)
-        steps, program = stepping(chain, state)
+        steps, program = step_program(chain, state)
         yield count, "us a step", 1e6 / steps, {"svkc": program}
 
 
 def lanes():
     """The open figure of 46 freedoms, 256 to 16384 lanes."""
-    chain, state = figures.case("open")
+    chain, state = speed_cases.load_case("open")
     for batch in (256, 1024, 4096, 16384):
-        steps, program = stepping(chain, figures.lanes(chain, state, batch), batch)
+        steps, program = step_program(chain, speed_cases.random_states(chain, state, batch), batch)
         yield batch, "us a step and lane", 1e6 / steps, {"svkc": program}
 
 
 def time():
     """The high bar without releases, 0.5 to 8 s."""
-    chain, state = figures.case("high bar")
+    chain, state = speed_cases.load_case("high bar")
     for end in (0.5, 1.0, 2.0, 4.0, 8.0):
         yield (
             end,
@@ -167,16 +167,16 @@ def draw(table):
     figure.savefig(RESULTS / "scaling.png", dpi=110)
 
 
-def main(asked):
+def main(names):
     """Measures, prints, fits, writes."""
     table = []
     print("| " + " | ".join(HEAD) + " |")
-    for name in asked:
-        begun = len(table)
+    for name in names:
+        first = len(table)
         for size, unit, scale, runs in GROWTH[name]():
-            seconds = {who: x * scale for who, x in speed.timed(runs).items()}
+            seconds = {who: x * scale for who, x in speed.time_in_turns(runs).items()}
             ours, peer = seconds["svkc"], seconds.get("MuJoCo")
-            made = [f"{value:.2f}" for value in runs["svkc"].made]
+            compile_columns = [f"{value:.2f}" for value in runs["svkc"].compile_stats]
             table.append(
                 [
                     name,
@@ -184,14 +184,14 @@ def main(asked):
                     unit,
                     *(f"{f(ours):.3g}" for f in (np.median, min, max)),
                     "" if peer is None else f"{np.median(peer):.3g}",
-                    *made,
+                    *compile_columns,
                 ]
             )
             print("| " + " | ".join(map(str, table[-1])) + " |", flush=True)
-        sizes, costs = (np.log([float(row[i]) for row in table[begun:]]) for i in (1, 3))
+        log_x, log_costs = (np.log([float(row[i]) for row in table[first:]]) for i in (1, 3))
         print(
-            f"{name}: exponent {np.polyfit(sizes, costs, 1)[0]:.2f} over all,"
-            f" {np.polyfit(sizes[-3:], costs[-3:], 1)[0]:.2f} over the last three",
+            f"{name}: exponent {np.polyfit(log_x, log_costs, 1)[0]:.2f} over all,"
+            f" {np.polyfit(log_x[-3:], log_costs[-3:], 1)[0]:.2f} over the last three",
             flush=True,
         )
     with (RESULTS / "scaling.csv").open("w", newline="") as file:

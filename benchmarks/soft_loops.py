@@ -14,28 +14,28 @@ import maximal
 import reference_problems as reference
 
 import svkc.scenes
-from svkc.scenes.swing import parts
+from svkc.scenes.swing import model_and_links
 
 INTEGRATORS = ("Euler", "implicitfast", "RK4")
 
 
-def mechanism(problem, given: dict, dt: float):
+def mechanism_model(problem, problem_data: dict, dt: float):
     """A problem given body by body: its joints left over as `connect`s, its springs as tendons.
     MjModel."""
-    xml, bodies, _, loops = maximal.mjcf(given)
-    numbers, soft, sites, tendons = maximal._numbers, "", {}, ""
+    xml, bodies, _, loops = maximal.mjcf(problem_data)
+    numbers, equalities, sites, tendons = maximal._numbers, "", {}, ""
     for joint in loops:
         parent = bodies[joint["parent"]]
         anchor = parent.turn.T @ (np.array(joint["point_world0"]) - parent.place)
-        one, other = (
+        first, second = (
             "world" if name == "ground" else name for name in (joint["parent"], joint["child"])
         )
-        soft += (
-            f'<connect body1="{one}" body2="{other}" anchor="{numbers(anchor)}" solref="{2 * dt}'
+        equalities += (
+            f'<connect body1="{first}" body2="{second}" anchor="{numbers(anchor)}" solref="{2 * dt}'
             ' 1"/>'
         )
     for i, spring in enumerate(
-        force for force in given.get("forces", ()) if force["type"] == "spring_damper"
+        force for force in problem_data.get("forces", ()) if force["type"] == "spring_damper"
     ):
         for end in ("parent", "child"):
             body = bodies[spring[end]]
@@ -48,63 +48,74 @@ def mechanism(problem, given: dict, dt: float):
             f' springlength="{spring["rest_length"]}"><site site="parent{i}"/><site'
             f' site="child{i}"/></spatial>'
         )
-    for name, inside in sites.items():
-        head = (
+    for name, elements in sites.items():
+        opening_tag = (
             "<worldbody>"
             if name == "ground"
             else xml[xml.index(f'<body name="{name}"') :].split(">")[0] + ">"
         )
-        xml = xml.replace(head, head + "".join(inside), 1)
+        xml = xml.replace(opening_tag, opening_tag + "".join(elements), 1)
     return mujoco.MjModel.from_xml_string(
-        xml.replace("</mujoco>", f"<tendon>{tendons}</tendon><equality>{soft}</equality></mujoco>")
+        xml.replace(
+            "</mujoco>", f"<tendon>{tendons}</tendon><equality>{equalities}</equality></mujoco>"
+        )
     )
 
 
-def figure(problem, spec: mujoco.MjSpec, dt: float):
+def figure_model(problem, spec: mujoco.MjSpec, dt: float):
     """A model and the virtual links of the problem's start: two `connect`s for a hinge, one for a
     ball; a slide is a `weld` to a sled of a gram. MjModel."""
     chain, s = problem.chain, problem.state.structure
     rows = dict(zip(chain.topology.body_row, chain.body_names))
     body = lambda row: spec.worldbody if rows[int(row)] == "world" else spec.body(rows[int(row)])
     for i, name in enumerate(chain.link_names):
-        turns, slides = np.flatnonzero(s.freedoms[i, :3]), np.flatnonzero(s.freedoms[i, 3:])
+        rotations, translations = (
+            np.flatnonzero(s.freedoms[i, :3]),
+            np.flatnonzero(s.freedoms[i, 3:]),
+        )
         ends = [
             (body(s.parent[i]), s.pos[i], s.quat[i]),
             (body(s.real[i]), s.real_pos[i], s.real_quat[i]),
         ]
-        kind = mujoco.mjtEq.mjEQ_WELD if slides.size else mujoco.mjtEq.mjEQ_CONNECT
-        if slides.size:
+        kind = mujoco.mjtEq.mjEQ_WELD if translations.size else mujoco.mjtEq.mjEQ_CONNECT
+        if translations.size:
             sled = ends[0][0].add_body(
                 name=name, pos=ends[0][1], quat=ends[0][2], mass=1e-3, inertia=[1e-6] * 3
             )
-            sled.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=np.eye(3)[slides[0]])
+            sled.add_joint(
+                name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=np.eye(3)[translations[0]]
+            )
             ends[0] = (sled, np.zeros(3), np.array([1.0, 0, 0, 0]))
-        for side in (-0.05, 0.05) if turns.size == 1 else (0.0,):
+        for side in (-0.05, 0.05) if rotations.size == 1 else (0.0,):
             for label, (holder, place, quat) in zip(("parent", "real"), ends):
-                along = np.zeros(3)
+                offset = np.zeros(3)
                 mujoco.mju_rotVecQuat(
-                    along, side * np.eye(3)[turns[0] if turns.size else 0], np.asarray(quat, float)
+                    offset,
+                    side * np.eye(3)[rotations[0] if rotations.size else 0],
+                    np.asarray(quat, float),
                 )
                 holder.add_site(
                     name=f"{name}{side}{label}",
-                    pos=np.asarray(place) + along,
+                    pos=np.asarray(place) + offset,
                     quat=np.asarray(quat, float),
                 )
             sites = {"name1": f"{name}{side}parent", "name2": f"{name}{side}real"}
-            held = spec.add_equality(
+            equality = spec.add_equality(
                 name=f"{name}{side}", type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, **sites
             )
-            held.solref = [2 * dt, 1]
+            equality.solref = [2 * dt, 1]
     return spec.compile()
 
 
 MODELS = {
-    "n_four_bar": lambda problem, dt: mechanism(problem, reference.n_four_bar(2), dt),
-    "andrews": lambda problem, dt: mechanism(problem, reference.given("andrews")["problem"], dt),
-    "high_bar": lambda problem, dt: figure(
+    "n_four_bar": lambda problem, dt: mechanism_model(problem, reference.n_four_bar(2), dt),
+    "andrews": lambda problem, dt: mechanism_model(
+        problem, reference.given("andrews")["problem"], dt
+    ),
+    "high_bar": lambda problem, dt: figure_model(
         problem, mujoco.MjSpec.from_file(str(svkc.scenes.FOLDER / "figure16.xml")), dt
     ),
-    "swing": lambda problem, dt: figure(problem, parts()[0], dt),
+    "swing": lambda problem, dt: figure_model(problem, model_and_links()[0], dt),
 }
 
 

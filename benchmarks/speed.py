@@ -21,7 +21,7 @@ import peers  # first: its own processes go without the next line
 
 # before jax makes its first program
 os.environ["XLA_FLAGS"] = (
-    peers.FLAGS
+    peers.USER_XLA_FLAGS
     + " --xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000000"
 )
 
@@ -30,14 +30,14 @@ import jax
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", os.cpu_count())
 
-import figures
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from figures import DT
+import speed_cases
 from jax.sharding import PartitionSpec
-from peers import by_mujoco
-from programs import Program, scanned
+from peers import mujoco_runs
+from programs import Program, scan_steps
+from speed_cases import DT
 
 import svkc
 
@@ -64,101 +64,106 @@ def steps_for(batch: int) -> int:
     return max(5, min(250, 40000 // batch))
 
 
-def by_svkc(chain, state, batch: int, steps: int):
+def svkc_runs(chain, state, batch: int, steps: int):
     """One core, and all of them."""
     tau = jnp.zeros(chain.nv, state.q.dtype)
-    run = scanned(lambda s: svkc.step(chain, s, tau, DT), steps)
+    run = scan_steps(lambda s: svkc.step(chain, s, tau, DT), steps)
     if batch == 1:
-        yield "svkc", Program(run, jax.tree.map(lambda x: x[0], figures.lanes(chain, state, 1)))
+        yield (
+            "svkc",
+            Program(run, jax.tree.map(lambda x: x[0], speed_cases.random_states(chain, state, 1))),
+        )
         return
-    states, many = (
-        figures.lanes(chain, state, batch),
-        scanned(jax.vmap(lambda s: svkc.step(chain, s, tau, DT)), steps),
+    states, batch_steps = (
+        speed_cases.random_states(chain, state, batch),
+        scan_steps(jax.vmap(lambda s: svkc.step(chain, s, tau, DT)), steps),
     )
-    yield "svkc, vmap on one core", Program(many, states)
+    yield "svkc, vmap on one core", Program(batch_steps, states)
     cores = jax.device_count()
     if batch % cores == 0:
         mesh = jax.make_mesh((cores,), ("lanes",))
-        spread = jax.shard_map(
-            many,
+        sharded = jax.shard_map(
+            batch_steps,
             mesh=mesh,
             in_specs=PartitionSpec("lanes"),
             out_specs=PartitionSpec("lanes"),
             check_vma=False,
         )
-        placed = jax.device_put(states, jax.sharding.NamedSharding(mesh, PartitionSpec("lanes")))
-        yield "svkc, all cores", Program(spread, placed)
+        sharded_states = jax.device_put(
+            states, jax.sharding.NamedSharding(mesh, PartitionSpec("lanes"))
+        )
+        yield "svkc, all cores", Program(sharded, sharded_states)
 
 
-def timed(runs: dict) -> dict[str, np.ndarray]:
+def time_in_turns(runs: dict) -> dict[str, np.ndarray]:
     """Seconds of each, in turns; a first one is left out."""
     seconds = {name: [] for name in runs}
     for _ in range(ROUNDS + 1):
         for name, run in list(runs.items()):
-            begun = time.perf_counter()
+            start = time.perf_counter()
             try:
                 run()
-            except TimeoutError as late:
-                print(f"left out: {late}", flush=True)
+            except TimeoutError as timeout:
+                print(f"left out: {timeout}", flush=True)
                 del runs[name]
                 continue
-            seconds[name].append(time.perf_counter() - begun)
+            seconds[name].append(time.perf_counter() - start)
     return {name: np.array(seconds[name][1:]) for name in runs}
 
 
-def compared(name: str, dtype: str, batch: int, said: set):
+def compare_case(name: str, dtype: str, batch: int, messages: set):
     """Rows of one case."""
-    chain, state = figures.case(name)
-    model, q, _ = figures.in_mujoco(name, chain, state)
+    chain, state = speed_cases.load_case(name)
+    model, q, _ = speed_cases.mujoco_case(name, chain, state)
     v, steps, runs = (
-        np.asarray(figures.lanes(chain, state, batch).v[:, : chain.nv], float),
+        np.asarray(speed_cases.random_states(chain, state, batch).v[:, : chain.nv], float),
         steps_for(batch),
         {},
     )
-    them = [
-        lambda: by_svkc(chain, state, batch, steps),
-        lambda: by_mujoco(model, q, v, batch, steps),
+    libraries = [
+        lambda: svkc_runs(chain, state, batch, steps),
+        lambda: mujoco_runs(model, q, v, batch, steps),
     ]
     if batch <= 1024:
-        them += [
-            lambda: peers.by_pinocchio(name, chain, state, batch, steps),
+        libraries += [
+            lambda: peers.pinocchio_runs(name, chain, state, batch, steps),
             lambda: [("MJX, one core", peers.Process("mjx", name, dtype, batch, steps))],
         ]
-        them += (
+        libraries += (
             [lambda: [("JaxSim, one core", peers.Process("jaxsim", name, dtype, batch, steps))]]
             if name == "open"
             else []
         )
-    for peer in them:
+    for peer in libraries:
         try:
             runs |= dict(peer())
         except (ImportError, NotImplementedError) as missing:
-            if str(missing) not in said:
-                said.add(str(missing))
+            if str(missing) not in messages:
+                messages.add(str(missing))
                 print(f"left out: {missing}", flush=True)
-    times = {who: seconds / steps / batch * 1e6 for who, seconds in timed(runs).items()}
+    times = {who: seconds / steps / batch * 1e6 for who, seconds in time_in_turns(runs).items()}
     for run in runs.values():
         if isinstance(run, peers.Process):
             run.close()
-    ours = {
+    svkc_medians = {
         "all cores" in who: float(np.median(x))
         for who, x in times.items()
         if who.startswith("svkc")
     }
-    for who, x in times.items():
-        made = (
-            [f"{value:.2f}" for value in runs[who].made]
-            if isinstance(runs[who], Program | peers.Process)
+    for label, x in times.items():
+        compile_columns = (
+            [f"{value:.2f}" for value in runs[label].compile_stats]
+            if isinstance(runs[label], Program | peers.Process)
             else [""] * 4
         )
         yield [
             name,
             dtype,
             batch,
-            who,
+            label,
             *(f"{f(x):.3g}" for f in (np.median, min, max)),
-            f"{np.median(x) / ours.get('all cores' in who, np.nan):.2f}",
-            *made,
+            f"{np.median(x) / svkc_medians.get('all cores' in label, np.nan):.2f}",
+            *compile_columns,
         ]
 
 
@@ -222,14 +227,14 @@ def machine() -> dict:
 def main(cases, dtypes, batches):
     """Measures, prints, writes: rows of a case, a dtype and a number of lanes in place of their old
     ones."""
-    said = set()
+    messages = set()
     print("| " + " | ".join(HEAD) + " |")
     for name in cases:
         for dtype in dtypes:
             with jax.enable_x64(dtype == "float64"):
                 for batch in batches:
                     rows = []
-                    for row in compared(name, dtype, batch, said):
+                    for row in compare_case(name, dtype, batch, messages):
                         rows.append(row)
                         print("| " + " | ".join(map(str, row)) + " |", flush=True)
                     save((name, dtype, str(batch)), rows)
@@ -241,20 +246,22 @@ def save(key: tuple, rows):
     """In the file of all, and in its picture."""
     path = RESULTS / "speed.csv"
     with path.open() as file:
-        kept = [row for row in list(csv.reader(file))[1:] if tuple(row[:3]) != key]
-    kept += [[*map(str, row), *map(str, machine().values())] for row in rows]
-    kept.sort(key=lambda row: (figures.CASES.index(row[0]), row[1] != "float64", int(row[2])))
+        rows_of_file = [row for row in list(csv.reader(file))[1:] if tuple(row[:3]) != key]
+    rows_of_file += [[*map(str, row), *map(str, machine().values())] for row in rows]
+    rows_of_file.sort(
+        key=lambda row: (speed_cases.CASES.index(row[0]), row[1] != "float64", int(row[2]))
+    )
     with path.open("w", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows([[*HEAD, *machine()], *kept])
-    draw([[row[0], row[1], int(row[2]), *row[3:]] for row in kept])
+        csv.writer(file, lineterminator="\n").writerows([[*HEAD, *machine()], *rows_of_file])
+    draw([[row[0], row[1], int(row[2]), *row[3:]] for row in rows_of_file])
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
     parser.add_argument(
-        "cases", nargs="*", metavar="case", help=f"of {', '.join(figures.CASES)}; none: all"
+        "cases", nargs="*", metavar="case", help=f"of {', '.join(speed_cases.CASES)}; none: all"
     )
     parser.add_argument("--dtype", nargs="+", default=["float64", "float32"])
     parser.add_argument("--batch", nargs="+", type=int, default=BATCHES, help="lanes")
     options = parser.parse_args()
-    main(options.cases or figures.CASES, options.dtype, options.batch)
+    main(options.cases or speed_cases.CASES, options.dtype, options.batch)

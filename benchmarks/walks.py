@@ -24,14 +24,14 @@ HAND = """<mujoco><worldbody><body name="arm"><joint name="arm" axis="0 1 0"/>
 </worldbody></mujoco>"""
 
 
-def walk(call) -> list[str]:
+def record_files(call) -> list[str]:
     """Return the file of each function of svkc, in the order of first calls."""
-    seen, files = set(), []
+    entered, files = set(), []
 
     def enter(frame, event, _):
         code = frame.f_code
-        if event == "call" and code not in seen and code.co_filename.startswith(str(ROOT)):
-            seen.add(code)
+        if event == "call" and code not in entered and code.co_filename.startswith(str(ROOT)):
+            entered.add(code)
             files.append(str(pathlib.Path(code.co_filename).relative_to(ROOT)))
 
     jax.clear_caches()
@@ -43,7 +43,7 @@ def walk(call) -> list[str]:
     return files
 
 
-def counted(files: list[str]) -> tuple[int, int, int, int]:
+def count_moves(files: list[str]) -> tuple[int, int, int, int]:
     """Return files entered, moves between files, returns to a file already left, packages."""
     moves = [b for a, b in zip(files, files[1:], strict=False) if a != b]
     returns = len(moves) - len(set(moves) - {files[0]})
@@ -88,7 +88,7 @@ def main():
     print("| walk | files | moves | returns | packages |")
     print("|---|---|---|---|---|")
     for name, call in walks.items():
-        print(f"| {name} | {' | '.join(map(str, counted(walk(call))))} |", flush=True)
+        print(f"| {name} | {' | '.join(map(str, count_moves(record_files(call))))} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -11,21 +11,21 @@ jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp
 
 import svkc
-from svkc.scenes.swing import EDGE, swing
+from svkc.scenes.swing import PLATE_EDGE, swing
 
 chain, state = swing()
 thighs = ["right_thigh_plate", "left_thigh_plate"]
 
 
-def passes_the_edge(link):
+def distance_beyond_edge(link):
     """A guard: how far beyond the plate's edge a thigh is on its slide."""
     along = svkc.touch(chain, link, 0.0, axes="z")
-    return lambda t, state, args: jnp.abs(along(t, state)) - EDGE
+    return lambda t, state, args: jnp.abs(along(t, state)) - PLATE_EDGE
 
 
 # two guards; the figure sits straight, so that both fire at one instant and make one change of
 # structure
-events = [svkc.when(passes_the_edge(link), cut=link, direction=True) for link in thighs]
+events = [svkc.when(distance_beyond_edge(link), cut=link, direction=True) for link in thighs]
 traj = svkc.simulate(
     chain, state, 2.0, ts=jnp.linspace(0, 2.0, 81), events=events, rtol=1e-8, atol=1e-10
 )

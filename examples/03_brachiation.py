@@ -20,7 +20,7 @@ to_bar2, to_bar3 = (
 )
 
 
-def each(side="", **numbers):
+def per_joint(side="", **numbers):
     """A number for each joint, by the end of its name; zero for the others."""
     return jnp.array(
         [
@@ -34,15 +34,15 @@ def each(side="", **numbers):
 
 
 right_arm, left_arm = (
-    each(side, shoulder_flexion=1, shoulder_abduction=1, elbow=1, wrist=1) > 0
+    per_joint(side, shoulder_flexion=1, shoulder_abduction=1, elbow=1, wrist=1) > 0
     for side in ("right", "left")
 )
-hanging = each(shoulder_flexion=3.0, shoulder_abduction=-0.1, elbow=0.85, wrist=0.2)
-loose = each(shoulder_flexion=1.2, elbow=0.6, hip_flexion=0.3, knee=0.4, ankle=-0.5)
-pump = each(hip_flexion=0.9, knee=0.6)
+hanging_pose = per_joint(shoulder_flexion=3.0, shoulder_abduction=-0.1, elbow=0.85, wrist=0.2)
+free_pose = per_joint(shoulder_flexion=1.2, elbow=0.6, hip_flexion=0.3, knee=0.4, ankle=-0.5)
+pump_amplitude = per_joint(hip_flexion=0.9, knee=0.6)
 # kg m^2: what an arm that holds has to turn is the whole body; a free limb turns itself
-body = each(shoulder_flexion=3.0, elbow=3.0, shoulder_abduction=20.0, wrist=10.0)
-limb = jnp.diag(svkc.mass_matrix(chain, state))[6:]
+load_inertia = per_joint(shoulder_flexion=3.0, elbow=3.0, shoulder_abduction=20.0, wrist=10.0)
+limb_inertia = jnp.diag(svkc.mass_matrix(chain, state))[6:]
 
 
 @jax.jit
@@ -51,20 +51,20 @@ def control(t, state, args):
     the free hand to the next bar."""
     bar1, bar2, bar3 = state.structure.connected
     q, v = state.q[7:23], state.v[6:22]
-    holding = (right_arm & (bar1 | bar3)) | (left_arm & bar2)
-    goal = jnp.where(holding, hanging, loose) + pump * jnp.tanh(2.0 * state.v[0])
-    rate = jnp.where(holding, 8.0, 9.0)
-    tau = jnp.where(holding, body, limb) * (rate * rate * (goal - q) - 2.0 * rate * v)
+    holds = (right_arm & (bar1 | bar3)) | (left_arm & bar2)
+    goal = jnp.where(holds, hanging_pose, free_pose) + pump_amplitude * jnp.tanh(2.0 * state.v[0])
+    rate = jnp.where(holds, 8.0, 9.0)
+    tau = jnp.where(holds, load_inertia, limb_inertia) * (rate * rate * (goal - q) - 2.0 * rate * v)
 
-    def stretched(dv):
+    def spring_energy(dv):
         moved = svkc.State(svkc.integrate(chain, state.q, dv), state.v, state.structure)
         distance = jnp.where(bar1, to_bar2(t, moved), to_bar3(t, moved))
         return 150.0 * jnp.sqrt(distance**2 + 0.01)
 
-    reach = -jax.grad(stretched)(jnp.zeros_like(state.v))[6:22] - 8.0 * limb * v
+    reach_torque = -jax.grad(spring_energy)(jnp.zeros_like(state.v))[6:22] - 8.0 * limb_inertia * v
     reaching = (left_arm & bar1 & ~bar2) | (right_arm & bar2 & ~bar1 & ~bar3)
     # none at the base, none at the bars
-    return jnp.pad(jnp.where(reaching, reach, tau), (6, chain.dofs - 22))
+    return jnp.pad(jnp.where(reaching, reach_torque, tau), (6, chain.dofs - 22))
 
 
 def swings_forward(bar):

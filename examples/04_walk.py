@@ -12,16 +12,16 @@ jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp
 
 import svkc
-from svkc.scenes.walking import ANKLE, HIP, SOLE, STRIDE, leg, walking
+from svkc.scenes.walking import ANKLE_HEIGHT, HIP_HEIGHT, SOLE_OFFSET, STRIDE, leg_angles, walking
 
 # steps, s a step, the part of it on both feet, s to get going and to stop
-STEPS, PERIOD, SHARED, RAMP = 5, 0.65, 0.12, 0.6
-END = RAMP + (STEPS + SHARED / 2) * PERIOD
+STEPS, PERIOD, DOUBLE_SUPPORT, RAMP = 5, 0.65, 0.12, 0.6
+END = RAMP + (STEPS + DOUBLE_SUPPORT / 2) * PERIOD
 chain, state = walking()
 feet = {side: chain.link_names.index(f"{side}_foot_ground") for side in ("left", "right")}
 
 
-def progress(t):
+def steps_done(t):
     """How many steps are done: the right foot comes down at 1, the left one at 2."""
     starting, stopping = jnp.minimum(t, RAMP), jnp.minimum(END - t, RAMP)
     return (starting**2 - stopping**2 + RAMP**2) / (2 * RAMP * PERIOD) + (
@@ -29,24 +29,31 @@ def progress(t):
     ) / PERIOD
 
 
-def plan(t, structure):
+def planned_angles(t, structure):
     """Angles of the 16 joints: hips at one height, a little slower over the foot that stands; feet
     that hold stay where they are."""
-    done, middle = progress(t), progress(t) - (1 + SHARED) / 2
-    hips = STRIDE * middle - 0.007 * jnp.sin(2 * jnp.pi * middle) - SOLE
-    swing, joints = 0.3 * jnp.cos(jnp.pi * (done - SHARED / 2)), {}
+    steps, middle = steps_done(t), steps_done(t) - (1 + DOUBLE_SUPPORT) / 2
+    hips = STRIDE * middle - 0.007 * jnp.sin(2 * jnp.pi * middle) - SOLE_OFFSET
+    swing, joints = 0.3 * jnp.cos(jnp.pi * (steps - DOUBLE_SUPPORT / 2)), {}
     for side, odd in (("right", 0), ("left", 1)):
         link, step = feet[side], 2 * jnp.round((middle - odd) / 2) + odd
-        u = jnp.clip((done - step - SHARED) / (1 - SHARED), 0, 1.2)
-        part, start, stands = jnp.minimum(u, 1), structure.pos[link, 0], structure.connected[link]
-        ahead = start + ((step + 1) * STRIDE - start) * part**3 * (10 - 15 * part + 6 * part**2)
+        u = jnp.clip((steps - step - DOUBLE_SUPPORT) / (1 - DOUBLE_SUPPORT), 0, 1.2)
+        phase, lift_off_x, supports = (
+            jnp.minimum(u, 1),
+            structure.pos[link, 0],
+            structure.connected[link],
+        )
+        foot_x = lift_off_x + ((step + 1) * STRIDE - lift_off_x) * phase**3 * (
+            10 - 15 * phase + 6 * phase**2
+        )
         # comes down with some speed, and would go below the ground
-        above = 0.6 * u**2 * (1 - u) * (1.15 - u)
-        angles = leg(
-            jnp.where(stands, start, ahead) - SOLE - hips, HIP - ANKLE - jnp.where(stands, 0, above)
+        foot_height = 0.6 * u**2 * (1 - u) * (1.15 - u)
+        angles = leg_angles(
+            jnp.where(supports, lift_off_x, foot_x) - SOLE_OFFSET - hips,
+            HIP_HEIGHT - ANKLE_HEIGHT - jnp.where(supports, 0, foot_height),
         )
         # toes down on the way
-        angles["ankle"] -= jnp.where(stands, 0, 6 * part**2 * (1 - part) ** 2)
+        angles["ankle"] -= jnp.where(supports, 0, 6 * phase**2 * (1 - phase) ** 2)
         angles |= {"shoulder_flexion": -swing if odd else swing, "elbow": 0.35}
         joints |= {f"{side}_{name}": angle for name, angle in angles.items()}
     return jnp.stack(
@@ -54,40 +61,45 @@ def plan(t, structure):
     )
 
 
-def torques_on(foot, state, vdot):
+def torques_on_foot(foot, state, vdot):
     """Torques for an acceleration of all joints that leave the whole load to this foot."""
-    alone = eqx.tree_at(
+    single_support = eqx.tree_at(
         lambda s: (s.connected, s.rank),
         state.structure,
         (jnp.arange(2) == foot, jnp.asarray(6, jnp.int32)),
     )
-    return svkc.actuation(chain, svkc.State(state.q, state.v, alone), vdot).tau
+    return svkc.actuation(chain, svkc.State(state.q, state.v, single_support), vdot).tau
 
 
 def control(t, state, args):
     """Computed torque: the plan's accelerations as nearly as the feet allow, the load led from the
     rear leg to the front one."""
-    both = lambda t: jax.jvp(lambda t: plan(t, state.structure), (t,), (jnp.ones_like(t),))
-    (q, v), (_, a) = jax.jvp(both, (t,), (jnp.ones_like(t),))
-    co = svkc.coordinates(chain, state)
-    W, wanted = co.W[6:], a + 200 * (q - state.q[7:]) + 28 * (v - state.v[6:]) - co.bias[6:]
-    vdot = co.bias + co.W @ jnp.linalg.solve(
-        W.T @ W + jnp.diag(jnp.where(co.independent, 0.0, 1.0)), W.T @ wanted
+    position_and_velocity = lambda t: jax.jvp(
+        lambda t: planned_angles(t, state.structure), (t,), (jnp.ones_like(t),)
     )
-    (left, right), stands, place = (
+    (q, v), (_, a) = jax.jvp(position_and_velocity, (t,), (jnp.ones_like(t),))
+    co = svkc.coordinates(chain, state)
+    W, desired_acceleration = (
+        co.W[6:],
+        a + 200 * (q - state.q[7:]) + 28 * (v - state.v[6:]) - co.bias[6:],
+    )
+    vdot = co.bias + co.W @ jnp.linalg.solve(
+        W.T @ W + jnp.diag(jnp.where(co.independent, 0.0, 1.0)), W.T @ desired_acceleration
+    )
+    (left, right), supports, foot_x = (
         feet.values(),
         state.structure.connected,
         state.structure.pos[:, 0],
     )
-    part = jnp.clip((progress(t) - jnp.round(progress(t))) / SHARED, 0, 1)
+    phase = jnp.clip((steps_done(t) - jnp.round(steps_done(t))) / DOUBLE_SUPPORT, 0, 1)
     # passes one: then the ground would have to pull the rear foot
-    front = 0.02 + 1.03 * part**2 * (3 - 2 * part)
+    front = 0.02 + 1.03 * phase**2 * (3 - 2 * phase)
     on_left = jnp.where(
-        jnp.all(stands),
-        jnp.where(place[left] > place[right], front, 1 - front),
-        jnp.where(stands[left], 1.0, 0.0),
+        jnp.all(supports),
+        jnp.where(foot_x[left] > foot_x[right], front, 1 - front),
+        jnp.where(supports[left], 1.0, 0.0),
     )
-    return jnp.stack([on_left, 1 - on_left]) @ jax.vmap(torques_on, (0, None, None))(
+    return jnp.stack([on_left, 1 - on_left]) @ jax.vmap(torques_on_foot, (0, None, None))(
         jnp.asarray([left, right]), state, vdot
     )
 

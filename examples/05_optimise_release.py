@@ -24,7 +24,7 @@ chain, start = high_bar(ignore="limit")
 # all but the free base: q[7:23], v[6:22]
 joints, mass, rest = chain.joint_names[1:], chain.mass.sum(), start.q[7:23]
 limb = jnp.diag(svkc.mass_matrix(chain, start))[6:22]  # kg m^2
-driven = jnp.array(
+driven_joints = jnp.array(
     [
         joints.index(f"{side}_{name}")
         for side in ("right", "left")
@@ -33,8 +33,8 @@ driven = jnp.array(
 )
 bumps = jnp.linspace(0.1, 0.9, 5)  # s: when each bump of a joint's torque is at its top
 # m: the centre of mass on landing; m per (100 N m)^2; of the optimiser; s
-MAT, PRICE, STEPS, END = 1.0, 0.3, 25, 1.9
-EXACT = {
+MAT_HEIGHT, TORQUE_COST, STEPS, END = 1.0, 0.3, 25, 1.9
+OPTIONS = {
     "solver": diffrax.Dopri8(),
     "rtol": 1e-9,
     "atol": 1e-11,
@@ -46,11 +46,11 @@ def control(t, state, torques):
     """Weak springs towards the first pose, and for each driven joint a sum of bumps in time
     (parameters in units of 100 N m)."""
     tau = limb * (25.0 * (rest - state.q[7:23]) - 10.0 * state.v[6:22])
-    tau = tau.at[driven].add(100.0 * torques @ jnp.exp(-(((t - bumps) / 0.15) ** 2)))
+    tau = tau.at[driven_joints].add(100.0 * torques @ jnp.exp(-(((t - bumps) / 0.15) ** 2)))
     return jnp.pad(tau, (6, chain.dofs - 22))  # none at the base, none at the bar
 
 
-def centre(state):
+def center_of_mass(state):
     """The centre of mass: gravity's potential is linear in gravity."""
     return (
         -jax.grad(lambda g: svkc.potential_energy(dataclasses.replace(chain, gravity=g), state))(
@@ -75,7 +75,7 @@ def swing(x, ts=None):
             control=control,
             args=x["torques"],
             throw=False,
-            **EXACT,
+            **OPTIONS,
         ),
         right,
         right + delay,
@@ -86,36 +86,40 @@ def loss(x):
     """A price on torque, less the distance (m) at which the freely falling centre of mass passes
     the mat's height, before or after the run's end."""
     traj, *_ = swing(x)
-    (px, _, pz), (vx, _, vz) = centre(traj.final), svkc.momentum(chain, traj.final)[0] / mass
-    distance = px + vx * (vz + jnp.sqrt(vz**2 + 2 * 9.81 * (pz - MAT))) / 9.81
-    return PRICE * jnp.mean(x["torques"] ** 2) - distance, distance
+    (px, _, pz), (vx, _, vz) = (
+        center_of_mass(traj.final),
+        svkc.momentum(chain, traj.final)[0] / mass,
+    )
+    distance = px + vx * (vz + jnp.sqrt(vz**2 + 2 * 9.81 * (pz - MAT_HEIGHT))) / 9.81
+    return TORQUE_COST * jnp.mean(x["torques"] ** 2) - distance, distance
 
 
 first = x = {
-    "torques": jnp.zeros((len(driven), len(bumps))),
+    "torques": jnp.zeros((len(driven_joints), len(bumps))),
     "times": jax.scipy.special.logit(jnp.array([0.9 / 1.4, 0.25 / 0.4])),
 }
 gradient, adam = jax.jit(jax.value_and_grad(loss, has_aux=True)), optax.adam(0.07)
-memory = adam.init(x)
+optimizer_state = adam.init(x)
 for _ in range(STEPS):
-    change, memory = adam.update(gradient(x)[1], memory)
+    change, optimizer_state = adam.update(gradient(x)[1], optimizer_state)
     x = optax.apply_updates(x, change)
-ts, shown, figure = (
+ts, run_swing, figure = (
     jnp.linspace(0, END, 77),
     jax.jit(swing),
     Figure(figsize=(9, 11), layout="constrained"),
 )
 for axes, steps, at in zip(figure.subplots(2, 1, sharex=True, sharey=True), (0, STEPS), (first, x)):
-    traj, right, left = shown(at, ts)
+    traj, right, left = run_swing(at, ts)
     title = (
         f"after {steps} steps: lands at {(distance := gradient(at)[0][1]):.2f} m, releases at"
         f" {right:.3f} s and {left:.3f} s"
     )
     print(f"{title}; torque parameters up to {100 * jnp.abs(at['torques']).max():.0f} N m")
     positions, path = (
-        np.asarray(jax.vmap(f)(traj.states)) for f in (lambda s: svkc.poses(chain, s)[0], centre)
+        np.asarray(jax.vmap(f)(traj.states))
+        for f in (lambda s: svkc.poses(chain, s)[0], center_of_mass)
     )
-    down = int(np.argmax((path[:, 2] < MAT) & (ts > left))) or len(ts) - 1
+    down = int(np.argmax((path[:, 2] < MAT_HEIGHT) & (ts > left))) or len(ts) - 1
     axes.set(aspect="equal", title=title, xlabel="x (m)", ylabel="z (m)")
     for k in np.linspace(0, down, 10).astype(int):
         color = "#1f5fa8" if ts[k] < right else "#d9822b" if ts[k] < left else "#2f8f4e"
@@ -129,10 +133,12 @@ for axes, steps, at in zip(figure.subplots(2, 1, sharex=True, sharey=True), (0, 
             )
     axes.plot(path[: down + 1, 0], path[: down + 1, 2], "k--", linewidth=1)
     # and the bar; blue: two hands on it, orange: one, green: none
-    axes.plot(distance, MAT, "kv", 0, 2.6, "ko")
+    axes.plot(distance, MAT_HEIGHT, "kv", 0, 2.6, "ko")
 figure.savefig(
     pathlib.Path(sys.argv[1] if len(sys.argv) > 1 else ".") / "05_optimise_release.png", dpi=110
 )
-alone = lambda x: loss(x)[0]
+scalar_loss = lambda x: loss(x)[0]
 for when, at in (("start", first), ("end", x)):
-    print(f"gradient at the {when}: {svkc.check_grad(alone, at, mode='reverse', directions=1)}")
+    print(
+        f"gradient at the {when}: {svkc.check_grad(scalar_loss, at, mode='reverse', directions=1)}"
+    )

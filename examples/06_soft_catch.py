@@ -15,81 +15,87 @@ import matplotlib.pyplot as plt
 import optax
 
 import svkc
-from svkc.scenes import BAR_HEIGHT, high_bar, swinging
+from svkc.scenes import BAR_HEIGHT, hanging_state, high_bar
 
 # s, m/s
-HANDS, CATCH, ARRIVING = ("right_hand_grip", "left_hand_grip"), 0.4, jnp.array([0.6, 0.0, -1.2])
+HANDS, CATCH_TIME, ARRIVAL_VELOCITY = (
+    ("right_hand_grip", "left_hand_grip"),
+    0.4,
+    jnp.array([0.6, 0.0, -1.2]),
+)
 # joint ranges are left out: penalties keep the joints' motion small instead
 chain, _ = high_bar(ignore="limit")
 
 # a flight with arms stretched and limbs at rest, back along its parabola from the bar: nothing but
 # the fall moves the hands, and they come to the bar
-hanging, fall = swinging(chain, angle=0.3), chain.gravity
-q = hanging.q[: chain.nq].at[:3].add(fall * CATCH**2 / 2 - ARRIVING * CATCH)
-start = chain.state(q, {"base": [*(ARRIVING - fall * CATCH), 0, 0, 0]}, connected=())
+hanging_start, fall = hanging_state(chain, angle=0.3), chain.gravity
+q = hanging_start.q[: chain.nq].at[:3].add(fall * CATCH_TIME**2 / 2 - ARRIVAL_VELOCITY * CATCH_TIME)
+start = chain.state(q, {"base": [*(ARRIVAL_VELOCITY - fall * CATCH_TIME), 0, 0, 0]}, connected=())
 # kg m^2: what each joint has to turn
-limb = jnp.diag(svkc.mass_matrix(chain, start))[6:22]
+limb_inertia = jnp.diag(svkc.mass_matrix(chain, start))[6:22]
 
 
 def control(t, state, bend):
     """Torques that change evenly in flight, none after it; alike on both sides. Inner ones: the
     flight's momentum stays as it was."""
-    arm, leg = jnp.split(bend[0] + (bend[1] - bend[0]) * t / CATCH, 2)
-    tau = limb * jnp.concatenate([arm, arm, leg, leg])
+    arm, leg = jnp.split(bend[0] + (bend[1] - bend[0]) * t / CATCH_TIME, 2)
+    tau = limb_inertia * jnp.concatenate([arm, arm, leg, leg])
     return jnp.pad(jnp.where(state.structure.connected[0], 0.0, tau), (6, 2))
 
 
 def fly(p, t1, ts=None):
     """Both hands take hold at a time, wherever they are then: it is for the loss to have them at
     the bar."""
-    events = [svkc.at(CATCH + p["late"] / 100, connect=HANDS, here=True)]
-    exact = {"solver": diffrax.Dopri8(), "rtol": 1e-9, "atol": 1e-11}
+    events = [svkc.at(CATCH_TIME + p["late"] / 100, connect=HANDS, here=True)]
+    options = {"solver": diffrax.Dopri8(), "rtol": 1e-9, "atol": 1e-11}
     return svkc.simulate(
-        chain, start, t1, ts=ts, events=events, control=control, args=p["bend"], **exact
+        chain, start, t1, ts=ts, events=events, control=control, args=p["bend"], **options
     )
 
 
 def loss(p):
     """Energy lost in the catch, 1 J for a hand 1 cm off the bar, a little for torques."""
     traj = fly(p, 0.5)
-    off = traj.final.structure.pos[:, ::2] - jnp.array([0.0, BAR_HEIGHT])
-    found = (
+    hand_offset = traj.final.structure.pos[:, ::2] - jnp.array([0.0, BAR_HEIGHT])
+    metrics = (
         traj.events.energy_lost[0],
         jnp.linalg.norm(traj.events.impulse[0, 0]),
-        100 * jnp.linalg.norm(off[0]),
+        100 * jnp.linalg.norm(hand_offset[0]),
     )
-    return found[0] + 1e4 * jnp.sum(off**2) + 2e-3 * jnp.sum(p["bend"] ** 2), found
+    return metrics[0] + 1e4 * jnp.sum(hand_offset**2) + 2e-3 * jnp.sum(p["bend"] ** 2), metrics
 
 
 # rad/s^2, for four joints of an arm and four of a leg, at the start and at the time meant for the
 # catch; hundredths of a second
 p = first = {"bend": jnp.zeros((2, 8)), "late": jnp.zeros(())}
 step, adam = jax.jit(jax.value_and_grad(loss, has_aux=True)), optax.adam(0.4)
-memory = adam.init(p)
+optimizer_state = adam.init(p)
 for i in range(41):
     (value, (lost, impulse, off)), gradient = step(p)
     if i % 10 == 0:
-        after = CATCH + float(p["late"]) / 100
+        after = CATCH_TIME + float(p["late"]) / 100
         print(
             f"{i}: loss {value:.3f}; a catch after {after:.3f} s costs {lost:.2f} J, {impulse:.2f}"
             f" N s a hand, {off:.1f} cm off the bar"
         )
     if i < 40:
-        change, memory = adam.update(gradient, memory)
+        change, optimizer_state = adam.update(gradient, optimizer_state)
         p = optax.apply_updates(p, change)
-shown = jax.jit(lambda p: fly(p, 0.8, jnp.linspace(0, 0.8, 65)))
+run_flight = jax.jit(lambda p: fly(p, 0.8, jnp.linspace(0, 0.8, 65)))
 folder = pathlib.Path(sys.argv[1] if len(sys.argv) > 1 else ".")
 figure, panels = plt.subplots(1, 2, figsize=(11, 7.6), layout="constrained")
 with tempfile.TemporaryDirectory() as scratch:
     for panel, what, x in zip(panels, ("before", "after"), (first, p)):
         picture = plt.imread(
-            svkc.render(chain, shown(x), pathlib.Path(scratch) / "strobe.png", frames=6)
+            svkc.render(chain, run_flight(x), pathlib.Path(scratch) / "strobe.png", frames=6)
         )
         panel.imshow(picture[:, 270:830])  # without the empty sides
         panel.set_title(what, fontsize=16)
         panel.axis("off")
 figure.savefig(folder / "06_soft_catch.png", dpi=110, bbox_inches="tight")
 print("wrote", folder / "06_soft_catch.png")
-alone = lambda p: loss(p)[0]
+scalar_loss = lambda p: loss(p)[0]
 for when, at in (("start", first), ("end", p)):
-    print(f"gradient at the {when}: {svkc.check_grad(alone, at, mode='reverse', directions=1)}")
+    print(
+        f"gradient at the {when}: {svkc.check_grad(scalar_loss, at, mode='reverse', directions=1)}"
+    )

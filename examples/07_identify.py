@@ -29,7 +29,7 @@ ARM = """<mujoco><worldbody>
         fromto="0 0 0 0 0 -0.3" size="0.02" mass="1"/>
         <body name="end of tool" pos="0 0 -0.3"/></body></body></body></worldbody></mujoco>"""
 chain = svkc.load(ARM, cuttable="wrist")
-links, seen = (
+links, markers = (
     np.array([chain.body_names.index(name) for name in names])
     for names in (["upper", "fore", "tool"], ["fore", "end of fore", "end of tool"])
 )
@@ -37,7 +37,7 @@ rows = np.array(chain.topology.body_row)[links]
 masses, limit = chain.mass[rows], 50.0  # kg, N: as drawn, and the first guess
 start = chain.state({"shoulder": -1.6, "elbow": 0.3, "wrist": 0.2})
 ts, noise = jnp.linspace(0, 0.9, 31), 2e-3  # s, m
-EXACT = {"solver": diffrax.Dopri8(), "rtol": 1e-9, "atol": 1e-11}
+OPTIONS = {"solver": diffrax.Dopri8(), "rtol": 1e-9, "atol": 1e-11}
 
 
 def control(t, state, args):
@@ -62,10 +62,10 @@ def run(p):
         )
     ]
     traj = svkc.simulate(
-        arm, start, ts[-1], ts=ts, events=events, control=control, max_events=1, **EXACT
+        arm, start, ts[-1], ts=ts, events=events, control=control, max_events=1, **OPTIONS
     )
     return (
-        jax.vmap(lambda s: svkc.poses(chain, s)[0])(traj.states)[:, seen][:, :, ::2],
+        jax.vmap(lambda s: svkc.poses(chain, s)[0])(traj.states)[:, markers][:, :, ::2],
         traj.events.time[0],
     )
 
@@ -75,25 +75,25 @@ guess = {"mass": jnp.ones(3), "limit": jnp.ones(())}
 observed = run(true)[0] + noise * np.random.default_rng(0).normal(size=(len(ts), 3, 2))
 # Levenberg and Marquardt's method: few parameters, so forward mode, and one program gives the
 # misses too
-misses = lambda p: (run(p)[0] - observed).ravel()
+residuals = lambda p: (run(p)[0] - observed).ravel()
 x, tree = ravel_pytree(guess)
-derivatives = jax.jit(jax.jacfwd(lambda x: 2 * (misses(tree(x)),), has_aux=True))
+derivatives = jax.jit(jax.jacfwd(lambda x: 2 * (residuals(tree(x)),), has_aux=True))
 (J, r), damping = derivatives(x), 1e-2
 for _ in range(12):
     trial = x - jnp.linalg.solve(J.T @ J + damping * jnp.diag(jnp.sum(J * J, 0)), J.T @ r)
     new = derivatives(trial)
     better = bool(jnp.sum(new[1] ** 2) < jnp.sum(r**2))
     x, (J, r), damping = (trial, new, damping / 10) if better else (x, (J, r), damping * 10)
-found = tree(x)
+estimate = tree(x)
 error = tree(noise * jnp.sqrt(jnp.diag(jnp.linalg.inv(J.T @ J))))
-for what, p in (("true", true), ("guess", guess), ("found", found), ("expected error", error)):
+for what, p in (("true", true), ("guess", guess), ("found", estimate), ("expected error", error)):
     print(
         f"{what}: masses {np.asarray(masses * p['mass']).round(4)} kg, limit"
         f" {limit * p['limit']:.3f} N"
     )
     if what != "expected error":
         print(
-            f"  breaks at {run(p)[1]:.4f} s; misses {1e3 * jnp.sqrt(jnp.mean(misses(p) ** 2)):.2f}"
+            f"  breaks at {run(p)[1]:.4f} s; misses {1e3 * jnp.sqrt(jnp.mean(residuals(p) ** 2)):.2f}"
             " mm rms"
         )
 folder = pathlib.Path(sys.argv[1] if len(sys.argv) > 1 else ".")
@@ -103,7 +103,7 @@ for i, (name, color) in enumerate(
 ):
     for what, path, style in (
         ("guess", run(guess)[0], "--"),
-        ("found", run(found)[0], "-"),
+        ("found", run(estimate)[0], "-"),
         ("observed", observed, "o"),
     ):
         axes.plot(*path[:, i].T, style, color=color, markersize=4, label=f"{name}, {what}")
@@ -116,5 +116,7 @@ axes.set(
 figure.legend(loc="outside lower center", ncols=3)
 figure.savefig(folder / "07_identify.png", dpi=110)
 print("wrote", folder / "07_identify.png")
-for when, at in (("start", guess), ("end", found)):
-    print(f"derivatives at the {when}: {svkc.check_grad(misses, at, directions=1, mode='forward')}")
+for when, at in (("start", guess), ("end", estimate)):
+    print(
+        f"derivatives at the {when}: {svkc.check_grad(residuals, at, directions=1, mode='forward')}"
+    )

@@ -18,7 +18,7 @@ import numpy as np
 import svkc
 from svkc.scenes import high_bar
 
-chain, start = high_bar()
+chain, initial_state = high_bar()
 model = chain.model.model  # mujoco's own, of which the chain was made
 data = mujoco.MjData(model)
 
@@ -30,12 +30,12 @@ with warnings.catch_warnings(action="ignore"):  # glfw warns before it fails
 events = [svkc.at(0.9, cut="right_hand_grip"), svkc.at(1.15, cut="left_hand_grip")]
 ts = np.arange(0, 1.8, 1 / 60)
 states = jax.device_get(
-    svkc.simulate(chain, start, ts[-1], ts=jnp.asarray(ts), events=events).states
+    svkc.simulate(chain, initial_state, ts[-1], ts=jnp.asarray(ts), events=events).states
 )
 
 import mujoco.viewer
 
-others = set(threading.enumerate())
+threads_before = set(threading.enumerate())
 with mujoco.viewer.launch_passive(model, data, show_left_ui=False, show_right_ui=False) as viewer:
     viewer.cam.lookat[:], viewer.cam.distance, viewer.cam.azimuth, viewer.cam.elevation = (
         (0, 0, 2.2),
@@ -52,5 +52,5 @@ with mujoco.viewer.launch_passive(model, data, show_left_ui=False, show_right_ui
             break
         time.sleep(max(0.0, begin + t - time.perf_counter()))
     print(f"played {i + 1} of {len(ts)} states")
-for thread in set(threading.enumerate()) - others:
+for thread in set(threading.enumerate()) - threads_before:
     thread.join()  # the window is mujoco's own thread's: it is to be closed before Python ends

@@ -2,6 +2,6 @@
 
 from svkc.integration.integrators import (
     RodriguesEuler as RodriguesEuler,
-    SemiImplicitEuler as SymplecticEuler,
+    SymplecticEuler as SymplecticEuler,
 )
 from svkc.integration.replay import Replay as Replay

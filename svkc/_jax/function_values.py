@@ -66,11 +66,11 @@ class FunctionPytree(eqx.Module):
     parts: list
     build: Callable = eqx.field(static=True)
 
-    def made(self):
+    def rebuild(self):
         """Return the function or the container itself."""
         return self.build(
             *(
-                x.made()
+                x.rebuild()
                 if isinstance(x, FunctionPytree)
                 else x.value
                 if isinstance(x, StaticValue)
@@ -80,7 +80,7 @@ class FunctionPytree(eqx.Module):
         )
 
     def __call__(self, *args):
-        function = self.made()
+        function = self.rebuild()
         try:
             return function(*args)
         except CONCRETIZATION_ERRORS:

@@ -3,7 +3,7 @@
 import pathlib
 import webbrowser
 
-from svkc.cli.run import print_phases
+from svkc.cli.run import print_report
 
 
 def info(path: str) -> int:
@@ -11,7 +11,7 @@ def info(path: str) -> int:
     import svkc
     from svkc._jax.compilation_cache import use_cache
 
-    kept = use_cache()
+    cache_folder = use_cache()
     try:
         chain = svkc.load(path)
     except ValueError as error:
@@ -19,7 +19,7 @@ def info(path: str) -> int:
         if "not simulated" not in str(error):
             return 1
         chain = svkc.load(path, ignore="all")
-    state = chain.state() if not len(chain.link_names) else _state_or_none(chain)
+    state = chain.state() if not len(chain.link_names) else _load_state(chain)
     print(f"{len(chain.body_names) - 1} bodies: {', '.join(chain.body_names[1:])}")
     print(f"{len(chain.joint_names)} joints: {', '.join(chain.joint_names)}")
     print(f"{len(chain.link_names)} virtual links: {', '.join(chain.link_names) or 'none'}")
@@ -31,12 +31,14 @@ def info(path: str) -> int:
         print(f"as loaded:\n{svkc.mobility(chain, state)}")
     for line in chain.left_out:
         print(f"left out: {line}")
-    _suggest(chain)
-    print(f"compiled programs: {kept or 'not kept'} (SVKC_CACHE_DIR names another folder, or off)")
+    _print_suggestions(chain)
+    print(
+        f"compiled programs: {cache_folder or 'not kept'} (SVKC_CACHE_DIR names another folder, or off)"
+    )
     return 0
 
 
-def _state_or_none(chain):
+def _load_state(chain):
     try:
         return chain.state()
     except ValueError as error:
@@ -44,14 +46,14 @@ def _state_or_none(chain):
         return None
 
 
-def _suggest(chain):
+def _print_suggestions(chain):
     """Joints that can be cut, and bodies at the ends of the tree, which could hold on to
     something."""
     from svkc.mjcf.cuttable_joints import cuttable_joints
 
     def cut(name):
         try:
-            return bool(cuts_of(chain.model.model, [name]))
+            return bool(cuttable_joints(chain.model.model, [name]))
         except ValueError:
             return False
 
@@ -88,14 +90,14 @@ def view(path: pathlib.Path, show: bool) -> int:
     except (ValueError, OSError) as error:
         print(error)
         return 1
-    print_phases(chain, traj)
+    print_report(chain, traj)
     written, missing = [], []
-    for target, how in (
+    for target, write in (
         (path.with_suffix(".html"), lambda p: svkc.render(chain, traj, p)),
         (path.with_name(f"{path.stem}_curves.png"), lambda p: traj.plot(chain).savefig(p)),
     ):
         try:
-            how(target)
+            write(target)
             written.append(target)
         except ImportError as error:
             missing.append(f"{target.name} not drawn: {error}")

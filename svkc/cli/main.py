@@ -9,7 +9,7 @@ import sys
 from svkc.cli import inspect, run
 
 
-def _event(kind: str):
+def _event_parser(kind: str):
     """Reads NAME@TIME."""
 
     def read(text: str):
@@ -27,7 +27,7 @@ def _event(kind: str):
     return read
 
 
-def _parser() -> argparse.ArgumentParser:
+def _argument_parser() -> argparse.ArgumentParser:
     """Return the parser of all commands."""
     parser = argparse.ArgumentParser(
         "svkc",
@@ -67,7 +67,7 @@ def _add_run_options(parser: argparse.ArgumentParser):
             dest="events",
             action="append",
             default=[],
-            type=_event(kind),
+            type=_event_parser(kind),
             metavar="NAME@TIME",
             help=f"{what} at a time, s; again for more, instead of the scene's own events",
         )
@@ -89,7 +89,7 @@ def main(argv=None) -> int:
         or (argv[0].startswith("-") and argv[0] not in ("-h", "--help"))
     ):
         argv = ["run", *argv]
-    options = _parser().parse_args(argv)
+    options = _argument_parser().parse_args(argv)
     if options.command == "run":
         return run.run(
             options.what,

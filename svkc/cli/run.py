@@ -21,10 +21,10 @@ def _high_bar():
 
 
 def _swing():
-    from svkc.scenes.swing import leaving, swing
+    from svkc.scenes.swing import seat_events, swing
 
     chain, state = swing()
-    return chain, state, leaving(chain)
+    return chain, state, seat_events(chain)
 
 
 def _brachiation():
@@ -61,9 +61,9 @@ SCENES = {
 
 def scenes() -> int:
     """The scenes that ship."""
-    wide = max(map(len, SCENES))
+    width = max(map(len, SCENES))
     for name, (_, end, what) in SCENES.items():
-        print(f"{name:<{wide}}  {end:.1f} s  {what}")
+        print(f"{name:<{width}}  {end:.1f} s  {what}")
     print("run one:  svkc run NAME")
     return 0
 
@@ -75,32 +75,32 @@ def run(
 
     events: (kind, link, time), instead of the scene's own.
     """
-    kept = _configure_process()
+    cache_folder = _configure_process()
     import svkc
 
     times = [time.perf_counter()]
-    stages = _stages(quiet)
+    progress = _progress_bar(quiet)
     try:
-        chain, state, events, end = _wanted(name, t1, events, ignore)
+        chain, state, events, end = _prepare_run(name, t1, events, ignore)
         out.mkdir(parents=True, exist_ok=True)
         times.append(time.perf_counter())
-        _next(stages, "compiling, and the first run")
-        _simulated(chain, state, events, end, stages.disable)
+        _next_stage(progress, "compiling, and the first run")
+        _simulate(chain, state, events, end, progress.disable)
     except (ValueError, OSError) as error:
-        stages.close()
+        progress.close()
         print(error)
         return 1
     times.append(time.perf_counter())
-    _next(stages, "a run")
-    traj = _simulated(chain, state, events, end, stages.disable)
+    _next_stage(progress, "a run")
+    traj = _simulate(chain, state, events, end, progress.disable)
     times.append(time.perf_counter())
-    _next(stages, "pictures")
+    _next_stage(progress, "pictures")
     options = {**TOLERANCES, "t1": end, "what": name}
-    written, missing = _write(chain, traj, out, pathlib.Path(name).stem, video, options)
-    _next(stages, "done")
-    stages.close()
-    print_phases(chain, traj)
-    _print_times(times, kept)
+    written, missing = _write_results(chain, traj, out, pathlib.Path(name).stem, video, options)
+    _next_stage(progress, "done")
+    progress.close()
+    print_report(chain, traj)
+    _print_times(times, cache_folder)
     _print_files(written, missing)
     # what ended early is kept and said, and the shell is told
     return 0 if traj.result in (svkc.RESULTS.successful, svkc.RESULTS.stopped) else 1
@@ -114,15 +114,15 @@ def _configure_process() -> pathlib.Path | None:
     jax.config.update("jax_enable_x64", True)
     from svkc._jax.compilation_cache import use_cache
 
-    kept = use_cache()
+    cache_folder = use_cache()
     # tracing makes very many small objects that stay: the collector would look through all of them
     # again and again
     gc.freeze()
     gc.set_threshold(100_000, 20, 50)
-    return kept
+    return cache_folder
 
 
-def _stages(quiet: bool):
+def _progress_bar(quiet: bool):
     """Return the progress bar of the command's four stages."""
     from tqdm import tqdm
 
@@ -135,15 +135,15 @@ def _stages(quiet: bool):
     )
 
 
-def _print_times(times: list[float], kept: pathlib.Path | None):
+def _print_times(times: list[float], cache_folder: pathlib.Path | None):
     """Print the seconds between the four times, and where compiled programs are kept."""
     load, first, second = (b - a for a, b in itertools.pairwise(times))
     print(
         f"load and close the loops {load:.1f} s, first run with compilation"
         f" {first:.1f} s, a run {second:.3f} s"
     )
-    if kept is not None:
-        print(f"compiled programs are kept in {kept}")
+    if cache_folder is not None:
+        print(f"compiled programs are kept in {cache_folder}")
 
 
 def _print_files(written: list[pathlib.Path], missing: list[str]):
@@ -155,7 +155,7 @@ def _print_files(written: list[pathlib.Path], missing: list[str]):
     )
 
 
-def _simulated(chain, state, events, end: float, quiet: bool):
+def _simulate(chain, state, events, end: float, quiet: bool):
     """The run, to its end on the clock. Phases of long runs show how far they are."""
     import diffrax
     import jax
@@ -172,22 +172,22 @@ def _simulated(chain, state, events, end: float, quiet: bool):
     )
 
 
-def _next(stages, what: str):
-    stages.update()
-    stages.set_description(what)
+def _next_stage(progress, description: str):
+    progress.update()
+    progress.set_description(description)
 
 
-def _wanted(name: str, t1: float | None, events, ignore):
+def _prepare_run(name: str, t1: float | None, events, ignore):
     """Chain, state, events and end of the run that was asked for."""
     from svkc.model.validation import positive_scalar
 
-    chain, state, own, end = _scene(name, ignore)
+    chain, state, scene_events, end = _load_scene(name, ignore)
     end = end if t1 is None else t1
-    positive("--t1", end)
-    return chain, state, _asked(chain, events) or own, end
+    positive_scalar("--t1", end)
+    return chain, state, _requested_events(chain, events) or scene_events, end
 
 
-def _scene(name: str, ignore):
+def _load_scene(name: str, ignore):
     """Chain, state, events and end of a scene that ships, or of a model file at its load pose for
     two seconds."""
     import svkc
@@ -201,7 +201,7 @@ def _scene(name: str, ignore):
     return chain, chain.state(), (), 2.0
 
 
-def _asked(chain, events):
+def _requested_events(chain, events):
     """The events of --release and --catch."""
     import svkc
 
@@ -217,7 +217,7 @@ def _asked(chain, events):
     )
 
 
-def _write(
+def _write_results(
     chain, traj, out: pathlib.Path, stem: str, video: bool, options: dict
 ) -> tuple[list, list[str]]:
     """The run and its pictures: what was written, and a line for each that could not be."""
@@ -234,18 +234,18 @@ def _write(
         (f"{stem}.mp4", draw),
         (f"{stem}.html", draw),
     ]
-    for file, how in pictures:
+    for file, write in pictures:
         if file.endswith(".mp4") and not video:
             continue
         try:
-            how(out / file)
+            write(out / file)
             written.append(out / file)
         except (RuntimeError, ImportError) as error:
             missing.append(f"{file} not drawn: {error}")
     return written, missing
 
 
-def print_phases(chain, traj):
+def print_report(chain, traj):
     """Freedoms, rank, mobility, steps and energy before and after each event, then the
     certificate."""
     p, report = traj.phases, traj.report()
@@ -256,15 +256,17 @@ def print_phases(chain, traj):
         )
         for i in range(int(p.count))
     }
-    wide = max(34, *map(len, names.values()))
-    print(f"      from        to  {'held by':<{wide}} joint   rank  mobility   steps  energy drift")
-    print(f"         s         s  {'':<{wide}} freedoms                           J")
+    width = max(34, *map(len, names.values()))
+    print(
+        f"      from        to  {'held by':<{width}} joint   rank  mobility   steps  energy drift"
+    )
+    print(f"         s         s  {'':<{width}} freedoms                           J")
     for i in range(int(p.count)):
         if float(p.start[i]) == float(p.stop[i]) and i:
             continue
         print(
             f"{float(p.start[i]):10.6f}{float(p.stop[i]):10.6f} "
-            f" {names[i]:<{wide}}{int(p.joint_freedoms[i]):6d}{int(p.rank[i]):7d}"
+            f" {names[i]:<{width}}{int(p.joint_freedoms[i]):6d}{int(p.rank[i]):7d}"
             f"{int(p.freedoms[i]):10d}{int(p.accepted[i]):8d}{float(p.energy_drift[i]):14.2e}"
         )
     times = ", ".join(f"{float(t):.6f} s" for t in traj.events.time[: int(traj.events.count)])

@@ -7,21 +7,29 @@ import diffrax
 import jax
 import jax.numpy as jnp
 
-from svkc.integration.event_location import Found
-from svkc.integration.integrators import Motion
-from svkc.integration.replay import staged
-from svkc.integration.solution import EVENT, NON_FINITE, SUCCESSFUL, How, Path, Tally, World
-from svkc.integration.stabilization import projects
-from svkc.integration.vector_field import Field, settle
+from svkc.integration.event_location import EventInfo
+from svkc.integration.integrators import ODEState
+from svkc.integration.replay import with_scan_kind
+from svkc.integration.solution import (
+    EVENT,
+    NON_FINITE,
+    SUCCESSFUL,
+    PhaseProblem,
+    PhaseSolution,
+    Stats,
+    StepperOptions,
+)
+from svkc.integration.stabilization import needs_projection
+from svkc.integration.vector_field import VectorField, project_state
 
 
-class _Interpolation(diffrax.AbstractLocalInterpolation):
+class _ProjectedInterpolation(diffrax.AbstractLocalInterpolation):
     """The inner solver's dense output, drawn to the settled end of the step."""
 
     t0: Any
     t1: Any
     inner: Any
-    shift: Motion
+    shift: ODEState
 
     def evaluate(self, t0, t1=None, left=True):
         def at(t):
@@ -35,18 +43,18 @@ class _Interpolation(diffrax.AbstractLocalInterpolation):
         return jax.tree.map(lambda a, b: b - a, at(t0), at(t1))
 
 
-def _interpolation(cls, *, t0, t1, inner, shift):
-    return _Interpolation(t0=t0, t1=t1, inner=cls(t0=t0, t1=t1, **inner), shift=shift)
+def _make_interpolation(cls, *, t0, t1, inner, shift):
+    return _ProjectedInterpolation(t0=t0, t1=t1, inner=cls(t0=t0, t1=t1, **inner), shift=shift)
 
 
-class Settled(diffrax.AbstractWrappedSolver):
+class ProjectedSolver(diffrax.AbstractWrappedSolver):
     """Any diffrax solver, its steps settled, for diffrax's own adjoints."""
 
     # diffrax takes a wrapper for what it wraps and asks for it; the inner solver has its own
     scan_kind: ClassVar[str] = "inner"
 
     solver: diffrax.AbstractSolver
-    field: Field
+    field: VectorField
 
     @property
     def term_structure(self):  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -54,7 +62,7 @@ class Settled(diffrax.AbstractWrappedSolver):
 
     @property
     def interpolation_cls(self):  # pyright: ignore[reportIncompatibleVariableOverride]
-        return functools.partial(_interpolation, self.solver.interpolation_cls)
+        return functools.partial(_make_interpolation, self.solver.interpolation_cls)
 
     def order(self, terms):
         return self.solver.order(terms)
@@ -72,23 +80,23 @@ class Settled(diffrax.AbstractWrappedSolver):
         return self.solver.func(terms, t0, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        fresh = True if projects(self.field.stabilization, args) else made_jump
+        fresh = True if needs_projection(self.field.stabilization, args) else made_jump
         raw, error, dense, solver_state, result = self.solver.step(
             terms, t0, t1, y0, args, solver_state, made_jump=fresh
         )
-        y1, _ = settle(self.field, args, raw)
+        y1, _ = project_state(self.field, args, raw)
         shift = jax.tree.map(lambda a, b: a - b, y1, raw)
         return y1, error, {"inner": dense, "shift": shift}, solver_state, result
 
 
-def solve_by_diffrax(
-    start: Motion,
+def integrate_with_diffrax(
+    start: ODEState,
     times,
-    world: World,
-    how: How,
+    world: PhaseProblem,
+    how: StepperOptions,
     adjoint: diffrax.AbstractAdjoint,
-    found: Found | None,
-) -> Path:
+    found: EventInfo | None,
+) -> PhaseSolution:
     """Integrate one phase by `diffrax.diffeqsolve` and return its path.
 
     times: the start, the end and the save times. found: the event at the end, None: none.
@@ -99,12 +107,12 @@ def solve_by_diffrax(
     saveat = diffrax.SaveAt(subs=[diffrax.SubSaveAt(t1=True), diffrax.SubSaveAt(ts=at)])
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(world.field),
-        Settled(staged(how.solver, kind), world.field),
+        ProjectedSolver(with_scan_kind(how.solver, kind), world.field),
         t0=t0,
         t1=stop,
         dt0=how.first_step,
         y0=start,
-        args=world.scene,
+        args=world.field_args,
         saveat=saveat,
         stepsize_controller=how.controller,
         adjoint=adjoint,
@@ -115,18 +123,18 @@ def solve_by_diffrax(
     (end, saved), result = solution.ys, solution.result._value
     result = jnp.where(result == diffrax.RESULTS.internal_error._value, NON_FINITE, result)
     if found is not None:
-        result = jnp.where((result == SUCCESSFUL) & found.hit, EVENT, result)
+        result = jnp.where((result == SUCCESSFUL) & found.occurred, EVENT, result)
     accepted = jnp.asarray(solution.stats["num_accepted_steps"], jnp.int32)
     rejected = jnp.asarray(solution.stats["num_rejected_steps"], jnp.int32)
-    return Path(
+    return PhaseSolution(
         t=solution.ts[0][0],
-        end=jax.tree.map(lambda x: x[0], end),
-        saved=saved,
-        times=jnp.zeros(0, t0.dtype),
-        kept=saved,
+        y=jax.tree.map(lambda x: x[0], end),
+        ys=saved,
+        step_ts=jnp.zeros(0, t0.dtype),
+        checkpoints=saved,
         accepted=accepted,
         rejected=rejected,
         result=result,
-        tally=Tally.unknown(t0.dtype, accepted + rejected),
-        found=found,
+        stats=Stats.attempts_only(t0.dtype, accepted + rejected),
+        event=found,
     )

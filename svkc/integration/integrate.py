@@ -15,67 +15,70 @@ from jaxtyping import Array, Float
 
 from svkc._jax.control_flow import buffer_at_set, while_loop
 from svkc._jax.pytrees import tree_where
-from svkc.integration.event_location import Bracket, Search, found, watch
-from svkc.integration.integrators import REST, Motion, finite, motion_norm
+from svkc.integration.event_location import Bracket, EventSearch, event_info, update_search
+from svkc.integration.integrators import MAX_STRETCH, ODEState, is_finite, rms_norm
 from svkc.integration.solution import (
     EVENT,
+    LOOP_OPEN,
     MAX_STEPS,
-    MOVED,
     NON_FINITE,
-    OPEN,
+    PROJECTION_ERROR_WEIGHT,
     SUCCESSFUL,
-    How,
-    Path,
-    Step,
-    Tally,
-    Tried,
-    World,
-    _counted,
+    PhaseProblem,
+    PhaseSolution,
+    Stats,
+    StepAttempt,
+    StepperOptions,
+    StepperState,
+    update_stats,
 )
-from svkc.integration.stabilization import projects
-from svkc.integration.vector_field import Seen, settle
+from svkc.integration.stabilization import needs_projection
+from svkc.integration.vector_field import ProjectionInfo, project_state
 
 
-def march(start: Motion, times, world: World, how: How) -> Path:
+def integrate_phase(
+    start: ODEState, times, world: PhaseProblem, how: StepperOptions
+) -> PhaseSolution:
     """From times = (t0, stop, save times) to `stop`, or to where a guard was zero first."""
     _, stop, at = times
-    world = World(world.scene, dataclasses.replace(world.field, differentiated=False))
+    world = PhaseProblem(world.field_args, dataclasses.replace(world.field, differentiated=False))
 
-    def going(s: Step):
+    def going(s: StepperState):
         more = (s.t < stop) & (s.accepted + s.rejected < how.max_steps)
         if s.search is not None:
-            more = (more | s.search.on) & ~s.search.done
+            more = (more | s.search.active) & ~s.search.done
         return more & (s.result == SUCCESSFUL)
 
-    begin, buffers = _begin(start, times, world, how), lambda s: (s.times, s.kept, s.saved)
+    begin, buffers = (
+        _init_stepper(start, times, world, how),
+        lambda s: (s.step_ts, s.checkpoints, s.ys),
+    )
     end = while_loop(
-        going, lambda s: _step(s, times, world, how), begin, buffers=buffers, kind="lax"
+        going, lambda s: _body_fun(s, times, world, how), begin, buffers=buffers, kind="lax"
     )
-    how.progress_meter.close(end.meter)
+    how.progress_meter.close(end.progress_meter_state)
     # of times that are equal the first one's row is written
-    saved = (
-        jax.tree.map(lambda x: x[jnp.searchsorted(at, at)], end.saved) if at.shape[0] else end.saved
-    )
+    saved = jax.tree.map(lambda x: x[jnp.searchsorted(at, at)], end.ys) if at.shape[0] else end.ys
     short = jnp.where(end.t < stop, MAX_STEPS, SUCCESSFUL)
-    fired = None if how.watched is None else found(end.search, end.guards, end.t)
+    fired = None if how.armed_guards is None else event_info(end.search, end.guard_values, end.t)
     if fired is not None:
-        short = jnp.where(fired.hit, EVENT, short)
+        short = jnp.where(fired.occurred, EVENT, short)
     result = jnp.where(end.result == SUCCESSFUL, short, end.result)
-    return Path(
+    return PhaseSolution(
         t=end.t,
-        end=end.y,
-        saved=saved,
-        times=end.times,
-        kept=end.kept,
+        y=end.y,
+        ys=saved,
+        step_ts=end.step_ts,
+        checkpoints=end.checkpoints,
         accepted=end.accepted,
         rejected=end.rejected,
         result=result.astype(jnp.int32),
-        tally=end.tally,
-        found=fired,
+        stats=end.stats,
+        event=fired,
     )
 
 
-def _begin(start: Motion, times, world: World, how: How) -> Step:
+def _init_stepper(start: ODEState, times, world: PhaseProblem, how: StepperOptions) -> StepperState:
     t0, stop, at = times
     term, no, zero = diffrax.ODETerm(world.field), jnp.zeros((), bool), jnp.zeros((), jnp.int32)
     first, controller = how.controller.init(
@@ -84,186 +87,210 @@ def _begin(start: Motion, times, world: World, how: How) -> Step:
         stop,
         start,
         how.first_step,
-        world.scene,
+        world.field_args,
         func=how.solver.func,
         error_order=how.solver.error_order(term),
     )
     rows = lambda n: jax.tree.map(lambda x: jnp.broadcast_to(x[None], (n, *x.shape)), start)
-    values, search, seen = None, None, Seen.first(world.field, world.scene, start.q)
-    if how.watched is not None:
-        values = how.watched.values
-        search = Search(
-            span=t0,
-            side=jnp.zeros_like(values),
-            size=values,
+    values, search, seen = (
+        None,
+        None,
+        ProjectionInfo.initial(world.field, world.field_args, start.q),
+    )
+    if how.armed_guards is not None:
+        values = how.armed_guards.initial_values
+        search = EventSearch(
+            step_size=t0,
+            sides=jnp.zeros_like(values),
+            magnitudes=values,
             bracket=Bracket.around(t0, t0, t0, t0),
-            motion=start,
+            y=start,
             values=values,
-            ahead=values,
-            on=no,
-            narrow=no,
+            values_after=values,
+            active=no,
+            narrowing=no,
             done=no,
         )
-    return Step(
+    return StepperState(
         t=t0,
         y=start,
-        next=_met(t0, first, times),
-        length=first - t0,
-        jumped=no,
-        solver=how.solver.init(term, t0, first, start, world.scene),
-        controller=controller,
-        meter=how.progress_meter.init(),
-        guards=values,
+        tnext=_clip_to_save_time(t0, first, times),
+        step_size=first - t0,
+        made_jump=no,
+        solver_state=how.solver.init(term, t0, first, start, world.field_args),
+        controller_state=controller,
+        progress_meter_state=how.progress_meter.init(),
+        guard_values=values,
         search=search,
-        times=jnp.full(how.max_steps, jnp.inf, t0.dtype),
-        kept=rows(how.max_steps // how.every),
-        saved=rows(at.shape[0]),
+        step_ts=jnp.full(how.max_steps, jnp.inf, t0.dtype),
+        checkpoints=rows(how.max_steps // how.checkpoint_interval),
+        ys=rows(at.shape[0]),
         accepted=zero,
         rejected=zero,
         result=jnp.asarray(SUCCESSFUL, jnp.int32),
-        tally=Tally.none(t0.dtype, seen is not None and seen.pivots is not None),
-        seen=seen,
+        stats=Stats.zeros(t0.dtype, seen is not None and seen.pivots is not None),
+        projection_info=seen,
     )
 
 
-def _met(t, proposed, times) -> Float[Array, ""]:
+def _clip_to_save_time(t, proposed, times) -> Float[Array, ""]:
     """The end of a step from t: as proposed, or the next time to be met."""
     _, stop, at = times
     limit = jnp.minimum(stop, jnp.min(jnp.where(at > t, at, jnp.inf), initial=jnp.inf))
-    return jnp.where(t + (proposed - t) * (1 + REST) >= limit, limit, proposed)
+    return jnp.where(t + (proposed - t) * (1 + MAX_STRETCH) >= limit, limit, proposed)
 
 
-def _try(s: Step, t1, world: World, how: How) -> Tried:
+def _attempt_step(s: StepperState, t1, world: PhaseProblem, how: StepperOptions) -> StepAttempt:
     """A step of the solver to t1, settled, and what the controller says of it."""
     term, stabilization = diffrax.ODETerm(world.field), world.field.stabilization
     # a step begins with the rate where the one before was settled to, not with one remembered from
     # where it was before that
-    fresh = True if projects(stabilization, world.scene) else s.jumped
+    fresh = True if needs_projection(stabilization, world.field_args) else s.made_jump
     y, error, _, solver, solved = how.solver.step(
-        term, s.t, t1, s.y, world.scene, s.solver, made_jump=fresh
+        term, s.t, t1, s.y, world.field_args, s.solver, made_jump=fresh
     )
-    raw, (y, seen) = y, settle(world.field, world.scene, y)
-    if error is not None and world.field.pivotless:
+    raw, (y, seen) = y, project_state(world.field, world.field_args, y)
+    if error is not None and world.field.projects_by_loop_forces:
         # without pivots nothing else shows that loops lose rank
         error = jax.tree.map(
-            lambda e, new, old: jnp.maximum(jnp.abs(e), MOVED * jnp.abs(new - old)), error, y, raw
+            lambda e, new, old: jnp.maximum(
+                jnp.abs(e), PROJECTION_ERROR_WEIGHT * jnp.abs(new - old)
+            ),
+            error,
+            y,
+            raw,
         )
-    whole, order = finite(y), how.solver.error_order(term)
-    why = jnp.where(whole, OPEN, NON_FINITE)
+    whole, order = is_finite(y), how.solver.error_order(term)
+    why = jnp.where(whole, LOOP_OPEN, NON_FINITE)
     if seen is not None:
         whole = whole & (jnp.max(seen.gap) <= how.gap)
     error = jax.tree.map(lambda x: jnp.where(whole & jnp.isfinite(x), x, jnp.inf), error)
     keep, t, ahead, jumped, controller, said = how.controller.adapt_step_size(
-        s.t, t1, s.y, y, world.scene, error, error_order=order, controller_state=s.controller
+        s.t, t1, s.y, y, world.field_args, error, error_order=order, controller_state=s.controller
     )
     keep, length = jnp.asarray(keep), ahead - t
     if isinstance(how.controller, diffrax.PIDController):
         # the length asked for before a step was much shortened, where that step says no more than
         # that it may grow as far as it ever may
         grown = keep & (length >= 0.99 * how.controller.factormax * (t1 - s.t))
-        length = jnp.where(grown, jnp.maximum(length, s.length), length)
+        length = jnp.where(grown, jnp.maximum(length, s.step_size), length)
     failed = keep & (solved._value != SUCCESSFUL)
     result = jnp.where(failed, solved._value, said._value)
     # what is not finite, or open, is never kept: it ends the run where the step has to be of that
     # length, or when there is no shorter one
     result = jnp.where(~whole & (keep | (result != SUCCESSFUL)), why, result).astype(jnp.int32)
-    estimate = jnp.asarray(jnp.inf, t.dtype) if error is None else motion_norm(error)
-    return Tried(
+    estimate = jnp.asarray(jnp.inf, t.dtype) if error is None else rms_norm(error)
+    return StepAttempt(
         t=t,
         y=y,
-        keep=keep & whole,
-        length=length,
-        jumped=jnp.asarray(jumped),
-        solver=solver,
-        controller=controller,
+        keep_step=keep & whole,
+        step_size=length,
+        made_jump=jnp.asarray(jumped),
+        solver_state=solver,
+        controller_state=controller,
         result=result,
-        error=estimate,
-        seen=seen,
+        error_norm=estimate,
+        projection_info=seen,
     )
 
 
-def _located(s: Step, world: World, how: How) -> tuple[Tried, Array, Search, Array]:
+def _attempt_and_locate(
+    s: StepperState, world: PhaseProblem, how: StepperOptions
+) -> tuple[StepAttempt, Array, EventSearch, Array]:
     """Take a try of a step and look at the guards there. Return it, the values of the guards, the
     search for the zero of one, and whether that search goes on or has just ended."""
-    t1 = jnp.where(s.search.on, s.search.asked(), s.next)
-    tried = _try(s, t1, world, how)
-    guards, search = watch(
+    t1 = jnp.where(s.search.active, s.search.next_time(), s.tnext)
+    tried = _attempt_step(s, t1, world, how)
+    guards, search = update_search(
         s.search,
-        s.guards,
+        s.guard_values,
         t0=s.t,
         t1=t1,
         y=tried.y,
-        keep=tried.keep,
-        scene=world.scene,
-        watched=how.watched,
+        keep=tried.keep_step,
+        scene=world.field_args,
+        watched=how.armed_guards,
     )
-    still = s.search.on | search.on
-    blind = tried.keep & jnp.any(jnp.isnan(guards))
-    t, y = tree_where(search.done, (search.bracket.b, search.motion), (tried.t, tried.y))
+    still = s.search.active | search.active
+    blind = tried.keep_step & jnp.any(jnp.isnan(guards))
+    t, y = tree_where(search.done, (search.bracket.b, search.y), (tried.t, tried.y))
     tried = dataclasses.replace(
         tried,
         t=t,
         y=y,
-        keep=(tried.keep & ~blind & ~still) | search.done,
+        keep_step=(tried.keep_step & ~blind & ~still) | search.done,
         result=jnp.where(blind, NON_FINITE, tried.result),
     )
     return tried, guards, search, still
 
 
-def _saved(s: Step, tried: Tried, t, at, accepted, every: int) -> tuple[Motion, Motion]:
+def _write_states(
+    s: StepperState, tried: StepAttempt, t, at, accepted, every: int
+) -> tuple[ODEState, ODEState]:
     """Return the saved states and the kept ones, with the state after a try written in where it is
     one of them. t, accepted: the time and the number of steps after it."""
-    saved, kept = s.saved, s.kept
+    saved, kept = s.ys, s.checkpoints
     if at.shape[0]:
         place = jnp.minimum(jnp.sum(at < t, dtype=jnp.int32), at.shape[0] - 1)
-        saved = _written(saved, place, tried.y, tried.keep & (at[place] == t))
+        saved = _write_row(saved, place, tried.y, tried.keep_step & (at[place] == t))
     if kept.q.shape[0]:
-        kept = _written(kept, accepted // every - 1, tried.y, tried.keep & (accepted % every == 0))
+        kept = _write_row(
+            kept, accepted // every - 1, tried.y, tried.keep_step & (accepted % every == 0)
+        )
     return saved, kept
 
 
-def _step(s: Step, times, world: World, how: How) -> Step:
+def _body_fun(s: StepperState, times, world: PhaseProblem, how: StepperOptions) -> StepperState:
     """One try: kept, or to be made shorter; or one more look at the step in which a guard went
     through zero."""
     t0, stop, at = times
-    if s.seen is not None and s.seen.pivots is not None and world.field.dynamics.hold is not None:
+    if (
+        s.projection_info is not None
+        and s.projection_info.pivots is not None
+        and world.field.dynamics.hold is not None
+    ):
         world = eqx.tree_at(
-            lambda w: w.scene.pivots, world, s.seen.pivots, is_leaf=lambda x: x is None
+            lambda w: w.field_args.pivots,
+            world,
+            s.projection_info.pivots,
+            is_leaf=lambda x: x is None,
         )
     if s.search is None:
-        tried = _try(s, s.next, world, how)
+        tried = _attempt_step(s, s.tnext, world, how)
         guards, search, still = None, None, jnp.zeros((), bool)
     else:
-        tried, guards, search, still = _located(s, world, how)
-    moved = lambda new, old: tree_where(tried.keep, new, old)
+        tried, guards, search, still = _attempt_and_locate(s, world, how)
+    moved = lambda new, old: tree_where(tried.keep_step, new, old)
     # while a zero is looked for, nothing else goes on
     next_ = lambda new, old: tree_where(still, old, new)
-    t, accepted = moved(tried.t, s.t), s.accepted + tried.keep.astype(jnp.int32)
-    saved, kept = _saved(s, tried, t, at, accepted, how.every)
+    t, accepted = moved(tried.t, s.t), s.accepted + tried.keep_step.astype(jnp.int32)
+    saved, kept = _write_states(s, tried, t, at, accepted, how.checkpoint_interval)
     result = next_(tried.result, s.result)
-    return Step(
+    return StepperState(
         t=t,
         y=moved(tried.y, s.y),
-        next=next_(_met(t, t + tried.length, times), s.next),
-        length=next_(tried.length, s.length),
-        jumped=moved(tried.jumped, s.jumped),
-        solver=moved(tried.solver, s.solver),
-        controller=next_(tried.controller, s.controller),
-        meter=how.progress_meter.step(s.meter, (t - t0) / jnp.where(stop > t0, stop - t0, 1)),
-        guards=None if guards is None else moved(guards, s.guards),
+        tnext=next_(_clip_to_save_time(t, t + tried.step_size, times), s.tnext),
+        step_size=next_(tried.step_size, s.step_size),
+        made_jump=moved(tried.made_jump, s.made_jump),
+        solver_state=moved(tried.solver, s.solver),
+        controller_state=next_(tried.controller, s.controller),
+        progress_meter_state=how.progress_meter.step(
+            s.progress_meter_state, (t - t0) / jnp.where(stop > t0, stop - t0, 1)
+        ),
+        guard_values=None if guards is None else moved(guards, s.guard_values),
         search=search,
-        times=_written(s.times, s.accepted, t, tried.keep),
-        kept=kept,
-        saved=saved,
+        step_ts=_write_row(s.step_ts, s.accepted, t, tried.keep_step),
+        checkpoints=kept,
+        ys=saved,
         accepted=accepted,
-        rejected=s.rejected + (~tried.keep & ~still).astype(jnp.int32),
+        rejected=s.rejected + (~tried.keep_step & ~still).astype(jnp.int32),
         result=result,
-        tally=_counted(s, tried, result, world.scene),
-        seen=moved(tried.seen, s.seen),
+        stats=update_stats(s, tried, result, world.field_args),
+        projection_info=moved(tried.projection_info, s.projection_info),
     )
 
 
-def _written(rows, i, new, pred):
+def _write_row(rows, i, new, pred):
     """Rows of numbers with new ones at i."""
     # the index of a row that is not to be written may be anything
     i = jnp.where(pred, i, 0)

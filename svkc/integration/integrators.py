@@ -20,10 +20,10 @@ from svkc.tree.configuration import integrate
 from svkc.tree.inverse_dynamics import limit_forces
 
 # a step that would leave less than this part of itself before a time to be met goes all the way
-REST = 1e-6
+MAX_STRETCH = 1e-6
 
 
-class Motion(eqx.Module):
+class ODEState(eqx.Module):
     """What is integrated: q, v, and the work (J) done by control, limits and dampers; None where
     the scene has none of them."""
 
@@ -32,7 +32,7 @@ class Motion(eqx.Module):
     work: Float[Array, ""] | None = None
 
 
-class Scene(eqx.Module):
+class FieldArgs(eqx.Module):
     """The `args` of the vector field: all it depends on besides time and motion. pivots: of the
     loops' rows, where they are held (`AbstractDynamics.hold`)."""
 
@@ -42,7 +42,7 @@ class Scene(eqx.Module):
     pivots: Float[Array, "steps dofs"] | None = None
 
 
-def finite(y: Motion) -> Bool[Array, ""]:
+def is_finite(y: ODEState) -> Bool[Array, ""]:
     """Whether every number is."""
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(y)]))
 
@@ -57,25 +57,25 @@ class FixedSteps(diffrax.AbstractStepSizeController):
     def wrap(self, direction):
         return self
 
-    def _next(self, t):
+    def _tnext(self, t):
         times = jnp.where(self.ts > t, self.ts, jnp.inf)
         stop = jnp.min(times, initial=jnp.inf)
-        return jnp.where(t + self.dt * (1 + REST) >= stop, stop, t + self.dt)
+        return jnp.where(t + self.dt * (1 + MAX_STRETCH) >= stop, stop, t + self.dt)
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
-        return self._next(t0), None
+        return self._tnext(t0), None
 
     def adapt_step_size(
         self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
     ):
-        whole = finite(y1_candidate)
+        whole = is_finite(y1_candidate)
         said = diffrax.RESULTS.where(
             whole, diffrax.RESULTS.successful, diffrax.RESULTS.internal_error
         )
-        return whole, jnp.where(whole, t1, t0), self._next(t1), False, controller_state, said
+        return whole, jnp.where(whole, t1, t0), self._tnext(t1), False, controller_state, said
 
 
-def motion_norm(error: Motion) -> Float[Array, ""]:
+def rms_norm(error: ODEState) -> Float[Array, ""]:
     """Root mean square over q and v alone: work and guards do not choose the step."""
     both = jnp.concatenate([error.q, error.v])
     return jnp.sqrt(jnp.mean(both * both))
@@ -92,7 +92,7 @@ class RodriguesEuler(diffrax.AbstractSolver):
     term_structure: ClassVar = diffrax.AbstractTerm
     interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
 
-    def _moving(self, before, after):
+    def _position_velocity(self, before, after):
         """The velocity that q goes by."""
         return before
 
@@ -111,12 +111,14 @@ class RodriguesEuler(diffrax.AbstractSolver):
         moved = eqx.tree_at(lambda y: y.v, y0, y0.v + dt * rate.v)
         if y0.work is not None:
             moved = eqx.tree_at(lambda y: y.work, moved, y0.work + dt * rate.work)
-        v = jnp.where(active_dofs(args.chain, args.structure), self._moving(y0.v, moved.v), 0)
+        v = jnp.where(
+            active_dofs(args.chain, args.structure), self._position_velocity(y0.v, moved.v), 0
+        )
         y1 = eqx.tree_at(lambda y: y.q, moved, integrate(args.chain, y0.q, dt * v))
         return y1, None, {"y0": y0, "y1": y1}, None, diffrax.RESULTS.successful
 
 
-class SemiImplicitEuler(RodriguesEuler):
+class SymplecticEuler(RodriguesEuler):
     """Symplectic Euler: the velocity first, v(t + dt) = v(t) + vdot dt, then q moved by the new one
     along the exponential map. First order; on conservative open chains the energy's error stays
     bounded. For `svkc.simulate` alone, with dt.

@@ -3,7 +3,7 @@
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from svkc.integration.integrators import Scene
+from svkc.integration.integrators import FieldArgs
 from svkc.model.validation import integer, scalar
 
 
@@ -46,6 +46,6 @@ class NoStabilization(AbstractStabilization):
     """Nothing is done about loop drift."""
 
 
-def projects(stabilization, scene: Scene) -> bool:
+def needs_projection(stabilization, scene: FieldArgs) -> bool:
     """Whether steps are put back onto the loops."""
     return bool(scene.chain.topology.link_names) and isinstance(stabilization, Projection)

@@ -6,13 +6,13 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from svkc.integration.integrators import Motion, Scene
+from svkc.integration.integrators import FieldArgs, ODEState
 from svkc.integration.stabilization import (
     AbstractStabilization,
     Baumgarte,
     CoordinatePartitioning,
     Projection,
-    projects,
+    needs_projection,
 )
 from svkc.loops.constrained_dynamics import AbstractDynamics, ArticulatedBodies
 from svkc.loops.forward_dynamics import (
@@ -28,7 +28,7 @@ from svkc.tree.inverse_dynamics import limit_forces
 from svkc.tree.traversal import LEVELS_UNROLLED
 
 
-class Field(eqx.Module):
+class VectorField(eqx.Module):
     """The vector field of one phase: qdot, vdot, power. differentiated: or in a loop that nothing
     differentiates, where a `vmap` keeps lanes last."""
 
@@ -38,7 +38,7 @@ class Field(eqx.Module):
     differentiated: bool = eqx.field(static=True, default=True)
 
     @property
-    def pivotless(self) -> bool:
+    def projects_by_loop_forces(self) -> bool:
         """Whether steps are put back onto the loops by the loops' forces, without pivots."""
         return (
             not self.dynamics.uses_pivots
@@ -46,16 +46,16 @@ class Field(eqx.Module):
             and not isinstance(self.stabilization, CoordinatePartitioning)
         )
 
-    def __call__(self, t, y: Motion, scene: Scene) -> Motion:
+    def __call__(self, t, y: ODEState, scene: FieldArgs) -> ODEState:
         chain, structure, held = scene.chain, scene.structure, self.stabilization
         if isinstance(held, CoordinatePartitioning):
-            y, _ = settle(self, scene, y)
+            y, _ = project_state(self, scene, y)
         tau, power = self.torques(t, y, scene)
         rate, agree = (
             held.rate if isinstance(held, Baumgarte) else None,
-            isinstance(held, Projection) and not self.pivotless,
+            isinstance(held, Projection) and not self.projects_by_loop_forces,
         )
-        if self._in_lanes(chain) and not agree:
+        if self._batches_lanes_last(chain) and not agree:
             v, vdot = velocity_and_acceleration_lanes_last(chain, structure, y.q, y.v, tau, rate)
         else:
             v, vdot = velocity_and_acceleration(
@@ -69,13 +69,13 @@ class Field(eqx.Module):
                 project_velocity=agree,
                 pivots=scene.pivots,
             )
-        return Motion(
+        return ODEState(
             configuration_derivative(chain, y.q, jnp.where(active_dofs(chain, structure), v, 0)),
             vdot,
             power,
         )
 
-    def _in_lanes(self, chain: Chain) -> bool:
+    def _batches_lanes_last(self, chain: Chain) -> bool:
         """Whether it is for speed alone, and accelerations are had by articulated bodies, level by
         level."""
         return (
@@ -84,7 +84,7 @@ class Field(eqx.Module):
             and len(chain.topology.levels) <= LEVELS_UNROLLED
         )
 
-    def torques(self, t, y: Motion, scene: Scene):
+    def torques(self, t, y: ODEState, scene: FieldArgs):
         """Joint torques of the control and the limits, and the power of all that is not
         conservative (None: there is none)."""
         chain = scene.chain
@@ -101,7 +101,7 @@ class Field(eqx.Module):
         return tau, tau @ v if chain.damping is None else tau @ v - jnp.sum(chain.damping * v * v)
 
 
-class Seen(eqx.Module):
+class ProjectionInfo(eqx.Module):
     """What the loops show as a step is put back onto them: how far each loop is open yet (rad,
     `chain.length`s) and, where pivots are chosen, |R_mm| / |R_11| and those to go on with."""
 
@@ -110,16 +110,16 @@ class Seen(eqx.Module):
     pivots: Float[Array, "steps dofs"] | None = None
 
     @classmethod
-    def first(cls, field: Field, scene: Scene, q) -> "Seen | None":
+    def initial(cls, field: VectorField, scene: FieldArgs, q) -> "Seen | None":
         """Before the first step."""
-        if not projects(field.stabilization, scene):
+        if not needs_projection(field.stabilization, scene):
             return None
         links, dofs = len(scene.chain.link_names), scene.chain.dofs
         gap = jnp.zeros((links, 2), q.dtype)
         # the first evaluation of the field finds no pivots held, and chooses
         return (
             cls(gap)
-            if field.pivotless
+            if field.projects_by_loop_forces
             else cls(gap, jnp.ones((), q.dtype), jnp.zeros((min(6 * links, dofs), dofs), q.dtype))
         )
 
@@ -129,13 +129,15 @@ class Seen(eqx.Module):
         return jnp.any(self.pivots > 0, 0)
 
 
-def settle(field: Field, scene: Scene, y: Motion) -> tuple[Motion, Seen | None]:
+def project_state(
+    field: VectorField, scene: FieldArgs, y: ODEState
+) -> tuple[ODEState, ProjectionInfo | None]:
     """The motion put back: quaternions to unit length, loops closed, velocities in agreement; and
     what that showed (None: loops are left alone)."""
     chain, structure, held = scene.chain, scene.structure, field.stabilization
-    if not projects(held, scene):
+    if not needs_projection(held, scene):
         return eqx.tree_at(lambda y: y.q, y, normalize(chain, y.q)), None
-    if field.pivotless:
+    if field.projects_by_loop_forces:
         q, v, *seen = project_by_loop_forces(
             chain,
             structure,
@@ -155,4 +157,4 @@ def settle(field: Field, scene: Scene, y: Motion) -> tuple[Motion, Seen | None]:
             pivots=scene.pivots,
             hold=field.dynamics.hold or 0.0,
         )
-    return eqx.tree_at(lambda y: (y.q, y.v), y, (q, v)), Seen(*seen)
+    return eqx.tree_at(lambda y: (y.q, y.v), y, (q, v)), ProjectionInfo(*seen)

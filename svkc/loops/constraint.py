@@ -183,7 +183,7 @@ def loop_jacobian_dot_v(
     carried = motion_cross(x, y + z) + motion_cross(y, z)
     bias = bias + jnp.where(is_ball, 0, carried)
     A_virtual = shift_motion(A[structure.parent], end.from_parent_root) + bias
-    A_real = shift_motion(A[structure.real], end.real)
+    A_real = shift_motion(A[structure.real], end.real_position)
     return jnp.where(structure.connected[:, None], A_virtual - A_real, 0).reshape(-1)
 
 

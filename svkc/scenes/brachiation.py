@@ -4,7 +4,14 @@ import numpy as np
 
 from svkc.mjcf.load import load
 from svkc.model.chain import Chain, State
-from svkc.scenes.figure import ARM, BAR_HEIGHT, add_rod, figure16, hand_on_bar, hanging
+from svkc.scenes.figure import (
+    ARM_LENGTH,
+    BAR_HEIGHT,
+    add_rod,
+    figure16,
+    hand_on_bar,
+    hanging_base_pose,
+)
 
 RADIUS = 0.02  # m: of bars and of the rails that carry them
 SPACING = 0.5  # m: from bar to bar
@@ -33,14 +40,14 @@ def brachiation(**options) -> tuple[Chain, State]:
         for bar, (side, y) in enumerate((("right", -HAND), ("left", HAND), ("right", -HAND)))
     ]
     chain = load(spec, virtual_links=hands, **options)
-    return chain, swung_back(chain, angle=0.9)
+    return chain, hanging_state(chain, angle=0.9)
 
 
-def swung_back(chain: Chain, angle: float) -> State:
+def hanging_state(chain: Chain, angle: float) -> State:
     """Hanging from the first bar by the right hand, the whole figure turned back by `angle` (rad)
     about the bar, at rest, the left arm half way up."""
     q = {
-        "base": hanging(ARM, angle),
+        "base": hanging_base_pose(ARM_LENGTH, angle),
         "right_shoulder_flexion": np.pi - 0.1,
         "right_elbow": 0.1,
         "left_shoulder_flexion": 1.2,

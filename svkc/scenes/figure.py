@@ -8,8 +8,8 @@ from svkc.model.virtual_link import VirtualLink
 
 FOLDER = pathlib.Path(__file__).parent
 BAR_HEIGHT = 2.6  # m: bars above the ground
-SHOULDER = 0.5155  # m: the shoulders above the hips
-ARM = 0.2817 + 0.2689  # m: from the shoulder to the wrist
+SHOULDER_ABOVE_HIPS = 0.5155  # m: the shoulders above the hips
+ARM_LENGTH = 0.2817 + 0.2689  # m: from the shoulder to the wrist
 PALM = 0.0681  # m: from the wrist to the palm's centre
 
 
@@ -50,13 +50,13 @@ def hand_on_bar(name: str, side: str, *, x: float, y: float, connected: bool) ->
     )
 
 
-def hanging(arm: float, angle: float) -> list[float]:
+def hanging_base_pose(arm: float, angle: float) -> list[float]:
     """Return the base's pose, (x, y, z) in m and a quaternion, of the figure that hangs from the
     bar above the origin.
 
     arm: how far the shoulders are below the wrists (m). angle: of the whole figure about the bar,
     backwards (rad).
     """
-    below = arm + PALM + SHOULDER
-    turn = [np.cos(angle / 2), 0.0, np.sin(angle / 2), 0.0]
-    return [-below * np.sin(angle), 0.0, BAR_HEIGHT - below * np.cos(angle), *turn]
+    distance = arm + PALM + SHOULDER_ABOVE_HIPS
+    quaternion = [np.cos(angle / 2), 0.0, np.sin(angle / 2), 0.0]
+    return [-distance * np.sin(angle), 0.0, BAR_HEIGHT - distance * np.cos(angle), *quaternion]

@@ -4,9 +4,16 @@ import numpy as np
 
 from svkc.mjcf.load import load
 from svkc.model.chain import Chain, State
-from svkc.scenes.figure import ARM, BAR_HEIGHT, add_rod, figure16, hand_on_bar, hanging
+from svkc.scenes.figure import (
+    ARM_LENGTH,
+    BAR_HEIGHT,
+    add_rod,
+    figure16,
+    hand_on_bar,
+    hanging_base_pose,
+)
 
-GRIP = 0.30  # m: half the distance between the hands
+HALF_GRIP_WIDTH = 0.30  # m: half the distance between the hands
 
 
 def high_bar(**options) -> tuple[Chain, State]:
@@ -22,17 +29,17 @@ def high_bar(**options) -> tuple[Chain, State]:
         add_rod(spec, (0, y, 0), (0, y, BAR_HEIGHT), radius=0.03)
     hands = [
         hand_on_bar(f"{side}_hand_grip", side, x=0.0, y=y, connected=True)
-        for side, y in (("right", -GRIP), ("left", GRIP))
+        for side, y in (("right", -HALF_GRIP_WIDTH), ("left", HALF_GRIP_WIDTH))
     ]
     chain = load(spec, virtual_links=hands, **options)
-    return chain, swinging(chain, angle=1.7)
+    return chain, hanging_state(chain, angle=1.7)
 
 
-def swinging(chain: Chain, angle: float) -> State:
+def hanging_state(chain: Chain, angle: float) -> State:
     """Hanging from the bar by both hands, the whole figure turned by `angle` (rad) about the bar,
     at rest."""
-    spread = np.arcsin((GRIP - 0.18) / ARM)
-    q = {"base": hanging(ARM * np.cos(spread), angle)}
+    spread = np.arcsin((HALF_GRIP_WIDTH - 0.18) / ARM_LENGTH)
+    q = {"base": hanging_base_pose(ARM_LENGTH * np.cos(spread), angle)}
     for side in ("right", "left"):
         q |= {
             f"{side}_shoulder_flexion": np.pi - 0.1,

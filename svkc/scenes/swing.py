@@ -12,8 +12,11 @@ from svkc.transitions.guards import touch
 
 # m: pivot above the ground, plate under it; half the distance of the rods; half the depth of the
 # plate
-TOP, DROP, HALF, EDGE = 3.2, 2.0, 0.33, 0.2
-GRASP, SIT = 1.3, 0.07  # m: hands under the pivot; thigh's axis above the plate
+PIVOT_HEIGHT, ROD_LENGTH, HALF_WIDTH, PLATE_EDGE = 3.2, 2.0, 0.33, 0.2
+HANDS_BELOW_PIVOT, THIGH_ABOVE_PLATE = (
+    1.3,
+    0.07,
+)  # m: hands under the pivot; thigh's axis above the plate
 
 
 def swing(angle: float = 0.6, **options) -> tuple[Chain, State]:
@@ -24,29 +27,37 @@ def swing(angle: float = 0.6, **options) -> tuple[Chain, State]:
     thigh has passed the plate's edge: two fewer after both have. State: at rest, the swing turned
     by `angle` (rad) about its pivot. `options` go to `svkc.load`.
     """
-    spec, links = parts()
+    spec, links = model_and_links()
     chain = load(spec, virtual_links=links, **options)
     return chain, _sitting(chain, angle)
 
 
-def parts():
+def model_and_links():
     """The model, an `mujoco.MjSpec`, and its virtual links."""
     import mujoco
 
     spec = figure16()
     look = {"contype": 0, "conaffinity": 0, "rgba": [0.55, 0.4, 0.3, 1]}
     capsule, box = mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOX
-    body = spec.worldbody.add_body(name="swing", pos=[0, 0, TOP])
+    body = spec.worldbody.add_body(name="swing", pos=[0, 0, PIVOT_HEIGHT])
     body.add_joint(name="pivot", axis=[0, 1, 0])
-    for y in (-HALF, HALF):
+    for y in (-HALF_WIDTH, HALF_WIDTH):
         body.add_geom(
-            type=capsule, fromto=[0, y, 0, 0, y, -DROP], size=[0.012, 0, 0], mass=2.0, **look
+            type=capsule, fromto=[0, y, 0, 0, y, -ROD_LENGTH], size=[0.012, 0, 0], mass=2.0, **look
         )
     body.add_geom(
-        name="plate", type=box, pos=[0, 0, -DROP - 0.01], size=[EDGE, HALF, 0.01], mass=3.0, **look
+        name="plate",
+        type=box,
+        pos=[0, 0, -ROD_LENGTH - 0.01],
+        size=[PLATE_EDGE, HALF_WIDTH, 0.01],
+        mass=3.0,
+        **look,
     )
     spec.worldbody.add_geom(
-        type=capsule, fromto=[0, -0.6, TOP, 0, 0.6, TOP], size=[0.03, 0, 0], **look
+        type=capsule,
+        fromto=[0, -0.6, PIVOT_HEIGHT, 0, 0.6, PIVOT_HEIGHT],
+        size=[0.03, 0, 0],
+        **look,
     )
     quarter = np.sqrt(0.5)
     links = []
@@ -56,7 +67,7 @@ def parts():
             "swing",
             f"{side}_hand",
             "ball",
-            pos=(0, y * HALF, -GRASP),
+            pos=(0, y * HALF_WIDTH, -HANDS_BELOW_PIVOT),
             real_pos=(0, 0, -PALM),
             connected=True,
         )
@@ -67,8 +78,8 @@ def parts():
             f"{side}_thigh",
             "slide",
             axis=(1, 0, 0),
-            pos=(0, y * 0.085, -DROP),
-            real_pos=(-SIT, 0, -0.2),
+            pos=(0, y * 0.085, -ROD_LENGTH),
+            real_pos=(-THIGH_ABOVE_PLATE, 0, -0.2),
             real_quat=(quarter, 0, quarter, 0),
             connected=True,
         )
@@ -76,13 +87,13 @@ def parts():
     return spec, links
 
 
-def leaving(chain: Chain) -> list[When]:
+def seat_events(chain: Chain) -> list[When]:
     """The seat gives way: each thigh's slide is cut as the thigh passes the front or the back edge
     of the plate."""
 
     def beyond(link):
         along = touch(chain, link, 0.0, axes="z")  # the slide's own axis
-        return lambda t, state, args: jnp.abs(along(t, state)) - EDGE
+        return lambda t, state, args: jnp.abs(along(t, state)) - PLATE_EDGE
 
     return [
         when(beyond(link), cut=link, direction=True)
@@ -93,8 +104,8 @@ def leaving(chain: Chain) -> list[When]:
 def _sitting(chain: Chain, angle: float) -> State:
     """Thighs along the plate, trunk upright, hands on the rods."""
     c, s = np.cos(angle), np.sin(angle)
-    hips = np.array([-0.17, SIT - DROP])
-    place = [c * hips[0] + s * hips[1], 0, TOP - s * hips[0] + c * hips[1]]
+    hips = np.array([-0.17, THIGH_ABOVE_PLATE - ROD_LENGTH])
+    place = [c * hips[0] + s * hips[1], 0, PIVOT_HEIGHT - s * hips[0] + c * hips[1]]
     q = {"pivot": angle, "base": [*place, np.cos(angle / 2), 0, np.sin(angle / 2), 0]}
     for side in ("right", "left"):
         q |= {

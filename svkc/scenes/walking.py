@@ -8,10 +8,10 @@ from svkc.model.chain import Chain, State
 from svkc.model.virtual_link import VirtualLink
 from svkc.scenes.figure import figure16
 
-STRIDE, HIP = 0.33, 0.906  # m: from foot to foot where both stand; the hips above the ground
-HIPS = 0.085  # m: half the distance between the hips, and between the feet
+STRIDE, HIP_HEIGHT = 0.33, 0.906  # m: from foot to foot where both stand; the hips above the ground
+HALF_HIP_WIDTH = 0.085  # m: half the distance between the hips, and between the feet
 # m: the ankle above the ground; the sole's point that holds ahead of the ankle
-THIGH, SHANK, ANKLE, SOLE = 0.4222, 0.434, 0.075, 0.04
+THIGH_LENGTH, SHANK_LENGTH, ANKLE_HEIGHT, SOLE_OFFSET = 0.4222, 0.434, 0.075, 0.04
 
 
 def walking(**options) -> tuple[Chain, State]:
@@ -34,28 +34,36 @@ def walking(**options) -> tuple[Chain, State]:
             f"{side}_foot",
             joint="weld",
             pos=(x, y, 0),
-            real_pos=(SOLE, 0, -ANKLE),
+            real_pos=(SOLE_OFFSET, 0, -ANKLE_HEIGHT),
             real_quat=(1, 0, 0, 0),
             connected=True,
         )
-        for side, x, y in (("left", 0, HIPS), ("right", -STRIDE, -HIPS))
+        for side, x, y in (("left", 0, HALF_HIP_WIDTH), ("right", -STRIDE, -HALF_HIP_WIDTH))
     ]
     chain = load(spec, virtual_links=feet, **options)
-    hips = -0.55 * STRIDE - SOLE
-    q = {"base": [hips, 0, HIP, 1, 0, 0, 0]}
+    hips = -0.55 * STRIDE - SOLE_OFFSET
+    q = {"base": [hips, 0, HIP_HEIGHT, 1, 0, 0, 0]}
     for link, arm in zip(feet, (-0.3, 0.3), strict=True):
         side = link.name.removesuffix("_foot_ground")
         q |= {f"{side}_shoulder_flexion": arm, f"{side}_elbow": 0.35}
-        for joint, angle in leg(link.pos[0] - SOLE - hips, HIP - ANKLE).items():
+        for joint, angle in leg_angles(
+            link.pos[0] - SOLE_OFFSET - hips, HIP_HEIGHT - ANKLE_HEIGHT
+        ).items():
             q[f"{side}_{joint}"] = float(angle)
     return chain, chain.state(q)
 
 
-def leg(forward, down) -> dict:
+def leg_angles(forward, down) -> dict:
     """Angles (rad) of a leg whose ankle is this far (m) ahead of and below its hip, trunk upright,
     foot flat; out of reach: stretched."""
     reach = forward * forward + down * down
-    cosine = jnp.clip((reach - THIGH**2 - SHANK**2) / (2 * THIGH * SHANK), -0.9999, 0.9999)
+    cosine = jnp.clip(
+        (reach - THIGH_LENGTH**2 - SHANK_LENGTH**2) / (2 * THIGH_LENGTH * SHANK_LENGTH),
+        -0.9999,
+        0.9999,
+    )
     knee = jnp.arccos(cosine)
-    hip = jnp.arctan2(forward, down) + jnp.arctan2(SHANK * jnp.sin(knee), THIGH + SHANK * cosine)
+    hip = jnp.arctan2(forward, down) + jnp.arctan2(
+        SHANK_LENGTH * jnp.sin(knee), THIGH_LENGTH + SHANK_LENGTH * cosine
+    )
     return {"hip_flexion": hip, "knee": knee, "ankle": knee - hip}

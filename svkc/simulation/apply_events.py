@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from svkc._jax.control_flow import unvmap_any
-from svkc.integration.integrators import Motion, finite
+from svkc.integration.integrators import ODEState, is_finite
 from svkc.model.chain import Chain, State, Structure
-from svkc.simulation.phase import Run, Solved
+from svkc.simulation.phase import PhaseOutcome, RunState
 from svkc.simulation.records import RESULTS, Events
 from svkc.transitions.impact import StructureChange
 from svkc.transitions.plan import Plan
@@ -17,14 +17,19 @@ from svkc.transitions.spare_links import bind_grip, cleared
 from svkc.transitions.transition import CONNECT_TOLERANCE, change_structure, release_constraints
 
 
-def reevaluated(made: Plan) -> np.ndarray:
+def reevaluated_guards(made: Plan) -> np.ndarray:
     """Return which guards are re-evaluated after a change of structure, so that a guard is compared
     within one phase: all but those that need torques."""
     return np.array([not g.needs_torques for g in made.guards], bool)
 
 
 def apply_events(
-    chain: Chain, run: Run, ended: State, solved: Solved, fired: Bool[Array, " events"], made: Plan
+    chain: Chain,
+    run: RunState,
+    ended: State,
+    solved: PhaseOutcome,
+    fired: Bool[Array, " events"],
+    made: Plan,
 ):
     """The change of structure that all events of this instant make together; one record row for
     each of them."""
@@ -48,9 +53,9 @@ def apply_events(
 
     done = jax.lax.cond(unvmap_any(happened), changed, same)
     # what a change makes of numbers that are not is not taken
-    sound = finite(Motion(done.state.q, done.state.v)) & ~jnp.isnan(done.initial_gap)
+    sound = is_finite(ODEState(done.state.q, done.state.v)) & ~jnp.isnan(done.initial_gap)
     after = jax.tree.map(lambda new, old: jnp.where(happened & sound, new, old), done.state, ended)
-    mine = made.table(chain, "connect") | made.grip_mask(chain)
+    mine = made.action_mask(chain, "connect") | made.grip_mask(chain)
     events, overflow = _recorded(run.events, solved.t, fired, mine, done)
     stops = jnp.any(fired & np.array([a.stop for a in made.actions], bool))
     result = RESULTS.where(stops, RESULTS.stopped, solved.result)
@@ -66,13 +71,13 @@ def apply_events(
 def _masks(chain: Chain, structure: Structure, fired: Bool[Array, " events"], made: Plan) -> dict:
     """Return the connected links, the locked joints, and the new links whose joint is made where
     the bodies are, after the events of this instant. None: no event has to do with that."""
-    any_of = lambda what: jnp.any(fired[:, None] & made.table(chain, what), 0)
+    any_of = lambda what: jnp.any(fired[:, None] & made.action_mask(chain, what), 0)
     return {
         "connected": (structure.connected | any_of("connect")) & ~any_of("cut"),
         "locked": (structure.locked | any_of("lock")) & ~any_of("unlock")
         if made.has_locks
         else None,
-        "here": any_of("here") if made.table(chain, "here").any() or made.has_binds else None,
+        "here": any_of("here") if made.action_mask(chain, "here").any() or made.has_binds else None,
     }
 
 

@@ -18,12 +18,12 @@ from svkc.loops.constraint import (
 from svkc.loops.pivoting import pivot_ratio, pivoted_qr, rank_tolerance
 from svkc.model.chain import Chain, State, Structure, active_dofs
 from svkc.model.topology import FREE
-from svkc.simulation.records import Phases, Records
+from svkc.simulation.records import PhaseRecords, Phases
 from svkc.tree.energy import energy_and_momentum
 from svkc.tree.kinematics import kinematics
 
 
-class Checked(eqx.Module):
+class StateCheck(eqx.Module):
     """Quantities of the certificate at one state: the largest gaps of the loops (rad, m) and their
     rates, and at the ends of phases energy (J), linear momentum (N s), angular momentum about the
     centre of mass (N m s) and rank margin."""
@@ -37,8 +37,8 @@ class Checked(eqx.Module):
 
 
 def certificate(
-    chain: Chain, records: Records, count: Int[Array, ""], saved: State, stages: int
-) -> tuple[Phases, Checked, Int[Array, ""]]:
+    chain: Chain, records: PhaseRecords, count: Int[Array, ""], saved: State, stages: int
+) -> tuple[Phases, StateCheck, Int[Array, ""]]:
     """Return the phases of a run, the checks of its saved states, and the index of the first phase
     whose loops lose rank at an end (past the last: none).
 
@@ -54,7 +54,9 @@ def certificate(
     return phases, saved_checks, lost_at
 
 
-def _check_states(chain: Chain, records: Records, saved: State) -> tuple[Checked, Checked, Checked]:
+def _check_states(
+    chain: Chain, records: PhaseRecords, saved: State
+) -> tuple[StateCheck, StateCheck, StateCheck]:
     """Return the checks of the states at the starts of phases, at their ends, and of the saved
     ones. One loop checks them all, so that kinematics and energy are compiled once."""
     r, rows, join = records, records.start.shape[0], lambda *x: jnp.concatenate(x)
@@ -73,9 +75,9 @@ def _check_states(chain: Chain, records: Records, saved: State) -> tuple[Checked
 
 def _phases(
     chain: Chain,
-    records: Records,
+    records: PhaseRecords,
     count: Int[Array, ""],
-    both: tuple[Checked, Checked],
+    both: tuple[StateCheck, StateCheck],
     stages: int,
 ) -> Phases:
     """Return the phases of a run. both: the checks at their starts and at their ends."""
@@ -104,14 +106,14 @@ def _phases(
         joint_freedoms=fill(joint_freedoms, -1),
         energy=fill(jnp.stack([first.energy, last.energy], 1), 0),
         work=r.work,
-        margin=fill(jnp.minimum(margin, r.tally.margin), 1),
+        margin=fill(jnp.minimum(margin, r.stats.margin), 1),
         accepted=r.accepted,
         rejected=r.rejected,
-        evaluations=stages * r.tally.tries,
-        swaps=r.tally.swaps,
-        loop=r.tally.loop,
-        error=r.tally.error,
-        gap=fill(jnp.maximum(gap, r.tally.gap), 0),
+        evaluations=stages * r.stats.attempts,
+        swaps=r.stats.swaps,
+        loop=r.stats.loop,
+        error=r.stats.error,
+        gap=fill(jnp.maximum(gap, r.stats.gap), 0),
         gap_rate=fill(gap_rate, 0),
         free=fill(free, False),
         momentum_drift=jnp.where((written & free)[:, None], drift, 0),
@@ -119,7 +121,7 @@ def _phases(
     )
 
 
-def _check_state(chain: Chain, state: State, at_end: Bool[Array, ""]) -> Checked:
+def _check_state(chain: Chain, state: State, at_end: Bool[Array, ""]) -> StateCheck:
     """Check one state. at_end: whether it is at an end of a phase; elsewhere energy, momenta and
     margin are left out."""
     kin, dtype, looped = kinematics(chain, state.q), state.q.dtype, bool(chain.link_names)
@@ -149,7 +151,7 @@ def _check_state(chain: Chain, state: State, at_end: Bool[Array, ""]) -> Checked
 
     none = jnp.zeros((), dtype), jnp.zeros(3, dtype), jnp.zeros(3, dtype), jnp.ones((), dtype)
     energy, linear, angular, margin = jax.lax.cond(at_end, whole, lambda: none)
-    return Checked(
+    return StateCheck(
         gap=gaps, gap_rate=rates, energy=energy, linear=linear, angular=angular, margin=margin
     )
 
@@ -165,7 +167,7 @@ def _free(chain: Chain, s: Structure) -> Bool[Array, ""]:
 
 
 def _momentum_drift(
-    chain: Chain, first: Checked, last: Checked, span: Float[Array, " phases"]
+    chain: Chain, first: StateCheck, last: StateCheck, span: Float[Array, " phases"]
 ) -> Float[Array, "phases 2"]:
     """Change of linear momentum (N s) that gravity does not explain, and of the angular momentum
     about the centre of mass (N m s)."""
@@ -176,7 +178,7 @@ def _momentum_drift(
     )
 
 
-def stages(solver: diffrax.AbstractSolver) -> int:
+def evaluations_per_step(solver: diffrax.AbstractSolver) -> int:
     """Evaluations of the vector field in one try of a step; Newton iterations of implicit stages
     are not counted."""
     tableau = getattr(solver, "tableau", None)

@@ -12,10 +12,10 @@ import optimistix
 from jaxtyping import Array, Float
 
 from svkc._jax.pytrees import is_concrete
-from svkc.integration.integrators import FixedSteps, SimplifiedNewton, motion_norm
+from svkc.integration.integrators import FixedSteps, SimplifiedNewton, rms_norm
 from svkc.integration.replay import Replay
 from svkc.integration.stabilization import AbstractStabilization, Projection
-from svkc.integration.vector_field import Field
+from svkc.integration.vector_field import VectorField
 from svkc.loops.constrained_dynamics import AbstractDynamics, Dynamics, default_dynamics
 from svkc.loops.constraint import gap_tolerance
 from svkc.model.chain import Chain, State
@@ -43,11 +43,11 @@ class Options(eqx.Module):
     gap: float = eqx.field(static=True)
 
     @property
-    def field(self) -> Field:
+    def field(self) -> VectorField:
         """The vector field of a phase."""
-        return Field(self.control, self.stabilization, self.dynamics)
+        return VectorField(self.control, self.stabilization, self.dynamics)
 
-    def steps(self, ts=None):
+    def step_size_control(self, ts=None):
         """The step-size controller and the first step; for a loop that does not look to the save
         times itself, made to stop at each of `ts`."""
         if self.dt is not None:
@@ -61,7 +61,7 @@ class Options(eqx.Module):
         )
 
 
-def tolerances(dtype, rtol=None, atol=None) -> tuple[Float[Array, ""], Float[Array, ""]]:
+def resolve_tolerances(dtype, rtol=None, atol=None) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Those left open are 1e-7 (float32: 1e-4), and a hundredth of rtol, or what round-off
     leaves."""
     eps = np.finfo(dtype).eps
@@ -75,7 +75,7 @@ def tolerances(dtype, rtol=None, atol=None) -> tuple[Float[Array, ""], Float[Arr
     return jnp.asarray(rtol, dtype), jnp.asarray(atol, dtype)
 
 
-def checked(
+def prepare_options(
     chain: Chain, state: State, t0, t1, *, ts, events, control, dt, rtol, atol, solver,
     stepsize_controller, stabilization, dynamics, adjoint, max_events, max_steps, progress_meter,
 ) -> tuple[Options, Float[Array, " times"], Plan]:  # fmt: skip
@@ -99,7 +99,7 @@ def checked(
         controller = _controller(rtol, atol, smallest, dtype)
     options = Options(
         control=control,
-        solver=_solving(solver, None if dt is not None else controller, dtype),
+        solver=_resolve_solver(solver, None if dt is not None else controller, dtype),
         stabilization=_stabilization(stabilization),
         dynamics=_dynamics(chain, dynamics),
         controller=controller,
@@ -119,9 +119,9 @@ def checked(
 def _controller(rtol, atol, smallest, dtype) -> diffrax.PIDController:
     """Return the default control of adaptive steps. smallest: step (s)."""
     # as arrays: another tolerance is the same program
-    rtol, atol = tolerances(dtype, rtol, atol)
+    rtol, atol = resolve_tolerances(dtype, rtol, atol)
     return diffrax.PIDController(
-        rtol, atol, norm=motion_norm, dtmin=jnp.asarray(smallest, dtype), force_dtmin=False
+        rtol, atol, norm=rms_norm, dtmin=jnp.asarray(smallest, dtype), force_dtmin=False
     )
 
 
@@ -172,7 +172,7 @@ def _dynamics(chain: Chain, dynamics) -> AbstractDynamics:
     return dynamics
 
 
-def _solving(solver, controller, dtype) -> diffrax.AbstractSolver:
+def _resolve_solver(solver, controller, dtype) -> diffrax.AbstractSolver:
     """The solver, or the default; one with implicit stages solves them as closely as steps are
     controlled, or, where they are not, to sqrt(eps)."""
     if solver is None:
@@ -205,7 +205,7 @@ def _solving(solver, controller, dtype) -> diffrax.AbstractSolver:
         # a step that cannot be made shorter has to be solved: by Newton's method
         close = float(np.finfo(dtype).eps ** 0.5)
         return eqx.tree_at(
-            lambda s: s.root_finder, solver, optimistix.Newton(close, close, norm=motion_norm)
+            lambda s: s.root_finder, solver, optimistix.Newton(close, close, norm=rms_norm)
         )
     if left_open and isinstance(finder, diffrax.VeryChord):
         solver = eqx.tree_at(lambda s: s.root_finder, solver, SimplifiedNewton(0.0, 0.0))

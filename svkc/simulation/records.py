@@ -5,11 +5,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from svkc.integration.solution import Path, Tally
+from svkc.integration.solution import PhaseSolution, Stats
 from svkc.model.chain import State, Structure
 
 
-class Records(eqx.Module):
+class PhaseRecords(eqx.Module):
     """One row for each phase: its times, the motion at its two ends, its structure, and the counts
     of its steps.
 
@@ -24,7 +24,7 @@ class Records(eqx.Module):
     work: Float[Array, "*phases"]
     accepted: Int[Array, "*phases"]
     rejected: Int[Array, "*phases"]
-    tally: Tally
+    tally: Stats
 
 
 class Events(eqx.Module):
@@ -43,7 +43,7 @@ class Events(eqx.Module):
     count: Int[Array, ""]
 
 
-def no_events(rows: int, links: int, dtype) -> Events:
+def empty_events(rows: int, links: int, dtype) -> Events:
     """Return empty rows for events. Their times are inf, their indices -1."""
     impulse = jnp.zeros((rows, links, 3), dtype)
     return Events(
@@ -56,13 +56,13 @@ def no_events(rows: int, links: int, dtype) -> Events:
     )
 
 
-def no_records(rows: int, state: State) -> Records:
+def empty_phase_records(rows: int, state: State) -> PhaseRecords:
     """Return the records before the first phase."""
     dtype = state.q.dtype
     repeat = lambda tree, *axes: jax.tree.map(
         lambda x: jnp.broadcast_to(x, (*axes, *jnp.shape(x))), tree
     )
-    return Records(
+    return PhaseRecords(
         start=jnp.full(rows, jnp.inf, dtype),
         stop=jnp.full(rows, jnp.inf, dtype),
         q=repeat(state.q, rows, 2),
@@ -71,17 +71,22 @@ def no_records(rows: int, state: State) -> Records:
         work=jnp.zeros(rows, dtype),
         accepted=jnp.zeros(rows, jnp.int32),
         rejected=jnp.zeros(rows, jnp.int32),
-        tally=repeat(Tally.none(dtype, True), rows),
+        tally=repeat(Stats.zeros(dtype, True), rows),
     )
 
 
-def recorded(
-    records: Records, row: Bool[Array, " phases"], began: tuple, ended: tuple, work, path: Path
-) -> Records:
+def write_phase_row(
+    records: PhaseRecords,
+    row: Bool[Array, " phases"],
+    began: tuple,
+    ended: tuple,
+    work,
+    path: PhaseSolution,
+) -> PhaseRecords:
     """Return the records with the row of one phase written. row: one-hot, or all False for no
     phase; began, ended: time and state."""
     (start, first), (stop, last) = began, ended
-    new = Records(
+    new = PhaseRecords(
         start=start,
         stop=stop,
         q=jnp.stack([first.q, last.q]),
@@ -90,7 +95,7 @@ def recorded(
         work=work,
         accepted=path.accepted,
         rejected=path.rejected,
-        tally=path.tally,
+        tally=path.stats,
     )
     write = lambda old, new: jnp.where(
         row.reshape(-1, *(1,) * jnp.ndim(new)), jnp.asarray(new)[None], old

@@ -19,14 +19,14 @@ from svkc._jax.eager import eager_jit
 from svkc._jax.functions import call_with_comparable
 from svkc._jax.primitive import ClosureConverted
 from svkc._jax.pytrees import stop_gradient_tree
-from svkc.integration.event_location import Reading, event_tolerance
-from svkc.integration.integrators import Motion, Scene
+from svkc.integration.event_location import GuardValues, event_tolerance
+from svkc.integration.integrators import FieldArgs, ODEState
 from svkc.model.chain import Chain, State
-from svkc.simulation.apply_events import apply_events, reevaluated
-from svkc.simulation.certificate import certificate, stages
-from svkc.simulation.options import Options, checked
-from svkc.simulation.phase import Run, Solved, solve
-from svkc.simulation.records import RESULTS, no_events, no_records, recorded
+from svkc.simulation.apply_events import apply_events, reevaluated_guards
+from svkc.simulation.certificate import certificate, evaluations_per_step
+from svkc.simulation.options import Options, prepare_options
+from svkc.simulation.phase import PhaseOutcome, RunState, solve_phase
+from svkc.simulation.records import RESULTS, empty_events, empty_phase_records, write_phase_row
 from svkc.simulation.trajectory import Trajectory
 from svkc.transitions.plan import Plan
 
@@ -57,7 +57,7 @@ def simulate(
     ValueError: a call that cannot be right. A run that goes wrong ends with a code in `result`,
     raised when throw=True.
     """
-    options, save_at, made = checked(
+    options, save_at, made = prepare_options(
         chain, state, t0, t1, ts=ts, events=events, control=control, dt=dt, rtol=rtol, atol=atol,
         solver=solver, stepsize_controller=stepsize_controller, stabilization=stabilization,
         dynamics=dynamics, adjoint=adjoint, max_events=max_events, max_steps=max_steps,
@@ -69,8 +69,10 @@ def simulate(
         *given, _with(made, guards=events), _with(options, control=control), args
     )
     run = call_with_comparable(run, control=options.control, events=made.guards)
-    certified = _certified_once if len(save_at) <= FEW_STATES else _certified
-    traj = certified(chain, run, save_at, given[3], options.gap, stages(options.solver))
+    certified = _certified_once if len(save_at) <= MAX_EAGER_STATES else _certified
+    traj = certified(
+        chain, run, save_at, given[3], options.gap, evaluations_per_step(options.solver)
+    )
     return _raised(chain, traj) if throw else traj
 
 
@@ -90,11 +92,11 @@ def _raised(chain: Chain, traj: Trajectory) -> Trajectory:
 
 
 @eqx.filter_jit
-def _run(chain: Chain, state: State, t0, t1, ts, made: Plan, options: Options, args) -> Run:
-    made, options = _converted(chain, state, t0, made, options, args)
+def _run(chain: Chain, state: State, t0, t1, ts, made: Plan, options: Options, args) -> RunState:
+    made, options = _closure_convert(chain, state, t0, made, options, args)
     run = _start(chain, state, t0, ts, made, options)
 
-    def phase(run: Run, index):
+    def phase(run: RunState, index):
         return _phase(chain, run, index, (t1, ts), made=made, options=options, args=args), None
 
     if options.max_events == 0:
@@ -104,7 +106,9 @@ def _run(chain: Chain, state: State, t0, t1, ts, made: Plan, options: Options, a
     return run
 
 
-def _with_certificate(chain: Chain, run: Run, ts, t1, most: float, evaluations: int) -> Trajectory:
+def _with_certificate(
+    chain: Chain, run: RunState, ts, t1, most: float, evaluations: int
+) -> Trajectory:
     """Return the run with its certificate. most: the largest gap of a closed loop; evaluations: of
     the field in one try of a step."""
     short = (run.t < t1) & (run.result == RESULTS.successful)
@@ -134,14 +138,14 @@ def _with_certificate(chain: Chain, run: Run, ts, t1, most: float, evaluations: 
 
 
 # a program of its own, which an eager call compiles for compile time: it checks each state once
-FEW_STATES = 1000
+MAX_EAGER_STATES = 1000
 _certified, _certified_once = (
     eqx.filter_jit(_with_certificate),
     eager_jit(_with_certificate, eqx.filter_jit),
 )
 
 
-def _converted(
+def _closure_convert(
     chain: Chain, state: State, t0, made: Plan, options: Options, args
 ) -> tuple[Plan, Options]:
     """Control and guards with all that they close over as their leaves, so that it can be
@@ -168,22 +172,22 @@ def _lockable(chain: Chain, state: State, made: Plan) -> State:
     )
 
 
-def _start(chain: Chain, state: State, t0, ts, made: Plan, options: Options) -> Run:
+def _start(chain: Chain, state: State, t0, ts, made: Plan, options: Options) -> RunState:
     """Empty records, sized by capacity; unwritten entries show: inf, -1."""
     links, rows, dtype = len(chain.link_names), options.max_events, state.q.dtype
     state = _lockable(chain, state, made)
     # an overload from the start is a crossing; guards that need no torques are evaluated at the
     # start of the phase
     initial = [g.initial_value for g in made.guards]
-    return Run(
+    return RunState(
         t=t0,
         state=state,
         work=jnp.zeros((), dtype) if options.has_work else None,
         guards=jnp.asarray(initial, dtype) if made.guards else None,
-        stale=jnp.asarray(reevaluated(made)) if made.guards else None,
+        stale=jnp.asarray(reevaluated_guards(made)) if made.guards else None,
         pending=jnp.ones(len(made.timed), bool),
-        events=no_events(rows, links, dtype),
-        records=no_records(rows + 1, state),
+        events=empty_events(rows, links, dtype),
+        records=empty_phase_records(rows + 1, state),
         count=jnp.asarray(0, jnp.int32),
         saved=jax.tree.map(lambda x: jnp.broadcast_to(x[None], (ts.shape[0], *x.shape)), state),
         result=RESULTS.successful,
@@ -192,7 +196,7 @@ def _start(chain: Chain, state: State, t0, ts, made: Plan, options: Options) -> 
     )  # fmt: skip
 
 
-def _next_stop(run: Run, t1, made: Plan):
+def _next_stop(run: RunState, t1, made: Plan):
     """Return the time at which the next phase ends at the latest: that of the next event, or t1.
 
     Of two equal times the one taken is differentiated: the event's where it is t1, and t1 where the
@@ -203,7 +207,9 @@ def _next_stop(run: Run, t1, made: Plan):
     return jnp.where((stop < run.t) | (run.result != RESULTS.successful), run.t, stop)
 
 
-def _phase(chain: Chain, run: Run, index, times, *, made: Plan, options: Options, args) -> Run:
+def _phase(
+    chain: Chain, run: RunState, index, times, *, made: Plan, options: Options, args
+) -> RunState:
     """One solve, the events at its end, and the records of both. times: the end and the save
     times."""
     t1, ts = times
@@ -211,7 +217,7 @@ def _phase(chain: Chain, run: Run, index, times, *, made: Plan, options: Options
     going = (run.t < t1) | jnp.any(run.pending & (made.times <= t1))
     going = going & (run.result == RESULTS.successful)
     stop = _next_stop(run, t1, made)
-    solved = solve(run, stop, ts, made, options, Scene(chain, run.state.structure, args))
+    solved = solve_phase(run, stop, ts, made, options, FieldArgs(chain, run.state.structure, args))
     reached = going & (solved.result == RESULTS.successful)
     timed = run.pending & (made.times <= solved.t + event_tolerance(solved.t)) & reached
     fired = (
@@ -223,7 +229,9 @@ def _phase(chain: Chain, run: Run, index, times, *, made: Plan, options: Options
     saved = _save(run, ended, solved, ts)
     row = (jnp.arange(run.records.start.shape[0]) == index) & going
     work = jnp.zeros_like(run.t) if run.work is None else solved.motion.work - run.work
-    records = recorded(run.records, row, (run.t, run.state), (solved.t, ended), work, solved.path)
+    records = write_phase_row(
+        run.records, row, (run.t, run.state), (solved.t, ended), work, solved.path
+    )
     count = run.count + going.astype(jnp.int32)
     derivative, invalid_from = _derivative(run, solved, going, timed, index)
     after, events, result = ended, run.events, solved.result
@@ -232,11 +240,11 @@ def _phase(chain: Chain, run: Run, index, times, *, made: Plan, options: Options
     result = RESULTS.where(run.result == RESULTS.successful, result, run.result)
     # a guard that rests at zero after it fired keeps its value
     stale = (
-        jnp.asarray(reevaluated(made)) & jnp.any(fired) & (solved.guards != 0)
+        jnp.asarray(reevaluated_guards(made)) & jnp.any(fired) & (solved.guards != 0)
         if made.guards
         else None
     )
-    return Run(
+    return RunState(
         t=solved.t,
         state=after,
         work=solved.motion.work,
@@ -254,7 +262,7 @@ def _phase(chain: Chain, run: Run, index, times, *, made: Plan, options: Options
 
 
 def _derivative(
-    run: Run, solved: Solved, going, timed: Bool[Array, " timed"], index
+    run: RunState, solved: PhaseOutcome, going, timed: Bool[Array, " timed"], index
 ) -> tuple[RESULTS, Int[Array, ""]]:
     """Return the first reason why the run has no derivative, and the index of its phase. Ranks are
     checked after the run."""
@@ -267,18 +275,18 @@ def _derivative(
     )
 
 
-def _with_guards(chain: Chain, run: Run, made: Plan, options: Options, args) -> Run:
+def _with_guards(chain: Chain, run: RunState, made: Plan, options: Options, args) -> RunState:
     """Return the run with its stale guards re-evaluated at the start of a phase."""
-    if not made.guards or not reevaluated(made).any():
+    if not made.guards or not reevaluated_guards(made).any():
         return run
-    scene = Scene(chain, run.state.structure, args)
-    now = stop_gradient_tree(Reading(made, options.field))(
-        *stop_gradient_tree((run.t, Motion(run.state.q, run.state.v), scene))
+    scene = FieldArgs(chain, run.state.structure, args)
+    now = stop_gradient_tree(GuardValues(made, options.field))(
+        *stop_gradient_tree((run.t, ODEState(run.state.q, run.state.v), scene))
     )
     return dataclasses.replace(run, guards=jnp.where(run.stale, now, run.guards))
 
 
-def _save(run: Run, ended: State, solved: Solved, ts) -> State:
+def _save(run: RunState, ended: State, solved: PhaseOutcome, ts) -> State:
     """The saved states with those of this phase written in: from its start to its end, both
     included; later ones hold its end."""
     here, later = ((ts >= run.t) & (ts <= solved.t))[:, None], (ts > solved.t)[:, None]

@@ -12,13 +12,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from svkc.integration.integrators import RodriguesEuler, SemiImplicitEuler
+from svkc.integration.integrators import RodriguesEuler, SymplecticEuler
 from svkc.integration.stabilization import NoStabilization, Projection
 from svkc.loops.constrained_dynamics import ArticulatedBodies
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import check_state
 from svkc.model.validation import integer, positive_scalar, scalar
-from svkc.simulation.options import tolerances
+from svkc.simulation.options import resolve_tolerances
 from svkc.simulation.records import RESULTS
 from svkc.simulation.simulate import simulate
 from svkc.simulation.trajectory import Trajectory
@@ -71,43 +71,47 @@ class Tuning:
         )
 
 
-def candidates(dtype, span: float) -> list[Candidate]:
+def default_candidates(dtype, span: float) -> list[Candidate]:
     """From fast to exact: fixed steps of low order, adaptive ones of higher order, with and without
     projection, by articulated bodies; an implicit one."""
-    found = []
+    candidates = []
     for steps in (1e-2, 1e-3):
-        for solver in (SemiImplicitEuler(), RodriguesEuler(), diffrax.Heun(), diffrax.Tsit5()):
+        for solver in (SymplecticEuler(), RodriguesEuler(), diffrax.Heun(), diffrax.Tsit5()):
             dt = min(steps, span / 4)
-            found.append(
+            candidates.append(
                 Candidate(f"{type(solver).__name__}, dt {dt:g}", {"solver": solver, "dt": dt})
             )
     double = np.finfo(dtype).eps < 1e-10
     for rtol in (1e-4, 1e-6, 1e-8, 1e-10) if double else (1e-3, 1e-4, 1e-5):
         for solver in (diffrax.Tsit5(), diffrax.Dopri8()):
-            name, how = (
+            name, options = (
                 f"{type(solver).__name__}, rtol {rtol:g}",
                 {"solver": solver, "rtol": rtol, "atol": rtol / 100},
             )
-            found.append(Candidate(name, how | {"stabilization": Projection()}))
-            found.append(Candidate(f"{name}, drift", how | {"stabilization": NoStabilization()}))
-            found.append(Candidate(f"{name}, by bodies", how | {"dynamics": ArticulatedBodies()}))
+            candidates.append(Candidate(name, options | {"stabilization": Projection()}))
+            candidates.append(
+                Candidate(f"{name}, drift", options | {"stabilization": NoStabilization()})
+            )
+            candidates.append(
+                Candidate(f"{name}, by bodies", options | {"dynamics": ArticulatedBodies()})
+            )
         if rtol >= 1e-8:
-            found.append(
+            candidates.append(
                 Candidate(
                     f"Kvaerno5, rtol {rtol:g}",
                     {"solver": diffrax.Kvaerno5(), "rtol": rtol, "atol": rtol / 100},
                 )
             )
-    return found
+    return candidates
 
 
 def configuration_error(chain: Chain, run: Trajectory, reference: Trajectory) -> float:
     """Root mean square, over coordinates and save times, of how far two runs are apart in
     configuration (rad, m); the largest over the save times."""
-    apart = jax.vmap(lambda a, b: difference(chain, a, b)[: chain.nv])(
+    errors = jax.vmap(lambda a, b: difference(chain, a, b)[: chain.nv])(
         reference.states.q, run.states.q
     )
-    return float(jnp.max(jnp.sqrt(jnp.mean(apart**2, 1))))
+    return float(jnp.max(jnp.sqrt(jnp.mean(errors**2, 1))))
 
 
 def estimate_error(chain: Chain, state: State, t1, **options) -> float:
@@ -119,11 +123,11 @@ def estimate_error(chain: Chain, state: State, t1, **options) -> float:
     """
     run = simulate(chain, state, t1, **options)
     if "dt" in options:
-        finer = options | {"dt": options["dt"] / 2}
+        finer_options = options | {"dt": options["dt"] / 2}
     else:
-        rtol, atol = tolerances(state.q.dtype, options.get("rtol"), options.get("atol"))
-        finer = options | {"rtol": rtol / 32, "atol": atol / 32}
-    return configuration_error(chain, run, simulate(chain, state, t1, **finer))
+        rtol, atol = resolve_tolerances(state.q.dtype, options.get("rtol"), options.get("atol"))
+        finer_options = options | {"rtol": rtol / 32, "atol": atol / 32}
+    return configuration_error(chain, run, simulate(chain, state, t1, **finer_options))
 
 
 def tune(
@@ -134,7 +138,7 @@ def tune(
     options: Sequence[Candidate] | None = None,
     repeats: int = 3,
     show: bool = True,
-    **call,
+    **common,
 ) -> Tuning:
     """Runs candidates on this scene and tells the fastest whose configuration stays within `target`
     (rad, m; root mean square over the coordinates, largest over the save times) of a run with much
@@ -152,33 +156,40 @@ def tune(
         scalar("t1", t1),
         integer("repeats", repeats, 1),
     )
-    dtype, span = state.q.dtype, float(t1) - float(call.get("t0", 0.0))
-    tight = float(max(target * 1e-3, 50 * np.finfo(dtype).eps))
-    call = {"ts": jnp.linspace(call.get("t0", 0.0), t1, 11, dtype=dtype), **call, "throw": False}
-    run = lambda **options: simulate(chain, state, t1, **call, **options)
-    reference = run(solver=diffrax.Dopri8(), rtol=tight, atol=tight / 100)
+    dtype, span = state.q.dtype, float(t1) - float(common.get("t0", 0.0))
+    reference_rtol = float(max(target * 1e-3, 50 * np.finfo(dtype).eps))
+    common = {
+        "ts": jnp.linspace(common.get("t0", 0.0), t1, 11, dtype=dtype),
+        **common,
+        "throw": False,
+    }
+    run = lambda **options: simulate(chain, state, t1, **common, **options)
+    reference = run(solver=diffrax.Dopri8(), rtol=reference_rtol, atol=reference_rtol / 100)
     if reference.result != RESULTS.successful:
         raise ValueError(
-            f"target: {target} cannot be judged, a run at rtol {tight:.1e} ends with:"
+            f"target: {target} cannot be judged, a run at rtol {reference_rtol:.1e} ends with:"
             f" {RESULTS[reference.result]}"
         )
     error = lambda traj: configuration_error(chain, traj, reference)
-    tried, best = [], np.inf
-    for candidate in candidates(dtype, span) if options is None else options:
-        tried.append(_measure(run, candidate, error=error, repeats=repeats, limit=10 * best))
-        if tried[-1].error <= target:
-            best = min(best, tried[-1].seconds)
+    measured, best = [], np.inf
+    for candidate in default_candidates(dtype, span) if options is None else options:
+        measured.append(_measure(run, candidate, error=error, repeats=repeats, limit=10 * best))
+        if measured[-1].error <= target:
+            best = min(best, measured[-1].seconds)
         if show:
             print(
-                f"\r{len(tried)} tried, {candidate.name:<40}", end="", file=sys.stderr, flush=True
+                f"\r{len(measured)} tried, {candidate.name:<40}",
+                end="",
+                file=sys.stderr,
+                flush=True,
             )
-    table = sorted(tried, key=lambda c: (not c.error <= target, c.seconds))
-    found = Tuning(
+    table = sorted(measured, key=lambda c: (not c.error <= target, c.seconds))
+    tuning = Tuning(
         target, table[0].options if table and table[0].error <= target else None, tuple(table)
     )
     if show:
-        print(f"\r{found}", flush=True)
-    return found
+        print(f"\r{tuning}", flush=True)
+    return tuning
 
 
 def _measure(
@@ -186,20 +197,20 @@ def _measure(
 ) -> Candidate:
     """Return a candidate with what it costs and gives. limit (s): what takes longer is not
     repeated."""
-    once = lambda: jax.block_until_ready(run(**candidate.options))
-    traj, seconds = once(), np.inf
+    run_once = lambda: jax.block_until_ready(run(**candidate.options))
+    traj, seconds = run_once(), np.inf
     for _ in range(repeats):
-        begun = time.perf_counter()
-        once()
-        seconds = min(seconds, time.perf_counter() - begun)
+        start = time.perf_counter()
+        run_once()
+        seconds = min(seconds, time.perf_counter() - start)
         if seconds > limit:
             break
     report = traj.report()
-    good = traj.result == RESULTS.successful
+    successful = traj.result == RESULTS.successful
     return dataclasses.replace(
         candidate,
         seconds=seconds,
-        error=error(traj) if good else np.inf,
+        error=error(traj) if successful else np.inf,
         gap=float(jnp.maximum(report.gap, report.angular_gap)),
         energy_drift=float(report.energy_drift),
         steps=int(report.accepted + report.rejected),

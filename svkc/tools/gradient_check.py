@@ -11,7 +11,7 @@ import numpy as np
 from svkc.model.validation import check_function, integer, positive_scalar
 
 
-class Check(eqx.Module):
+class GradientCheck(eqx.Module):
     """What `check_grad` found: the worst entry. `error`: its difference, over the largest entry of
     its output leaf in either of the two derivatives.
 
@@ -41,7 +41,7 @@ class Check(eqx.Module):
 
 def check_grad(
     f: Callable, x, mode: str = "both", directions: int = 2, step: float = 0.05, seed: int = 0
-) -> Check:
+) -> GradientCheck:
     """The derivative of f at x against central differences, Richardson-extrapolated (Ridders),
     along random directions; says which entry is worst.
 
@@ -57,116 +57,149 @@ def check_grad(
     positive_scalar("step", step)
     if mode not in ("forward", "reverse", "both"):
         raise ValueError(f"mode: got {mode!r}, expected 'forward', 'reverse' or 'both'")
-    free, rest = eqx.partition(
+    differentiable, static = eqx.partition(
         jax.tree.map(lambda leaf: jnp.asarray(leaf) if isinstance(leaf, float) else leaf, x),
         eqx.is_inexact_array,
     )
     # (without weak types, which would compile the same program again for every parameter)
-    free = jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype), free)
-    named = jax.tree_util.tree_flatten_with_path(free)[0]
-    if not any(leaf.size for _, leaf in named):
+    differentiable = jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype), differentiable)
+    leaves = jax.tree_util.tree_flatten_with_path(differentiable)[0]
+    if not any(leaf.size for _, leaf in leaves):
         raise ValueError("check_grad: x has no floating-point arrays to differentiate by")
 
-    value = lambda free: _outputs(f, free, rest)
-    base = {name: np.asarray(leaf) for name, leaf in value(free).items()}
+    value = lambda free: _outputs(f, free, static)
+    base = {name: np.asarray(leaf) for name, leaf in value(differentiable).items()}
     for name, leaf in base.items():
         if not np.isfinite(leaf).all():
             raise ValueError(f"check_grad: f(x){name} is not finite: {leaf}")
     if not any(leaf.size for leaf in base.values()):
         raise ValueError("check_grad: f(x) has no floating-point arrays to be differentiated")
-    rng, found = np.random.default_rng(seed), []
+    rng, checks = np.random.default_rng(seed), []
     weights = {name: rng.normal(size=leaf.shape) for name, leaf in base.items()}
-    gradients = {} if mode == "forward" else _gradients(f, free, rest, weights)
-    for place, (path, leaf) in enumerate(named):
+    gradients = {} if mode == "forward" else _reverse_gradients(f, differentiable, static, weights)
+    for index, (path, leaf) in enumerate(leaves):
         for _ in range(directions if leaf.size else 0):
-            direction = _direction(free, place, rng)
-            difference, doubt = _differences(value, free, direction, step)
-            forward = None if mode == "reverse" else _along(f, free, rest, direction)
+            direction = _direction(differentiable, index, rng)
+            difference, uncertainty = _central_differences(value, differentiable, direction, step)
+            forward = (
+                None
+                if mode == "reverse"
+                else _forward_derivative(f, differentiable, static, direction)
+            )
             for name, weight in weights.items():
-                back = None if mode == "forward" else _inner(gradients[name], direction)
-                ahead = None if forward is None else np.asarray(forward[name])
-                pair = f"f(x){name}", f"x{jax.tree_util.keystr(path)}"
-                found.append(_check(ahead, back, weight, difference[name], doubt[name], pair))
-    worst = max(found, key=lambda c: c.error)
-    return dataclasses.replace(worst, modes=max(c.modes for c in found), mode=mode)
+                reverse_value = (
+                    None
+                    if mode == "forward"
+                    else _directional_derivative(gradients[name], direction)
+                )
+                forward_value = None if forward is None else np.asarray(forward[name])
+                paths = f"f(x){name}", f"x{jax.tree_util.keystr(path)}"
+                checks.append(
+                    _compare_leaf(
+                        forward_value,
+                        reverse_value,
+                        weight,
+                        difference[name],
+                        uncertainty[name],
+                        paths,
+                    )
+                )
+    worst = max(checks, key=lambda c: c.error)
+    return dataclasses.replace(worst, modes=max(c.modes for c in checks), mode=mode)
 
 
-def _direction(free, place: int, rng: np.random.Generator):
+def _direction(differentiable, index: int, rng: np.random.Generator):
     """Return a random direction of one leaf, as long as the leaf (one, where it is zero)."""
-    leaves, shape = jax.tree.flatten(free)
-    leaf, along = leaves[place], rng.normal(size=leaves[place].shape)
+    leaves, structure = jax.tree.flatten(differentiable)
+    leaf, along = leaves[index], rng.normal(size=leaves[index].shape)
     along = along / np.linalg.norm(along) * (np.linalg.norm(leaf) or 1.0)
-    rest = [jnp.zeros_like(x) for x in leaves]
-    return shape.unflatten([*rest[:place], jnp.asarray(along, leaf.dtype), *rest[place + 1 :]])
+    zeros = [jnp.zeros_like(x) for x in leaves]
+    return structure.unflatten(
+        [*zeros[:index], jnp.asarray(along, leaf.dtype), *zeros[index + 1 :]]
+    )
 
 
-def _inner(gradient, direction) -> float:
+def _directional_derivative(gradient, direction) -> float:
     """Return the derivative along a direction, from the leaves of a gradient."""
     return sum(
         float(jnp.vdot(g, d)) for g, d in zip(gradient, jax.tree.leaves(direction), strict=True)
     )
 
 
-def _check(ahead, back: float | None, weight, difference, doubt, pair: tuple[str, str]) -> Check:
+def _compare_leaf(
+    forward, reverse: float | None, weight, difference, uncertainty, paths: tuple[str, str]
+) -> GradientCheck:
     """Compare the derivatives of one output leaf along one direction with the difference.
 
     ahead: the derivative in forward mode; back: the weighted sum of the derivative's entries in
     reverse mode; None: not asked for.
     """
-    if ahead is None:
+    if forward is None:
         # one number for the whole leaf: reverse mode has no more for one pass
-        weighed = lambda x: np.asarray(np.sum(weight * x))
-        return _compare(np.asarray(back), weighed(difference), weighed(doubt), 0.0, *pair)
-    size = np.linalg.norm(weight) * np.linalg.norm(ahead)
-    apart = 0.0 if back is None else abs(back - np.sum(weight * ahead))
-    return _compare(ahead, difference, doubt, float(apart / (size if size > 1e-9 else 1.0)), *pair)
+        weighted_sum = lambda x: np.asarray(np.sum(weight * x))
+        return _worst_entry(
+            np.asarray(reverse), weighted_sum(difference), weighted_sum(uncertainty), 0.0, *paths
+        )
+    scale = np.linalg.norm(weight) * np.linalg.norm(forward)
+    mode_difference = 0.0 if reverse is None else abs(reverse - np.sum(weight * forward))
+    return _worst_entry(
+        forward,
+        difference,
+        uncertainty,
+        float(mode_difference / (scale if scale > 1e-9 else 1.0)),
+        *paths,
+    )
 
 
 # (compiled once for a function, however many points it is checked at)
 @eqx.filter_jit
-def _outputs(f, free, rest):
+def _outputs(f, differentiable, static):
     """The floats of f(x) by their paths."""
     floats = jax.tree_util.tree_flatten_with_path(
-        eqx.filter(f(eqx.combine(free, rest)), eqx.is_inexact_array)
+        eqx.filter(f(eqx.combine(differentiable, static)), eqx.is_inexact_array)
     )[0]
     return {jax.tree_util.keystr(path): leaf for path, leaf in floats}
 
 
 @eqx.filter_jit
-def _along(f, free, rest, direction):
-    return jax.jvp(lambda free: _outputs(f, free, rest), (free,), (direction,))[1]
+def _forward_derivative(f, differentiable, static, direction):
+    return jax.jvp(lambda free: _outputs(f, free, static), (differentiable,), (direction,))[1]
 
 
 @eqx.filter_jit
-def _weighed(f, free, rest, weights):
-    return jax.tree.leaves(jax.vjp(lambda free: _outputs(f, free, rest), free)[1](weights)[0])
+def _weighted_gradient(f, differentiable, static, weights):
+    return jax.tree.leaves(
+        jax.vjp(lambda free: _outputs(f, free, static), differentiable)[1](weights)[0]
+    )
 
 
-def _gradients(f, free, rest, weights):
+def _reverse_gradients(f, differentiable, static, weights):
     """For each output leaf, the gradient of its entries summed with random weights."""
-    shapes = eqx.filter_eval_shape(_outputs, f, free, rest)
-    only = lambda chosen: {
-        name: jnp.asarray(w if name == chosen else np.zeros_like(w), shapes[name].dtype)
+    shapes = eqx.filter_eval_shape(_outputs, f, differentiable, static)
+    weights_of = lambda output: {
+        name: jnp.asarray(w if name == output else np.zeros_like(w), shapes[name].dtype)
         for name, w in weights.items()
     }
-    return {name: _weighed(f, free, rest, only(name)) for name in weights}
+    return {
+        name: _weighted_gradient(f, differentiable, static, weights_of(name)) for name in weights
+    }
 
 
-def _differences(value, free, direction, step):
+def _central_differences(value, differentiable, direction, step):
     """Central differences at eight halved steps, extrapolated to zero; for every entry the estimate
     that changed least, and by how much."""
-    at = lambda h: value(
-        jax.tree.map(lambda x, d: x + jnp.asarray(h, x.dtype) * d, free, direction)
+    evaluate = lambda h: value(
+        jax.tree.map(lambda x, d: x + jnp.asarray(h, x.dtype) * d, differentiable, direction)
     )
-    table, best, change = [], {}, {}
+    table, best, uncertainty = [], {}, {}
     for h in step / 2.0 ** np.arange(8):
-        ahead, behind = at(h), at(-h)
-        if not all(np.isfinite(x).all() for x in (*ahead.values(), *behind.values())):
+        after, before = evaluate(h), evaluate(-h)
+        if not all(np.isfinite(x).all() for x in (*after.values(), *before.values())):
             # so far away f is not defined: begin again, nearer
-            table, best, change = [], {}, {}
+            table, best, uncertainty = [], {}, {}
             continue
         row = [
-            {name: (np.asarray(ahead[name]) - np.asarray(behind[name])) / (2 * h) for name in ahead}
+            {name: (np.asarray(after[name]) - np.asarray(before[name])) / (2 * h) for name in after}
         ]
         for k, before in enumerate(table[-1] if table else [], start=1):
             row.append(
@@ -177,39 +210,41 @@ def _differences(value, free, direction, step):
             )
         for k in range(1, len(row)):
             for name, new in row[k].items():
-                moved = np.maximum(
+                change = np.maximum(
                     np.abs(new - row[k - 1][name]), np.abs(new - table[-1][k - 1][name])
                 )
-                closer = moved < change.get(name, np.inf)
-                best[name] = np.where(closer, new, best.get(name, new))
-                change[name] = np.where(closer, moved, change.get(name, moved))
+                better = change < uncertainty.get(name, np.inf)
+                best[name] = np.where(better, new, best.get(name, new))
+                uncertainty[name] = np.where(better, change, uncertainty.get(name, change))
         table.append(row)
     # (not finite at every step tried, and so worth nothing)
-    nothing = {name: np.full(np.shape(leaf), np.nan) for name, leaf in ahead.items()}
-    return nothing | best, nothing | change
+    undefined = {name: np.full(np.shape(leaf), np.nan) for name, leaf in after.items()}
+    return undefined | best, undefined | uncertainty
 
 
-def _compare(derivative, difference, doubt, modes: float, output: str, input: str) -> Check:
+def _worst_entry(
+    derivative, difference, uncertainty, modes: float, output: str, input: str
+) -> GradientCheck:
     """Return the worst entry of one leaf."""
-    size = max(
+    scale = max(
         np.abs(x[np.isfinite(x)]).max(initial=0) for x in map(np.asarray, (derivative, difference))
     )
     # both nothing: what is within the round-off of differences is no error
-    size = size if size > 1e-9 else 1.0
-    off = np.abs(derivative - difference)
-    off = np.where(np.isfinite(off), off, np.inf).ravel()
+    scale = scale if scale > 1e-9 else 1.0
+    errors = np.abs(derivative - difference)
+    errors = np.where(np.isfinite(errors), errors, np.inf).ravel()
     modes = modes if np.isfinite(modes) else np.inf
-    if not off.size:
-        nothing = {"derivative": 0.0, "difference": 0.0, "uncertainty": 0.0}
-        return Check(error=0.0, output=output, input=input, **nothing, modes=modes)
-    at = int(np.argmax(off))
-    pick = lambda x: float(np.ravel(x)[at])
-    return Check(
-        error=float(off[at] / size),
-        output=f"{output}[{at}]" if off.size > 1 else output,
+    if not errors.size:
+        zeros = {"derivative": 0.0, "difference": 0.0, "uncertainty": 0.0}
+        return GradientCheck(error=0.0, output=output, input=input, **zeros, modes=modes)
+    worst = int(np.argmax(errors))
+    entry = lambda x: float(np.ravel(x)[worst])
+    return GradientCheck(
+        error=float(errors[worst] / scale),
+        output=f"{output}[{worst}]" if errors.size > 1 else output,
         input=input,
-        derivative=pick(derivative),
-        difference=pick(difference),
-        uncertainty=pick(doubt) / float(size),
+        derivative=entry(derivative),
+        difference=entry(difference),
+        uncertainty=entry(uncertainty) / float(scale),
         modes=modes,
     )

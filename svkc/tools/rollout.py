@@ -53,28 +53,32 @@ def rollout(
     not fit into memory, or another process is gone; the chunks that were finished are kept.
     """
     check_chain(chain)
-    lanes = _count(states, data, cost)
+    lanes = _count_lanes(states, data, cost)
     scalar("t1", t1)
     check_function("lane", lane)
-    devices, chunk = _checked_devices(devices, chunk, lanes)
+    devices, chunk = _prepare_devices(devices, chunk, lanes)
     size = chunk * len(devices)
     order = np.arange(lanes) if cost is None else np.argsort(np.asarray(cost), kind="stable")
-    chunks = _chunks(order, size)
-    run = _program(chain, jnp.asarray(t1, states.q.dtype), lane, options, devices)
+    chunks = _assign_chunks(order, size)
+    run = _chunk_runner(chain, jnp.asarray(t1, states.q.dtype), lane, options, devices)
     inputs = (chain, states, t1, data, order, options)
-    folder = None if out is None else _folder(pathlib.Path(out), inputs, size)
-    mine = range(jax.process_index(), len(chunks), jax.process_count())
-    done, begun = {}, time.perf_counter()
-    for count, i in enumerate(mine, 1):
-        own = jax.tree.map(lambda x, i=i: x[chunks[i]], (states, data))
-        done[i] = _chunk(run, own, folder and folder / f"chunk_{i:05d}.npz", chain, chunk)
+    folder = None if out is None else _prepare_folder(pathlib.Path(out), inputs, size)
+    own_chunks = range(jax.process_index(), len(chunks), jax.process_count())
+    done, start = {}, time.perf_counter()
+    for count, i in enumerate(own_chunks, 1):
+        inputs_of_chunk = jax.tree.map(lambda x, i=i: x[chunks[i]], (states, data))
+        done[i] = _load_or_run(
+            run, inputs_of_chunk, folder and folder / f"chunk_{i:05d}.npz", chain, chunk
+        )
         if progress:
-            _say(count, len(mine), lanes, time.perf_counter() - begun)
-    back = np.argsort(order)
-    return jax.tree.map(lambda *x: np.concatenate(x)[back], *_gathered(done, len(chunks)))
+            _print_progress(count, len(own_chunks), lanes, time.perf_counter() - start)
+    inverse_order = np.argsort(order)
+    return jax.tree.map(
+        lambda *x: np.concatenate(x)[inverse_order], *_gather_chunks(done, len(chunks))
+    )
 
 
-def _checked_devices(devices, chunk: int | None, lanes: int) -> tuple[list[jax.Device], int]:
+def _prepare_devices(devices, chunk: int | None, lanes: int) -> tuple[list[jax.Device], int]:
     """Return the devices and how many lanes each takes at once. ValueError: no device or no count
     of lanes."""
     if chunk is not None:
@@ -84,12 +88,12 @@ def _checked_devices(devices, chunk: int | None, lanes: int) -> tuple[list[jax.D
     devices = list(devices) if np.iterable(devices) else [devices]
     if not devices or not all(isinstance(device, jax.Device) for device in devices):
         raise ValueError(f"devices: expected some of jax.local_devices(), got {devices!r}")
-    most = max(1, lanes // (len(devices) * jax.process_count()))
+    most_lanes = max(1, lanes // (len(devices) * jax.process_count()))
     default = 64 if devices[0].platform == "cpu" else 4096
-    return devices, min(chunk or default, most)
+    return devices, min(chunk or default, most_lanes)
 
 
-def _chunks(order: np.ndarray, size: int) -> np.ndarray:
+def _assign_chunks(order: np.ndarray, size: int) -> np.ndarray:
     """Return the lanes of each chunk, [chunks size]; the last one is filled up with its last lane.
     ValueError: fewer chunks than processes."""
     chunks = np.pad(order, (0, -len(order) % size), mode="edge").reshape(-1, size)
@@ -101,7 +105,7 @@ def _chunks(order: np.ndarray, size: int) -> np.ndarray:
     return chunks
 
 
-def _program(chain: Chain, t1, lane: Callable | None, options: dict, devices) -> Callable:
+def _chunk_runner(chain: Chain, t1, lane: Callable | None, options: dict, devices) -> Callable:
     """Return the function that runs a chunk, (states, data) of its lanes, on the devices. Equal
     functions share a compiled program."""
     common = {"throw": False, "adjoint": Replay(every=1 << 30), **options}
@@ -109,23 +113,25 @@ def _program(chain: Chain, t1, lane: Callable | None, options: dict, devices) ->
     functions = {"control": options.get("control"), "events": options.get("events", ())}
 
     def run(lanes):
-        piece = lambda lane, **own: _piece((chain, t1, common | own, lane), lanes, mesh)
+        piece = lambda lane, **own: _run_chunk((chain, t1, common | own, lane), lanes, mesh)
         return call_with_comparable(piece, lane=lane, **functions)
 
     return run
 
 
-def _count(states, data, cost) -> int:
+def _count_lanes(states, data, cost) -> int:
     if not isinstance(states, State):
         raise ValueError(
             f"states: expected a svkc.State with a leading axis, got {type(states).__name__}"
         )
-    sizes = {np.shape(x)[0] if np.ndim(x) else None for x in jax.tree.leaves((states, data, cost))}
-    lanes = next(iter(sizes))
-    if len(sizes) != 1 or not lanes or states.q.ndim != 2:
+    lane_counts = {
+        np.shape(x)[0] if np.ndim(x) else None for x in jax.tree.leaves((states, data, cost))
+    }
+    lanes = next(iter(lane_counts))
+    if len(lane_counts) != 1 or not lanes or states.q.ndim != 2:
         raise ValueError(
             "states, data, cost: expected one leading axis of lanes, got sizes"
-            f" {sorted(map(str, sizes))} and q of shape {states.q.shape}"
+            f" {sorted(map(str, lane_counts))} and q of shape {states.q.shape}"
         )
     if cost is not None and finite_array("cost", cost).ndim != 1:
         raise ValueError(f"cost: got shape {np.shape(cost)}, expected one number for each lane")
@@ -133,12 +139,12 @@ def _count(states, data, cost) -> int:
 
 
 @eqx.filter_jit
-def _piece(common, lanes, mesh: Mesh) -> Trajectory:
+def _run_chunk(common, lanes, mesh: Mesh) -> Trajectory:
     """The run of one chunk: a piece for each device, without a word between them, so that none
     waits for another's steps."""
-    fixed, static = eqx.partition(common, eqx.is_array)
+    arrays, static = eqx.partition(common, eqx.is_array)
 
-    def one(fixed, state, data):
+    def run_lane(fixed, state, data):
         chain, t1, options, lane = eqx.combine(fixed, static)
         own = {} if lane is None else lane(chain, data)
         if not isinstance(own, dict):
@@ -146,18 +152,18 @@ def _piece(common, lanes, mesh: Mesh) -> Trajectory:
         own = dict(own)
         return simulate(own.pop("chain", chain), state, own.pop("t1", t1), **{**options, **own})
 
-    every, spec = PartitionSpec(), PartitionSpec("lanes")
+    replicated, by_lanes = PartitionSpec(), PartitionSpec("lanes")
     parts = jax.shard_map(
-        jax.vmap(one, (None, 0, 0)),
+        jax.vmap(run_lane, (None, 0, 0)),
         mesh=mesh,
-        in_specs=(every, spec, spec),
-        out_specs=spec,
+        in_specs=(replicated, by_lanes, by_lanes),
+        out_specs=by_lanes,
         check_vma=False,
     )
-    return parts(fixed, *lanes)
+    return parts(arrays, *lanes)
 
 
-def _folder(folder: pathlib.Path, inputs, size: int) -> pathlib.Path:
+def _prepare_folder(folder: pathlib.Path, inputs, size: int) -> pathlib.Path:
     """The folder, made, with what it is the rollout of; ValueError where it is another's."""
     digest = hashlib.sha256()
     for path, leaf in jax.tree_util.tree_leaves_with_path(inputs):
@@ -168,21 +174,23 @@ def _folder(folder: pathlib.Path, inputs, size: int) -> pathlib.Path:
             if eqx.is_array_like(leaf)
             else repr(getattr(leaf, "__qualname__", leaf)).encode()
         )
-    told = {"rollout": digest.hexdigest(), "lanes in a chunk": size}
+    description = {"rollout": digest.hexdigest(), "lanes in a chunk": size}
     folder.mkdir(parents=True, exist_ok=True)
-    label = folder / "rollout.json"
-    if label.exists() and json.loads(label.read_text()) != told:
+    label_path = folder / "rollout.json"
+    if label_path.exists() and json.loads(label_path.read_text()) != description:
         raise ValueError(
             f"out: {folder} holds another rollout (other states, options or chunks); give another"
             " folder, or empty it"
         )
     temporary = folder / f"rollout.{os.getpid()}.part"
-    temporary.write_text(json.dumps(told))
-    temporary.replace(label)
+    temporary.write_text(json.dumps(description))
+    temporary.replace(label_path)
     return folder
 
 
-def _chunk(run: Callable, lanes, path: pathlib.Path | None, chain: Chain, chunk: int) -> Trajectory:
+def _load_or_run(
+    run: Callable, lanes, path: pathlib.Path | None, chain: Chain, chunk: int
+) -> Trajectory:
     """One chunk, read where it was finished before; on the host, so that the device is free for the
     next."""
     if path is not None and path.exists():
@@ -202,11 +210,11 @@ def _chunk(run: Callable, lanes, path: pathlib.Path | None, chain: Chain, chunk:
     return traj
 
 
-def _say(done: int, chunks: int, lanes: int, seconds: float) -> None:
-    left = seconds / done * (chunks - done)
+def _print_progress(done: int, chunks: int, lanes: int, seconds: float) -> None:
+    remaining = seconds / done * (chunks - done)
     end = "\n" if done == chunks else ""
     print(
-        f"\rrollout: {done} of {chunks} chunks ({lanes} lanes), {seconds:.1f} s, {left:.0f} s"
+        f"\rrollout: {done} of {chunks} chunks ({lanes} lanes), {seconds:.1f} s, {remaining:.0f} s"
         " to go ",
         end=end,
         file=sys.stderr,
@@ -214,25 +222,26 @@ def _say(done: int, chunks: int, lanes: int, seconds: float) -> None:
     )
 
 
-def _gathered(done: dict[int, Trajectory], count: int) -> list[Trajectory]:
+def _gather_chunks(done: dict[int, Trajectory], count: int) -> list[Trajectory]:
     """Every chunk in order, those of the other processes too."""
     if jax.process_count() == 1:
         return [done[i] for i in range(count)]
     from jax.experimental import multihost_utils
 
-    processes, mine = jax.process_count(), jax.process_index()
-    found = []
+    processes, process = jax.process_count(), jax.process_index()
+    chunks = []
     for first in range(0, count, processes):
         # who has no chunk in a round sends one again
-        own = done.get(first + mine, next(iter(done.values())))
+        own_chunk = done.get(first + process, next(iter(done.values())))
         try:
-            parts = multihost_utils.process_allgather(own)
+            round_chunks = multihost_utils.process_allgather(own_chunk)
         except Exception as error:
             raise RuntimeError(
                 "rollout: another process has ended before its chunks did; the same call with the"
                 " same `out` goes on from those"
             ) from error
-        found += [
-            jax.tree.map(lambda x, p=p: x[p], parts) for p in range(min(processes, count - first))
+        chunks += [
+            jax.tree.map(lambda x, p=p: x[p], round_chunks)
+            for p in range(min(processes, count - first))
         ]
-    return found
+    return chunks

@@ -1,4 +1,8 @@
-"""Events: changes of structure at a time or at the zero of a guard."""
+"""Events: changes of structure at a given time, or when a guard crosses zero.
+
+An event says when something happens and what happens; `svkc.transitions.plan` checks events against
+a chain and turns them into tables.
+"""
 
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -11,9 +15,15 @@ from svkc.transitions.spare_links import Grip
 
 
 class Action(eqx.Module):
-    """What an event does: names of virtual links to connect (those in `here`: where they are) and
-    cut, of joints to lock and unlock, grips to make with spare slots and, by slot or by pair of
-    bodies, to give up."""
+    """The changes of structure that one event makes.
+
+    connect, cut: names of virtual links.
+    lock, unlock: names of joints.
+    at_current_pose: the links of `connect` whose joint is made at the current poses of the bodies.
+    stop: whether the event ends the run.
+    unbind: spare slots to clear, by name or as pairs (parent, real) of body names.
+    bind: grips to make with spare slots.
+    """
 
     connect: tuple[str, ...] = eqx.field(static=True, default=())
     cut: tuple[str, ...] = eqx.field(static=True, default=())
@@ -26,15 +36,17 @@ class Action(eqx.Module):
 
 
 class At(eqx.Module):
-    """An event at a time (s); the time is differentiable."""
+    """An event at a given time (s). The time is differentiable."""
 
     time: Any
     action: Action
 
 
 class When(eqx.Module):
-    """An event when guard(t, state, args) crosses zero: upwards (True), downwards (False), either
-    way (None)."""
+    """An event at the time at which guard(t, state, args) crosses zero.
+
+    direction: True for rising guards only, False for falling guards only, None for either.
+    """
 
     guard: Callable
     action: Action
@@ -42,11 +54,12 @@ class When(eqx.Module):
 
 
 def _as_tuple(value) -> tuple:
-    """One thing, or what holds several."""
+    """Return an iterable as a tuple, and any other value or a string as a tuple of one."""
     return tuple(value) if isinstance(value, Iterable) and not isinstance(value, str) else (value,)
 
 
 def _make_action(*, connect, cut, lock, unlock, here, stop, bind, unbind) -> Action:
+    """Return the validated action of an event. Raises ValueError for invalid arguments."""
     bind = _as_tuple(bind)
     if not all(isinstance(g, Grip) for g in bind):
         raise ValueError(f"bind: expected svkc.Grip objects, got {bind!r}")
@@ -82,12 +95,23 @@ def _make_action(*, connect, cut, lock, unlock, here, stop, bind, unbind) -> Act
 def at(
     time, connect=(), cut=(), *, lock=(), unlock=(), here=False, stop=False, bind=(), unbind=()
 ) -> At:
-    """At this time (s): connect and cut virtual links, lock and unlock joints, by name. Where a
-    link is both connected and cut, it is cut.
+    """Return an event that changes the structure at a given time.
 
-    here: True, or names: grip where the bodies are. stop: end the run then. bind: `svkc.Grip`s to
-    make with spare slots, where the bodies are; where all are taken the run ends with a code.
-    unbind: spare slots by name, or all between a pair (parent, real) of bodies, cut and emptied.
+    A link that events of one instant both connect and cut is cut.
+
+    time: when the event happens (s). The time is differentiable.
+    connect, cut: name or names of virtual links.
+    lock, unlock: name or names of joints of the tree.
+    here: make new joints at the current poses of the bodies instead of at their declared
+        placements: True for all links of `connect`, or names of some of them.
+    stop: end the run at this event.
+    bind: `svkc.Grip` or several, made with spare slots at the current poses of the bodies. The run
+        ends with the result `no_slot` if no spare slot is free.
+    unbind: spare slots to cut and clear: names of slots, or pairs (parent, real) of body names for
+        all slots between two bodies.
+
+    Raises ValueError if an argument has another type or if `here` names a link that `connect` does
+    not name. Names are checked against the chain by `simulate`.
     """
     real_array("time", time)
     action = _make_action(
@@ -110,16 +134,23 @@ def when(
     bind=(),
     unbind=(),
 ) -> When:
-    """When guard(t, state, args) -> real crosses zero, located to round-off and differentiable in
-    time; the actions are those of `at`.
+    """Return an event that changes the structure when a guard crosses zero.
 
-    direction: True for upwards only, False for downwards only. A guard is watched while its action
-    would change something, or always if it has none, so name the links it is about where several
-    act alike; one that is exactly zero at the start has not crossed, nor has one that rests at zero
-    (to eps^(3/4)) after it fired. Crossings are seen between the ends of steps of one phase: two
-    within one step go unseen, so bound the step (`stepsize_controller`, `dt`) where that can
-    happen. A guard that jumps over zero happens where it jumps; only a smooth one has a time to
-    differentiate.
+    The time of the event is located to round-off and is differentiable if the guard is smooth.
+
+    A guard is armed while its action would change the structure. A guard whose action stops the
+    run or changes nothing is always armed. A guard that is exactly zero at the start has not
+    crossed zero, nor has a guard that stays at zero (to eps^(3/4)) after its event. Crossings are
+    detected between the ends of steps: two crossings within one step are missed, so bound the step
+    size (`stepsize_controller`, `dt`) where that can happen. The event of a discontinuous guard is
+    located at the jump; derivatives treat its time as constant.
+
+    guard: function (t, state, args) -> real number, or a guard such as `svkc.touch` returns.
+    connect, cut, lock, unlock, here, stop, bind, unbind: as for `svkc.at`.
+    direction: True for rising guards only, False for falling guards only, None for either.
+
+    Raises ValueError if the guard is not callable, the direction is not True, False or None, or an
+    argument is one that `svkc.at` refuses.
     """
     if not callable(guard):
         raise ValueError(f"when: guard must be a function of (t, state, args), got {guard!r}")
@@ -134,7 +165,10 @@ def when(
 
 
 def as_events(events) -> tuple:
-    """The events of a list; ValueError for anything that is not one."""
+    """Return one event or an iterable of events as a tuple.
+
+    Raises ValueError if an element is not an event.
+    """
     events = tuple(events) if isinstance(events, Iterable) else (events,)
     for event in events:
         if not isinstance(event, At | When):

@@ -1,4 +1,4 @@
-"""The velocity and the impulses after a change of structure (paper, (29)-(38))."""
+"""Velocities and impulses of inelastic impacts at changes of structure (paper, (29)-(38))."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -14,28 +14,32 @@ from svkc.tree.kinematics import kinematics
 
 
 def velocity_after_impact(
-    chain: Chain, structure: Structure, loops: LoopKinematics, selection: PivotedQR, v
+    chain: Chain, structure: Structure, loops: LoopKinematics, qr: PivotedQR, v
 ):
     """Return v+ = W (W^T M W)^-1 W^T M v-, the impulse of each loop on its real link, and the
-    energy lost: the paper's (29)-(38) in one formula.
+    energy lost (J): the paper's (29)-(38) in one formula.
 
-    v+ is the projection of v-, orthogonal in the metric of the inertia, on the velocities that the
-    structure allows. Redundant loops need no special case.
+    v+ is the projection of v- onto the velocities that the structure allows, orthogonal in the
+    metric of the mass matrix. Redundant loops need no special case.
     """
-    solve = CompositeBodies().prepare(chain, structure, loops, selection)
-    jump = solve(jnp.zeros_like(v), loops.J @ (v / jacobian_scales(chain)[1]))
-    impulse = append_virtual_joints(chain, mass_matrix_product(chain, loops.kin, jump[: chain.nv]))
-    # v- and v+ differ by a vector orthogonal to v+, so that the loss is a square and cannot be
-    # negative
-    return v + jump, -constraint_forces(chain, selection, loops.J, impulse), jump @ impulse / 2
+    solve = CompositeBodies().prepare(chain, structure, loops, qr)
+    delta_v = solve(jnp.zeros_like(v), loops.J @ (v / jacobian_scales(chain)[1]))
+    impulse = append_virtual_joints(
+        chain, mass_matrix_product(chain, loops.kin, delta_v[: chain.nv])
+    )
+    # v+ - v- is orthogonal to v+, so the energy lost is a squared norm and cannot be negative
+    return v + delta_v, -constraint_forces(chain, qr, loops.J, impulse), delta_v @ impulse / 2
 
 
 class StructureChange(eqx.Module):
-    """What a change of structure did: the state after it, impulses on the real links from their
-    parents, at the joints, and energy lost (J).
+    """The result of a change of structure.
 
-    `gap`: the largest gap of a loop before it was closed; `left`: of each loop after it (rad, or
-    `chain.length`s).
+    state: the state after the change.
+    impulse, angular_impulse: of each virtual link on its real link from the parent, at the joint,
+        in world axes (N s, N m s).
+    energy_lost: kinetic energy lost in the impact (J).
+    initial_gap: largest loop gap before the new loops were closed (rad, or in `chain.length`s).
+    residual_gaps: largest gap of each loop after they were closed (rad, or in `chain.length`s).
     """
 
     state: State
@@ -47,13 +51,13 @@ class StructureChange(eqx.Module):
 
 
 def lock_projection(chain: Chain, structure: Structure, q, v):
-    """The projection where only joints are locked and there are no virtual links; velocity after,
-    energy lost."""
+    """Return the velocity after locking joints of a chain without virtual links, and the energy
+    lost (J)."""
     if structure.locked is None:
         return v, jnp.zeros((), v.dtype)
     kin = kinematics(chain, q)
     after = ArticulatedBodies().prepare_open(chain, structure, kin)(
         mass_matrix_product(chain, kin, v)
     )
-    jump = after - v
-    return after, jump @ mass_matrix_product(chain, kin, jump) / 2
+    delta_v = after - v
+    return after, delta_v @ mass_matrix_product(chain, kin, delta_v) / 2

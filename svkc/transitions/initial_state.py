@@ -52,13 +52,13 @@ def _set_values(array, at, values):
     return out
 
 
-def _full_vector(chain: Chain, what: str, value, default):
+def _full_vector(chain: Chain, quantity: str, value, default):
     """Return the full vector of a user's array or dict for `what`, q or v, and which coordinates
     the dict named."""
     top = chain.topology
     tree_size, widths, start, model_entries = (
         (top.nq, Q_SIZE, top.q_start, top.model_q)
-        if what == "q"
+        if quantity == "q"
         else (top.nv, V_SIZE, top.v_start, top.model_v)
     )
     named = np.zeros(len(default), bool)
@@ -68,17 +68,17 @@ def _full_vector(chain: Chain, what: str, value, default):
         out = default
         for name, number in value.items():
             at = joint_slice(chain, name, widths, start)
-            number = finite_array(f"{what}[{name!r}]", number, default.dtype)
+            number = finite_array(f"{quantity}[{name!r}]", number, default.dtype)
             if number.size != at.stop - at.start:
                 raise ValueError(
-                    f"{what}[{name!r}]: got {number.size} numbers, the joint has"
+                    f"{quantity}[{name!r}]: got {number.size} numbers, the joint has"
                     f" {at.stop - at.start}"
                 )
             out = _set_values(out, at, number.reshape(-1))
-            if what == "v" or at.stop - at.start == 1:
+            if quantity == "v" or at.stop - at.start == 1:
                 named[at] = True
         return out, named
-    value = finite_array(what, value, default.dtype)
+    value = finite_array(quantity, value, default.dtype)
     if top.cut_joints and value.shape == (len(model_entries),):
         # as for the plain tree
         return _set_values(default, np.array(model_entries, int), value), named
@@ -86,7 +86,7 @@ def _full_vector(chain: Chain, what: str, value, default):
         return _set_values(default, slice(tree_size), value), named
     if value.shape != default.shape:
         raise ValueError(
-            f"{what}: got shape {value.shape}, expected ({tree_size},) for the tree or {default.shape}"
+            f"{quantity}: got shape {value.shape}, expected ({tree_size},) for the tree or {default.shape}"
             " for every coordinate"
         )
     return value, named
@@ -144,7 +144,7 @@ def _close_and_project(
     links_to_place = (np.array(chain.topology.link_child, int) >= 0) & (not q_is_complete)
     if links_to_place.any():
         q, v = _place_cuttable_bodies(chain, structure, q, v, links_to_place)
-    held = dataclasses.replace(held, read=jnp.asarray(~links_to_place) | ~structure.connected)
+    held = dataclasses.replace(held, read_links=jnp.asarray(~links_to_place) | ~structure.connected)
     solution = solve_structure(chain, structure, q, v, held, _ASSEMBLE_SCHEDULE)
     return (
         State(

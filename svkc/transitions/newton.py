@@ -62,7 +62,7 @@ class HeldCoordinates(eqx.Module):
 
     q: Bool[Array, " dofs"] | None = None
     v: Bool[Array, " dofs"] | None = None
-    read: Bool[Array, " links"] | None = None
+    read_links: Bool[Array, " links"] | None = None
 
 
 class NewtonState(eqx.Module):
@@ -230,7 +230,7 @@ class _Iteration(eqx.Module):
 
         def read():
             coordinates = joint_coordinates(chain, self.structure, loops.kin, q)
-            return with_coordinates(chain, self.held.read, coordinates, q)
+            return with_coordinates(chain, self.held.read_links, coordinates, q)
 
         return jax.lax.cond(kind == READ_COORDINATES, read, lambda: q_next)
 

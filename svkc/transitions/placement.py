@@ -1,4 +1,4 @@
-"""Joint coordinates of virtual links, and links placed where their bodies are."""
+"""Coordinates of virtual joints, and placements of virtual links, from the poses of their bodies."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -20,58 +20,66 @@ from svkc.tree.spatial import (
 def joint_coordinates(
     chain: Chain, structure: Structure, kin: Kinematics, q: Float[Array, " q"]
 ) -> Float[Array, " q"]:
-    """Q with the coordinates of every virtual joint read off from where its two bodies are: what
-    the joint's freedoms can express of it."""
+    """Return q with the coordinates of every virtual joint computed from the poses of its two
+    bodies.
+
+    The part of the relative pose that the joint's freedoms cannot express is left out.
+    """
     top = chain.topology
-    base = loop_frames(chain, structure, kin, q)
-    turn = quat_multiply(quat_conjugate(base.base_quat), base.real_quat)
+    frames = loop_frames(chain, structure, kin, q)
+    rotation = quat_multiply(quat_conjugate(frames.base_quat), frames.real_quat)
     p = structure.parent
-    start = (
+    origin = (
         kin.r[p]
         + quat_rotate(kin.quat[p], structure.pos)
         + (kin.root_position[p] - kin.root_position[structure.real])
     )
-    slide = jnp.where(
+    translation = jnp.where(
         structure.freedoms[:, 3:],
-        quat_rotate(quat_conjugate(base.base_quat), base.real_position - start),
+        quat_rotate(quat_conjugate(frames.base_quat), frames.real_position - origin),
         0,
     )
-    angle = _euler_angles(turn, structure.freedoms)
-    masked = quat_normalize(
-        jnp.concatenate([turn[:, :1], jnp.where(structure.freedoms[:, :3], turn[:, 1:], 0)], -1)
+    angle = _euler_angles(rotation, structure.freedoms)
+    ball_quat = quat_normalize(
+        jnp.concatenate(
+            [rotation[:, :1], jnp.where(structure.freedoms[:, :3], rotation[:, 1:], 0)], -1
+        )
     )
     table = top.links
-    for values, index in ((angle, table.angle), (slide, table.slide), (masked, table.quat)):
+    for values, index in (
+        (angle, table.angle),
+        (translation, table.slide),
+        (ball_quat, table.quat),
+    ):
         at = np.flatnonzero((index < top.nq_all).ravel())
         q = q.at[index.ravel()[at]].set(values.ravel()[at])
     return q
 
 
 def with_coordinates(
-    chain: Chain, which: Bool[Array, " links"], new: Float[Array, " q"], q: Float[Array, " q"]
+    chain: Chain, links: Bool[Array, " links"], new: Float[Array, " q"], q: Float[Array, " q"]
 ) -> Float[Array, " q"]:
-    """The coordinates of the virtual joints in `which` from `new`, everything else from `q`."""
+    """Return q with the coordinates of the virtual joints in the mask `links` taken from `new`."""
     table, top = chain.topology.links, chain.topology
     for index in (table.angle, table.slide, table.quat):
         at = np.flatnonzero((index < top.nq_all).ravel())
         slots = index.ravel()[at]
-        q = q.at[slots].set(jnp.where(which[at // index.shape[1]], new[slots], q[slots]))
+        q = q.at[slots].set(jnp.where(links[at // index.shape[1]], new[slots], q[slots]))
     return q
 
 
 def _euler_angles(
-    turn: Float[Array, "links 4"], freedoms: Bool[Array, "links 6"]
+    rotation: Float[Array, "links 4"], freedoms: Bool[Array, "links 6"]
 ) -> Float[Array, "links 3"]:
-    """Turns about x, y, z in sequence; those not free are taken as zero, the others solved from the
-    rotation."""
-    R = quat_matrix(turn)
+    """Return the Euler angles about x, y, z in sequence; the angle of a locked axis is zero."""
+    R = quat_matrix(rotation)
     fx, fy, fz = freedoms[:, 0], freedoms[:, 1], freedoms[:, 2]
 
     def angle(s, c):
-        # where there is none, no derivative that is not a number either
+        # arctan2(0, 0) has the derivative NaN
         return jnp.arctan2(s, jnp.where((s == 0) & (c == 0), 1, c))
 
-    # each from the entries of Rx Ry, Rx Rz or Ry Rz that hold it alone
+    # each angle from entries of Rx Ry, Rx Rz or Ry Rz that depend on this angle alone
     x = jnp.where(
         fx, jnp.where(fz, angle(-R[:, 1, 2], R[:, 2, 2]), angle(R[:, 2, 1], R[:, 1, 1])), 0
     )
@@ -83,27 +91,26 @@ def _euler_angles(
 
 
 def place_at_current_pose(
-    chain: Chain, structure: Structure, q, here: Bool[Array, " links"], kin: Kinematics
+    chain: Chain, structure: Structure, q, links: Bool[Array, " links"], kin: Kinematics
 ) -> Structure:
-    """Placements of the links in `here` taken from where the bodies are: the point is the real
-    link's own, the axes stay the parent's.
+    """Return the structure with the links in the mask `links` placed at the current poses of their
+    bodies.
 
-    So a palm grips the bar where it touches it, about the bar's direction; floats of the placement
-    stay differentiable.
+    The joint's origin is the declared point of the real link; the joint's axes stay those declared
+    in the parent. A palm, for example, grips a bar where it touches the bar, about the direction of
+    the bar. Derivatives with respect to the poses pass through the placement.
     """
-    end = loop_frames(chain, structure, kin, q)
+    frames = loop_frames(chain, structure, kin, q)
     p = structure.parent
     to_parent = quat_conjugate(kin.quat[p])
-    place = (
-        end.real_position
-        - kin.r[p]
-        - (kin.root_position[p] - kin.root_position[structure.real])
+    offset = (
+        frames.real_position - kin.r[p] - (kin.root_position[p] - kin.root_position[structure.real])
     )
-    pos = quat_rotate(to_parent, place)
-    real_quat = quat_multiply(quat_conjugate(kin.quat[structure.real]), end.base_quat)
-    take = here[:, None]
+    pos = quat_rotate(to_parent, offset)
+    real_quat = quat_multiply(quat_conjugate(kin.quat[structure.real]), frames.base_quat)
+    mask = links[:, None]
     return eqx.tree_at(
         lambda s: (s.pos, s.real_quat),
         structure,
-        (jnp.where(take, pos, structure.pos), jnp.where(take, real_quat, structure.real_quat)),
+        (jnp.where(mask, pos, structure.pos), jnp.where(mask, real_quat, structure.real_quat)),
     )

@@ -58,24 +58,26 @@ class Plan(eqx.Module):
         """Return whether any event connects a link or locks a joint. If none does, no impact is
         compiled."""
         return bool(
-            self.has_binds or self.table(chain, "connect").any() or self.table(chain, "lock").any()
+            self.has_binds
+            or self.action_mask(chain, "connect").any()
+            or self.action_mask(chain, "lock").any()
         )
 
     @property
     def has_locks(self) -> bool:
         return any(a.lock or a.unlock for a in self.actions)
 
-    def table(self, chain: Chain, what: str) -> np.ndarray:
+    def action_mask(self, chain: Chain, action_name: str) -> np.ndarray:
         """[events, links or dofs] Boolean of one part of the actions."""
-        if what in ("lock", "unlock"):
+        if action_name in ("lock", "unlock"):
             table = np.zeros((len(self.actions), chain.dofs), bool)
             for row, action in zip(table, self.actions, strict=True):
-                for name in getattr(action, what):
+                for name in getattr(action, action_name):
                     row[joint_slice(chain, name, V_SIZE, chain.topology.v_start)] = True
             return table
         table = np.zeros((len(self.actions), len(chain.link_names)), bool)
         for row, action in zip(table, self.actions, strict=True):
-            row[[link_index(chain, name) for name in getattr(action, what)]] = True
+            row[[link_index(chain, name) for name in getattr(action, action_name)]] = True
         return table
 
     def grip_mask(self, chain: Chain) -> np.ndarray:
@@ -88,11 +90,11 @@ class Plan(eqx.Module):
     def armed(self, chain: Chain, structure: Structure) -> Bool[Array, " guards"]:
         """Guards whose action would change something now, or that have none."""
         rows = list(self.guarded)
-        on, off = (self.table(chain, what)[rows] for what in ("connect", "cut"))
+        on, off = (self.action_mask(chain, what)[rows] for what in ("connect", "cut"))
         c = structure.connected[None]
         change = jnp.any(on & ~c, 1) | jnp.any(off & c, 1)
         if self.has_locks:
-            on, off = (self.table(chain, what)[rows] for what in ("lock", "unlock"))
+            on, off = (self.action_mask(chain, what)[rows] for what in ("lock", "unlock"))
             change = (
                 change
                 | jnp.any(on & ~structure.locked[None], 1)
@@ -156,7 +158,7 @@ def make_plan(chain: Chain, events: tuple, dtype) -> Plan:
         grips=tuple(tuple(_validate_grip(chain, g, dtype) for g in e.action.bind) for e in events),
     )
     for what in ("connect", "cut", "lock", "unlock"):
-        plan.table(chain, what)
+        plan.action_mask(chain, what)
     for action in plan.actions:
         for what in action.unbind:
             spare_slot(chain, what) if isinstance(what, str) else body_rows(chain, *what)

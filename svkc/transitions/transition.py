@@ -1,4 +1,8 @@
-"""Changes of structure: connect, cut, lock, unlock, unbind (paper, section V)."""
+"""Changes of the structure of a state: connect, cut, lock, unlock, unbind (paper, section V).
+
+Connecting a link or locking a joint is an inelastic impact: the velocity jumps. Cutting, unlocking
+and unbinding leave q and v unchanged.
+"""
 
 import functools
 
@@ -20,6 +24,7 @@ from svkc.transitions.newton import (
     CONNECTION,
     RANK_SEARCH,
     HeldCoordinates,
+    NewtonState,
     Schedule,
     decide_rank,
     solve_structure,
@@ -32,29 +37,30 @@ from svkc.tree.kinematics import kinematics
 def _with_masks(
     chain: Chain, structure: Structure, connected, locked
 ) -> tuple[Structure, Bool[Array, " links"], Bool[Array, ""]]:
-    """Return the structure with these masks, its rank not decided yet, the links that are new, and
-    whether anything new holds."""
+    """Return the structure with these masks and its old rank, the links that are new, and whether
+    any link or lock is new."""
     new_links = connected & ~structure.connected
-    holds, after = jnp.any(new_links), eqx.tree_at(lambda s: s.connected, structure, connected)
+    any_new = jnp.any(new_links)
+    after = eqx.tree_at(lambda s: s.connected, structure, connected)
     if locked is None:
-        return after, new_links, holds
-    was = jnp.zeros(chain.dofs, bool) if structure.locked is None else structure.locked
+        return after, new_links, any_new
+    locked_before = jnp.zeros(chain.dofs, bool) if structure.locked is None else structure.locked
     return (
         eqx.tree_at(lambda s: s.locked, after, locked, is_leaf=lambda x: x is None),
         new_links,
-        holds | jnp.any(locked & ~was),
+        any_new | jnp.any(locked & ~locked_before),
     )
 
 
 @eqx.filter_checkpoint
 def _place_new_links(
-    chain: Chain, structure: Structure, new_links, here, q
+    chain: Chain, structure: Structure, new_links, at_current_pose, q
 ) -> tuple[Structure, Float[Array, " q"]]:
-    """Return the structure with the placements of the links in `here`, and q with the coordinates
-    of the new joints read off from where the bodies are."""
+    """Return the structure with the links in `at_current_pose` placed there, and q with the
+    coordinates of the new joints computed from the poses of their bodies."""
     kin = kinematics(chain, q)
-    if here is not None:
-        structure = place_at_current_pose(chain, structure, q, here & new_links, kin)
+    if at_current_pose is not None:
+        structure = place_at_current_pose(chain, structure, q, at_current_pose & new_links, kin)
     return structure, with_coordinates(
         chain, new_links, joint_coordinates(chain, structure, kin, q), q
     )
@@ -66,41 +72,59 @@ def change_structure(
     state: State,
     connected: Bool[Array, " links"],
     locked: Bool[Array, " dofs"] | None = None,
-    here: Bool[Array, " links"] | None = None,
+    at_current_pose: Bool[Array, " links"] | None = None,
 ) -> StructureChange:
-    """The state under another set of connected links and locked joints.
+    """Return the state with these links connected and these joints locked.
 
-    Where links are only cut or joints only unlocked, q and v are kept bit for bit; where something
-    new holds, coordinates of the new joints are read off, the remaining gap is closed by the least
-    change, and the velocity is projected.
+    If a link or a lock is new, the coordinates of the new joints are computed from the poses of
+    their bodies, the remaining loop gaps are closed by the least change of q, and the velocity is
+    projected as by an inelastic impact. Otherwise q and v stay unchanged, bit for bit.
+
+    locked: None leaves the locks of the state unchanged.
+    at_current_pose: new links whose joint is made at the current poses of its bodies; None: no
+        link.
     """
-    structure, new_links, holds = _with_masks(chain, state.structure, connected, locked)
-    q, v, nothing = state.q, state.v, jnp.zeros((len(chain.link_names), 3), state.v.dtype)
+    structure, new_links, any_new = _with_masks(chain, state.structure, connected, locked)
     if not len(chain.link_names):
-        after, lost = lock_projection(chain, structure, q, v)
-        v = jnp.where(holds, after, v)
-        return StructureChange(
-            state=State(q, v, structure),
-            impulse=nothing,
-            angular_impulse=nothing,
-            energy_lost=jnp.where(holds, lost, 0),
-            initial_gap=jnp.zeros((), v.dtype),
-            residual_gaps=nothing[:, 0],
-        )
-    structure, new_q = _place_new_links(chain, structure, new_links, here, q)
-    joined = solve_structure(
-        chain, structure, new_q, v, HeldCoordinates(), Schedule(RANK_SEARCH + CONNECTION)
+        return _lock_without_links(chain, state, structure, any_new)
+    structure, q = _place_new_links(chain, structure, new_links, at_current_pose, state.q)
+    solution = solve_structure(
+        chain, structure, q, state.v, HeldCoordinates(), Schedule(RANK_SEARCH + CONNECTION)
     )
-    structure = eqx.tree_at(lambda s: (s.rank, s.margin), structure, (joined.rank, joined.margin))
-    q, v = jnp.where(holds, joined.q, q), jnp.where(holds, joined.v, v)
-    wrench = jnp.where(holds, joined.spatial_impulse, 0)
+    return _select_change(state, structure, solution, any_new)
+
+
+def _lock_without_links(
+    chain: Chain, state: State, structure: Structure, any_new: Bool[Array, ""]
+) -> StructureChange:
+    """Return the change of structure of a chain without virtual links."""
+    v, energy_lost = lock_projection(chain, structure, state.q, state.v)
+    no_impulse = jnp.zeros((0, 3), state.v.dtype)
+    return StructureChange(
+        state=State(state.q, jnp.where(any_new, v, state.v), structure),
+        impulse=no_impulse,
+        angular_impulse=no_impulse,
+        energy_lost=jnp.where(any_new, energy_lost, 0),
+        initial_gap=jnp.zeros((), state.v.dtype),
+        residual_gaps=no_impulse[:, 0],
+    )
+
+
+def _select_change(
+    state: State, structure: Structure, solution: NewtonState, any_new: Bool[Array, ""]
+) -> StructureChange:
+    """Return the solution as a change of structure, with the old q and v where nothing is new."""
+    rank = (solution.rank, solution.margin)
+    structure = eqx.tree_at(lambda s: (s.rank, s.margin), structure, rank)
+    q, v = jnp.where(any_new, solution.q, state.q), jnp.where(any_new, solution.v, state.v)
+    impulse = jnp.where(any_new, solution.spatial_impulse, 0)
     return StructureChange(
         state=State(q, v, structure),
-        impulse=wrench[:, 3:],
-        angular_impulse=wrench[:, :3],
-        energy_lost=jnp.where(holds, joined.energy_lost, 0),
-        initial_gap=jnp.where(holds, jnp.max(joined.search_gaps[0]), 0),
-        residual_gaps=jnp.where(holds, joined.residual_gaps, joined.search_gaps[0]),
+        impulse=impulse[:, 3:],
+        angular_impulse=impulse[:, :3],
+        energy_lost=jnp.where(any_new, solution.energy_lost, 0),
+        initial_gap=jnp.where(any_new, jnp.max(solution.search_gaps[0]), 0),
+        residual_gaps=jnp.where(any_new, solution.residual_gaps, solution.search_gaps[0]),
     )
 
 
@@ -111,80 +135,106 @@ def release_constraints(
     connected: Bool[Array, " links"],
     locked: Bool[Array, " dofs"] | None = None,
 ) -> StructureChange:
-    """`change` where links are only cut and joints only unlocked: q and v stay, the rank is decided
-    anew."""
+    """Return the state after cutting links and unlocking joints: q and v stay unchanged and the
+    rank is decided again.
+
+    `change_structure` gives the same result; this function compiles no impact.
+    """
     structure, _, _ = _with_masks(chain, state.structure, connected, locked)
-    nothing = jnp.zeros((len(chain.link_names), 3), state.v.dtype)
+    no_impulse = jnp.zeros((len(chain.link_names), 3), state.v.dtype)
     zero = jnp.zeros((), state.v.dtype)
     return StructureChange(
         state=State(state.q, state.v, decide_rank(chain, structure, state.q)),
-        impulse=nothing,
-        angular_impulse=nothing,
+        impulse=no_impulse,
+        angular_impulse=no_impulse,
         energy_lost=zero,
         initial_gap=zero,
-        residual_gaps=nothing[:, 0],
+        residual_gaps=no_impulse[:, 0],
     )
 
 
 def transition(chain: Chain, state: State, connected) -> State:
-    """The state with exactly these virtual links connected (mask, or names): new ones with their
-    impact (paper, (29)-(38)), the others cut."""
+    """Return the state with exactly these virtual links connected.
+
+    Links that are not connected yet are connected at their declared placements, with the inelastic
+    impact of the paper's (29)-(38); connected links that are not named are cut.
+
+    connected: names of virtual links, or a Boolean mask over `chain.link_names`.
+
+    Raises ValueError for unknown names, and if bodies are too far from the declared placement or a
+    loop cannot be closed (a runtime error under jit).
+    """
     check_state(chain, state)
     mask = jnp.asarray(connection_mask(chain, connected))
     return _check_connected(chain, change_structure(chain, state, mask))
 
 
 def connect(chain: Chain, state: State, *names: str, here: bool = False) -> State:
-    """Connects virtual links: coordinates of the new joints, and the velocity after the impact
-    (paper, section V-C).
+    """Return the state with virtual links connected, after the inelastic impact (paper, section
+    V-C).
 
-    At their declared placement, where the bodies must already be; here=True: the joint is made
-    where the real link is. ValueError: unknown names, or bodies that are not at the placement (says
-    by how much).
+    The coordinates of the new joints are computed from the poses of their bodies. Links that are
+    already connected stay unchanged.
+
+    names: virtual links to connect.
+    here: False makes each joint at its declared placement, where the bodies must already be; True
+        makes it at the current poses of the bodies.
+
+    Raises ValueError for unknown names, and if bodies are too far from the declared placement or a
+    loop cannot be closed (a runtime error under jit).
     """
     check_state(chain, state)
-    chosen = np.isin(np.arange(len(chain.link_names)), [link_index(chain, n) for n in names])
-    mask = state.structure.connected | jnp.asarray(chosen)
-    return _check_connected(
-        chain,
-        change_structure(
-            chain, state, mask, here=jnp.asarray(chosen) if boolean("here", here) else None
-        ),
-    )
+    named = _link_mask(chain, names)
+    connected = state.structure.connected | named
+    at_current_pose = named if boolean("here", here) else None
+    change = change_structure(chain, state, connected, at_current_pose=at_current_pose)
+    return _check_connected(chain, change)
 
 
-def _check_connected(chain: Chain, done: StructureChange) -> State:
-    """The state after a change; an error where bodies were too far from the declared placement to
-    be joined."""
-    limit = CONNECT_TOLERANCE
-    if isinstance(done.initial_gap, jax.core.Tracer):
+def _link_mask(chain: Chain, names: tuple[str, ...]) -> Bool[Array, " links"]:
+    """Return the mask of these virtual links. Raises ValueError for unknown names."""
+    named = np.isin(np.arange(len(chain.link_names)), [link_index(chain, n) for n in names])
+    return jnp.asarray(named)
+
+
+def _check_connected(chain: Chain, change: StructureChange) -> State:
+    """Return the state after a change.
+
+    Raises ValueError (a runtime error under jit) if bodies were too far from the declared placement
+    or a loop is still open.
+    """
+    if isinstance(change.initial_gap, jax.core.Tracer):
         return eqx.error_if(
-            done.state,
-            done.initial_gap > limit,
+            change.state,
+            change.initial_gap > CONNECT_TOLERANCE,
             "connect: the bodies are not where the joint is declared; use here=True",
         )
-    if done.initial_gap > limit:
+    if change.initial_gap > CONNECT_TOLERANCE:
         raise ValueError(
-            f"connect: the bodies are {float(done.initial_gap):.3g} (rad, or lengths of"
+            f"connect: the bodies are {float(change.initial_gap):.3g} (rad, or lengths of"
             f" {float(chain.length):.3g} m) away from where the joint is declared; move them there,"
             " or grip where they are with here=True"
         )
-    return check_closed(chain, done.state, done.residual_gaps)
+    return check_closed(chain, change.state, change.residual_gaps)
 
 
-# gap, in rad or in `chain.length`s, up to which connecting may still move the bodies to their
-# declared placement
+# largest gap (rad, or in `chain.length`s) that connecting closes by moving the bodies
 CONNECT_TOLERANCE = 1e-2
 
 
 def cut(chain: Chain, state: State, *names: str) -> State:
-    """Cuts virtual links: q and v stay as they are, bit for bit (paper, section V-C)."""
+    """Return the state with virtual links cut; q and v stay unchanged, bit for bit (paper, section
+    V-C).
+
+    names: virtual links to cut. Raises ValueError for unknown names.
+    """
     check_state(chain, state)
-    chosen = np.isin(np.arange(len(chain.link_names)), [link_index(chain, n) for n in names])
-    return release_constraints(chain, state, state.structure.connected & ~jnp.asarray(chosen)).state
+    connected = state.structure.connected & ~_link_mask(chain, names)
+    return release_constraints(chain, state, connected).state
 
 
 def _set_locked(chain: Chain, state: State, joints, value: bool) -> State:
+    """Return the state with these joints locked, or unlocked where value is False."""
     check_state(chain, state)
     locked = (
         jnp.zeros(chain.dofs, bool) if state.structure.locked is None else state.structure.locked
@@ -197,19 +247,30 @@ def _set_locked(chain: Chain, state: State, joints, value: bool) -> State:
 
 
 def lock(chain: Chain, state: State, *joints: str) -> State:
-    """Holds joints of the tree still from now on, with the impact of stopping them: velocities
-    (rad/s, m/s) as by (29)-(38) for connecting."""
+    """Return the state with joints of the tree locked at their current coordinates.
+
+    The velocity jumps as in the impact of a connected link (paper, (29)-(38)), so that the locked
+    joints are at rest.
+
+    joints: names of joints. Raises ValueError for unknown names.
+    """
     return _set_locked(chain, state, joints, True)
 
 
 def unlock(chain: Chain, state: State, *joints: str) -> State:
-    """Lets locked joints move again; q (m, rad) and v (m/s, rad/s) stay as they are."""
+    """Return the state with joints unlocked; q and v stay unchanged.
+
+    joints: names of joints. Raises ValueError for unknown names.
+    """
     return _set_locked(chain, state, joints, False)
 
 
 def unbind(chain: Chain, state: State, *names: str) -> State:
-    """Cuts spare virtual links and empties their slots for other bodies; q and v stay as they
-    are."""
+    """Return the state with spare virtual links cut and their slots cleared, so that the slots can
+    be bound to other bodies; q and v stay unchanged.
+
+    names: spare slots. Raises ValueError for names that are not spare slots.
+    """
     check_state(chain, state)
     slots = np.isin(np.arange(len(chain.link_names)), [spare_slot(chain, n) for n in names])
     after = release_constraints(chain, state, state.structure.connected & ~jnp.asarray(slots)).state

@@ -1,8 +1,8 @@
 """Articulated bodies (Featherstone chapter 7): M^-1 f on the tree without M, level by level.
 
-In world axes about the root's origin articulated inertias add up along the tree as they are. All
-rows of a level are one array; a joint of fewer freedoms than its level's widest has freedoms that
-are nothing: no motion, an inertia of one.
+Articulated inertias are given in world axes about the root's origin, so that those of children
+add up without a change of coordinates. All rows of a level are one array. Joints with fewer
+freedoms than the widest of their level are padded with freedoms without motion and with inertia 1.
 """
 
 from typing import NamedTuple
@@ -29,60 +29,67 @@ from svkc.tree.traversal import (
 
 
 class ArticulatedLevel(NamedTuple):
-    """What `accelerations` needs of the bodies of one level: joint axes S, U = S I^A, (S I^A
-    S^T)^-1."""
+    """Factors of the mass matrix at one level (Featherstone (7.43), (7.44)).
+
+    S: motion subspaces, one row per freedom. U: S I^A. D_inverse: (S I^A S^T + armature)^-1.
+    """
 
     S: Float[Array, "*levels n d 6"]
     U: Float[Array, "*levels n d 6"]
-    inverse: Float[Array, "*levels n d d"]
+    D_inverse: Float[Array, "*levels n d d"]
 
 
 def articulated_inertias(
     chain: Chain, kin: Kinematics, free: Bool[Array, " nv"] | None = None
 ) -> list[ArticulatedLevel] | ArticulatedLevel:
-    """Articulated inertias from the leaves to the roots. free: coordinates that are not locked
-    (None: all)."""
+    """Return the factors of the mass matrix, from articulated inertias summed towards the roots.
+
+    free: coordinates that are not locked (None: all).
+    """
     top, own = chain.topology, spatial_inertias(chain, kin)
     S = kin.S if free is None else jnp.where(free[:, None], kin.S, 0)
-    more = jnp.zeros(chain.nv, S.dtype) if chain.armature is None else chain.armature
-    more = more if free is None else jnp.where(free, more, 1)
-    more = jnp.concatenate([more, jnp.ones(1, S.dtype)])
+    armature = jnp.zeros(chain.nv, S.dtype) if chain.armature is None else chain.armature
+    armature = armature if free is None else jnp.where(free, armature, 1)
+    # the last entry is that of the padding
+    armature = jnp.concatenate([armature, jnp.ones(1, S.dtype)])
 
-    def step(below, given):
-        level, A, s, m = given
-        A = A if below is None else A + sum_children(level.children, below)
-        U = jnp.sum(s[:, :, :, None] * A[:, None], 2)
-        D = jnp.sum(U[:, :, None] * s[:, None], -1) + m[:, :, None] * np.eye(s.shape[1])[None]
-        inverse = inverse_positive(D)
-        along = jnp.sum(inverse[..., None] * U[:, None], 2)
-        return A - jnp.sum(U[:, :, :, None] * along[:, :, None, :], 1), ArticulatedLevel(
-            s, U, inverse
-        )
+    def step(from_children, level_data):
+        level, I_A, s, rotor = level_data
+        I_A = I_A if from_children is None else I_A + sum_children(level.children, from_children)
+        U = jnp.sum(s[:, :, :, None] * I_A[:, None], 2)
+        D = jnp.sum(U[:, :, None] * s[:, None], -1) + rotor[:, :, None] * np.eye(s.shape[1])[None]
+        D_inverse = inverse_positive(D)
+        D_inverse_U = jnp.sum(D_inverse[..., None] * U[:, None], 2)
+        to_parent = I_A - jnp.sum(U[:, :, :, None] * D_inverse_U[:, :, None, :], 1)
+        return to_parent, ArticulatedLevel(s, U, D_inverse)
 
-    given = with_level_data(
+    level_data = with_level_data(
         top,
         lambda x: static_take(own, x.rows),
         lambda x: static_take(S, x.dofs),
-        lambda x: static_take(more, x.dofs),
+        lambda x: static_take(armature, x.dofs),
     )
-    return scan_levels(step, initial_carry(top, 6, 6, dtype=S.dtype), given, reverse=True)
+    return scan_levels(step, initial_carry(top, 6, 6, dtype=S.dtype), level_data, reverse=True)
 
 
 def _batched_matvec(A: Float[Array, "n i j"], x: Float[Array, "n j *k"]) -> Float[Array, "n i *k"]:
+    """Return A x for each of n matrices, over any trailing axes of x."""
     return jnp.sum(A.reshape(*A.shape, *(1,) * (x.ndim - 2)) * x[:, None], 2)
 
 
 def _inward_pass(top: Topology, bodies, f: Float[Array, "nv *k"]):
-    """For each level the forces that its joints are left with, those from below taken off, and the
-    accelerations that these give each joint alone."""
+    """Return (u, D^-1 u) of each level, with u = f - S p^A (Featherstone table 7.1, second pass).
 
-    def step(below, given):
-        (level, force), body = given
-        p = None if below is None else sum_children(level.children, below)
+    p^A is the articulated bias force that a body's children pass to it. f may have trailing axes.
+    """
+
+    def step(from_children, level_data):
+        (level, force), body = level_data
+        p = None if from_children is None else sum_children(level.children, from_children)
         u = force if p is None else force - _batched_matvec(body.S, p)
-        x = _batched_matvec(body.inverse, u)
-        passed = _batched_matvec(jnp.swapaxes(body.U, 1, 2), x)
-        return passed if p is None else passed + p, (u, x)
+        x = _batched_matvec(body.D_inverse, u)
+        to_parent = _batched_matvec(jnp.swapaxes(body.U, 1, 2), x)
+        return to_parent if p is None else to_parent + p, (u, x)
 
     return scan_levels(
         step,
@@ -93,38 +100,39 @@ def _inward_pass(top: Topology, bodies, f: Float[Array, "nv *k"]):
 
 
 def delassus_matrix(top: Topology, bodies, J: Float[Array, "rows nv"]) -> Float[Array, "rows rows"]:
-    """J M^-1 J^T. M = L D L^T with a joint's block of D for each (Featherstone section 6.5), so
-    that half the way to M^-1 J^T is enough."""
+    """Return J M^-1 J^T.
+
+    M^-1 = L^-T D^-1 L^-1 with a block of D for each joint (Featherstone section 6.5), so that the
+    inward pass, L^-1 J^T, is enough.
+    """
     parts = _inward_pass(top, bodies, J.T)
     parts = parts if isinstance(parts, list) else [parts]
     u, x = (jnp.concatenate([part[i].reshape(-1, J.shape[0]) for part in parts]) for i in (0, 1))
-    # sums, not a `dot`, which XLA's CPU backend would not put into one kernel with what is around
-    # it
+    # sums instead of a `dot`, which XLA's CPU backend does not fuse with its neighbours
     return sum_in_chunks(u[:, :, None] * x[:, None], (0,))
 
 
 def solve_mass_matrix(top: Topology, bodies, f: Float[Array, " nv"]) -> Float[Array, " nv"]:
-    """M^-1 f: the joints' accelerations at rest, without gravity (Featherstone table 7.1)."""
+    """Return M^-1 f, the joint accelerations at rest without gravity (Featherstone table 7.1)."""
 
-    def step(above, given):
-        (level, body), (_, x) = given
-        if above is not None:
-            a = static_take(above, level.parent)
-            x = x - jnp.sum(body.inverse * jnp.sum(body.U * a[:, None], -1)[:, None], -1)
-        moved = jnp.sum(body.S * x[..., None], 1)
-        return moved if above is None else a + moved, x
+    def step(previous, level_data):
+        (level, body), (_, x) = level_data
+        if previous is not None:
+            a = static_take(previous, level.parent)
+            x = x - jnp.sum(body.D_inverse * jnp.sum(body.U * a[:, None], -1)[:, None], -1)
+        relative = jnp.sum(body.S * x[..., None], 1)
+        return relative if previous is None else a + relative, x
 
-    found = level_tables(top)
+    levels = level_tables(top)
     x = scan_levels(
         step,
         initial_carry(top, 6, dtype=f.dtype),
-        zip_levels(zip_levels(found, bodies), _inward_pass(top, bodies, f)),
+        zip_levels(zip_levels(levels, bodies), _inward_pass(top, bodies, f)),
     )
-    x, order = (
-        (jnp.concatenate([y.ravel() for y in x]), [y.dofs for y in found])
-        if isinstance(found, list)
-        else (x.ravel(), [found.dofs])
-    )
-    return static_take(
-        x, np.argsort(np.concatenate([y.ravel() for y in order]), kind="stable")[: top.nv]
-    )
+    if isinstance(levels, list):
+        x = jnp.concatenate([y.ravel() for y in x])
+        dofs = np.concatenate([level.dofs.ravel() for level in levels])
+    else:
+        x, dofs = x.ravel(), levels.dofs.ravel()
+    # the padding, whose entries of `dofs` are nv, comes last
+    return static_take(x, np.argsort(dofs, kind="stable")[: top.nv])

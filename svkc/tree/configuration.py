@@ -1,4 +1,7 @@
-"""The configuration manifold: retraction, difference, derivative, unit quaternions."""
+"""The configuration manifold: retraction, difference, derivative, unit quaternions.
+
+The only module that knows which entries of q are quaternions and which of v turn them.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -22,8 +25,10 @@ from svkc.tree.traversal import replace_rows
 def configuration_derivative(
     chain: Chain, q: Float[Array, " q"], v: Float[Array, " dofs"]
 ) -> Float[Array, " q"]:
-    """Qdot for the velocities v: quaternions turn by qdot = q w / 2, everything else is its own
-    rate."""
+    """Return qdot for the velocities v.
+
+    A quaternion has the derivative q w / 2, with w in body axes; every other coordinate's is v.
+    """
     quat_q, quat_v = chain.topology.quaternion_starts
     scalar_q, scalar_v = chain.topology.scalar_coordinates
     turn = quat_derivative(
@@ -36,18 +41,23 @@ def configuration_derivative(
 
 @checked_jit
 def integrate(chain: Chain, q: Float[Array, " q"], dv: Float[Array, " dofs"]) -> Float[Array, " q"]:
-    """Q moved by the tangent vector dv (m, rad; body axes for rotations): the exponential map,
-    Rodrigues' formula (39)."""
+    """Return the configuration q moved by the tangent vector dv, by the exponential map.
+
+    Rotations follow Rodrigues' formula (paper (39)); quaternions of q are normalized first.
+
+    q: configuration (m, rad, unit quaternions wxyz), [nq] for the tree or for every coordinate.
+    dv: displacement in the coordinates of v (m, rad; body axes for rotations).
+    """
     quat_q, quat_v = chain.topology.quaternion_starts
     scalar_q, scalar_v = chain.topology.scalar_coordinates
     at = quat_q[:, None] + np.arange(4)
-    turned = quat_multiply(
+    moved = quat_multiply(
         quat_normalize(static_take(q, at)),
         quat_exp(static_take(dv, quat_v[:, None] + np.arange(3))),
     )
     order = np.argsort(np.concatenate([scalar_q, at.ravel()]))
     return static_take(
-        jnp.concatenate([static_take(q, scalar_q) + static_take(dv, scalar_v), turned.ravel()]),
+        jnp.concatenate([static_take(q, scalar_q) + static_take(dv, scalar_v), moved.ravel()]),
         order,
     )
 
@@ -56,8 +66,14 @@ def integrate(chain: Chain, q: Float[Array, " q"], dv: Float[Array, " dofs"]) ->
 def difference(
     chain: Chain, q1: Float[Array, " q"], q2: Float[Array, " q"]
 ) -> Float[Array, " dofs"]:
-    """The tangent vector (m, rad, in the coordinates of v) that takes q1 to q2: integrate(q1,
-    difference(q1, q2)) = q2."""
+    """Return the tangent vector from q1 to q2 (m, rad; body axes for rotations).
+
+    It is the inverse of `integrate`: integrate(chain, q1, difference(chain, q1, q2)) = q2, up to
+    the signs of quaternions.
+
+    q1: configuration at which the tangent vector starts.
+    q2: configuration at which the tangent vector ends.
+    """
     quat_q, quat_v = chain.topology.quaternion_starts
     scalar_q, scalar_v = chain.topology.scalar_coordinates
     at = quat_q[:, None] + np.arange(4)
@@ -74,7 +90,7 @@ def difference(
 
 
 def normalize(chain: Chain, q: Float[Array, " q"]) -> Float[Array, " q"]:
-    """Q with every quaternion of unit length."""
+    """Return q with every quaternion normalized."""
     quat_q, _ = chain.topology.quaternion_starts
     if not len(quat_q):
         return q
@@ -83,11 +99,15 @@ def normalize(chain: Chain, q: Float[Array, " q"]) -> Float[Array, " q"]:
 
 
 def tangent_gradient(chain: Chain, q, gradient) -> Float[Array, " dofs"]:
-    """A gradient by q as one in the tangent of the configuration (per m, rad): of
-    f(integrate(chain, q, dv)) by dv at dv = 0.
+    """Return a gradient with respect to q as one with respect to tangent vectors (per m, per rad).
 
-    What an optimiser should step along: q <- integrate(chain, q, -rate * tangent(chain, q,
-    gradient)) keeps quaternions at unit length.
+    The result is the gradient of f(integrate(chain, q, dv)) with respect to dv at dv = 0. An
+    optimiser that steps along it, q <- integrate(chain, q, -rate * tangent_gradient(chain, q,
+    gradient)), keeps quaternions at unit length.
+
+    q: configuration at which the gradient was taken.
+    gradient: gradient of f with respect to q, as `jax.grad` gives it.
+    Raises ValueError if q or gradient has another length than a state's q.
     """
     check_chain(chain)
     q, gradient = (
@@ -100,7 +120,11 @@ def tangent_gradient(chain: Chain, q, gradient) -> Float[Array, " dofs"]:
 
 
 def quaternions_xyzw(chain: Chain, q) -> Float[Array, " q"]:
-    """Q with the scalar of every quaternion last, as Pinocchio, ROS and scipy have it."""
+    """Return q with the scalar part of every quaternion last, as in Pinocchio, ROS and scipy.
+
+    q: configuration with quaternions wxyz.
+    Raises ValueError if q has another length than a state's q.
+    """
     check_chain(chain)
     q = float_vector(chain, "q", q, chain.topology.nq_all)
     starts, _ = chain.topology.quaternion_starts

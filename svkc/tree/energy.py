@@ -1,4 +1,4 @@
-"""Energy and momentum of the tree; virtual links have no mass."""
+"""Energy and momentum of the tree. Virtual links have no mass and take no part."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -11,8 +11,11 @@ from svkc.tree.spatial import cross, matvec
 
 
 def _body_motions(chain: Chain, kin: Kinematics, v):
-    """Of each row: centre of mass from the root's origin, its velocity, angular velocity, angular
-    momentum about it."""
+    """Return of each row its centre of mass and that point's velocity, w, and I w.
+
+    Centres of mass are given from the root's origin; I w is the angular momentum about the centre
+    of mass. All are in world axes.
+    """
     V = twists(chain, kin, v)
     c = kin.r + matvec(kin.R, chain.com)
     w = V[:, :3]
@@ -23,6 +26,7 @@ def _body_motions(chain: Chain, kin: Kinematics, v):
 def _energies(
     chain: Chain, state: State, kin: Kinematics, bodies
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Return the kinetic and the potential energy. bodies: from `_body_motions`."""
     c, u, w, spin = bodies
     kinetic = jnp.sum(chain.mass * jnp.sum(u * u, -1)) / 2 + jnp.sum(w * spin) / 2
     if chain.armature is not None:
@@ -36,26 +40,29 @@ def _energies(
 
 
 def _kinetic_and_potential(chain: Chain, state: State) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Return the kinetic and the potential energy (J)."""
     kin = kinematics(chain, state.q)
     return _energies(chain, state, kin, _body_motions(chain, kin, state.v))
 
 
 @checked_jit(eager=True)
 def kinetic_energy(chain: Chain, state: State) -> Float[Array, ""]:
-    """Kinetic energy (J), armature included: v^T M v / 2."""
+    """Return the kinetic energy v^T M v / 2 (J), armature included."""
     return _kinetic_and_potential(chain, state)[0]
 
 
 @checked_jit(eager=True)
 def potential_energy(chain: Chain, state: State) -> Float[Array, ""]:
-    """Gravity's potential (J), zero at the world's origin, and that of the joints' springs."""
+    """Return the potential energy of gravity and of the joints' springs (J).
+
+    Gravity's potential is zero at the world's origin.
+    """
     return _kinetic_and_potential(chain, state)[1]
 
 
 @checked_jit(eager=True)
 def energy(chain: Chain, state: State) -> Float[Array, ""]:
-    """Mechanical energy (J): kinetic, gravity's and the joint springs' (Featherstone section
-    2.13)."""
+    """Return the mechanical energy (J): kinetic plus potential (Featherstone section 2.13)."""
     kinetic, potential = _kinetic_and_potential(chain, state)
     return kinetic + potential
 
@@ -63,20 +70,25 @@ def energy(chain: Chain, state: State) -> Float[Array, ""]:
 def energy_and_momentum(
     chain: Chain, state: State, kin: Kinematics
 ) -> tuple[Float[Array, ""], Float[Array, "3"], Float[Array, "3"]]:
-    """Return `energy`, linear momentum (N s), and angular momentum about the centre of mass of all
-    bodies (N m s), in world axes."""
+    """Return `energy` (J), linear momentum (N s) and angular momentum (N m s).
+
+    Angular momentum is taken about the centre of mass of all bodies; both are in world axes.
+    """
     bodies = _body_motions(chain, kin, state.v)
     kinetic, potential = _energies(chain, state, kin, bodies)
     c, u, _, spin = bodies
-    p, place = chain.mass[:, None] * u, kin.root_position + c
-    centre = jnp.sum(chain.mass[:, None] * place, 0) / jnp.sum(chain.mass)
-    return kinetic + potential, jnp.sum(p, 0), jnp.sum(spin + cross(place - centre[None], p), 0)
+    p, position = chain.mass[:, None] * u, kin.root_position + c
+    center = jnp.sum(chain.mass[:, None] * position, 0) / jnp.sum(chain.mass)
+    return kinetic + potential, jnp.sum(p, 0), jnp.sum(spin + cross(position - center[None], p), 0)
 
 
 @checked_jit(eager=True)
 def momentum(chain: Chain, state: State) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
-    """Linear momentum (N s) and angular momentum about the world's origin (N m s), in world axes
-    (Featherstone section 2.12)."""
+    """Return the linear momentum (N s) and the angular momentum (N m s) of all bodies.
+
+    Angular momentum is taken about the world's origin; both are in world axes (Featherstone
+    section 2.12).
+    """
     kin = kinematics(chain, state.q)
     c, u, _, spin = _body_motions(chain, kin, state.v)
     p = chain.mass[:, None] * u

@@ -1,5 +1,7 @@
-"""Recursive Newton-Euler on the tree (Featherstone chapter 5), and the forces of springs, dampers
-and joint limits."""
+"""Recursive Newton-Euler on the tree (Featherstone chapter 5).
+
+Also the forces of springs, dampers and joint limits, which act on joints as torques do.
+"""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -21,32 +23,36 @@ from svkc.tree.traversal import (
 def newton_euler(
     chain: Chain, kin: Kinematics, V: Float[Array, "rows 6"] | None, A: Float[Array, "rows 6"]
 ) -> Float[Array, " nv"]:
-    """Joint forces S^T F that give every row the spatial acceleration A at the twist V (None: at
-    rest); Featherstone section 5.3.
+    """Return the joint forces S^T F for given motions of the rows (Featherstone section 5.3).
 
-    Each body's force is taken at its centre of mass, where gyroscopic terms need no parallel axes,
-    and moved to the root's origin.
+    Each body's force is computed at its centre of mass, where gyroscopic terms need no parallel
+    axis theorem, and then moved to the root's origin.
+
+    V: twists (None: at rest). A: spatial accelerations.
     """
     c = kin.r + matvec(kin.R, chain.com)
     alpha, acceleration = angular_linear(A)
     acceleration = acceleration + cross(alpha, c)
     R = kin.R
 
-    def spin(w):
+    def angular_momentum(w):
         return matvec(R, matvec(chain.rotational, matvec(jnp.swapaxes(R, -1, -2), w)))
 
-    moment = spin(alpha)
+    moment = angular_momentum(alpha)
     if V is not None:
         w, u = angular_linear(V)
         acceleration = acceleration + cross(w, u + cross(w, c))
-        moment = moment + cross(w, spin(w))
+        moment = moment + cross(w, angular_momentum(w))
     force = chain.mass[:, None] * acceleration
     F = accumulate_to_root(chain.topology, jnp.concatenate([moment + cross(c, force), force], -1))
     return jnp.sum(kin.S * static_take(F, chain.topology.dof_row), -1)
 
 
 def rnea(chain: Chain, kin: Kinematics, V, v, vdot: Float[Array, " nv"]) -> Float[Array, " nv"]:
-    """ID(q, v, vdot) of the tree with gravity and armature (paper, section III-A, step 2)."""
+    """Return ID(q, v, vdot) of the tree with gravity and armature (paper, section III-A, step 2).
+
+    V: twists at v.
+    """
     A = accumulate_from_root(
         chain.topology,
         sum_dofs_per_row(chain.topology, kin.S * vdot[:, None])
@@ -60,28 +66,29 @@ def rnea(chain: Chain, kin: Kinematics, V, v, vdot: Float[Array, " nv"]) -> Floa
 def mass_matrix_product(
     chain: Chain, kin: Kinematics, x: Float[Array, " nv"]
 ) -> Float[Array, " nv"]:
-    """M x: ID(q, 0, x) without gravity."""
+    """Return M x, which is ID(q, 0, x) without gravity."""
     A = accumulate_from_root(chain.topology, sum_dofs_per_row(chain.topology, kin.S * x[:, None]))
     tau = newton_euler(chain, kin, None, A)
     return tau if chain.armature is None else tau + chain.armature * x
 
 
 def append_virtual_joints(chain: Chain, force: Float[Array, " nv"]) -> Float[Array, " dofs"]:
-    """Return forces of the tree's joints, then a zero for each coordinate of virtual joints, which
-    have no inertia."""
+    """Return the force with a zero appended for each coordinate of a virtual joint."""
     return jnp.concatenate([force, jnp.zeros(chain.dofs - chain.nv, force.dtype)])
 
 
 def passive_forces(
     chain: Chain, q: Float[Array, " q"], v: Float[Array, " dofs"]
 ) -> Float[Array, " dofs"]:
-    """Springs and dampers of the model's joints (N m, N), MuJoCo's meaning: -stiffness (q -
-    q_spring) - damping v."""
+    """Return the forces of the joints' springs and dampers (N m, N), as MuJoCo defines them.
+
+    They are -stiffness (q - q_spring) - damping v.
+    """
     tau = jnp.zeros_like(v)
     if chain.damping is not None:
         tau = tau - chain.damping * v
     if chain.stiffness is not None:
-        # the stretch of a ball is a rotation vector in body axes
+        # of a ball joint the difference is a rotation vector in body axes
         tau = tau - chain.stiffness * difference(chain, chain.q_spring, q)
     return tau
 
@@ -89,29 +96,34 @@ def passive_forces(
 def limit_forces(
     chain: Chain, q: Float[Array, " q"], v: Float[Array, " dofs"]
 ) -> Float[Array, " dofs"]:
-    """The torque that keeps joints inside their range (paper, section VII-B): a stiff spring and
-    damper that act outside of it only.
+    """Return the torques of stiff springs and dampers outside the joints' ranges.
 
-    With x the distance outside and a = 0.02 rad or m: -(k x + c v) exp(-a / x); zero inside. All
-    derivatives are continuous where it sets in: a kink there would cost adaptive steps of high
-    order more than the motion itself.
+    With x the distance outside the range (paper, section VII-B) and a = 0.02 rad or m, the torque
+    is -(k x + c v) exp(-a / x); inside it is zero. All its derivatives are continuous at the end
+    of the range: a kink would cost adaptive steps of high order more than the motion itself.
     """
     tau = jnp.zeros_like(v)
     if chain.limit is None:
         return tau
     k, c = chain.limit_spring
-    at_q, at_v = chain.topology.scalar_coordinates
-    lower, upper = chain.limit[:, at_v]
-    x = static_take(q, at_q)
-    out = jnp.maximum(x - upper, 0) - jnp.maximum(lower - x, 0)
-    onset = jnp.where(out != 0, jnp.exp(-0.02 / jnp.where(out != 0, jnp.abs(out), 1)), 0)
-    return replace_rows(tau, at_v, -(k[at_v] * out + c[at_v] * static_take(v, at_v)) * onset)
+    scalar_q, scalar_v = chain.topology.scalar_coordinates
+    lower, upper = chain.limit[:, scalar_v]
+    x = static_take(q, scalar_q)
+    outside = jnp.maximum(x - upper, 0) - jnp.maximum(lower - x, 0)
+    onset = jnp.where(
+        outside != 0, jnp.exp(-0.02 / jnp.where(outside != 0, jnp.abs(outside), 1)), 0
+    )
+    return replace_rows(
+        tau, scalar_v, -(k[scalar_v] * outside + c[scalar_v] * static_take(v, scalar_v)) * onset
+    )
 
 
 @checked_jit
 def bias_force(chain: Chain, state: State) -> Float[Array, " nv"]:
-    """Velocity-product and gravity forces (N, N m) of the tree: ID(q, v, 0) (MuJoCo's qfrc_bias;
-    Featherstone section 6.1)."""
+    """Return ID(q, v, 0), the velocity-product and gravity forces of the tree (N, N m).
+
+    MuJoCo calls it qfrc_bias (Featherstone section 6.1).
+    """
     kin = kinematics(chain, state.q)
     V = twists(chain, kin, state.v)
     return rnea(chain, kin, V, state.v, jnp.zeros(chain.nv, state.v.dtype))
@@ -121,11 +133,13 @@ def bias_force(chain: Chain, state: State) -> Float[Array, " nv"]:
 def inverse_dynamics(
     chain: Chain, state: State, vdot: Float[Array, " accelerations"]
 ) -> Float[Array, " nv"]:
-    """Torques (N m, N) the tree's joints must be given for vdot (over the tree, or over every
-    coordinate): recursive Newton-Euler.
+    """Return the joint torques (N m, N) of the tree for the accelerations vdot.
 
-    What springs and dampers of the joints give by themselves is taken off, so that this is the
-    inverse of `forward_dynamics` on a tree.
+    The forces of the joints' springs and dampers are subtracted, so that this is the inverse of
+    `forward_dynamics` on a tree. Computed by recursive Newton-Euler (Featherstone chapter 5).
+
+    vdot: accelerations (rad/s^2, m/s^2) of the tree's coordinates, or of every coordinate.
+    Raises ValueError if vdot has neither length.
     """
     if vdot.shape not in ((chain.nv,), (chain.dofs,)):
         raise ValueError(

@@ -1,6 +1,6 @@
 """Poses, twists and accelerations of the tree.
 
-Joint kinds are few and known beforehand: all joints of one kind are one array, and a level of the
+The kinds of joints are few and static: all joints of one kind are one array, and each level of the
 tree is one operation.
 """
 
@@ -32,8 +32,13 @@ from svkc.tree.traversal import (
 
 
 class Kinematics(eqx.Module):
-    """Poses and joint axes at one configuration: rotation, quaternion, place relative to the root's
-    origin, the root's place, motion subspace S."""
+    """Poses of the rows and motion subspaces of the joints at one configuration, in world axes.
+
+    R, quat: rotation of each row, as a matrix and as a quaternion.
+    r: position of each row relative to its root's origin (m).
+    root_position: position of that root's origin (m).
+    S: motion subspace of each coordinate of the tree, about its root's origin.
+    """
 
     R: Float[Array, "rows 3 3"]
     quat: Float[Array, "rows 4"]
@@ -43,14 +48,16 @@ class Kinematics(eqx.Module):
 
 
 def _joint_poses(chain: Chain, q: Float[Array, " q"]):
-    """Of each row in its parent: rotation [rows 4], the same without the joint's own turn, and
-    offset along the slide [rows]."""
+    """Return each row's rotation in its parent, the rotation at load, and the slide joints' offset.
+
+    Quaternions are [rows 4]. The offset [rows 3] (m) is in the axes at load; None without slides.
+    """
     top, start = chain.topology, np.array(chain.topology.q_start)
-    quat, fixed, slide = chain.quat, chain.quat, None
+    quat, at_load, offset = chain.quat, chain.quat, None
     hinges, balls, slides = top.rows_of_kind(HINGE), top.rows_of_kind(BALL), top.rows_of_kind(SLIDE)
-    turn = []
+    rotations = []
     if len(hinges):
-        turn.append(
+        rotations.append(
             (
                 hinges,
                 quat_from_axis_angle(
@@ -60,9 +67,11 @@ def _joint_poses(chain: Chain, q: Float[Array, " q"]):
             )
         )
     if len(balls):
-        turn.append((balls, quat_normalize(static_take(q, start[balls][:, None] + np.arange(4)))))
-    for rows, joint in turn:
-        quat = replace_rows(quat, rows, quat_multiply(static_take(fixed, rows), joint))
+        rotations.append(
+            (balls, quat_normalize(static_take(q, start[balls][:, None] + np.arange(4))))
+        )
+    for rows, joint in rotations:
+        quat = replace_rows(quat, rows, quat_multiply(static_take(at_load, rows), joint))
     free = top.rows_of_kind(FREE)
     if len(free):
         quat = replace_rows(
@@ -70,22 +79,24 @@ def _joint_poses(chain: Chain, q: Float[Array, " q"]):
         )
     if len(slides):
         along = static_take(q, start[slides]) - static_take(chain.q_load, start[slides])
-        slide = replace_rows(
+        offset = replace_rows(
             jnp.zeros_like(chain.axis), slides, along[:, None] * static_take(chain.axis, slides)
         )
-    return quat, fixed, slide
+    return quat, at_load, offset
 
 
-def _rotations_in_ground(top: Topology, quat: Float[Array, "rows 4"]) -> Float[Array, "rows 4"]:
-    """Rotations in the parent -> rotations in the world: level by level, or by doubling along the
-    ancestors in deep trees."""
+def _absolute_rotations(top: Topology, quat: Float[Array, "rows 4"]) -> Float[Array, "rows 4"]:
+    """Return rotations in world axes, from rotations in the parent.
+
+    Level by level, and by pointer doubling along the ancestors in deep trees.
+    """
     parent = np.array(top.parent)
     if len(top.levels) > LEVELS_UNROLLED:
-        above = np.maximum(parent, 0)
+        ancestor = np.maximum(parent, 0)
         for _ in range(int(np.ceil(np.log2(len(top.levels))))):
-            quat, above = (
-                jnp.concatenate([quat[:1], quat_multiply(static_take(quat, above), quat)[1:]]),
-                above[above],
+            quat, ancestor = (
+                jnp.concatenate([quat[:1], quat_multiply(static_take(quat, ancestor), quat)[1:]]),
+                ancestor[ancestor],
             )
         return quat
     levels = [quat[:1]]
@@ -98,20 +109,22 @@ def _rotations_in_ground(top: Topology, quat: Float[Array, "rows 4"]) -> Float[A
 
 @jax.jit
 def kinematics(chain: Chain, q: Float[Array, " q"]) -> Kinematics:
-    """Poses of every row and the joint axes at q (Featherstone section 4.4, world axes)."""
+    """Return the poses of the rows and the motion subspaces at q (Featherstone section 4.4)."""
     top = chain.topology
-    local, fixed, slide = _joint_poses(chain, q)
-    quat = quat_normalize(_rotations_in_ground(top, local))
+    local, at_load, offset = _joint_poses(chain, q)
+    quat = quat_normalize(_absolute_rotations(top, local))
     R = quat_matrix(quat)
     parent = np.maximum(np.array(top.parent), 0)
-    above = static_take(R, parent)
-    step = matvec(above, chain.pos)
-    if slide is not None:
-        step = step + matvec(above, matvec(quat_matrix(fixed), slide))
+    parent_R = static_take(R, parent)
+    step = matvec(parent_R, chain.pos)
+    if offset is not None:
+        step = step + matvec(parent_R, matvec(quat_matrix(at_load), offset))
     if chain.anchor is not None:
-        # the anchor stays where it is while the row turns about it
+        # the row turns about the anchor, which is fixed in the parent
         step = (
-            step + matvec(above, matvec(quat_matrix(fixed), chain.anchor)) - matvec(R, chain.anchor)
+            step
+            + matvec(parent_R, matvec(quat_matrix(at_load), chain.anchor))
+            - matvec(R, chain.anchor)
         )
     free = top.rows_of_kind(FREE)
     if len(free):
@@ -130,19 +143,19 @@ def kinematics(chain: Chain, q: Float[Array, " q"]) -> Kinematics:
 
 
 def _motion_subspaces(chain: Chain, R, r) -> Float[Array, "nv 6"]:
-    """Motion subspace of every joint coordinate, in world axes about the root's origin."""
+    """Return the motion subspace of every coordinate, in world axes about the root's origin."""
     top = chain.topology
     eye = jnp.eye(3, dtype=R.dtype)
     point = r if chain.anchor is None else r + matvec(R, chain.anchor)
     parts, order = [], []
 
-    def turning(rows, axes):
+    def revolute_axes(rows, axes):
         return jnp.concatenate([axes, cross(static_take(point, rows), axes)], -1)
 
     hinges, slides = top.rows_of_kind(HINGE), top.rows_of_kind(SLIDE)
     if len(hinges):
         parts.append(
-            turning(hinges, matvec(static_take(R, hinges), static_take(chain.axis, hinges)))
+            revolute_axes(hinges, matvec(static_take(R, hinges), static_take(chain.axis, hinges)))
         )
         order.append(np.array(top.v_start)[hinges])
     if len(slides):
@@ -152,7 +165,7 @@ def _motion_subspaces(chain: Chain, R, r) -> Float[Array, "nv 6"]:
     for kind, offset in ((BALL, 0), (FREE, 3)):
         rows = top.rows_of_kind(kind)
         for k in range(3) if len(rows) else ():
-            parts.append(turning(rows, static_take(R, rows)[..., k]))
+            parts.append(revolute_axes(rows, static_take(R, rows)[..., k]))
             order.append(np.array(top.v_start)[rows] + offset + k)
             if kind == FREE:
                 parts.append(
@@ -167,7 +180,7 @@ def _motion_subspaces(chain: Chain, R, r) -> Float[Array, "nv 6"]:
 
 
 def twists(chain: Chain, kin: Kinematics, v: Float[Array, " dofs"]) -> Float[Array, "rows 6"]:
-    """V = sum of S v along the tree (rad/s, m/s), in world axes about the root's origin."""
+    """Return each row's twist (rad/s, m/s), in world axes about its root's origin."""
     return accumulate_from_root(
         chain.topology, sum_dofs_per_row(chain.topology, kin.S * v[: chain.nv, None])
     )
@@ -176,28 +189,33 @@ def twists(chain: Chain, kin: Kinematics, v: Float[Array, " dofs"]) -> Float[Arr
 def velocity_products(
     chain: Chain, kin: Kinematics, V: Float[Array, "rows 6"], v: Float[Array, " dofs"]
 ) -> Float[Array, "rows 6"]:
-    """Sdot v of each row's joint: V x (S v) for axes fixed in the row; a free joint's translations
-    have axes fixed in the world."""
+    """Return Sdot v of each row's joint.
+
+    It is V x (S v) for axes fixed in the row. Translations of a free joint have axes fixed in the
+    world and contribute nothing.
+    """
     top = chain.topology
-    moving = np.ones(chain.nv, bool)
+    fixed_in_row = np.ones(chain.nv, bool)
     free = top.rows_of_kind(FREE)
-    moving[(np.array(top.v_start)[free][:, None] + np.arange(3)).ravel()] = False
+    fixed_in_row[(np.array(top.v_start)[free][:, None] + np.arange(3)).ravel()] = False
     return motion_cross(
-        V, sum_dofs_per_row(top, kin.S * jnp.where(moving, v[: chain.nv], 0)[:, None])
+        V, sum_dofs_per_row(top, kin.S * jnp.where(fixed_in_row, v[: chain.nv], 0)[:, None])
     )
 
 
 def bias_accelerations(
     chain: Chain, kin: Kinematics, V: Float[Array, "rows 6"], v: Float[Array, " dofs"]
 ) -> Float[Array, "rows 6"]:
-    """Spatial accelerations with vdot = 0 and no gravity."""
+    """Return each row's spatial acceleration for vdot = 0, without gravity."""
     return accumulate_from_root(chain.topology, velocity_products(chain, kin, V, v))
 
 
 @checked_jit
 def poses(chain: Chain, state: State) -> tuple[Float[Array, "bodies 3"], Float[Array, "bodies 4"]]:
-    """Positions (m) and quaternions (wxyz, body to world) of the body frames in the world; row 0 is
-    the world (Featherstone section 4.4)."""
+    """Return the position (m) and the quaternion (wxyz, body to world) of every body frame.
+
+    Body 0 is the world (Featherstone section 4.4).
+    """
     rows = np.array(chain.topology.body_row)
     kin = kinematics(chain, state.q)
     return (kin.root + kin.r)[rows], kin.quat[rows]
@@ -207,8 +225,10 @@ def poses(chain: Chain, state: State) -> tuple[Float[Array, "bodies 3"], Float[A
 def velocities(
     chain: Chain, state: State
 ) -> tuple[Float[Array, "bodies 3"], Float[Array, "bodies 3"]]:
-    """Linear velocity of each body's origin (m/s) and angular velocity (rad/s), in world axes; row
-    0 is the world (Featherstone section 5.3)."""
+    """Return the linear velocity (m/s) of every body's origin and its angular velocity (rad/s).
+
+    Both are in world axes. Body 0 is the world (Featherstone section 5.3).
+    """
     rows = np.array(chain.topology.body_row)
     kin = kinematics(chain, state.q)
     V = twists(chain, kin, state.v)

@@ -1,4 +1,4 @@
-"""The mass matrix: by composite bodies, by unit vectors."""
+"""The mass matrix of the tree: by composite rigid bodies, by unit vectors."""
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,10 @@ from svkc.tree.traversal import accumulate_to_root
 
 
 def mass_matrix_unit_vectors(chain: Chain, kin: Kinematics) -> Float[Array, "nv nv"]:
-    """Column i is ID(q, 0, e_i) without gravity: the paper's way (section III-B, step 3)."""
+    """Return the mass matrix, whose column i is ID(q, 0, e_i) without gravity.
+
+    This is the paper's method (section III-B, step 3).
+    """
     return jax.vmap(lambda unit: mass_matrix_product(chain, kin, unit), out_axes=1)(
         jnp.eye(chain.nv, dtype=kin.r.dtype)
     )
@@ -23,15 +26,19 @@ def mass_matrix_unit_vectors(chain: Chain, kin: Kinematics) -> Float[Array, "nv 
 def central_inertias(
     chain: Chain, kin: Kinematics
 ) -> tuple[Float[Array, "rows 3"], Float[Array, "rows 3 3"]]:
-    """Of each row: the centre of mass from the root's origin, and the inertia about it, in world
-    axes."""
+    """Return each row's centre of mass, from the root's origin, and the inertia about it.
+
+    Both are in world axes.
+    """
     RI = jnp.sum(kin.R[:, :, :, None] * chain.rotational[:, None, :, :], 2)
     return kin.r + matvec(kin.R, chain.com), jnp.sum(RI[:, :, None, :] * kin.R[:, None, :, :], -1)
 
 
 def mass_matrix_crba(chain: Chain, kin: Kinematics) -> Float[Array, "nv nv"]:
-    """Composite rigid bodies (Featherstone section 6.2): mass, first moment and rotational inertia
-    simply add up towards the root."""
+    """Return the mass matrix by composite rigid bodies (Featherstone section 6.2).
+
+    About the root's origin mass, first moment and rotational inertia of bodies add up.
+    """
     top, (c, central) = chain.topology, central_inertias(chain, kin)
     m = chain.mass[:, None]
     square = (
@@ -44,7 +51,7 @@ def mass_matrix_crba(chain: Chain, kin: Kinematics) -> Float[Array, "nv nv"]:
     )
     m, h, I = total[:, :1], total[:, 1:4], total[:, 4:].reshape(-1, 3, 3)
     w, u = angular_linear(kin.S)
-    # momentum of everything a joint carries, for a unit of its velocity
+    # momentum of the composite body beyond a joint, for a unit of the joint's velocity
     F = jnp.concatenate([matvec(I, w) + cross(h, u), m * u + cross(w, h)], -1)
     related = top.ancestor_mask[top.dof_row][:, top.dof_row]
     M = jnp.where(related, F @ kin.S.T, 0)
@@ -54,13 +61,18 @@ def mass_matrix_crba(chain: Chain, kin: Kinematics) -> Float[Array, "nv nv"]:
 
 @checked_jit
 def mass_matrix(chain: Chain, state: State) -> Float[Array, "nv nv"]:
-    """Joint-space inertia of the tree (kg, kg m, kg m^2), armature included, by composite bodies
-    (Featherstone section 6.2)."""
+    """Return the mass matrix of the tree (kg, kg m, kg m^2), armature included.
+
+    Computed by composite rigid bodies (Featherstone section 6.2).
+    """
     return mass_matrix_crba(chain, kinematics(chain, state.q))
 
 
 def spatial_inertias(chain: Chain, kin: Kinematics) -> Float[Array, "rows 6 6"]:
-    """Spatial inertia of each row in world axes about its root's origin (Featherstone (2.63))."""
+    """Return each row's spatial inertia about its root's origin (Featherstone (2.63)).
+
+    Axes are the world's.
+    """
     (c, central), m = central_inertias(chain, kin), chain.mass[:, None, None]
     cx = skew(c)
     square = jnp.sum(cx[:, :, None, :] * cx[:, None, :, :], -1)

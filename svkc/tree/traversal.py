@@ -1,4 +1,8 @@
-"""Recursions over the tree, from the root and to the root, level by level."""
+"""Recursions over the tree, from the root and to the root, level by level.
+
+Every recursion of this package goes through this module, so that the choice between unrolled
+levels and loops over stacked levels is made in one place.
+"""
 
 import functools
 from collections.abc import Callable
@@ -12,15 +16,16 @@ from jaxtyping import Array, Float, Int
 from svkc._jax.static_gather import static_take
 from svkc.model.topology import BALL, FREE, HINGE, SLIDE, V_SIZE, Topology
 
-# deeper trees sum by doubling along the ancestors: compile time would grow with every level
+# Trees with more levels use pointer doubling and `lax.scan`: unrolled, their compile time would
+# grow with every level.
 LEVELS_UNROLLED = 24
-# children's children and so on that a row may have side by side there; with more the table of
-# ancestors is smaller
+# Largest number of descendants of one row in one doubling table. With more, a product with the
+# ancestor mask costs less than the gathers.
 MAX_DESCENDANTS = 4
 
 
 def accumulate_from_root(top: Topology, x: Float[Array, "rows *n"]) -> Float[Array, "rows *n"]:
-    """Sum of x over each row and its ancestors, level by level."""
+    """Return, for each row, the sum of x over the row and its ancestors."""
     if len(top.levels) > LEVELS_UNROLLED:
         for above, _ in _doubling_tables(top):
             x = x + static_take(x, above)
@@ -32,7 +37,7 @@ def accumulate_from_root(top: Topology, x: Float[Array, "rows *n"]) -> Float[Arr
 
 
 def accumulate_to_root(top: Topology, x: Float[Array, "rows *n"]) -> Float[Array, "rows *n"]:
-    """Sum of x over each row and its descendants, level by level."""
+    """Return, for each row, the sum of x over the row and its descendants."""
     if len(top.levels) > LEVELS_UNROLLED:
         if any(below.shape[1] > MAX_DESCENDANTS for _, below in _doubling_tables(top)):
             return jnp.tensordot(jnp.asarray(top.ancestor_mask.T, x.dtype), x, 1)
@@ -49,34 +54,45 @@ def accumulate_to_root(top: Topology, x: Float[Array, "rows *n"]) -> Float[Array
 
 @functools.cache
 def _doubling_tables(top: Topology) -> list[tuple[np.ndarray, np.ndarray]]:
-    """For 1, 2, 4, ... generations: each row's ancestor so far up, and its descendants so far down;
-    one past the last row where there is none."""
+    """Return, for 1, 2, 4, ... generations, the tables (ancestor [rows], descendants [rows n]).
+
+    Each names the rows that many generations above and below a row; entries without such a row
+    hold the number of rows. Tables are int32, as in `level_tables`.
+    """
     parent = np.array(top.parent)
-    none, above = len(parent), np.append(np.where(parent < 0, len(parent), parent), len(parent))
-    found = []
-    while np.any(above < none):
-        below = [np.flatnonzero(above[:-1] == i) for i in range(none)]
-        table = np.full((none, max(map(len, below))), none)
-        for row, own in zip(table, below, strict=True):
-            row[: len(own)] = own
-        # (as small as jax has them in both precisions: `levels`)
-        found.append((above[:-1].astype(np.int32), table.astype(np.int32)))
-        above = above[above]
-    return found
+    none = len(parent)
+    ancestor = np.append(np.where(parent < 0, none, parent), none)
+    tables = []
+    while np.any(ancestor < none):
+        descendants = [np.flatnonzero(ancestor[:-1] == i) for i in range(none)]
+        tables.append((ancestor[:-1].astype(np.int32), _rectangular(descendants, none)))
+        ancestor = ancestor[ancestor]
+    return tables
+
+
+def _rectangular(lists: list[np.ndarray], padding: int, width: int = 0) -> np.ndarray:
+    """Return the lists as rows of one int32 table at least `width` wide, padded at the right."""
+    table = np.full((len(lists), max(width, *map(len, lists))), padding, np.int32)
+    for row, entries in zip(table, lists, strict=True):
+        row[: len(entries)] = entries
+    return table
 
 
 def replace_rows(
     x: Float[Array, "rows *n"], rows: np.ndarray, values: Float[Array, "some *n"]
 ) -> Float[Array, "rows *n"]:
-    """X with some of its rows replaced. (No scatter: XLA's CPU backend makes one kernel of a loop's
-    whole body only where there is none.)"""
+    """Return x with the rows `rows` replaced by `values`.
+
+    This is a gather, not a scatter: XLA's CPU backend fuses a loop body that has a scatter into
+    more than one kernel.
+    """
     source = np.arange(len(x))
     source[rows] = len(x) + np.arange(len(rows))
     return static_take(jnp.concatenate([x, values]), source)
 
 
 def sum_dofs_per_row(top: Topology, x: Float[Array, "nv *n"]) -> Float[Array, "rows *n"]:
-    """Sum of x over the coordinates of each row's joint."""
+    """Return, for each row, the sum of x over the coordinates of the row's joint."""
     parts, order = [], []
     for kinds, size in (((HINGE, SLIDE), 1), ((BALL,), 3), ((FREE,), 6)):
         rows = top.rows_of_kind(*kinds)
@@ -92,9 +108,13 @@ def sum_dofs_per_row(top: Topology, x: Float[Array, "nv *n"]) -> Float[Array, "r
 
 
 class Level(NamedTuple):
-    """The rows of one level below the world's; where there are fewer than n: one past the last row.
-    Coordinates of each row's joint, nv where it has fewer than d; its children in the level below,
-    as many as that has where there are fewer; its parent in the level above."""
+    """Index tables of one level below the world: n rows, each with at most d coordinates.
+
+    rows: rows of the tree (padding: the number of rows).
+    dofs: coordinates of each row's joint (padding: nv).
+    children: places of each row's children in the next level (padding: that level's size).
+    parent: place of each row's parent in the previous level (padding: 0).
+    """
 
     rows: np.ndarray
     dofs: np.ndarray
@@ -104,82 +124,98 @@ class Level(NamedTuple):
 
 @functools.cache
 def level_tables(top: Topology) -> list[Level] | Level:
-    """One for each level, as small as it can be; in deep trees all as large as the largest,
-    stacked, for a loop over them.
+    """Return one `Level` for each level below the world, stacked in deep trees.
 
-    int32: jax (0.10) takes the same array of int64 for an index in one precision only of those that
-    a process computes in.
+    A list holds tables as small as possible, for unrolled recursions. A stacked `Level` holds
+    tables padded to the largest level, for `lax.scan`.
+
+    Tables are int32: JAX 0.10 accepts an int64 table as an index in only one of the precisions
+    that a process computes in.
     """
-    deep, parents = len(top.levels) > LEVELS_UNROLLED, np.array(top.parent)
-    bounds = [*top.levels[1:], (len(parents), len(parents))]
-    families = [
-        [np.flatnonzero(parents[lo:hi] == i) for i in range(first, last)]
-        for (first, last), (lo, hi) in zip(bounds[:-1], bounds[1:], strict=True)
-    ]
-    sizes = [[V_SIZE[top.kind[i]] for i in range(first, last)] for first, last in bounds[:-1]]
-    widest, freest, most = (
-        max(map(len, sizes)),
-        max(max(x) for x in sizes),
-        max((len(x) for family in families for x in family), default=0),
+    levels = [_level(top, i) for i in range(1, len(top.levels))]
+    return _pad(top, levels) if len(top.levels) > LEVELS_UNROLLED else levels
+
+
+def _level(top: Topology, i: int) -> Level:
+    """Return the unpadded tables of level i of `top.levels`."""
+    parent, end = np.array(top.parent), len(top.parent)
+    first, last = top.levels[i]
+    next_first, next_last = top.levels[i + 1] if i + 1 < len(top.levels) else (end, end)
+    rows = np.arange(first, last, dtype=np.int32)
+    dofs = [np.arange(top.v_start[r], top.v_start[r] + V_SIZE[top.kind[r]]) for r in rows]
+    children = [np.flatnonzero(parent[next_first:next_last] == r) for r in rows]
+    return Level(
+        rows=rows,
+        dofs=_rectangular(dofs, top.nv, width=1),
+        children=_rectangular(children, next_last - next_first),
+        parent=(parent[first:last] - top.levels[i - 1][0]).astype(np.int32),
     )
-    found = []
-    for level, (first, last) in enumerate(bounds[:-1]):
-        n, below = (
-            (widest, widest) if deep else (last - first, len(parents[slice(*bounds[level + 1])]))
-        )
-        d = max(1, freest if deep else max(sizes[level]))
-        filled = lambda shape, value: np.full(shape, value, np.int32)
-        children = most if deep else max(map(len, families[level]))
-        of = Level(
-            rows=filled(n, len(parents)),
-            dofs=filled((n, d), top.nv),
-            children=filled((n, children), below),
-            parent=filled(n, 0),
-        )
-        of.rows[: last - first] = np.arange(first, last)
-        of.parent[: last - first] = parents[first:last] - top.levels[level][0]
-        for i, (size, family) in enumerate(zip(sizes[level], families[level], strict=True)):
-            of.dofs[i, :size] = np.arange(top.v_start[first + i], top.v_start[first + i] + size)
-            of.children[i, : len(family)] = family
-        found.append(of)
-    return Level(*map(np.stack, zip(*found, strict=True))) if deep else found
+
+
+def _pad(top: Topology, levels: list[Level]) -> Level:
+    """Return the levels stacked, each padded to the largest."""
+    widest = max(len(level.rows) for level in levels)
+
+    def stack(tables, padding: int) -> np.ndarray:
+        stacked = np.full((len(tables), *np.max([x.shape for x in tables], 0)), padding, np.int32)
+        for padded, table in zip(stacked, tables, strict=True):
+            padded[tuple(map(slice, table.shape))] = table
+        return stacked
+
+    # in the children's tables the padding is the size of the next level, which is now `widest`
+    next_sizes = [*(len(level.rows) for level in levels[1:]), 0]
+    children = [
+        np.where(level.children == size, widest, level.children)
+        for level, size in zip(levels, next_sizes, strict=True)
+    ]
+    return Level(
+        rows=stack([level.rows for level in levels], len(top.parent)),
+        dofs=stack([level.dofs for level in levels], top.nv),
+        children=stack(children, widest),
+        parent=stack([level.parent for level in levels], 0),
+    )
 
 
 def scan_levels(step: Callable, start, over, reverse: bool = False):
-    """What `step(carried, level)` leaves level by level: unrolled over a list, a loop over what is
-    stacked."""
+    """Return the outputs of `carry, output = step(carry, level)` over all levels.
+
+    The recursion is unrolled over a list of levels, and a `lax.scan` over stacked levels.
+    """
     if not isinstance(over, list):
         return jax.lax.scan(step, start, over, reverse=reverse)[1]
-    found, carried = [], start
+    outputs, carry = [], start
     for level in reversed(over) if reverse else over:
-        carried, out = step(carried, level)
-        found.append(out)
-    return found[::-1] if reverse else found
+        carry, output = step(carry, level)
+        outputs.append(output)
+    return outputs[::-1] if reverse else outputs
 
 
 def initial_carry(top: Topology, *shape: int, dtype) -> Array | None:
-    """What a sweep starts with where levels are stacked; else it starts with nothing."""
-    found = level_tables(top)
-    return None if isinstance(found, list) else jnp.zeros((found.rows.shape[1], *shape), dtype)
+    """Return the first carry of `scan_levels`: zeros for stacked levels, None for a list."""
+    levels = level_tables(top)
+    return None if isinstance(levels, list) else jnp.zeros((levels.rows.shape[1], *shape), dtype)
 
 
 def sum_children(
     children: Int[Array, "m c"] | np.ndarray, below: Float[Array, "n *k"]
 ) -> Float[Array, "m *k"]:
-    """For each row of a level, the sum of its children's in the level below."""
+    """Return, for each row of a level, the sum of `below` over the row's children.
+
+    children: a level's table. below: values of the next level.
+    """
     return jnp.sum(static_take(below, children), 1)
 
 
-def with_level_data(top: Topology, *given: Callable):
-    """Levels, and beside each what the functions give of them."""
-    found = level_tables(top)
+def with_level_data(top: Topology, *functions: Callable):
+    """Return (level, f(level), ...) for each level, or for the stacked levels at once."""
+    levels = level_tables(top)
     return (
-        [(level, *(f(level) for f in given)) for level in found]
-        if isinstance(found, list)
-        else (found, *(f(found) for f in given))
+        [(level, *(f(level) for f in functions)) for level in levels]
+        if isinstance(levels, list)
+        else (levels, *(f(levels) for f in functions))
     )
 
 
 def zip_levels(a, b):
-    """Return pairs of what two functions give, level by level or stacked."""
+    """Return the pairs of two results of `scan_levels` or `with_level_data`, level by level."""
     return list(zip(a, b, strict=True)) if isinstance(a, list) else (a, b)

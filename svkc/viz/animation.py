@@ -9,10 +9,15 @@ import numpy as np
 from svkc.mjcf.bodies import rotation_matrix
 from svkc.model.chain import Chain
 from svkc.simulation.trajectory import Trajectory
-from svkc.viz.shapes import color, happened, held, world_poses
+from svkc.viz.shapes import (
+    color,
+    connected_link_positions,
+    event_descriptions,
+    positions_and_rotations,
+)
 
 GL_PACKAGES = "libegl1 libgl1"
-FLASH = 0.3  # s: for how long the links that an event changed are drawn large
+FLASH_DURATION = 0.3  # s: for how long the links that an event changed are drawn large
 
 
 def _use_offscreen_context():
@@ -33,7 +38,7 @@ def _use_offscreen_context():
     )
 
 
-def gif(path: pathlib.Path, images: Iterator, fps: float):
+def write_gif(path: pathlib.Path, images: Iterator, fps: float):
     """An animation that repeats, 96 colours a frame, rare ones too."""
     from PIL import Image
 
@@ -41,7 +46,7 @@ def gif(path: pathlib.Path, images: Iterator, fps: float):
     first.save(path, save_all=True, append_images=others, duration=round(1000 / fps), loop=0)
 
 
-def mp4(path: pathlib.Path, images: Iterator, fps: float):
+def write_mp4(path: pathlib.Path, images: Iterator, fps: float):
     """H.264 by the ffmpeg that imageio-ffmpeg brings. RuntimeError: it is not installed."""
     try:
         import imageio_ffmpeg
@@ -79,24 +84,27 @@ def frames(chain: Chain, traj: Trajectory, *, fps: float, size, trails, **view) 
         raise ValueError(f"trails: no body {unknown[0]!r}; bodies: {', '.join(chain.body_names)}")
     _set_buffer(model, size)
     data = mujoco.MjData(model)
-    ts, (positions, R) = np.asarray(traj.ts), world_poses(chain, traj.states)
-    holding, events = held(chain, traj.states, positions, R), happened(traj, chain)
-    eye = _camera(model, positions, **view)
+    ts, (positions, R) = np.asarray(traj.ts), positions_and_rotations(chain, traj.states)
+    link_positions, events = (
+        connected_link_positions(chain, traj.states, positions, R),
+        event_descriptions(traj, chain),
+    )
+    camera = _choose_camera(model, positions, **view)
     _use_offscreen_context()
     mujoco.mj_forward(model, data)
     with mujoco.Renderer(model, height=size[1], width=size[0]) as renderer:
         for t in np.arange(ts[0], ts[-1] + 0.5 / fps, 1 / fps):
             i = int(np.argmin(np.abs(ts - t)))
-            _place_bodies(model, data, positions[i], R[i])
-            renderer.update_scene(data, eye)
-            recent = any(0 <= t - when < FLASH for when, _ in events)
-            _draw_links(renderer.scene, holding[i], large=recent)
+            _set_poses(model, data, positions[i], R[i])
+            renderer.update_scene(data, camera)
+            just_changed = any(0 <= t - when < FLASH_DURATION for when, _ in events)
+            _draw_links(renderer.scene, link_positions[i], large=just_changed)
             for k, name in enumerate(trails):
-                path = positions[: i + 1, chain.body_names.index(name)]
-                _draw_trail(renderer.scene, path, color(k))
+                trail = positions[: i + 1, chain.body_names.index(name)]
+                _draw_trail(renderer.scene, trail, color(k))
             image = Image.fromarray(renderer.render())
-            links = [chain.link_names[k] for k in holding[i]]
-            yield _captioned(image, ts[i], ts[0], ts[-1], links, events)
+            links = [chain.link_names[k] for k in link_positions[i]]
+            yield _add_caption(image, ts[i], ts[0], ts[-1], links, events)
 
 
 def _set_buffer(model, size):
@@ -107,7 +115,7 @@ def _set_buffer(model, size):
     buffer.offwidth, buffer.offheight = np.maximum(size, (buffer.offwidth, buffer.offheight))
 
 
-def _place_bodies(model, data, positions: np.ndarray, R: np.ndarray):
+def _set_poses(model, data, positions: np.ndarray, R: np.ndarray):
     """Write the places of geoms and cameras, from those of the bodies in svkc: MuJoCo's tree may be
     another one where joints can be cut."""
     geoms = model.geom_bodyid, model.geom_pos, model.geom_quat, data.geom_xpos, data.geom_xmat
@@ -118,7 +126,7 @@ def _place_bodies(model, data, positions: np.ndarray, R: np.ndarray):
             xmat[k] = (R[body] @ rotation_matrix(quat[k])).ravel()
 
 
-def _camera(model, positions, *, camera, lookat, distance, azimuth, elevation):
+def _choose_camera(model, positions, *, camera, lookat, distance, azimuth, elevation):
     """Return the model's camera of that name, or one that sees all places where bodies are."""
     import mujoco
 
@@ -129,13 +137,13 @@ def _camera(model, positions, *, camera, lookat, distance, azimuth, elevation):
                 f"camera: no camera {camera!r} in the model; cameras: {', '.join(names) or 'none'}"
             )
         return camera
-    moving = positions[:, 1:].reshape(-1, 3)
-    low, high = moving.min(0), moving.max(0)
-    eye = mujoco.MjvCamera()
-    eye.lookat[:] = (low + high) / 2 if lookat is None else lookat
-    eye.distance = float(np.linalg.norm(high - low)) + 1 if distance is None else distance
-    eye.azimuth, eye.elevation = azimuth, elevation
-    return eye
+    points = positions[:, 1:].reshape(-1, 3)
+    low, high = points.min(0), points.max(0)
+    free_camera = mujoco.MjvCamera()
+    free_camera.lookat[:] = (low + high) / 2 if lookat is None else lookat
+    free_camera.distance = float(np.linalg.norm(high - low)) + 1 if distance is None else distance
+    free_camera.azimuth, free_camera.elevation = azimuth, elevation
+    return free_camera
 
 
 def _rgba(hexadecimal: str, alpha: float):
@@ -144,11 +152,11 @@ def _rgba(hexadecimal: str, alpha: float):
     )
 
 
-def _draw_links(scene, places: dict[int, np.ndarray], large: bool):
+def _draw_links(scene, positions: dict[int, np.ndarray], large: bool):
     """A red sphere where each connected virtual link is, larger just after an event."""
     import mujoco
 
-    for place in places.values():
+    for position in positions.values():
         if scene.ngeom < scene.maxgeom:
             size, rgba = (
                 np.full(3, 0.07 if large else 0.04),
@@ -158,7 +166,7 @@ def _draw_links(scene, places: dict[int, np.ndarray], large: bool):
                 scene.geoms[scene.ngeom],
                 mujoco.mjtGeom.mjGEOM_SPHERE,
                 size,
-                place,
+                position,
                 np.eye(3).ravel(),
                 rgba,
             )
@@ -184,7 +192,7 @@ def _draw_trail(scene, path: np.ndarray, hexadecimal: str):
             scene.ngeom += 1
 
 
-def _captioned(image, t: float, start: float, end: float, holding: list[str], events):
+def _add_caption(image, t: float, start: float, end: float, links: list[str], events):
     """A strip below the picture: the time, what holds, the last event, and a line of time with a
     mark at each event."""
     from PIL import Image, ImageDraw, ImageFont
@@ -194,13 +202,13 @@ def _captioned(image, t: float, start: float, end: float, holding: list[str], ev
     out.paste(image, (0, 0))
     draw, y, font = ImageDraw.Draw(out), image.height, ImageFont.load_default(14)
     draw.text(
-        (margin, y + 6), f"{t:6.3f} s   held by {', '.join(holding) or 'nothing'}", "#222222", font
+        (margin, y + 6), f"{t:6.3f} s   held by {', '.join(links) or 'nothing'}", "#222222", font
     )
     past = [f"{when:.3f} s: {what}" for when, what in events if when <= t]
     draw.text((margin, y + 25), past[-1] if past else "", "#b03030", font)
-    place = lambda s: margin + (width - 2 * margin) * (s - start) / max(end - start, 1e-12)
+    pixel = lambda s: margin + (width - 2 * margin) * (s - start) / max(end - start, 1e-12)
     draw.rectangle((margin, y + 49, width - margin, y + 51), "#c8c8c4")
-    draw.rectangle((margin, y + 49, place(t), y + 51), "#1f5fa8")
+    draw.rectangle((margin, y + 49, pixel(t), y + 51), "#1f5fa8")
     for when, _ in events:
-        draw.rectangle((place(when) - 1, y + 45, place(when) + 1, y + 55), "#b03030")
+        draw.rectangle((pixel(when) - 1, y + 45, pixel(when) + 1, y + 55), "#b03030")
     return out

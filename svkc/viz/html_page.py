@@ -16,7 +16,7 @@ from svkc.model.chain import Chain, State, Structure, active_dofs
 from svkc.simulation.trajectory import Trajectory
 from svkc.tree.energy import energy
 from svkc.tree.kinematics import poses
-from svkc.viz.shapes import happened, one_run
+from svkc.viz.shapes import check_single_run, event_descriptions
 
 FOLDER = pathlib.Path(__file__).parent / "web"
 
@@ -45,13 +45,13 @@ def show(chain: Chain, traj: Trajectory, *, title: str = "svkc", height: int = 4
     Bodies move in straight lines and turn at constant rates between the saved times: save 40 a
     second or so. ValueError: a batch of runs.
     """
-    text = _read("page.html")
+    text = _read_web_file("page.html")
     # the run comes last: nothing in it is taken for a place to put something in
     parts = {
-        "three": _read("three.min.js"),
-        "page": _read("page.js"),
+        "three": _read_web_file("three.min.js"),
+        "page": _read_web_file("page.js"),
         "title": html.escape(title),
-        "run": _script(_run(chain, traj)),
+        "run": _script_json(_run_data(chain, traj)),
     }
     for place, value in parts.items():
         text = text.replace("{{" + place + "}}", value)
@@ -64,53 +64,53 @@ def write_page(chain: Chain, traj: Trajectory, path: pathlib.Path) -> pathlib.Pa
     return path
 
 
-def _read(name: str) -> str:
+def _read_web_file(name: str) -> str:
     return (FOLDER / name).read_text(encoding="utf-8")
 
 
-def _script(data) -> str:
+def _script_json(data) -> str:
     """JSON that can stand inside a <script>: no name in it ends the script."""
     return json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
 
 
-def _numbers(x):
+def _json_numbers(x):
     """Lists of numbers; null for what is not finite."""
     x = np.asarray(x, float)
-    told = x.astype(object)
-    told[~np.isfinite(x)] = None
-    return told.tolist()
+    values = x.astype(object)
+    values[~np.isfinite(x)] = None
+    return values.tolist()
 
 
-def _packed(x, dtype) -> str:
+def _base64(x, dtype) -> str:
     return base64.b64encode(
         np.ascontiguousarray(x, np.dtype(dtype).newbyteorder("<")).tobytes()
     ).decode()
 
 
-def _run(chain: Chain, traj: Trajectory) -> dict:
+def _run_data(chain: Chain, traj: Trajectory) -> dict:
     """All that the page knows of a run."""
-    one_run(traj)
-    ts, states, gaps = _frames(chain, traj)
+    check_single_run(traj)
+    ts, states, gaps = _saved_frames(chain, traj)
     positions, quats, energies = jax.jit(jax.vmap(lambda s: (*poses(chain, s), energy(chain, s))))(
         states
     )
-    phases = _phases(chain, traj, ts, states)
+    phases = _phase_rows(chain, traj, ts, states)
     geoms, meshes = _geoms(chain.model.model)
     return {
         "bodies": chain.body_names,
-        "times": _numbers(ts),
-        "poses": _packed(np.concatenate([positions, quats], -1), np.float32),
-        "energy": _numbers(energies),
-        "gaps": _numbers(gaps),
+        "times": _json_numbers(ts),
+        "poses": _base64(np.concatenate([positions, quats], -1), np.float32),
+        "energy": _json_numbers(energies),
+        "gaps": _json_numbers(gaps),
         "phases": phases,
-        "events": _events(chain, traj, ts[0]),
+        "events": _event_rows(chain, traj, ts[0]),
         "geoms": geoms,
         "meshes": meshes,
         "size": float(chain.length),
     }
 
 
-def _frames(chain: Chain, traj: Trajectory) -> tuple[np.ndarray, State, np.ndarray]:
+def _saved_frames(chain: Chain, traj: Trajectory) -> tuple[np.ndarray, State, np.ndarray]:
     """The saved times up to the end of the run, which may have come early, with states and gaps
     there; the end is one of them."""
     ts, end = np.asarray(traj.ts, float), float(traj.t_final)
@@ -130,7 +130,7 @@ def _frames(chain: Chain, traj: Trajectory) -> tuple[np.ndarray, State, np.ndarr
     )
 
 
-def _phases(chain: Chain, traj: Trajectory, ts: np.ndarray, states: State) -> list[dict]:
+def _phase_rows(chain: Chain, traj: Trajectory, ts: np.ndarray, states: State) -> list[dict]:
     """From when, with what mobility, held by which links. What an event at the very end leaves is a
     phase too."""
     p, final = traj.phases, traj.final.structure
@@ -139,12 +139,12 @@ def _phases(chain: Chain, traj: Trajectory, ts: np.ndarray, states: State) -> li
             "start": float(p.start[i]),
             "stop": float(p.stop[i]),
             "mobility": int(p.freedoms[i]),
-            "energy": _numbers(p.energy[i]),
-            "gap": _numbers(p.gap[i]),
+            "energy": _json_numbers(p.energy[i]),
+            "gap": _json_numbers(p.gap[i]),
         }
         for i in range(int(p.count))
     ]
-    held = [*np.asarray(p.connected)[: len(rows)]]
+    connected_rows = [*np.asarray(p.connected)[: len(rows)]]
     if not rows or np.any(np.asarray(traj.events.time) == rows[-1]["stop"]):
         end, mobility = (
             float(traj.t_final),
@@ -159,34 +159,36 @@ def _phases(chain: Chain, traj: Trajectory, ts: np.ndarray, states: State) -> li
                 "gap": [None, None],
             }
         )
-        held.append(np.asarray(final.connected))
+        connected_rows.append(np.asarray(final.connected))
     # a row of the topology as a body
-    body = {row: i for i, row in enumerate(chain.topology.body_row)}
+    body_of_row = {row: i for i, row in enumerate(chain.topology.body_row)}
     bounds = [row["start"] for row in rows] + [np.inf]
-    for row, connected, start, stop in zip(rows, held, bounds[:-1], bounds[1:], strict=True):
+    for row, connected, start, stop in zip(
+        rows, connected_rows, bounds[:-1], bounds[1:], strict=True
+    ):
         # where links hold is known where a state was saved
-        inside = np.flatnonzero((ts >= start) & (ts < stop))
+        saved = np.flatnonzero((ts >= start) & (ts < stop))
         s = (
-            jax.tree.map(lambda x, k=inside: np.asarray(x[k[0]]), states.structure)
-            if len(inside)
+            jax.tree.map(lambda x, k=saved: np.asarray(x[k[0]]), states.structure)
+            if len(saved)
             else None
         )
         row["links"] = [
-            {"name": chain.link_names[i], "link": i, "ends": s and _ends(s, i, body)}
+            {"name": chain.link_names[i], "link": i, "ends": s and _link_ends(s, i, body_of_row)}
             for i in np.flatnonzero(connected).tolist()
         ]
     return rows
 
 
-def _ends(s: Structure, link: int, body: dict) -> list:
+def _link_ends(s: Structure, link: int, body: dict) -> list:
     """Body and place in it, of the parent's end and the real link's."""
     return [
-        [body[int(row[link])], _numbers(pos[link])]
+        [body[int(row[link])], _json_numbers(pos[link])]
         for row, pos in ((s.parent, s.pos), (s.real, s.real_pos))
     ]
 
 
-def _events(chain: Chain, traj: Trajectory, begin: float) -> list[dict]:
+def _event_rows(chain: Chain, traj: Trajectory, begin: float) -> list[dict]:
     """What happened, one line an instant, and the energy (J) that it cost."""
     e = traj.events
     times, lost = (np.asarray(x[: int(e.count)], float) for x in (e.time, e.energy_lost))
@@ -194,7 +196,7 @@ def _events(chain: Chain, traj: Trajectory, begin: float) -> list[dict]:
     rounding = 100 * float(jnp.finfo(traj.ts.dtype).eps * jnp.max(jnp.abs(traj.phases.energy)))
     instants = [
         (time, text, float(lost[times == time].sum()))
-        for time, text in happened(traj, chain)
+        for time, text in event_descriptions(traj, chain)
         if time >= begin
     ]
     return [
@@ -225,12 +227,12 @@ def _geoms(model) -> tuple[list[dict], list[dict]]:
         shape = {
             "body": int(model.geom_bodyid[g]),
             "kind": kind.name.removeprefix("mjGEOM_").lower(),
-            "rgba": _numbers(rgba.round(4)),
+            "rgba": _json_numbers(rgba.round(4)),
         }
         shape |= {
-            "size": _numbers(model.geom_size[g]),
-            "pos": _numbers(model.geom_pos[g]),
-            "quat": _numbers(model.geom_quat[g]),
+            "size": _json_numbers(model.geom_size[g]),
+            "pos": _json_numbers(model.geom_pos[g]),
+            "quat": _json_numbers(model.geom_quat[g]),
         }
         if data >= 0:
             source = (kind == kinds.mjGEOM_HFIELD, data)
@@ -238,7 +240,7 @@ def _geoms(model) -> tuple[list[dict], list[dict]]:
                 known[source] = len(meshes)
                 vertices, faces = _heightfield(model, data) if source[0] else _mesh(model, data)
                 meshes.append(
-                    {"vertices": _packed(vertices, np.float32), "faces": _packed(faces, np.uint32)}
+                    {"vertices": _base64(vertices, np.float32), "faces": _base64(faces, np.uint32)}
                 )
             shape |= {"kind": "mesh", "mesh": known[source]}
         geoms.append(shape)

@@ -9,7 +9,13 @@ import numpy as np
 from svkc.model.chain import Chain
 from svkc.simulation.trajectory import Trajectory
 from svkc.tree.energy import kinetic_energy, potential_energy
-from svkc.viz.shapes import color, happened, held, segments, world_poses
+from svkc.viz.shapes import (
+    color,
+    connected_link_positions,
+    event_descriptions,
+    positions_and_rotations,
+    segments,
+)
 
 
 def strobe(chain: Chain, traj: Trajectory, path: pathlib.Path, frames: int) -> pathlib.Path:
@@ -18,31 +24,31 @@ def strobe(chain: Chain, traj: Trajectory, path: pathlib.Path, frames: int) -> p
     from matplotlib.figure import Figure
 
     ts = np.asarray(traj.ts)
-    pick = np.unique(np.searchsorted(ts, np.linspace(ts[0], ts[-1], frames)).clip(0, len(ts) - 1))
-    states = jax.tree.map(lambda x: x[pick], traj.states)
-    positions, R = world_poses(chain, states)
-    holding = held(chain, states, positions, R)
+    picked = np.unique(np.searchsorted(ts, np.linspace(ts[0], ts[-1], frames)).clip(0, len(ts) - 1))
+    states = jax.tree.map(lambda x: x[picked], traj.states)
+    positions, R = positions_and_rotations(chain, states)
+    link_positions = connected_link_positions(chain, states, positions, R)
     starts, structures = _structures(traj)
     colors = {s: color(n) for n, s in enumerate(dict.fromkeys(structures))}
     figure = Figure(figsize=(10, 7.5))
     axes = figure.add_subplot(aspect="equal", xlabel="x (m)", ylabel="z (m)")
     shapes = segments(chain)
-    fixed, moving = [s for s in shapes if s[0] == 0], [s for s in shapes if s[0] != 0]
-    low, high = _limits(fixed, positions)
+    ground_shapes, body_shapes = [s for s in shapes if s[0] == 0], [s for s in shapes if s[0] != 0]
+    low, high = _axis_limits(ground_shapes, positions)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     # points a metre
     scale = 72 * min(9 / (high[0] - low[0]), 6.7 / (high[1] - low[1]))
     draw = functools.partial(_draw_shapes, axes, scale=scale)
-    draw(fixed, positions[0], R[0], color="#9a9aa2", alpha=0.8)
-    for frame, i in enumerate(pick):
+    draw(ground_shapes, positions[0], R[0], color="#9a9aa2", alpha=0.8)
+    for frame, i in enumerate(picked):
         structure = structures[max(int(np.sum(starts <= ts[i])) - 1, 0)]
-        shade = 0.2 + 0.7 * (frame + 1) / len(pick)
-        draw(moving, positions[frame], R[frame], color=colors[structure], alpha=shade)
-        rings = np.array([place[[0, 2]] for place in holding[frame].values()]).reshape(-1, 2)
+        shade = 0.2 + 0.7 * (frame + 1) / len(picked)
+        draw(body_shapes, positions[frame], R[frame], color=colors[structure], alpha=shade)
+        rings = np.array([place[[0, 2]] for place in link_positions[frame].values()]).reshape(-1, 2)
         axes.plot(*rings.T, "o", color="#202020", alpha=shade, markersize=7, fillstyle="none")
     _add_legend(axes, chain, starts, structures, colors)
     axes.grid(alpha=0.2)
-    axes.set_title(f"{len(pick)} poses, {ts[pick[0]]:.2f} s to {ts[pick[-1]]:.2f} s")
+    axes.set_title(f"{len(picked)} poses, {ts[picked[0]]:.2f} s to {ts[picked[-1]]:.2f} s")
     figure.savefig(path, dpi=110, bbox_inches="tight")
     return path
 
@@ -56,16 +62,18 @@ def _structures(traj: Trajectory) -> tuple[np.ndarray, list[tuple[int, ...]]]:
     return np.asarray(p.start)[phases], links
 
 
-def _limits(fixed, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _axis_limits(ground_shapes, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the lowest and the highest x and z (m) that are shown.
 
     What is fixed is shown no further than a metre beyond what moves: a long floor would make the
     figure small.
     """
-    moving = positions[:, 1:, [0, 2]].reshape(-1, 2)
-    ends = np.array([end for _, *ends, _ in fixed for end in ends]).reshape(-1, 3)[:, [0, 2]]
-    shown = np.concatenate([moving, ends.clip(moving.min(0) - 1, moving.max(0) + 1)])
-    return shown.min(0) - 0.3, shown.max(0) + 0.3
+    points = positions[:, 1:, [0, 2]].reshape(-1, 2)
+    ends = np.array([end for _, *ends, _ in ground_shapes for end in ends]).reshape(-1, 3)[
+        :, [0, 2]
+    ]
+    visible = np.concatenate([points, ends.clip(points.min(0) - 1, points.max(0) + 1)])
+    return visible.min(0) - 0.3, visible.max(0) + 0.3
 
 
 def _draw_shapes(axes, shapes, positions, R, *, scale: float, color: str, alpha: float):
@@ -90,11 +98,13 @@ def _add_legend(axes, chain: Chain, starts, structures, colors: dict):
     """Name each structure by the links that hold, and the times from which it is there."""
     from matplotlib.transforms import ScaledTranslation
 
-    for structure, paint in colors.items():
-        since = [f"{t:.2f}" for t, s in zip(starts, structures, strict=True) if s == structure]
-        times = ", ".join(since[:6]) + ", ..." * (len(since) > 6)
+    for structure, color in colors.items():
+        starts_of_structure = [
+            f"{t:.2f}" for t, s in zip(starts, structures, strict=True) if s == structure
+        ]
+        times = ", ".join(starts_of_structure[:6]) + ", ..." * (len(starts_of_structure) > 6)
         links = ", ".join(chain.link_names[k] for k in structure) or "nothing"
-        axes.plot([], [], color=paint, linewidth=5, label=f"{links} from {times} s")
+        axes.plot([], [], color=color, linewidth=5, label=f"{links} from {times} s")
     # below the picture: inside it would hide limbs
     below = axes.transAxes + ScaledTranslation(0, -0.6, axes.figure.dpi_scale_trans)
     axes.legend(
@@ -118,19 +128,19 @@ def curves(traj: Trajectory, chain: Chain | None = None):
     joints, energies, gaps, mobility = panels = figure.subplots(
         4, 1, sharex=True, height_ratios=(2, 1.4, 1.2, 0.8)
     )
-    _coordinates(joints, ts, traj, chain)
-    _energies(energies, ts, traj, chain)
+    _plot_coordinates(joints, ts, traj, chain)
+    _plot_energies(energies, ts, traj, chain)
     gaps.semilogy(ts, np.maximum(np.asarray(traj.gaps), 1e-17), linewidth=1, label=["rad", "m"])
     gaps.set_ylabel("largest loop gap")
     gaps.legend(fontsize=8)
     bounds = np.append(np.asarray(p.start)[:count], p.stop[count - 1])
     mobility.stairs(np.asarray(p.freedoms)[:count], bounds, baseline=None, linewidth=1.5)
     mobility.set(ylabel="mobility", xlabel="t (s)")
-    _mark_events(figure, panels, happened(traj, chain))
+    _mark_events(figure, panels, event_descriptions(traj, chain))
     return figure
 
 
-def _coordinates(axes, ts, traj: Trajectory, chain: Chain | None):
+def _plot_coordinates(axes, ts, traj: Trajectory, chain: Chain | None):
     """Draw joints' coordinates, by name where they are few; quaternions' and positions' too."""
     axes.plot(ts, np.asarray(traj.states.q), linewidth=0.8)
     axes.set_ylabel("q (m, rad)")
@@ -139,11 +149,11 @@ def _coordinates(axes, ts, traj: Trajectory, chain: Chain | None):
         axes.legend(axes.lines[: chain.nq], chain.joint_names, fontsize=7)
 
 
-def _energies(axes, ts, traj: Trajectory, chain: Chain | None):
+def _plot_energies(axes, ts, traj: Trajectory, chain: Chain | None):
     """Draw the energy at the phases' ends; with the chain, kinetic and potential energy too."""
     if chain is not None:
-        for name, of in (("kinetic", kinetic_energy), ("potential", potential_energy)):
-            values = jax.jit(jax.vmap(lambda s, of=of: of(chain, s)))(traj.states)
+        for name, energy_of in (("kinetic", kinetic_energy), ("potential", potential_energy)):
+            values = jax.jit(jax.vmap(lambda s, of=energy_of: of(chain, s)))(traj.states)
             axes.plot(ts, np.asarray(values), linewidth=1, label=name)
     p, count = traj.phases, int(traj.phases.count)
     # a gap in the line after each phase

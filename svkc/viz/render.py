@@ -8,10 +8,10 @@ from svkc.model.checked_jit import check_chain
 from svkc.model.validation import integer, names, positive_scalar, scalar, vector
 from svkc.simulation.trajectory import Trajectory
 from svkc.viz.html_page import write_page
-from svkc.viz.shapes import one_run
+from svkc.viz.shapes import check_single_run
 
 
-def _installed() -> None:
+def _require_packages() -> None:
     """RuntimeError: what draws is not installed."""
     for name in ("matplotlib", "PIL"):
         try:
@@ -37,10 +37,10 @@ def render(
     ending, a batch, no such body or camera, what is no number. RuntimeError: no GL library, no
     matplotlib, pillow or imageio-ffmpeg (names the packages).
     """
-    from svkc.viz import animation, plots as figures
+    from svkc.viz import animation, plots
 
     check_chain(chain)
-    one_run(traj)
+    check_single_run(traj)
     frames, fps, path = (
         integer("frames", frames, 1),
         positive_scalar("fps", fps),
@@ -54,22 +54,22 @@ def render(
     distance = distance if distance is None else positive_scalar("distance", distance)
     azimuth, elevation = scalar("azimuth", azimuth), scalar("elevation", elevation)
     if path.suffix != ".html":
-        _installed()
+        _require_packages()
     if path.suffix == ".png":
-        return figures.strobe(chain, traj, path, frames)
+        return plots.strobe(chain, traj, path, frames)
     if path.suffix == ".html":
         return write_page(chain, traj, path)
-    write = {".gif": animation.gif, ".mp4": animation.mp4}.get(path.suffix)
-    if write is None:
+    writer = {".gif": animation.write_gif, ".mp4": animation.write_mp4}.get(path.suffix)
+    if writer is None:
         raise ValueError(f"render: {path.name} should end in .png, .gif, .mp4 or .html")
-    seen = {
+    view = {
         "camera": camera,
         "lookat": lookat,
         "distance": distance,
         "azimuth": azimuth,
         "elevation": elevation,
     }
-    write(path, animation.frames(chain, traj, fps=fps, size=size, trails=trails, **seen), fps)
+    writer(path, animation.frames(chain, traj, fps=fps, size=size, trails=trails, **view), fps)
     return path
 
 
@@ -78,8 +78,8 @@ def plot(traj: Trajectory, chain: Chain | None = None):
     names and energies in full where the chain is given."""
     from svkc.viz.plots import curves
 
-    one_run(traj)
-    _installed()
+    check_single_run(traj)
+    _require_packages()
     if chain is not None:
         check_chain(chain)
     return curves(traj, chain)

@@ -13,7 +13,7 @@ from svkc.tree.kinematics import poses
 COLORS = ("#1f5fa8", "#d9822b", "#2f8f4e", "#8e3b8e", "#b03030")
 
 
-def one_run(traj) -> None:
+def check_single_run(traj) -> None:
     """ValueError for what is no trajectory, or one of many lanes."""
     if not isinstance(traj, Trajectory):
         raise ValueError(f"traj: expected one run of svkc.simulate, got {type(traj).__name__}")
@@ -34,7 +34,7 @@ def segments(chain: Chain) -> list[tuple[int, np.ndarray, np.ndarray, float]]:
     in the body's frame (m)."""
     import mujoco
 
-    model, out = chain.model.model, []
+    model, lines = chain.model.model, []
     for g in range(model.ngeom):
         kind, size = mujoco.mjtGeom(int(model.geom_type[g])), model.geom_size[g]
         R = rotation_matrix(model.geom_quat[g])
@@ -53,7 +53,7 @@ def segments(chain: Chain) -> list[tuple[int, np.ndarray, np.ndarray, float]]:
             half, radius = R[:, longest] * size[longest], float(np.min(size))
         else:
             continue
-        out.append(
+        lines.append(
             (
                 int(model.geom_bodyid[g]),
                 model.geom_pos[g] - half,
@@ -61,10 +61,10 @@ def segments(chain: Chain) -> list[tuple[int, np.ndarray, np.ndarray, float]]:
                 float(radius),
             )
         )
-    return out
+    return lines
 
 
-def world_poses(chain: Chain, states: State) -> tuple[np.ndarray, np.ndarray]:
+def positions_and_rotations(chain: Chain, states: State) -> tuple[np.ndarray, np.ndarray]:
     """Positions [times bodies 3] (m) and rotations [times bodies 3 3] of the body frames in the
     world."""
     positions, quats = jax.jit(jax.vmap(lambda s: poses(chain, s)))(states)
@@ -79,29 +79,31 @@ def world_poses(chain: Chain, states: State) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(positions, float), np.moveaxis(R, (0, 1), (-2, -1))
 
 
-def held(chain: Chain, states: State, positions, R) -> list[dict[int, np.ndarray]]:
+def connected_link_positions(
+    chain: Chain, states: State, positions, R
+) -> list[dict[int, np.ndarray]]:
     """At each of these states, where each connected virtual link holds: {link: place in the world
     (m)}."""
     rows, s = {row: body for body, row in enumerate(chain.topology.body_row)}, states.structure
-    connected, real, place = (
+    connected, real, real_pos = (
         np.asarray(s.connected),
         np.asarray(s.real),
         np.asarray(s.real_pos, float),
     )
-    at = lambda i, link, body: positions[i, body] + R[i, body] @ place[i, link]
+    position_of = lambda i, link, body: positions[i, body] + R[i, body] @ real_pos[i, link]
     return [
-        {int(k): at(i, k, rows[int(real[i, k])]) for k in np.flatnonzero(connected[i])}
+        {int(k): position_of(i, k, rows[int(real[i, k])]) for k in np.flatnonzero(connected[i])}
         for i in range(len(positions))
     ]
 
 
-def happened(traj: Trajectory, chain: Chain | None = None) -> list[tuple[float, str]]:
+def event_descriptions(traj: Trajectory, chain: Chain | None = None) -> list[tuple[float, str]]:
     """(time in s, what was connected and cut) of each instant at which there were events; by the
     links' numbers where no chain is given."""
-    p, e, out = traj.phases, traj.events, []
+    p, e, descriptions = traj.phases, traj.events, []
     starts, connected = np.asarray(p.start)[: int(p.count)], np.asarray(p.connected)[: int(p.count)]
     times = np.asarray(e.time)[: int(e.count)]
-    name = (lambda k: chain.link_names[k]) if chain is not None else (lambda k: f"link {k}")
+    link_name = (lambda k: chain.link_names[k]) if chain is not None else (lambda k: f"link {k}")
     for time in np.unique(times):
         before = connected[max(int(np.sum(starts < time)) - 1, 0)]
         # what an event at the very end leaves is no phase any more
@@ -110,9 +112,11 @@ def happened(traj: Trajectory, chain: Chain | None = None) -> list[tuple[float, 
             if np.any(starts >= time)
             else np.asarray(traj.final.structure.connected)
         )
-        words = [f"connect {name(k)}" for k in np.flatnonzero(after & ~before)] + [
-            f"cut {name(k)}" for k in np.flatnonzero(before & ~after)
+        changes = [f"connect {link_name(k)}" for k in np.flatnonzero(after & ~before)] + [
+            f"cut {link_name(k)}" for k in np.flatnonzero(before & ~after)
         ]
-        numbers = ", ".join(str(int(k)) for k in np.asarray(e.which)[: int(e.count)][times == time])
-        out.append((float(time), ", ".join(words) or f"event {numbers}"))
-    return out
+        event_indices = ", ".join(
+            str(int(k)) for k in np.asarray(e.which)[: int(e.count)][times == time]
+        )
+        descriptions.append((float(time), ", ".join(changes) or f"event {event_indices}"))
+    return descriptions

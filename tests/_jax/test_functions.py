@@ -35,7 +35,7 @@ def programs(monkeypatch):
     """One item for each program of `simulate` that is made."""
     made, module = [], sys.modules["svkc.simulation.simulate"]
     whole = module._converted
-    monkeypatch.setattr(module, "_converted", lambda *args: (made.append(0), whole(*args))[1])
+    monkeypatch.setattr(module, "_closure_convert", lambda *args: (made.append(0), whole(*args))[1])
     return made
 
 

@@ -2,7 +2,7 @@
 every machine. `benchmarks/compile.py` has seconds."""
 
 import compile as counting
-import compiled
+import compile_cases
 import jax
 import pytest
 
@@ -16,8 +16,10 @@ SLOW = {"arm and ball": 16700, "gradient": 43600, "arm and ball gradient": 53900
     "name", [*BUDGETS, *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW)]
 )
 def test_a_program_is_no_larger_than_it_was(name):
-    function, args = compiled.PROGRAMS[name]()
-    count = counting.counted(jax.jit(function).lower(*args).compiler_ir("hlo").as_hlo_text())
+    function, args = compile_cases.PROGRAMS[name]()
+    count = counting.count_instructions(
+        jax.jit(function).lower(*args).compiler_ir("hlo").as_hlo_text()
+    )
     budget = (BUDGETS | SLOW)[name]
     assert budget / 2 < count <= budget
 
@@ -36,4 +38,4 @@ ENTRY main (x: f64[]) -> f64[] {
   ROOT b = f64[] call(a), to_apply=f
 }
 """
-    assert counting.counted(text) == 3 + 2 * 2
+    assert counting.count_instructions(text) == 3 + 2 * 2

@@ -14,7 +14,7 @@ import svkc
 from svkc import _deprecated as deprecated
 from svkc.loops.constrained_dynamics import Dynamics, default_dynamics
 from svkc.loops.projection import project
-from svkc.tools.accuracy import Candidate, candidates
+from svkc.tools.accuracy import Candidate, default_candidates
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +51,7 @@ def arm():
     ],
     ids=lambda x: type(x).__name__ if isinstance(x, diffrax.AbstractSolver) else None,
 )
-def test_orders(arm, exact, solver, order, dt):
+def test_order_of_integrators(arm, exact, solver, order, dt):
     """Halving the step divides the error by two to the order, on balls and free joints as well."""
     chain, state = arm
     run = jax.jit(
@@ -79,14 +79,17 @@ def test_symplectic_euler_keeps_energy():
         models.MJCF.format(models.bar("rod", models.Y, "0 0 -1")).replace("0.3 -0.2", "0 0")
     )
     state, ts = chain.state({"rod": 0.5}), jnp.linspace(0, 160.0, 161)
-    found = {}
+    errors = {}
     for solver in (svkc.integrators.SymplecticEuler(), svkc.integrators.RodriguesEuler()):
         traj = svkc.simulate(chain, state, 160.0, ts=ts, dt=0.026, solver=solver)
         energy = jax.vmap(lambda s: svkc.energy(chain, s))(traj.states)
-        found[type(solver)] = np.abs(energy - energy[0])
-    kept, lost = found[svkc.integrators.SymplecticEuler], found[svkc.integrators.RodriguesEuler]
-    assert kept[80:].max() < 1.1 * kept[:80].max()
-    assert lost[-1] > 20 * kept.max()
+        errors[type(solver)] = np.abs(energy - energy[0])
+    symplectic, explicit = (
+        errors[svkc.integrators.SymplecticEuler],
+        errors[svkc.integrators.RodriguesEuler],
+    )
+    assert symplectic[80:].max() < 1.1 * symplectic[:80].max()
+    assert explicit[-1] > 20 * symplectic.max()
 
 
 @pytest.mark.parametrize(
@@ -96,28 +99,28 @@ def test_symplectic_euler_keeps_energy():
         pytest.param(svkc.stabilization.CoordinatePartitioning(), marks=pytest.mark.slow),
     ],
 )
-def test_each_way_back_onto_the_loops(stabilization):
+def test_each_stabilization_closes_the_loops(stabilization):
     """One motion, loops closed to round-off. By short steps, and by one that is too long."""
     chain = models.four_bar()
     state = chain.state(v={"crank": 4.0})
-    free = lambda t1, dt: svkc.simulate(
+    unstabilized = lambda t1, dt: svkc.simulate(
         chain, state, t1, dt=dt, stabilization=svkc.stabilization.NoStabilization(), throw=False
     )
-    held = lambda t1, dt: svkc.simulate(chain, state, t1, dt=dt, stabilization=stabilization)
-    fine = held(0.5, 1e-3)
-    np.testing.assert_allclose(fine.final.q, free(0.5, 1e-3).final.q, atol=1e-7)
-    assert float(fine.gaps.max()) < 1e-14
-    assert float(fine.gap_rates.max()) < 1e-13
-    rough, settled = free(0.1, 0.1).final, held(0.1, 0.1).final
-    gap = np.abs(svkc.loop_gaps(chain, rough)).max()
+    stabilized = lambda t1, dt: svkc.simulate(chain, state, t1, dt=dt, stabilization=stabilization)
+    reference = stabilized(0.5, 1e-3)
+    np.testing.assert_allclose(reference.final.q, unstabilized(0.5, 1e-3).final.q, atol=1e-7)
+    assert float(reference.gaps.max()) < 1e-14
+    assert float(reference.gap_rates.max()) < 1e-13
+    before, after = unstabilized(0.1, 0.1).final, stabilized(0.1, 0.1).final
+    gap = np.abs(svkc.loop_gaps(chain, before)).max()
     assert gap > 1e-6
-    assert np.abs(svkc.loop_gaps(chain, settled)).max() < 1e-3 * gap
+    assert np.abs(svkc.loop_gaps(chain, after)).max() < 1e-3 * gap
 
 
-def test_only_dependent_coordinates_move():
+def test_partitioning_moves_only_dependent_coordinates():
     """Where no other may: the loops are closed, and the independent coordinates stay."""
     chain = models.four_bar()
-    rough = svkc.simulate(
+    drifted = svkc.simulate(
         chain,
         chain.state(v={"crank": 4.0}),
         0.1,
@@ -125,23 +128,23 @@ def test_only_dependent_coordinates_move():
         stabilization=svkc.stabilization.NoStabilization(),
         throw=False,
     ).final
-    moved = lambda dependent: project(
-        chain, rough.structure, rough.q, rough.v, iterations=3, dependent_only=dependent
+    projected = lambda dependent: project(
+        chain, drifted.structure, drifted.q, drifted.v, iterations=3, dependent_only=dependent
     )[:2]
-    independent = np.asarray(svkc.coordinates(chain, rough).independent)
-    q, v = moved(True)
-    np.testing.assert_allclose(q[independent], rough.q[independent], atol=1e-15)
-    np.testing.assert_allclose(v[independent], rough.v[independent], atol=1e-15)
-    closed = svkc.State(q, v, rough.structure)
-    assert np.abs(svkc.loop_gaps(chain, rough)).max() > 1e-6
+    independent = np.asarray(svkc.coordinates(chain, drifted).independent)
+    q, v = projected(True)
+    np.testing.assert_allclose(q[independent], drifted.q[independent], atol=1e-15)
+    np.testing.assert_allclose(v[independent], drifted.v[independent], atol=1e-15)
+    closed = svkc.State(q, v, drifted.structure)
+    assert np.abs(svkc.loop_gaps(chain, drifted)).max() > 1e-6
     assert np.abs(svkc.loop_gaps(chain, closed)).max() < 1e-13
     assert np.abs(svkc.loop_gap_rates(chain, closed)).max() < ROUND_OFF
     # in the metric of the inertia they move too
-    assert np.abs(moved(False)[0][independent] - rough.q[independent]).max() > 1e-9
+    assert np.abs(projected(False)[0][independent] - drifted.q[independent]).max() > 1e-9
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_the_older_spelling_of_dynamics():
+def test_former_names_of_dynamics():
     closed, tree = (
         models.four_bar(),
         svkc.load(models.MJCF.format(models.bar("a", models.Y, "0 0 1"))),
@@ -160,12 +163,12 @@ def test_the_older_spelling_of_dynamics():
         assert type(Dynamics().resolved(chain)) is usual
 
 
-def test_the_certificate():
+def test_every_line_of_the_report():
     """Every line of it against what is known otherwise: four bars driven round, a figure in flight,
     lanes."""
     chain = models.four_bar()
     control = lambda t, s, args: jnp.zeros(chain.dofs).at[0].set(3.0)
-    new = svkc.dynamics.CompositeBodies(hold=None)
+    dynamics = svkc.dynamics.CompositeBodies(hold=None)
     run = jax.jit(
         lambda dt: svkc.simulate(
             chain,
@@ -174,7 +177,7 @@ def test_the_certificate():
             ts=jnp.linspace(0, 1, 11),
             control=control,
             dt=dt,
-            dynamics=new,
+            dynamics=dynamics,
         )
     )
     coarse, fine = run(0.02), run(0.001)
@@ -224,42 +227,42 @@ def test_the_certificate():
 
 
 @pytest.mark.slow
-def test_gaps_are_seen_between_saved_times():
+def test_the_report_covers_steps_between_saved_times():
     """A loop that drifts open and is cut: no saved state shows it, the certificate does, and the
     run's code."""
     chain = models.four_bar()
-    rough = {
+    options = {
         "dt": 0.02,
         "solver": diffrax.Heun(),
         "stabilization": svkc.stabilization.NoStabilization(),
         "throw": False,
     }
     cut = svkc.simulate(
-        chain, chain.state(v={"crank": 6.0}), 0.4, events=[svkc.at(0.2, cut="pin")], **rough
+        chain, chain.state(v={"crank": 6.0}), 0.4, events=[svkc.at(0.2, cut="pin")], **options
     )
-    whole = svkc.simulate(
-        chain, chain.state(v={"crank": 6.0}), 0.2, ts=0.02 * np.arange(11), **rough
+    saved_every_step = svkc.simulate(
+        chain, chain.state(v={"crank": 6.0}), 0.2, ts=0.02 * np.arange(11), **options
     )
-    gap = float(whole.gaps[:, 1].max())
-    assert float(cut.gaps.max()) < ROUND_OFF < 1e-4 < float(whole.gaps[-1, 1]) < gap
+    gap = float(saved_every_step.gaps[:, 1].max())
+    assert float(cut.gaps.max()) < ROUND_OFF < 1e-4 < float(saved_every_step.gaps[-1, 1]) < gap
     assert float(cut.report().gap) == pytest.approx(gap, rel=ROUND_OFF)
     assert cut.result == svkc.RESULTS.loop_open
 
 
 @pytest.mark.slow
-def test_the_momentum_of_what_is_free(arm):
+def test_momentum_drift_of_a_free_system(arm):
     chain, state = arm
     report = svkc.simulate(chain, state, 0.5, rtol=1e-10, atol=1e-12).report()
     assert bool(report.free)
     assert 0 < float(report.momentum_drift) < 1e-8
     assert float(report.angular_momentum_drift) < 1e-8
-    rough = svkc.simulate(chain, state, 0.5, dt=0.05, solver=diffrax.Heun()).report()
-    assert float(rough.angular_momentum_drift) > 1e-3
-    assert "N m s" in str(rough)
+    inaccurate = svkc.simulate(chain, state, 0.5, dt=0.05, solver=diffrax.Heun()).report()
+    assert float(inaccurate.angular_momentum_drift) > 1e-3
+    assert "N m s" in str(inaccurate)
 
 
 @pytest.mark.slow
-def test_what_is_not_finite_ends_its_lane_where_it_appears(arm):
+def test_a_non_finite_lane_stops_and_keeps_its_last_finite_state(arm):
     """By control, by a guard, with fixed steps and adaptive ones: the time and the phase, the last
     state that was whole; other lanes are untouched."""
     chain, state = arm
@@ -278,25 +281,25 @@ def test_what_is_not_finite_ends_its_lane_where_it_appears(arm):
             **{"throw": False} | kw,
         )
 
-    theirs = diffrax.RecursiveCheckpointAdjoint()
-    for kw, close in (
+    diffrax_adjoint = diffrax.RecursiveCheckpointAdjoint()
+    for kw, tolerance in (
         ({"dt": 0.01}, 0.011),
-        ({"dt": 0.01, "adjoint": theirs}, 0.011),
+        ({"dt": 0.01, "adjoint": diffrax_adjoint}, 0.011),
         ({"rtol": 1e-6, "atol": 1e-8}, 1e-9),
     ):
         batch = jax.jit(jax.vmap(lambda times, kw=kw: run(times, **kw)))
         lanes = batch(jnp.array([[1.0, 1.0], [0.25, 1.0], [0.05, 1.0]]))
         assert (lanes.result == svkc.RESULTS.non_finite).tolist() == [False, True, True]
         assert (lanes.result == svkc.RESULTS.successful).tolist() == [True, False, False]
-        np.testing.assert_allclose(lanes.t_final, [0.4, 0.25, 0.05], atol=close)
+        np.testing.assert_allclose(lanes.t_final, [0.4, 0.25, 0.05], atol=tolerance)
         assert np.all(lanes.t_final[1:] <= np.array([0.25, 0.05]) + 1e-12)
         assert lanes.phases.count.tolist() == [2, 2, 1]
         assert np.isfinite(lanes.final.q).all()
         assert np.isfinite(lanes.states.q).all()
         # beside lanes in which nothing goes wrong
-        alone = batch(jnp.ones((3, 2)))
-        assert np.all(alone.result == svkc.RESULTS.successful)
-        np.testing.assert_allclose(lanes.final.q[0], alone.final.q[0], atol=ROUND_OFF)
+        finite_lanes = batch(jnp.ones((3, 2)))
+        assert np.all(finite_lanes.result == svkc.RESULTS.successful)
+        np.testing.assert_allclose(lanes.final.q[0], finite_lanes.final.q[0], atol=ROUND_OFF)
     with pytest.raises(
         RuntimeError, match=r"t = 0\.2\d* s, in phase 2: A number that is not finite"
     ):
@@ -307,17 +310,17 @@ def test_what_is_not_finite_ends_its_lane_where_it_appears(arm):
 
 
 @pytest.mark.slow
-def test_what_is_not_finite_after_an_event():
+def test_a_non_finite_event_keeps_the_state_before_it():
     """Made by an event, at the very end: the state before it is kept."""
     four = models.four_bar()
     hanging = four.state(connected=())
 
-    def late(place):
+    def connect_at_end(place):
         start = eqx.tree_at(lambda s: s.structure.pos, hanging, hanging.structure.pos * place)
         return svkc.simulate(four, start, 1e-5, events=[svkc.at(1e-5, connect="pin")], throw=False)
 
-    for place, code in ((1.0, svkc.RESULTS.successful), (jnp.nan, svkc.RESULTS.non_finite)):
-        traj = jax.jit(late)(place)
+    for factor, code in ((1.0, svkc.RESULTS.successful), (jnp.nan, svkc.RESULTS.non_finite)):
+        traj = jax.jit(connect_at_end)(factor)
         assert traj.result == code
         assert np.isfinite(traj.final.q).all()
         assert float(traj.t_final) == 1e-5
@@ -327,7 +330,7 @@ def test_tune(capsys):
     """The fastest of those that hold the target on this scene; a target that nobody holds."""
     chain = models.four_bar()
     state = chain.state(v={"crank": 4.0})
-    given = [
+    candidates = [
         Candidate("rough", {"dt": 0.02, "solver": svkc.integrators.SymplecticEuler()}),
         Candidate("fine", {"rtol": 1e-8, "atol": 1e-10}),
         Candidate(
@@ -339,28 +342,28 @@ def test_tune(capsys):
             },
         ),
     ]
-    found = svkc.accuracy.tune(chain, state, 0.5, target=1e-6, options=given, repeats=1)
-    assert str(found) in capsys.readouterr().out
-    assert found.best is given[1].options
-    assert found.table[0].name == "fine"
-    assert found.table[0].error <= 1e-6 < min(c.error for c in found.table[1:])
-    assert all(c.seconds > 0 and c.steps > 0 for c in found.table)
-    assert next(c for c in found.table if c.name == "loose").gap < 1e-13
+    tuning = svkc.accuracy.tune(chain, state, 0.5, target=1e-6, options=candidates, repeats=1)
+    assert str(tuning) in capsys.readouterr().out
+    assert tuning.best is candidates[1].options
+    assert tuning.table[0].name == "fine"
+    assert tuning.table[0].error <= 1e-6 < min(c.error for c in tuning.table[1:])
+    assert all(c.seconds > 0 and c.steps > 0 for c in tuning.table)
+    assert next(c for c in tuning.table if c.name == "loose").gap < 1e-13
     for word in ("* fine", "  rough", "loop gap", "* the fastest"):
-        assert word in str(found)
-    again = svkc.simulate(chain, state, 0.5, ts=jnp.linspace(0, 0.5, 11), **found.best)
-    assert int(again.report().accepted + again.report().rejected) == found.table[0].steps
-    none = svkc.accuracy.tune(
-        chain, state, 0.5, target=1e-9, options=given[:1], repeats=1, show=False
+        assert word in str(tuning)
+    run = svkc.simulate(chain, state, 0.5, ts=jnp.linspace(0, 0.5, 11), **tuning.best)
+    assert int(run.report().accepted + run.report().rejected) == tuning.table[0].steps
+    no_tuning = svkc.accuracy.tune(
+        chain, state, 0.5, target=1e-9, options=candidates[:1], repeats=1, show=False
     )
-    assert none.best is None
+    assert no_tuning.best is None
     assert not capsys.readouterr().out
-    assert "no candidate holds the target" in str(none)
-    names = [c.name for c in candidates(jnp.float64, 1.0)]
+    assert "no candidate holds the target" in str(no_tuning)
+    names = [c.name for c in default_candidates(jnp.float64, 1.0)]
     assert len(set(names)) == len(names)
 
 
-def test_errors_by_halving(arm, exact):
+def test_estimate_error_agrees_with_the_true_error(arm, exact):
     """The difference of a run and a finer one is what the run errs by."""
     chain, state = arm
     for options in ({"dt": 0.02, "solver": diffrax.Heun()}, {"rtol": 1e-5, "atol": 1e-7}):

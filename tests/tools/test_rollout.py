@@ -36,7 +36,7 @@ def control(t, state, torque):
     return torque * jnp.ones_like(state.v)
 
 
-def hanging():
+def held_rods():
     """Two rods held by a grip at the far end, let go at some time."""
     rods = models.bar(
         "upper",
@@ -71,7 +71,7 @@ def hanging():
     )
 
 
-def call(chain, states, data, **options):
+def run_rollout(chain, states, data, **options):
     return svkc.rollout(
         chain, states, 0.4, data=data, lane=lane, control=control, rtol=1e-6, atol=1e-8, **options
     )
@@ -85,9 +85,9 @@ def main(rank, count, port, out, dies=""):
     jax.distributed.initialize(
         f"localhost:{port}", int(count), int(rank), heartbeat_timeout_seconds=10
     )
-    traj = call(*hanging(), chunk=2, out=out, progress=False)
+    traj = run_rollout(*held_rods(), chunk=2, out=out, progress=False)
     np.savez(
-        pathlib.Path(out) / f"whole_{rank}.npz",
+        pathlib.Path(out) / f"results_{rank}.npz",
         q=traj.final.q,
         times=traj.events.time,
         result=traj.result._value,
@@ -96,22 +96,22 @@ def main(rank, count, port, out, dies=""):
 
 @pytest.fixture(scope="module")
 def case():
-    return hanging()
+    return held_rods()
 
 
 @pytest.fixture(scope="module")
-def alone(case):
+def single_runs(case):
     """Each lane by itself."""
     chain, states, data = case
-    single = lambda s, own: svkc.simulate(
+    simulate_lane = lambda s, own: svkc.simulate(
         own.pop("chain"), s, control=control, rtol=1e-6, atol=1e-8, throw=False, **own
     )
-    run = jax.jit(lambda s, x: single(s, dict(lane(chain, x))))
+    run = jax.jit(lambda s, x: simulate_lane(s, dict(lane(chain, x))))
     return [run(*jax.tree.map(lambda x, i=i: x[i], (states, data))) for i in range(LANES)]
 
 
-def agrees(traj, alone):
-    for i, one in enumerate(alone):
+def assert_equal_to_single_runs(traj, single_runs):
+    for i, one in enumerate(single_runs):
         np.testing.assert_allclose(traj.final.q[i], one.final.q, atol=ROUND_OFF)
         np.testing.assert_allclose(traj.events.time[i], one.events.time)
         assert float(traj.t_final[i]) == pytest.approx(float(one.t_final))
@@ -119,70 +119,77 @@ def agrees(traj, alone):
     assert traj.states.q.shape[:2] == (LANES, 2)
 
 
-def test_lanes_are_those_of_single_runs(case, alone, capsys):
+def test_lanes_equal_single_runs(case, single_runs, capsys):
     """Whatever the chunks, and the order in which lanes are taken."""
-    traj = call(*case, chunk=4, cost=-np.arange(LANES) % 3)
-    agrees(traj, alone)
+    traj = run_rollout(*case, chunk=4, cost=-np.arange(LANES) % 3)
+    assert_equal_to_single_runs(traj, single_runs)
     assert "3 of 3 chunks (11 lanes)" in capsys.readouterr().err
 
 
 @pytest.mark.slow
-def test_all_lanes_at_once(case, alone, capsys):
+def test_all_lanes_at_once(case, single_runs, capsys):
     """In one chunk, and without a word."""
-    agrees(call(*case, progress=False), alone)
+    assert_equal_to_single_runs(run_rollout(*case, progress=False), single_runs)
     assert capsys.readouterr().err == ""
 
 
 def test_out_of_memory_names_the_chunk(case, monkeypatch):
     """The one that was given, or the default of a CPU; other errors of XLA are passed on."""
     chain, states, data = case
-    many = jax.tree.map(lambda x: jnp.concatenate([x] * 8), (states, data))
+    more_lanes = jax.tree.map(lambda x: jnp.concatenate([x] * 8), (states, data))
 
-    def fails(words):
-        def piece(*args):
+    def fail_with(words):
+        def run_chunk(*args):
             raise jax.errors.JaxRuntimeError(words)
 
-        monkeypatch.setattr(sys.modules["svkc.tools.rollout"], "_piece", piece)
+        monkeypatch.setattr(sys.modules["svkc.tools.rollout"], "_run_chunk", run_chunk)
 
-    fails("RESOURCE_EXHAUSTED: Out of memory allocating 1099511627776 bytes.")
-    for given, used in (({"chunk": 4}, 4), ({}, 64)):
+    fail_with("RESOURCE_EXHAUSTED: Out of memory allocating 1099511627776 bytes.")
+    for options, chunk in (({"chunk": 4}, 4), ({}, 64)):
         with pytest.raises(
-            RuntimeError, match=rf"^chunk={used} lanes .* give a smaller chunk="
-        ) as seen:
-            call(chain, *many, devices=jax.local_devices()[:1], **given)
-        assert "RESOURCE_EXHAUSTED" in str(seen.value.__cause__)
-    fails("INTERNAL: something else")
+            RuntimeError, match=rf"^chunk={chunk} lanes .* give a smaller chunk="
+        ) as raised:
+            run_rollout(chain, *more_lanes, devices=jax.local_devices()[:1], **options)
+        assert "RESOURCE_EXHAUSTED" in str(raised.value.__cause__)
+    fail_with("INTERNAL: something else")
     with pytest.raises(jax.errors.JaxRuntimeError, match="INTERNAL"):
-        call(*case)
+        run_rollout(*case)
 
 
 @pytest.mark.slow
-def test_an_interrupted_run_goes_on(case, alone, tmp_path, monkeypatch):
+def test_an_interrupted_rollout_resumes(case, single_runs, tmp_path, monkeypatch):
     chain, states, data = case
-    asked = []
+    saved_names = []
     save = svkc.Trajectory.save
 
-    def interrupted(self, path, chain=None):
-        asked.append(path.name)
-        if len(asked) == 2:
+    def interrupted_save(self, path, chain=None):
+        saved_names.append(path.name)
+        if len(saved_names) == 2:
             raise KeyboardInterrupt
         save(self, path, chain)
 
-    monkeypatch.setattr(svkc.Trajectory, "save", interrupted)
+    monkeypatch.setattr(svkc.Trajectory, "save", interrupted_save)
     with pytest.raises(KeyboardInterrupt):
-        call(*case, chunk=4, out=tmp_path / "run")
-    kept = tmp_path / "run" / "chunk_00000.npz"
-    stamp = kept.stat().st_mtime_ns
-    agrees(call(*case, chunk=4, out=tmp_path / "run"), alone)
+        run_rollout(*case, chunk=4, out=tmp_path / "run")
+    first_chunk = tmp_path / "run" / "chunk_00000.npz"
+    stamp = first_chunk.stat().st_mtime_ns
+    assert_equal_to_single_runs(run_rollout(*case, chunk=4, out=tmp_path / "run"), single_runs)
     # the finished chunk was read, not made again
-    assert asked == ["chunk_00000.npz", "chunk_00001.npz", "chunk_00001.npz", "chunk_00002.npz"]
-    assert kept.stat().st_mtime_ns == stamp
-    assert svkc.load_trajectory(kept).final.q.shape == (4, chain.topology.nq_all)
+    assert saved_names == [
+        "chunk_00000.npz",
+        "chunk_00001.npz",
+        "chunk_00001.npz",
+        "chunk_00002.npz",
+    ]
+    assert first_chunk.stat().st_mtime_ns == stamp
+    assert svkc.load_trajectory(first_chunk).final.q.shape == (4, chain.topology.nq_all)
     with pytest.raises(ValueError, match="holds another rollout"):
-        call(chain, states, {**data, "torque": data["torque"] + 1}, chunk=4, out=tmp_path / "run")
+        run_rollout(
+            chain, states, {**data, "torque": data["torque"] + 1}, chunk=4, out=tmp_path / "run"
+        )
 
 
-def start(count, out, dies=""):
+def start_processes(count, out, dies=""):
     with socket.socket() as s:
         s.bind(("localhost", 0))
         port = s.getsockname()[1]
@@ -202,28 +209,32 @@ def start(count, out, dies=""):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [2, 4])
-def test_several_processes(alone, tmp_path, count):
+def test_several_processes(single_runs, tmp_path, count):
     """Each takes its share, all have the whole."""
-    for process in start(count, tmp_path):
-        _, said = process.communicate(timeout=600)
-        assert process.returncode == 0, said[-3000:]
+    for process in start_processes(count, tmp_path):
+        _, stderr = process.communicate(timeout=600)
+        assert process.returncode == 0, stderr[-3000:]
     for i in range(count):
-        whole = np.load(tmp_path / f"whole_{i}.npz")
-        np.testing.assert_allclose(whole["q"], [one.final.q for one in alone], atol=ROUND_OFF)
-        assert whole["result"].tolist() == [0] * LANES
+        results = np.load(tmp_path / f"results_{i}.npz")
+        np.testing.assert_allclose(
+            results["q"], [one.final.q for one in single_runs], atol=ROUND_OFF
+        )
+        assert results["result"].tolist() == [0] * LANES
     assert len(list(tmp_path.glob("chunk_*.npz"))) == 6
 
 
 @pytest.mark.slow
-def test_a_killed_process(case, alone, tmp_path):
+def test_a_killed_process_keeps_its_chunks(case, single_runs, tmp_path):
     """The other one ends and says why; what is finished stays, and the next run goes on from it."""
-    other, killed = start(2, tmp_path, dies="1")
-    _, said = other.communicate(timeout=600)
+    surviving, killed = start_processes(2, tmp_path, dies="1")
+    _, stderr = surviving.communicate(timeout=600)
     killed.communicate(timeout=600)
     assert killed.returncode == -signal.SIGKILL
-    assert other.returncode != 0
+    assert surviving.returncode != 0
     # ours, or that of jax, whichever sees it first
-    assert "another process has ended" in said or "another task died" in said
-    kept = sorted(path.name for path in tmp_path.glob("chunk_*.npz"))
-    assert kept == ["chunk_00000.npz", "chunk_00001.npz", "chunk_00002.npz", "chunk_00004.npz"]
-    agrees(call(*case, chunk=2, out=tmp_path, progress=False), alone)
+    assert "another process has ended" in stderr or "another task died" in stderr
+    finished = sorted(path.name for path in tmp_path.glob("chunk_*.npz"))
+    assert finished == ["chunk_00000.npz", "chunk_00001.npz", "chunk_00002.npz", "chunk_00004.npz"]
+    assert_equal_to_single_runs(
+        run_rollout(*case, chunk=2, out=tmp_path, progress=False), single_runs
+    )

@@ -11,9 +11,9 @@ import pytest
 from tolerances import REFERENCE, ROUND_OFF
 
 import svkc
-from svkc.scenes import BAR_HEIGHT, FOLDER, GRIP, PALM
+from svkc.scenes import BAR_HEIGHT, FOLDER, HALF_GRIP_WIDTH, PALM
 
-SIDES = (("right", -GRIP, "ball"), ("left", GRIP, "hinge"))
+SIDES = (("right", -HALF_GRIP_WIDTH, "ball"), ("left", HALF_GRIP_WIDTH, "hinge"))
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def figure():
         for s, y, joint in SIDES
     ]
     chain = svkc.load(spec, virtual_links=links, ignore="limit")
-    near = svkc.scenes.swinging(chain, 0.0)
+    near = svkc.scenes.hanging_state(chain, 0.0)
     return chain, chain.state(near.q[: chain.nq], connected=("right_grip", "left_grip"))
 
 

@@ -22,10 +22,10 @@ KINDS = """<mujoco><asset>
 </worldbody></mujoco>"""
 
 
-def still(chain):
+def static_run(chain):
     return svkc.simulate(chain, chain.state(), 0.0, ts=jnp.zeros(1))
 
 
-def kinds():
+def run_of_every_geom():
     chain = svkc.load(KINDS)
     return chain, svkc.simulate(chain, chain.state({"turn": 0.5}), 0.01, dt=0.01)

@@ -7,23 +7,23 @@ ROD = """<mujoco><worldbody><light pos="0 0 5"/>{}
   </body></worldbody></mujoco>"""
 
 
-def test_cameras(tmp_path):
+def test_each_camera_gives_another_image(tmp_path):
     """The model's own by its name, and those that are placed, each see something else."""
     from PIL import Image
 
     camera = '<camera name="above" pos="0 -1 4" xyaxes="1 0 0 0 1 0"/>'
     chain = svkc.load(ROD.format(camera))
-    traj, seen = svkc.simulate(chain, chain.state(), 0.1, ts=[0.0, 0.05, 0.1]), set()
-    ways = (
+    traj, images = svkc.simulate(chain, chain.state(), 0.1, ts=[0.0, 0.05, 0.1]), set()
+    views = (
         {"camera": "above"},
         {"lookat": (0, 0, -0.5)},
         {"lookat": (0, 0, -0.5), "distance": 6.0},
         {"azimuth": 20.0, "elevation": -60.0},
     )
-    for i, way in enumerate(ways):
+    for i, view in enumerate(views):
         try:
             path = svkc.render(
-                chain, traj, tmp_path / f"{i}.gif", size=(96, 64), trails=("rod",), **way
+                chain, traj, tmp_path / f"{i}.gif", size=(96, 64), trails=("rod",), **view
             )
         except RuntimeError:
             # without an offscreen OpenGL there is no picture: test_messages has what is said then
@@ -31,5 +31,5 @@ def test_cameras(tmp_path):
         with Image.open(path) as image:
             assert image.width == 96
             assert len(image.convert("RGB").getcolors(1 << 16)) > 10
-            seen.add(image.convert("RGB").tobytes())
-    assert len(seen) == len(ways)
+            images.add(image.convert("RGB").tobytes())
+    assert len(images) == len(views)

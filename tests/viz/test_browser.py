@@ -9,7 +9,7 @@ import shutil
 import jax
 import numpy as np
 import pytest
-from pages import CUTS, kinds, still
+from pages import CUTS, run_of_every_geom, static_run
 
 import svkc
 
@@ -42,27 +42,27 @@ def browser():
 
 
 @pytest.fixture
-def visit(browser):
+def open_page(browser):
     """Opens a page from its file, with no network; whatever the console has to say is an error."""
-    said, pages = [], []
+    messages, pages = [], []
 
-    def to(path, width=1000, height=640):
+    def visit_(path, width=1000, height=640):
         page = browser.new_page(viewport={"width": width, "height": height})
         pages.append(page)
         page.set_default_timeout(60000)
         page.context.set_offline(True)
-        page.on("console", lambda message: said.append(message.text))
-        page.on("pageerror", lambda error: said.append(str(error)))
+        page.on("console", lambda message: messages.append(message.text))
+        page.on("pageerror", lambda error: messages.append(str(error)))
         page.goto(pathlib.Path(path).as_uri())
         return page
 
-    yield to
+    yield visit_
     for page in pages:
         page.close()
-    assert not said
+    assert not messages
 
 
-def picture(page):
+def screenshot(page):
     """What is drawn, without numbers and timeline."""
     from PIL import Image
 
@@ -75,56 +75,59 @@ def picture(page):
     )
 
 
-def changed(one, other) -> int:
+def count_changed_pixels(one, other) -> int:
     """Pixels that differ."""
     return int(np.sum(np.abs(one - other).max(-1) > 24))
 
 
-def number(page, name):
+def read_number(page, name):
     return float(page.inner_text(f"#{name}").split()[0])
 
 
 @pytest.mark.slow
-def test_it_plays_and_goes_through_time(release, visit, tmp_path):
+def test_playing_seeking_and_keys(release, open_page, tmp_path):
     """The numbers at every time are the trajectory's."""
     chain, traj = release
-    page = visit(svkc.render(chain, traj, tmp_path / "run.html"))
-    first = picture(page)
+    page = open_page(svkc.render(chain, traj, tmp_path / "run.html"))
+    first = screenshot(page)
     assert len(np.unique(first.reshape(-1, 3), axis=0)) > 200
-    assert number(page, "time") == 0
+    assert read_number(page, "time") == 0
     # by hand: a click into each phase
-    bar, seen = page.locator("#track").bounding_box(), []
+    bar, phases_shown = page.locator("#track").bounding_box(), []
     for t, mobility, held in (
         (0.1, 12, "right_hand_grip\nleft_hand_grip"),
         (0.25, 17, "left_hand_grip"),
         (0.45, 22, "nothing"),
     ):
         page.mouse.click(bar["x"] + bar["width"] * t / 0.5, bar["y"] + bar["height"] / 2)
-        assert number(page, "time") == pytest.approx(t, abs=2e-3)
-        assert number(page, "mobility") == mobility
+        assert read_number(page, "time") == pytest.approx(t, abs=2e-3)
+        assert read_number(page, "mobility") == mobility
         assert page.inner_text("#links").strip() == held
-        seen.append(
+        phases_shown.append(
             (
-                picture(page),
+                screenshot(page),
                 page.inner_text("#gap"),
                 page.evaluate("svkc.bodies[5].matrixWorld.elements"),
             )
         )
-    assert all(changed(seen[i][0], seen[j][0]) > 500 for i, j in ((0, 1), (1, 2)))
-    assert len({gap for _, gap, _ in seen}) == 3
-    assert seen[0][2] != seen[1][2]
+    assert all(
+        count_changed_pixels(phases_shown[i][0], phases_shown[j][0]) > 500
+        for i, j in ((0, 1), (1, 2))
+    )
+    assert len({gap for _, gap, _ in phases_shown}) == 3
+    assert phases_shown[0][2] != phases_shown[1][2]
     # at a saved time: bodies, energy and gap of the trajectory
     page.evaluate("svkc.seek(svkc.run.times[13])")
     state = jax.tree.map(lambda x: x[13], traj.states)
     place = page.evaluate("svkc.bodies.map(body => body.matrixWorld.elements.slice(12, 15))")
     np.testing.assert_allclose(place, svkc.poses(chain, state)[0], atol=1e-5)
-    assert number(page, "energy") == pytest.approx(float(svkc.energy(chain, state)), abs=2e-4)
-    assert number(page, "gap") == pytest.approx(float(traj.gaps[13, 1]), rel=0.1)
+    assert read_number(page, "energy") == pytest.approx(float(svkc.energy(chain, state)), abs=2e-4)
+    assert read_number(page, "gap") == pytest.approx(float(traj.gaps[13, 1]), rel=0.1)
     # half way between two saved times
     page.evaluate("svkc.seek((svkc.run.times[2] + svkc.run.times[3]) / 2)")
-    middle = page.evaluate("svkc.bodies.map(body => body.matrixWorld.elements.slice(12, 15))")
+    midway = page.evaluate("svkc.bodies.map(body => body.matrixWorld.elements.slice(12, 15))")
     both = [svkc.poses(chain, jax.tree.map(lambda x, i=i: x[i], traj.states))[0] for i in (2, 3)]
-    np.testing.assert_allclose(middle, (both[0] + both[1]) / 2, atol=1e-5)
+    np.testing.assert_allclose(midway, (both[0] + both[1]) / 2, atol=1e-5)
     # by itself, to its end, and from there once more
     page.evaluate("svkc.seek(0)")
     page.click("#play")
@@ -133,11 +136,11 @@ def test_it_plays_and_goes_through_time(release, visit, tmp_path):
     page.wait_for_selector("#play[aria-label=play]")
     # (the button that was pressed last takes no keys but its own)
     page.keyboard.press("Home")
-    assert number(page, "time") == 0
+    assert read_number(page, "time") == 0
     # by the keys: on and off, a frame at a time
     page.locator("#track").focus()
     page.keyboard.press("ArrowRight")
-    assert number(page, "time") == pytest.approx(0.025)
+    assert read_number(page, "time") == pytest.approx(0.025)
     page.select_option("#speed", "0.1")
     page.locator("#track").focus()
     page.keyboard.press(" ")
@@ -149,9 +152,9 @@ def test_it_plays_and_goes_through_time(release, visit, tmp_path):
 
 
 @pytest.mark.slow
-def test_events_are_marked(release, visit, tmp_path):
+def test_event_marks(release, open_page, tmp_path):
     """A mark says what happened, leads there, and the links that hold are drawn until then."""
-    page = visit(svkc.render(*release, tmp_path / "run.html"))
+    page = open_page(svkc.render(*release, tmp_path / "run.html"))
     marks, bar = page.locator(".mark"), page.locator("#track").bounding_box()
     assert marks.count() == len(CUTS)
     for i, (t, link) in enumerate(CUTS.items()):
@@ -166,10 +169,10 @@ def test_events_are_marked(release, visit, tmp_path):
         marks.nth(i).hover()
         assert page.evaluate(label) == "block"
         marks.nth(i).click()
-        assert number(page, "time") == t
+        assert read_number(page, "time") == t
         assert page.locator("#events .past").count() == i + 1
     drawn = "[...svkc.holds.values()].filter(([ball]) => ball.visible).map(([ball]) => ball.name)"
-    red = lambda: int(np.sum(np.all(np.abs(picture(page) - [224, 32, 32]) < 50, -1)))
+    red = lambda: int(np.sum(np.all(np.abs(screenshot(page) - [224, 32, 32]) < 50, -1)))
     page.evaluate("svkc.seek(0.1)")
     assert page.evaluate(drawn) == ["right_hand_grip", "left_hand_grip"]
     assert red() > 20
@@ -179,20 +182,20 @@ def test_events_are_marked(release, visit, tmp_path):
 
 
 @pytest.mark.slow
-def test_energy_jumps_where_a_link_is_connected(stopped, visit, tmp_path):
+def test_energy_jumps_where_a_link_is_connected(stopped, open_page, tmp_path):
     """Between saved times too, numbers are those of one phase."""
     chain, traj = stopped
-    page = visit(svkc.render(chain, traj, tmp_path / "run.html"))
+    page = open_page(svkc.render(chain, traj, tmp_path / "run.html"))
 
     def energy(t):
         page.evaluate("t => svkc.seek(t)", t)
-        return number(page, "energy")
+        return read_number(page, "energy")
 
     before, after, lost = energy(0.035 - 1e-9), energy(0.035), float(traj.events.energy_lost[1])
     assert lost > 1e-3
     assert before - after == pytest.approx(lost, abs=1e-6 * abs(before))
-    assert number(page, "time") == 0.035
-    assert [number(page, "mobility"), page.inner_text("#links").strip()] == [1, "pin"]
+    assert read_number(page, "time") == 0.035
+    assert [read_number(page, "mobility"), page.inner_text("#links").strip()] == [1, "pin"]
     assert energy(0.0229) == pytest.approx(float(traj.phases.energy[0, 1]), rel=1e-5)
     # no state was saved between the cut and this: where nothing holds, nothing is drawn
     assert energy(0.0231) == pytest.approx(float(traj.phases.energy[1, 0]), rel=1e-5)
@@ -200,30 +203,30 @@ def test_energy_jumps_where_a_link_is_connected(stopped, visit, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_camera_turns_and_everything_is_seen(release, visit, tmp_path):
+def test_the_camera_turns_and_keeps_all_bodies_in_view(release, open_page, tmp_path):
     """Also in a narrow window, and after its size changed."""
     path = svkc.render(*release, tmp_path / "run.html")
-    page = visit(path)
-    first = picture(page)
+    page = open_page(path)
+    first = screenshot(page)
     page.mouse.move(300, 300)
     page.mouse.down()
     page.mouse.move(450, 330, steps=3)
     page.mouse.up()
-    assert changed(first, picture(page)) > 1000
+    assert count_changed_pixels(first, screenshot(page)) > 1000
     corners = """() => { const out = [];
         svkc.bodies.forEach(body => body.children.forEach(thing => {
         const c = thing.localToWorld(thing.position.clone().set(0, 0, 0)).project(svkc.camera);
         out.push(Math.abs(c.x), Math.abs(c.y)); }));
         return Math.max(...out); }"""
     for size in ((1000, 640), (380, 700)):
-        narrow = visit(path, *size)
-        picture(narrow)
+        narrow = open_page(path, *size)
+        screenshot(narrow)
         for t in (0, 0.25, 0.5):
             narrow.evaluate("t => svkc.seek(t)", t)
             assert narrow.evaluate(corners) < 1
         assert narrow.evaluate("document.documentElement.scrollWidth <= innerWidth")
     narrow.set_viewport_size({"width": 900, "height": 500})
-    picture(narrow)
+    screenshot(narrow)
     assert (
         narrow.evaluate(
             "Math.abs(svkc.camera.aspect - document.querySelector('canvas').clientWidth /"
@@ -235,33 +238,33 @@ def test_the_camera_turns_and_everything_is_seen(release, visit, tmp_path):
 
 
 @pytest.mark.slow
-def test_every_kind_of_geom_is_drawn(visit, tmp_path):
-    page = visit(svkc.render(*kinds(), tmp_path / "kinds.html"))
-    whole = picture(page)
+def test_every_kind_of_geom_is_drawn(open_page, tmp_path):
+    page = open_page(svkc.render(*run_of_every_geom(), tmp_path / "run_of_every_geom.html"))
+    all_geoms = screenshot(page)
     assert page.evaluate("svkc.bodies.map(body => body.children.length)") == [2, 7]
     for body, child in [(0, 1), *((1, i) for i in range(7))]:
         show = f"on => {{ svkc.bodies[{body}].children[{child}].visible = on; svkc.seek(0); }}"
         page.evaluate(show, False)
-        assert changed(whole, picture(page)) > 30, child
+        assert count_changed_pixels(all_geoms, screenshot(page)) > 30, child
         page.evaluate(show, True)
 
 
 @pytest.mark.slow
-def test_names_stay_names_in_the_browser(pendulum, visit, tmp_path):
+def test_names_are_escaped_in_the_browser(pendulum, open_page, tmp_path):
     """And a run of one moment can be looked at."""
     chain = pendulum
-    page = visit(svkc.render(chain, still(chain), tmp_path / "one.html"))
+    page = open_page(svkc.render(chain, static_run(chain), tmp_path / "one.html"))
     assert page.evaluate("svkc.bodies[1].name") == chain.body_names[1]
     assert page.locator("#x, .mark").count() == 0
     assert page.inner_text("#links").strip() == "nothing"
     assert not page.locator("#log").is_visible()
     page.click("#play")
     assert page.get_attribute("#play", "aria-label") == "play"
-    assert len(np.unique(picture(page).reshape(-1, 3), axis=0)) > 50
+    assert len(np.unique(screenshot(page).reshape(-1, 3), axis=0)) > 50
 
 
 @pytest.mark.slow
-def test_a_notebook_shows_it(release, visit, tmp_path):
+def test_a_notebook_shows_the_page(release, open_page, tmp_path):
     """As a frame in its own document."""
     shown = svkc.show(*release, height=400)
     cell = shown._repr_html_()
@@ -269,7 +272,7 @@ def test_a_notebook_shows_it(release, visit, tmp_path):
     (tmp_path / "cell.html").write_text(
         f"<!DOCTYPE html><meta charset=utf-8><link rel=icon href='data:,'>{cell}{cell}"
     )
-    page = visit(tmp_path / "cell.html")
+    page = open_page(tmp_path / "cell.html")
     page.frame_locator("iframe").nth(1).locator("#mobility").wait_for()
     page.frames[2].evaluate("svkc.seek(0.4)")
     assert [frame.inner_text("#mobility") for frame in page.frames[1:]] == ["12", "22"]

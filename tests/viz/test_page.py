@@ -12,13 +12,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from pages import CUTS, NAME, kinds, still
+from pages import CUTS, NAME, run_of_every_geom, static_run
 from tolerances import ROUND_OFF
 
 import svkc
 
 
-def contents(path) -> dict:
+def page_data(path) -> dict:
     """The run inside a page."""
     inside = re.findall(
         r'<script type="application/json" id="run">(.*?)</script>',
@@ -30,11 +30,11 @@ def contents(path) -> dict:
 
 
 @pytest.mark.slow
-def test_the_file_has_everything_in_it(release, tmp_path):
+def test_the_page_is_self_contained(release, tmp_path):
     chain, traj = release
     path = svkc.render(chain, traj, tmp_path / "run.html")
     assert path == tmp_path / "run.html"
-    text, run = path.read_text(), contents(path)
+    text, run = path.read_text(), page_data(path)
     # nothing is fetched, the licence goes with what it is for, every part was put in
     assert not re.search(
         r'src=|<link(?! rel="icon" href="data:,")|@import|url\(', text.split("<script", 1)[0]
@@ -87,26 +87,26 @@ def test_ten_seconds_are_below_five_megabytes(release, tmp_path):
         ),
     )
     path = svkc.render(chain, long, tmp_path / "long.html")
-    assert len(contents(path)["times"]) == 401
+    assert len(page_data(path)["times"]) == 401
     assert path.stat().st_size < 5e6
 
 
-def test_names_stay_names(pendulum, tmp_path):
+def test_names_are_escaped(pendulum, tmp_path):
     chain = pendulum
     path = svkc.render(
         chain, svkc.simulate(chain, chain.state(), 0.01, dt=0.01), tmp_path / "a <b> & c.html"
     )
-    assert contents(path)["bodies"][1] == chain.body_names[1] == NAME
+    assert page_data(path)["bodies"][1] == chain.body_names[1] == NAME
     assert '<b id="x">' not in path.read_text()
     assert "<title>a &lt;b&gt; &amp; c</title>" in path.read_text()
 
 
 @pytest.mark.slow
-def test_a_run_that_stopped_ends_where_it_did(stopped, tmp_path):
+def test_the_page_of_a_stopped_run_ends_at_its_stop(stopped, tmp_path):
     """Times asked for past the end are left out, what the last event made is there, what is no
     number is null."""
     chain, traj = stopped
-    run = contents(svkc.render(chain, traj, tmp_path / "stopped.html"))
+    run = page_data(svkc.render(chain, traj, tmp_path / "stopped.html"))
     np.testing.assert_allclose(run["times"], [0, 0.01, 0.02, 0.03, 0.035])
     assert [p["mobility"] for p in run["phases"]] == [1, 3, 1]
     assert [e["text"] for e in run["events"]] == ["cut pin", "connect pin"]
@@ -115,19 +115,19 @@ def test_a_run_that_stopped_ends_where_it_did(stopped, tmp_path):
     broken = eqx.tree_at(
         lambda t: (t.ts, t.gaps), traj, (traj.ts.at[4:].set(jnp.nan), traj.gaps.at[1].set(jnp.inf))
     )
-    run = contents(svkc.render(chain, broken, tmp_path / "broken.html"))
+    run = page_data(svkc.render(chain, broken, tmp_path / "broken.html"))
     assert len(run["times"]) == 5
     assert run["gaps"][1] == [None, None]
 
 
 @pytest.mark.slow
-def test_a_run_of_one_moment(pendulum, tmp_path):
-    run = contents(svkc.render(pendulum, still(pendulum), tmp_path / "still.html"))
+def test_a_run_of_zero_duration(pendulum, tmp_path):
+    run = page_data(svkc.render(pendulum, static_run(pendulum), tmp_path / "still.html"))
     assert (run["times"], run["events"], [p["mobility"] for p in run["phases"]]) == ([0.0], [], [1])
 
 
 def test_every_kind_of_geom(tmp_path):
-    run = contents(svkc.render(*kinds(), tmp_path / "kinds.html"))
+    run = page_data(svkc.render(*run_of_every_geom(), tmp_path / "kinds.html"))
     assert [g["kind"] for g in run["geoms"]] == [
         "plane",
         "mesh",
@@ -150,7 +150,7 @@ def test_every_kind_of_geom(tmp_path):
     assert faces.max() == 3
 
 
-def test_nothing_of_it_is_read_before_it_is_asked_for():
+def test_the_page_files_are_read_lazily():
     code = (
         "import sys; opened = []; sys.addaudithook(lambda name, args: opened.append(str(args[0]))"
         " if name == 'open' else None);import svkc.viz.html_page; assert any('render' in path for path in"

@@ -10,7 +10,7 @@ import svkc
 
 
 @pytest.mark.slow
-def test_a_long_floor_does_not_make_the_figure_small(tmp_path):
+def test_a_long_floor_does_not_shrink_the_figure(tmp_path):
     """What is fixed is shown no further than a metre beyond what moves: however long the floor, the
     picture is the same."""
 
@@ -29,7 +29,7 @@ def test_a_long_floor_does_not_make_the_figure_small(tmp_path):
     np.testing.assert_array_equal(drawn(4.0), drawn(40.0))
 
 
-def test_curves_have_what_a_run_has():
+def test_plot_draws_coordinates_and_events():
     """Lines over the saved times, the axes named, an event marked."""
     chain = svkc.load(models.ARM)
     traj = svkc.simulate(

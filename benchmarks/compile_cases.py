@@ -24,7 +24,7 @@ FOUR_BAR = """<mujoco><worldbody>
 <geom type="capsule" fromto="0 0 0 0.2 0 -0.6" size="0.03" contype="0" conaffinity="0"/></body>
 </body></body></worldbody></mujoco>"""
 
-EXACT = {"rtol": 1e-8, "atol": 1e-10, "throw": False}
+OPTIONS = {"rtol": 1e-8, "atol": 1e-10, "throw": False}
 
 
 def _figure():
@@ -65,7 +65,7 @@ def one_phase():
     import svkc
 
     chain, state = _figure()
-    return (lambda s: svkc.simulate(chain, s, 0.5, **EXACT)), (state,)
+    return (lambda s: svkc.simulate(chain, s, 0.5, **OPTIONS)), (state,)
 
 
 def main_job():
@@ -77,7 +77,9 @@ def main_job():
     chain, state = _figure()
     events = (svkc.at(0.9, cut="right_hand_grip"), svkc.at(1.15, cut="left_hand_grip"))
     return (
-        lambda s: svkc.simulate(chain, s, 1.8, ts=jnp.linspace(0, 1.8, 73), events=events, **EXACT)
+        lambda s: svkc.simulate(
+            chain, s, 1.8, ts=jnp.linspace(0, 1.8, 73), events=events, **OPTIONS
+        )
     ), (state,)
 
 
@@ -85,7 +87,7 @@ def _gradient():
     import gradients
     import jax
 
-    loss, p = gradients.whole_run()
+    loss, p = gradients.high_bar_loss()
     return jax.value_and_grad(loss), p
 
 
@@ -110,7 +112,7 @@ def four_bar():
 
     chain, state = _four_bar()
     events = (svkc.at(0.2, cut="pin"), svkc.at(0.3, connect="pin", here=True))
-    return (lambda s: svkc.simulate(chain, s, 0.5, events=events, **EXACT)), (state,)
+    return (lambda s: svkc.simulate(chain, s, 0.5, events=events, **OPTIONS)), (state,)
 
 
 def _arm_and_ball():
@@ -131,7 +133,7 @@ def _arm_and_ball():
         0.8,
         ts=jnp.linspace(0, 0.8, 17),
         events=events,
-        **EXACT,
+        **OPTIONS,
     )
     return end, state.v
 
@@ -160,7 +162,7 @@ def _lanes(count: int):
     import svkc
 
     chain, state = _figure()
-    how = {
+    options = {
         "solver": diffrax.Tsit5(),
         "rtol": 1e-4,
         "atol": 1e-6,
@@ -170,7 +172,7 @@ def _lanes(count: int):
 
     def one(state, right):
         events = (svkc.at(right, cut="right_hand_grip"), svkc.at(right + 0.2, cut="left_hand_grip"))
-        return svkc.simulate(chain, state, 1.8, events=events, **how)
+        return svkc.simulate(chain, state, 1.8, events=events, **options)
 
     states = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), state)
     return jax.vmap(one), (states, jnp.linspace(0.3, 0.9, count))
@@ -192,37 +194,37 @@ def lanes_4096():
     return _lanes(4096)
 
 
-MEASURED = (
+CASES = (
     forward_dynamics, one_phase, main_job, gradient, four_bar, arm_and_ball, arm_and_ball_gradient,
     gradients_in_lanes, lanes_8, lanes_512, lanes_4096,
 )  # fmt: skip
-PROGRAMS = {f.__name__.replace("_", " "): f for f in MEASURED}
+PROGRAMS = {f.__name__.replace("_", " "): f for f in CASES}
 
 
-def called_eagerly(model: str) -> dict:
+def eager_calls(model: str) -> dict:
     """Return the public functions by name, each ready to be called as a user calls it first; in
     this order, in one process."""
     import jax.numpy as jnp
 
     import svkc
 
-    made = {}
+    results = {}
 
     def first_state():
-        made["chain"], made["state"] = _figure() if model == "high bar" else _four_bar()
+        results["chain"], results["state"] = _figure() if model == "high bar" else _four_bar()
 
     def on_state(function):
-        return lambda: function(made["chain"], made["state"])
+        return lambda: function(results["chain"], results["state"])
 
     def report():
-        return svkc.Trajectory.report(made["run"])
+        return svkc.Trajectory.report(results["run"])
 
     def cut(chain, state):
-        made["open"] = svkc.cut(chain, state, chain.link_names[0])
-        return made["open"]
+        results["open"] = svkc.cut(chain, state, chain.link_names[0])
+        return results["open"]
 
     def connect(chain, state):
-        return svkc.connect(chain, made["open"], chain.link_names[0], here=True)
+        return svkc.connect(chain, results["open"], chain.link_names[0], here=True)
 
     return {
         "state": first_state,
@@ -238,7 +240,7 @@ def called_eagerly(model: str) -> dict:
         "cut": on_state(cut),
         "connect": on_state(connect),
         "simulate": on_state(
-            lambda chain, state: made.update(run=svkc.simulate(chain, state, 1e-3, throw=False))
+            lambda chain, state: results.update(run=svkc.simulate(chain, state, 1e-3, throw=False))
         ),
         "report": report,
     }

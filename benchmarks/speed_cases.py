@@ -18,7 +18,7 @@ FIGURE = str(svkc.scenes.FOLDER / "figure40.xml")
 CASES = ("open", "two ball grips", "two hinge grips", "high bar")
 
 
-def held(joint: str):
+def figure_with_grips(joint: str):
     """The 40-freedom figure, each hand held to the ground by a joint where it is when both arms are
     raised forward."""
     links = [
@@ -28,18 +28,18 @@ def held(joint: str):
         for side in ("right", "left")
     ]
     chain = svkc.load(FIGURE, virtual_links=links, ignore=("limit",))
-    raised = [np.cos(0.75), 0, -np.sin(0.75), 0]
-    bent = {
+    arm_raised = [np.cos(0.75), 0, -np.sin(0.75), 0]
+    pose = {
         f"{side}_{name}": value
         for side in ("right", "left")
-        for name, value in (("shoulder", raised), ("elbow", 0.3), ("knee", 0.2))
+        for name, value in (("shoulder", arm_raised), ("elbow", 0.3), ("knee", 0.2))
     }
     return chain, svkc.connect(
-        chain, chain.state(bent, connected=()), "right_grip", "left_grip", here=True
+        chain, chain.state(pose, connected=()), "right_grip", "left_grip", here=True
     )
 
 
-def case(name: str):
+def load_case(name: str):
     """Chain and state."""
     if name == "open":
         chain = svkc.load(FIGURE, ignore=("limit",))
@@ -48,17 +48,17 @@ def case(name: str):
         )
     if name == "high bar":
         return svkc.scenes.high_bar(ignore=("limit",))
-    return held("ball" if "ball" in name else "hinge")
+    return figure_with_grips("ball" if "ball" in name else "hinge")
 
 
-def path(name: str) -> str:
+def model_path(name: str) -> str:
     """Of the model."""
     return str(svkc.scenes.FOLDER / "figure16.xml") if name == "high bar" else FIGURE
 
 
-def in_mujoco(name: str, chain, state) -> tuple[mujoco.MjModel, np.ndarray, np.ndarray]:
+def mujoco_case(name: str, chain, state) -> tuple[mujoco.MjModel, np.ndarray, np.ndarray]:
     """MuJoCo's model with the step DT and no ranges, grips as `connect`s; qpos, qvel."""
-    spec = mujoco.MjSpec.from_file(path(name))
+    spec = mujoco.MjSpec.from_file(model_path(name))
     model = soft_loops.figure(SimpleNamespace(chain=chain, state=state), spec, DT)
     model.opt.timestep, model.opt.jacobian = DT, mujoco.mjtJacobian.mjJAC_DENSE
     model.opt.disableflags |= (
@@ -67,10 +67,10 @@ def in_mujoco(name: str, chain, state) -> tuple[mujoco.MjModel, np.ndarray, np.n
     return model, np.asarray(state.q[: chain.nq], float), np.asarray(state.v[: chain.nv], float)
 
 
-def lanes(chain, state, batch: int):
+def random_states(chain, state, batch: int):
     """States with velocities of their own that the loops allow."""
     v = jax.random.normal(jax.random.key(0), (batch, chain.dofs), state.v.dtype) * 0.5
     if chain.link_names:
         v = v @ svkc.coordinates(chain, state).W.T
-    spread = lambda x: jnp.broadcast_to(x, (batch, *x.shape))
-    return svkc.State(spread(state.q), v, jax.tree.map(spread, state.structure))
+    broadcast = lambda x: jnp.broadcast_to(x, (batch, *x.shape))
+    return svkc.State(broadcast(state.q), v, jax.tree.map(broadcast, state.structure))
