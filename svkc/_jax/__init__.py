@@ -1,1 +1,1 @@
-"""What depends on the internals of JAX, XLA and equinox."""
+"""Code that depends on internals of JAX, XLA and equinox."""

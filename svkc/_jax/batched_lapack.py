@@ -1,8 +1,8 @@
-"""LAPACK's factors and solves, in a batch a few matrices at a time.
+"""Cholesky factorisation and triangular solves whose batches are split into small chunks.
 
-jaxlib 0.10 deals a batch of more than 2e5 operations to its threads and blocks the one that waits
-for them. Where several CPU devices share those threads all of them may come to wait, for ever:
-there a batch goes in parts that are small enough.
+jaxlib 0.10 splits a batch of more than 2e5 operations over its thread pool, and blocks the calling
+thread until they are done. If several CPU devices share the pool, all threads may block, which is a
+deadlock. There, `lax.map` runs the batch in chunks below that size.
 """
 
 import functools
@@ -14,27 +14,28 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-# operations that jaxlib does in one thread
+# largest number of operations that jaxlib runs in one thread
 SINGLE_THREAD_OPERATIONS = 200_000 - 1
 
 
 def _in_chunks(function: Callable, cost: Callable) -> Callable:
-    """A function of matrices [*lanes, n, m] with any lanes; cost: operations for one of them, from
-    shapes."""
+    """Return `function` of matrices [*lanes, n, m], with batches over `lanes` split into chunks.
+
+    cost: the number of operations for one lane, from the shapes [n, m] of the matrices.
+    """
 
     @jax.custom_batching.custom_vmap
     def batch(*matrices):
         lanes = matrices[0].shape[:-2]
-        many, most = (
-            math.prod(lanes),
-            max(1, SINGLE_THREAD_OPERATIONS // max(1, cost(*(x.shape[-2:] for x in matrices)))),
-        )
-        if many <= most or jax.default_backend() != "cpu" or jax.local_device_count() == 1:
+        count = math.prod(lanes)
+        cost_per_lane = max(1, cost(*(x.shape[-2:] for x in matrices)))
+        max_chunk = max(1, SINGLE_THREAD_OPERATIONS // cost_per_lane)
+        if count <= max_chunk or jax.default_backend() != "cpu" or jax.local_device_count() == 1:
             return function(*matrices)
-        size = max(n for n in range(1, most + 1) if many % n == 0)
+        chunk = max(n for n in range(1, max_chunk + 1) if count % n == 0)
         out = lax.map(
-            lambda own: function(*own),
-            tuple(x.reshape(many // size, size, *x.shape[-2:]) for x in matrices),
+            lambda chunk_matrices: function(*chunk_matrices),
+            tuple(x.reshape(count // chunk, chunk, *x.shape[-2:]) for x in matrices),
         )
         return out.reshape(*lanes, *out.shape[-2:])
 
@@ -66,14 +67,19 @@ def _triangular_solver(lower: bool, trans: bool) -> Callable:
 def batched_solve_triangular(
     A: Float[Array, "n n"], x: Float[Array, "n *m"], trans: bool = False, lower: bool = False
 ) -> Float[Array, "n *m"]:
-    """A^-1 x or A^-T x; only the triangle that is named is read. Not to be differentiated: for the
-    `solve` of a `custom_linear_solve`."""
+    """Return A^-1 x, or A^-T x if `trans`, for a triangular A.
+
+    Only the triangle named by `lower` is read. There is no derivative rule: use this function as
+    the `solve` of a `custom_linear_solve`.
+    """
     return _triangular_solver(lower, trans)(A, x.reshape(x.shape[0], -1)).reshape(x.shape)
 
 
 def cholesky_solver(A: Float[Array, "n n"]) -> Callable:
-    """What takes x [n] or [n m] to A^-1 x, by Cholesky's factor of a symmetric positive A; the same
-    is true of it."""
+    """Return a function that maps x [n] or [n m] to A^-1 x, for a symmetric positive definite A.
+
+    A is factored once. As for `batched_solve_triangular`, there is no derivative rule.
+    """
     L = _cholesky(A)
     return lambda x: batched_solve_triangular(
         L, batched_solve_triangular(L, x, lower=True), trans=True, lower=True

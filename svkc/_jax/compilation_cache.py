@@ -1,5 +1,7 @@
-"""Compiled programs kept on disk from one process to the next, for the command line and the tests.
-A library user's settings stay as they are."""
+"""JAX's persistent compilation cache, set up for the command line and the tests.
+
+Importing svkc does not change a user's settings: only `use_cache` does.
+"""
 
 import contextlib
 import hashlib
@@ -12,7 +14,9 @@ import sys
 import tempfile
 import threading
 
-MAX_BYTES = 512 * 2**20  # bytes, of all processors and versions together
+# of all processors and versions of jaxlib together
+MAX_BYTES = 512 * 2**20
+# fields of /proc/cpuinfo that the compiled code depends on
 CPUINFO_KEYS = (
     "vendor_id",
     "cpu family",
@@ -32,11 +36,12 @@ _stderr_lock = threading.Lock()
 
 
 def use_cache() -> pathlib.Path | None:
-    """Set jax's persistent cache in this process, and return its folder: None without one. Call it
-    before the first program is compiled.
+    """Enable JAX's persistent compilation cache in this process, and return its folder.
 
-    $SVKC_CACHE_DIR names another folder, or is `off`. If it is not set and
-    JAX_COMPILATION_CACHE_DIR is, jax's own setting is kept.
+    Return None if there is no usable folder. Call this function before the first compilation.
+
+    $SVKC_CACHE_DIR names another folder, or is `off`. If $SVKC_CACHE_DIR is not set and
+    $JAX_COMPILATION_CACHE_DIR is, JAX's own setting is kept.
     """
     import jax
 
@@ -47,12 +52,12 @@ def use_cache() -> pathlib.Path | None:
         return pathlib.Path(jax.config.jax_compilation_cache_dir)
     if not jax.config.jax_enable_compilation_cache:
         return None
-    # without a home, or in one that is read only, programs are compiled anew
+    # without a home directory, or with a read-only one, there is no cache
     with contextlib.suppress(OSError, RuntimeError):
-        top = _root_folder()
-        folder = top and top / f"jaxlib-{importlib.metadata.version('jaxlib')}-{processor_id()}"
-        if folder and _make_private(top) and _make_private(folder):
-            _prune(top)
+        root = _root_folder()
+        folder = root and root / f"jaxlib-{importlib.metadata.version('jaxlib')}-{processor_id()}"
+        if folder and _make_private(root) and _make_private(folder):
+            _prune(root)
             jax.config.update("jax_compilation_cache_dir", str(folder))
             jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
             _patch_jax()
@@ -61,37 +66,40 @@ def use_cache() -> pathlib.Path | None:
 
 
 def _root_folder() -> pathlib.Path | None:
-    """Return the folder of all versions and processors, None where the user wants none."""
-    named = os.environ.get("SVKC_CACHE_DIR")
-    if named is not None:
-        return pathlib.Path(named).expanduser().absolute() if named not in ("", "off") else None
+    """Return the folder of all versions and processors, or None if $SVKC_CACHE_DIR is `off`."""
+    setting = os.environ.get("SVKC_CACHE_DIR")
+    if setting is not None:
+        return pathlib.Path(setting).expanduser().absolute() if setting not in ("", "off") else None
     if sys.platform == "darwin":
         return pathlib.Path.home() / "Library" / "Caches" / "svkc"
-    usual = os.environ.get("LOCALAPPDATA" if sys.platform == "win32" else "XDG_CACHE_HOME")
-    return (pathlib.Path(usual) if usual else pathlib.Path.home() / ".cache") / "svkc"
+    user_cache = os.environ.get("LOCALAPPDATA" if sys.platform == "win32" else "XDG_CACHE_HOME")
+    return (pathlib.Path(user_cache) if user_cache else pathlib.Path.home() / ".cache") / "svkc"
 
 
 def processor_id(cpuinfo: str = "/proc/cpuinfo") -> str:
-    """Name the model of the processor, with a hash of its features."""
+    """Return the model name of the processor, followed by a hash of its features."""
     try:
         lines = pathlib.Path(cpuinfo).read_text().partition("\n\n")[0].splitlines()
-        told = {
+        fields = {
             name.strip(): value.strip()
             for name, _, value in (line.partition(":") for line in lines)
         }
     except OSError:
-        told = {"model name": platform.processor() or platform.machine()}
-    model = re.sub(r"[^A-Za-z0-9]+", "-", told.get("model name", platform.machine())).strip("-")
-    described = repr([told.get(name) for name in CPUINFO_KEYS])
-    return f"{model}-{hashlib.sha256(described.encode()).hexdigest()[:12]}"
+        fields = {"model name": platform.processor() or platform.machine()}
+    model = re.sub(r"[^A-Za-z0-9]+", "-", fields.get("model name", platform.machine())).strip("-")
+    features = repr([fields.get(name) for name in CPUINFO_KEYS])
+    return f"{model}-{hashlib.sha256(features.encode()).hexdigest()[:12]}"
 
 
 def _make_private(folder: pathlib.Path) -> bool:
-    """Make a folder of mode 0700 and return True. Return False for one that others own or can write
-    to, as its programs are executed."""
+    """Make a folder with mode 0700, and return whether the cache may use the folder.
+
+    Return False if another user owns the folder or can write to it: programs in the cache are
+    executed.
+    """
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    found = folder.stat()
-    if hasattr(os, "getuid") and (found.st_uid != os.getuid() or found.st_mode & 0o022):
+    status = folder.stat()
+    if hasattr(os, "getuid") and (status.st_uid != os.getuid() or status.st_mode & 0o022):
         print(
             f"svkc: no cache of compiled programs: others own {folder} or can write to it",
             file=sys.stderr,
@@ -100,14 +108,15 @@ def _make_private(folder: pathlib.Path) -> bool:
     return True
 
 
-def _prune(top: pathlib.Path):
-    """Remove the least recently used files until the others take at most `SIZE`."""
+def _prune(root: pathlib.Path):
+    """Remove the least recently used files until the rest takes at most `MAX_BYTES`."""
     files = []
-    for path in top.glob("jaxlib-*/**/*"):
-        # another process may remove it now
+    for path in root.glob("jaxlib-*/**/*"):
+        # another process may have removed the file
         with contextlib.suppress(OSError):
-            found = path.stat()
-            files += [(max(found.st_atime, found.st_mtime), found.st_size, path)] * path.is_file()
+            status = path.stat()
+            last_used = max(status.st_atime, status.st_mtime)
+            files += [(last_used, status.st_size, path)] * path.is_file()
     total = sum(size for _, size, _ in files)
     for _, size, path in sorted(files):
         if total <= MAX_BYTES:
@@ -117,8 +126,10 @@ def _prune(top: pathlib.Path):
 
 
 def _patch_jax():
-    """Make jax write entries atomically, and load them without false warnings. If a later jax lacks
-    the names patched here, nothing is patched."""
+    """Make JAX write cache entries atomically, and load them without false warnings.
+
+    If the installed JAX lacks the names patched here, nothing is patched.
+    """
     with contextlib.suppress(ImportError, AttributeError):
         from jax._src import compilation_cache, lru_cache
 
@@ -128,32 +139,33 @@ def _patch_jax():
 
 
 def _write_entry(entries, key: str, value: bytes):
-    """Write an entry atomically. jax writes in place, and never replaces an entry that was cut
-    short."""
+    """Write a cache entry atomically.
+
+    JAX writes in place, and never replaces a truncated entry.
+    """
     path = pathlib.Path(entries.path)
-    # a full disk, or one that is read only: the program is compiled again
-    with contextlib.suppress(OSError), tempfile.TemporaryDirectory(dir=path) as aside:
-        whole = pathlib.Path(aside, "whole")
-        whole.write_bytes(value)
-        whole.replace(path / f"{key}-cache")
+    # if the disk is full or read-only, the program is compiled again
+    with contextlib.suppress(OSError), tempfile.TemporaryDirectory(dir=path) as temporary:
+        entry = pathlib.Path(temporary, "entry")
+        entry.write_bytes(value)
+        entry.replace(path / f"{key}-cache")
 
 
 def _without_false_warnings(load):
-    """Wrap jax's loading of a program so that the warnings of `PREFERENCE` are dropped from
-    stderr."""
+    """Wrap JAX's loading of a program: lines that match `FALSE_WARNING` are dropped from stderr."""
 
-    def quiet(*args, **kw):
-        # one at a time, as the process has one stderr
-        with _stderr_lock, tempfile.TemporaryFile() as heard:
-            kept = os.dup(2)
-            os.dup2(heard.fileno(), 2)
+    def load_quietly(*args, **kw):
+        # one thread at a time: a process has one stderr
+        with _stderr_lock, tempfile.TemporaryFile() as captured:
+            stderr = os.dup(2)
+            os.dup2(captured.fileno(), 2)
             try:
                 return load(*args, **kw)
             finally:
-                os.dup2(kept, 2)
-                os.close(kept)
-                heard.seek(0)
-                os.write(2, b"".join(line for line in heard if not FALSE_WARNING.search(line)))
+                os.dup2(stderr, 2)
+                os.close(stderr)
+                captured.seek(0)
+                os.write(2, b"".join(line for line in captured if not FALSE_WARNING.search(line)))
 
-    # the user may ask for all that XLA says
-    return load if os.environ.get("TF_CPP_MIN_LOG_LEVEL") == "0" else quiet
+    # TF_CPP_MIN_LOG_LEVEL=0 asks for every message of XLA
+    return load if os.environ.get("TF_CPP_MIN_LOG_LEVEL") == "0" else load_quietly

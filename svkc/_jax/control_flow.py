@@ -1,7 +1,7 @@
-"""Control flow of equinox that its public interface lacks."""
+"""Control flow from `equinox.internal`, imported in one place because that interface may change."""
 
-# unvmap_any: whether any lane of a `vmap` is true, for a `lax.cond` that stays one. while_loop,
-# buffer_at_set: rows of buffers written in place
+# unvmap_any reduces over all lanes of a `vmap`, so that a `lax.cond` on it stays a `lax.cond`;
+# while_loop and buffer_at_set write rows of buffers in place
 from equinox.internal import (
     buffer_at_set as buffer_at_set,
     unvmap_any as unvmap_any,

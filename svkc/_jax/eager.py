@@ -1,5 +1,7 @@
-"""Compilation of functions that are called eagerly, once or a few times: for compile time, not for
-speed."""
+"""Compilation of functions that are called eagerly, once or a few times.
+
+The compiler options here trade execution time for compile time.
+"""
 
 import functools
 import re
@@ -10,7 +12,7 @@ import jax
 try:
     from jax.core import trace_state_clean  # pyright: ignore[reportAttributeAccessIssue]
 except ImportError:
-    # not public in every release of jax, and nothing public says whether jax is tracing
+    # JAX has no other public way to ask whether it is tracing
     from jax._src.core import trace_state_clean
 
 # LLVM's optimization and the fusion emitters take most of XLA's compile time on a CPU
@@ -22,26 +24,27 @@ _FAST_COMPILE_OPTIONS = {
 
 
 def eager_jit(function: Callable, jit: Callable = jax.jit) -> Callable:
-    """Wrap a function in `jit` (`jax.jit` or `equinox.filter_jit`) so that an eager call compiles
-    fast, and its code runs slower.
+    """Wrap a function in `jit` so that an eager call compiles fast; the compiled code is slower.
 
-    jax accepts compiler options at the outermost jit only. Under jit, grad, vmap and scan the
+    JAX accepts compiler options at the outermost jit only. Under jit, grad, vmap and scan the
     function is therefore compiled without them. Options that the installed jaxlib does not know are
-    left out.
+    dropped.
+
+    jit: `jax.jit` or `equinox.filter_jit`.
     """
-    plain, quick = jit(function), {}
+    optimized, fast_compiled = jit(function), {}
 
     @functools.wraps(function)
     def call(*args, **kw):
         if not trace_state_clean() or jax.default_backend() != "cpu":
-            return plain(*args, **kw)
+            return optimized(*args, **kw)
         while True:
-            known = tuple(_FAST_COMPILE_OPTIONS)
-            if known not in quick:
-                # jax caches programs by the wrapper, so there is one for each set of options
-                quick[known] = jit(function, compiler_options=dict(_FAST_COMPILE_OPTIONS))
+            options = tuple(_FAST_COMPILE_OPTIONS)
+            if options not in fast_compiled:
+                # JAX caches programs by the wrapper, so each set of options has its own wrapper
+                fast_compiled[options] = jit(function, compiler_options=dict(_FAST_COMPILE_OPTIONS))
             try:
-                return quick[known](*args, **kw)
+                return fast_compiled[options](*args, **kw)
             except Exception as error:
                 if not _drop_unknown_option(str(error)):
                     raise
@@ -50,6 +53,6 @@ def eager_jit(function: Callable, jit: Callable = jax.jit) -> Callable:
 
 
 def _drop_unknown_option(message: str) -> bool:
-    """Leave out the option that the message says is unknown; False where it says something else."""
+    """Drop the option that an error message calls unknown; return whether there was one."""
     unknown = re.search(r"[Nn]o such compile option: '?(\w+)", message)
     return unknown is not None and _FAST_COMPILE_OPTIONS.pop(unknown[1], None) is not None

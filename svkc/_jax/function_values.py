@@ -1,4 +1,4 @@
-"""Functions and containers taken apart into arrays and static values, and built again."""
+"""Functions and the containers they read, decomposed into arrays and static values, and rebuilt."""
 
 import dataclasses
 import dis
@@ -20,8 +20,8 @@ import numpy as np
 from svkc._jax.pytrees import is_concrete
 
 PLAIN_TYPES = (type(None), bool, int, float, complex, str, bytes, range, type(...))
-# objects that libraries define do not change between two calls; svkc counts as a library, wherever
-# its sources are
+# objects that a library defines are assumed constant between two calls; svkc counts as a library,
+# also where it is installed from its sources
 _PATHS = {sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")} | {
     *site.getsitepackages(),
     site.getusersitepackages(),
@@ -29,7 +29,7 @@ _PATHS = {sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib
 LIBRARY_FOLDERS = tuple(
     path + os.sep for path in (*_PATHS, os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
 )
-# errors of jax where Python code reads the value of a tracer
+# errors of JAX where Python code reads the value of a tracer
 CONCRETIZATION_ERRORS = (
     jax.errors.ConcretizationTypeError,
     jax.errors.TracerArrayConversionError,
@@ -40,34 +40,39 @@ CONCRETIZATION_ERRORS += (
     jax.errors.NonConcreteBooleanIndexError,
 )
 JIT_FUNCTION_TYPE = type(jax.jit(len))
-# code of functions whose arrays Python has to read
+# code objects of functions in which Python reads values of arrays
 needs_concrete_arrays: set = set()
 
 
 @dataclasses.dataclass(frozen=True)
 class StaticValue:
-    """A static value, compared by a key: its content, or its id. It holds the original object, so
-    that writes to a list are kept."""
+    """A static value, compared by `key`: its content or its id.
+
+    `value` is the original object, so that a function can mutate a list that it reads.
+    """
 
     key: Any
     value: Any = dataclasses.field(compare=False)
 
 
 def _raise_incomparable(what: str) -> NoReturn:
-    """Raise the error that makes `shared` compare a function by identity."""
+    """Raise the error that makes `call_with_comparable` compare a function by identity."""
     error = TypeError(what)
     raise error
 
 
 class FunctionPytree(eqx.Module):
-    """A function, or a container that it reads, as build(*parts). Parts are arrays (the leaves),
-    `Still`s, or again `Function`s. Writes to a rebuilt container are lost."""
+    """A function, or a container that a function reads, as build(*parts).
+
+    Each part is an array (a leaf), a `StaticValue`, or a `FunctionPytree`. Writes to a rebuilt
+    container are lost.
+    """
 
     parts: list
     build: Callable = eqx.field(static=True)
 
     def rebuild(self):
-        """Return the function or the container itself."""
+        """Return the function or the container."""
         return self.build(
             *(
                 x.rebuild()
@@ -90,7 +95,7 @@ class FunctionPytree(eqx.Module):
 
 
 def _function(code, space, names, defaults, kwdefaults, *values) -> types.FunctionType:
-    # imported modules come last; Python finds them by itself
+    # `values` are globals, closure cells, imported modules; a function reaches modules by itself
     cells = tuple(map(types.CellType, values[len(names) :][: len(code.co_freevars)]))
     f = types.FunctionType(
         code, {**space, **dict(zip(names, values))}, code.co_name, defaults, cells
@@ -105,30 +110,31 @@ _tree = lambda shape, *parts: jax.tree.unflatten(shape, parts)
 
 
 def _is_library_module(space) -> bool:
-    """Return whether these are the globals of a module of Python, of an installed package, or of
-    svkc."""
+    """Return whether these are the globals of a module of Python, a package, or svkc."""
     return str(space.get("__file__")).startswith(LIBRARY_FOLDERS) or getattr(
         space.get("__spec__"), "origin", None
     ) in ("built-in", "frozen")
 
 
 def defined_by_library(x) -> bool:
-    """Return whether a library defines x: a module, a class, or a name of a module. jax compares
-    jit-wrapped functions of any module by identity."""
+    """Return whether x is a library's module, class, or name of a module.
+
+    Also true for jit-wrapped functions of any module, which JAX compares by identity.
+    """
     if isinstance(x, types.ModuleType):
         return _is_library_module(vars(x))
-    found = sys.modules.get(str(getattr(x, "__module__", None)))
-    if found is None or not (_is_library_module(vars(found)) or isinstance(x, JIT_FUNCTION_TYPE)):
+    scope = sys.modules.get(str(getattr(x, "__module__", None)))
+    if scope is None or not (_is_library_module(vars(scope)) or isinstance(x, JIT_FUNCTION_TYPE)):
         return False
     for name in str(getattr(x, "__qualname__", None) or getattr(x, "__name__", None)).split("."):
-        found = getattr(found, name, None)
-    return found is x or isinstance(x, type)
+        scope = getattr(scope, name, None)
+    return scope is x or isinstance(x, type)
 
 
 @functools.cache
 def _code_references(code: types.CodeType) -> tuple[set[str], set[str], set[str]]:
-    """Return the names in a code object and those nested in it, the modules that they import, and
-    the outer variables that they assign or delete."""
+    """Return (names, imported modules, outer variables assigned or deleted) of a code object and
+    those nested in it."""
     lines = [(line.opname, line.argval) for line in dis.get_instructions(code)]
     names, imports = (
         set(code.co_names),
@@ -149,17 +155,19 @@ def _code_references(code: types.CodeType) -> tuple[set[str], set[str], set[str]
 
 
 def _decompose_function(f: types.FunctionType):
-    """Return how to build a function, and from what: code, globals, the names among them, and the
-    values it reads."""
+    """Return (build, parts) of a function.
+
+    Parts are its code, globals, names of the globals it reads, defaults, and the values it reads.
+    """
     names, imports, written = _code_references(f.__code__)
     if written or set(vars(f)) - {"__wrapped__"}:
         _raise_incomparable(
             "a variable outside that it assigns" if written else "a function with attributes"
         )
-    # globals of libraries stay as they are
+    # the globals of a library are assumed constant
     space, own = f.__globals__, not _is_library_module(f.__globals__)
     names, imports = (
-        tuple(sorted(found)) if own else () for found in (names & space.keys(), imports)
+        tuple(sorted(used)) if own else () for used in (names & space.keys(), imports)
     )
     read = [
         *(space[name] for name in names),
@@ -177,42 +185,47 @@ def _decompose_function(f: types.FunctionType):
 
 
 class Reader:
-    """Reads the values that one function depends on. as_data: whether floating-point arrays are
-    data."""
+    """Decomposes one function: its code, and all values that the function reads.
+
+    arrays_as_data: whether floating-point arrays are leaves, not static values.
+    visited: id of an object -> its `StaticValue`, or None while the object is being read.
+    """
 
     def __init__(self, arrays_as_data: bool):
-        # by id: values read before; None while one is being read
-        self.as_data, self.known = arrays_as_data, {}
+        self.arrays_as_data, self.visited = arrays_as_data, {}
 
     def read(self, x):
-        """Return x as an array, a `Still`, or a `Function`. TypeError: x is not of a simple
-        kind."""
+        """Return x as an array, a `StaticValue`, or a `FunctionPytree`.
+
+        Raises TypeError if x, or an object that x holds, is of no comparable kind.
+        """
         kind = type(x)
         if kind is StaticValue:
             return x
         if kind in PLAIN_TYPES or isinstance(x, enum.Enum | np.dtype):
-            # compared by their text, nan equals nan and -0.0 differs from 0.0
+            # floats are compared by their text: nan equals nan, and -0.0 differs from 0.0
             return StaticValue((kind, repr(x) if kind in (float, complex) else x), x)
         if isinstance(x, np.ndarray | np.generic | jax.Array):
             return self.array(x)
         if defined_by_library(x):
             return StaticValue(id(x), x)
-        if id(x) in self.known:
-            # without this, functions that call each other would be read for ever
-            return self.known[id(x)] or _raise_incomparable("something that holds itself")
+        if id(x) in self.visited:
+            # functions that call each other would otherwise recurse without end
+            return self.visited[id(x)] or _raise_incomparable("something that holds itself")
         parts = self.parts(x)
-        del self.known[id(x)]
+        del self.visited[id(x)]
         leaves, shape = jax.tree.flatten(parts)
         if not all(isinstance(leaf, StaticValue) for leaf in leaves):
             return parts
-        self.known[id(x)] = StaticValue(("again", len(self.known)), x)
+        self.visited[id(x)] = StaticValue(("again", len(self.visited)), x)
         return StaticValue((shape, *leaves), x)
 
     def array(self, x):
+        """Return an array as a leaf, or as a `StaticValue` compared by its content."""
         if isinstance(x, jax.Array):
             # tracers are always data, and so are arrays whose values this process cannot read
             data = (
-                self.as_data
+                self.arrays_as_data
                 or not is_concrete(x)
                 or jnp.issubdtype(x.dtype, jax.dtypes.extended)
                 or not x.is_fully_addressable
@@ -220,9 +233,11 @@ class Reader:
         elif x.dtype.hasobject or type(x) not in (np.ndarray, x.dtype.type):
             _raise_incomparable("an array of objects or of a class of its own")
         else:
-            # integers are sizes and indices, which Python needs; jax has no long double
+            # integers are shapes and indices, which Python has to read; JAX has no long double
             data = (
-                self.as_data and jnp.issubdtype(x.dtype, jnp.inexact) and x.dtype.char not in "gG"
+                self.arrays_as_data
+                and jnp.issubdtype(x.dtype, jnp.inexact)
+                and x.dtype.char not in "gG"
             )
         return (
             x
@@ -240,9 +255,9 @@ class Reader:
         )
 
     def parts(self, x) -> FunctionPytree:
-        """Return the parts of a function or a container."""
+        """Return a function or a container as a `FunctionPytree`."""
         kind = type(x)
-        self.known[id(x)] = None
+        self.visited[id(x)] = None
         if kind is types.FunctionType:
             build, parts = _decompose_function(x)
         elif kind is functools.partial:
@@ -250,7 +265,7 @@ class Reader:
         elif kind is slice:
             build, parts = slice, [x.start, x.stop, x.step]
         elif kind is dict:
-            # in insertion order, which jax does not keep
+            # in insertion order; JAX sorts the keys
             build, parts = _dict, [tuple(x), *x.values()]
         elif isinstance(x, dict) or jax.tree_util.all_leaves([x]):
             _raise_incomparable(f"an object of type {kind.__name__}")
@@ -267,5 +282,6 @@ class Reader:
 
 
 def code_of(function):
-    """Return the code of a function, which all functions made by one line share."""
+    """Return the code object of a function, shared by all functions that one `def` or lambda
+    makes."""
     return getattr(getattr(function, "func", function), "__code__", type(function))

@@ -1,8 +1,8 @@
-"""A `vmap` that keeps the lanes on the last axis, where processors take several in one instruction.
+"""A `vmap` that keeps the batch axis last, so that SIMD instructions process several lanes at once.
 
-jax puts them first; the axes of 3, 6 or 46 that end up last are too short for that. A function's
-jaxpr is gone through once more with every array
-[..., lanes]; what has no rule here goes through jax's own `vmap`.
+`jax.vmap` puts the batch axis first. The last axes are then of length 3, 6 or 46, too short for
+SIMD. Here a function's jaxpr is evaluated with every batched array as [..., lanes]. Primitives
+without a rule in this module go through `jax.vmap`.
 """
 
 import functools
@@ -18,17 +18,18 @@ from jaxtyping import Array
 
 from svkc._jax.primitive import custom_primitive
 
-# lanes that one processor takes at a time: what they need between two operations stays in its cache
+# lanes evaluated together on a CPU: intermediate values of 32 lanes stay in the processor's cache
 # (benchmarks/README.md)
 TILE = 32
-# terms of a sum at a time: 46 in one loop cost a step with two grips a quarter of its time, 22 one
-# of the high bar's 16-joint figure a third
+# terms of a sum in one loop: with 46 terms that loop took a quarter of the time of a step with two
+# grips, with 22 terms a third of that of the high bar's 16-joint figure
 TERMS_PER_SUM = 8
 ELEMENTWISE = set(
     "abs add add_any and atan2 ceil clamp convert_element_type copy copy_p cos div eq exp exp2"
     " expm1 floor ge gt integer_pow is_finite le log log1p lt max min mul ne neg not or pow rem"
     " round rsqrt select_n sign sin sqrt square stop_gradient sub tan tanh xor".split()
 )
+# primitives whose parameters name axes counted from the front: lanes last changes nothing
 UNBATCHED_AXES = {
     "argmax",
     "argmin",
@@ -43,6 +44,7 @@ UNBATCHED_AXES = {
     "squeeze",
 }
 CONCATENATIONS = {"concatenate", "stack"}
+# primitives that call a jaxpr -> name of the parameter that holds the jaxpr
 CALL_JAXPR_PARAMETERS = {
     "closed_call": "call_jaxpr",
     "core_call": "call_jaxpr",
@@ -54,13 +56,13 @@ CALL_JAXPR_PARAMETERS = {
 
 
 class Batched(NamedTuple):
-    """A value of its own for each lane."""
+    """An array `x` [..., lanes], as opposed to a value that all lanes share."""
 
     x: Array
 
 
 def broadcast_to_lanes(x, lanes: int) -> Array:
-    """[..., lanes] of any value."""
+    """Return a value as an array [..., lanes]; broadcast a value that all lanes share."""
     return (
         x.x
         if isinstance(x, Batched)
@@ -80,7 +82,7 @@ def _slice(x: Array, lanes: int, *, start_indices, limit_indices, strides):
 
 SHAPE_RULES = {
     "broadcast_in_dim": _broadcast,
-    "reshape": lambda x, lanes, *, new_sizes, **_: x.reshape(*new_sizes, lanes),
+    "reshape": lambda x, lanes, **params: x.reshape(*params["new_sizes"], lanes),
     "slice": _slice,
     "transpose": lambda x, lanes, *, permutation: x.transpose(*permutation, len(permutation)),
 }
@@ -97,7 +99,7 @@ def _gather(x, index, lanes: int, *, dimension_numbers, slice_sizes, **rest):
             (*slice_sizes, lanes),
             **rest,
         )
-    # the index's own axis stays its last
+    # lax.gather reads an index vector from the last axis, so that lanes come before it
     index = jnp.swapaxes(index.x, -1, -2)
     if not isinstance(x, Batched):
         return lax.gather(x, index, d, slice_sizes, **rest)
@@ -115,8 +117,10 @@ def _gather(x, index, lanes: int, *, dimension_numbers, slice_sizes, **rest):
 
 
 def sum_in_chunks(x: Array, axes: tuple[int, ...]) -> Array:
-    """Sums of few at a time: such a loop is unrolled, and the one around it, over lanes or what
-    else is last, can take several in one instruction."""
+    """Sum over axes, `TERMS_PER_SUM` terms at a time.
+
+    XLA unrolls a sum this short, and can then vectorise the loop over the last axis.
+    """
     for axis in sorted(axes, reverse=True):
         size = x.shape[axis]
         parts = [
@@ -128,7 +132,7 @@ def sum_in_chunks(x: Array, axes: tuple[int, ...]) -> Array:
 
 
 def _dot_general(*sides, dimension_numbers, preferred_element_type, **_):
-    """Products and sums: XLA has no `dot` whose lanes come last."""
+    """Evaluate `dot_general` by products and sums, as XLA has no batch axis last for `dot`."""
     sides = [v.x if isinstance(v, Batched) else jnp.asarray(v)[..., None] for v in sides]
     contracted, batch = dimension_numbers
     free = [
@@ -138,7 +142,7 @@ def _dot_general(*sides, dimension_numbers, preferred_element_type, **_):
 
     axes = len(batch[0])
     middle, end = axes + len(free[0]), axes + len(free[0]) + len(free[1])
-    # the other side's own axes are of one
+    # broadcast: each side has axes of length one for the free axes of the other side
     left, right = (
         jnp.transpose(x, (*b, *f, *c, x.ndim - 1))
         for x, b, f, c in zip(sides, batch, free, contracted, strict=True)
@@ -153,7 +157,7 @@ def _dot_general(*sides, dimension_numbers, preferred_element_type, **_):
 
 
 def _solve(inputs: list, lanes: int, *, const_lengths, jaxprs, **_):
-    """The solve itself; what it is the inverse of matters to derivatives alone."""
+    """Evaluate the `solve` of a `custom_linear_solve`; its other jaxprs only serve derivatives."""
     before = const_lengths.matvec + const_lengths.vecmat
     return evaluate_jaxpr(
         jaxprs.solve,
@@ -163,16 +167,20 @@ def _solve(inputs: list, lanes: int, *, const_lengths, jaxprs, **_):
 
 
 def _apply_vmap(primitive, inputs: list, params: dict, lanes: int):
-    """Lanes first, through jax's own rule, and back."""
+    """Evaluate one primitive by `jax.vmap`, with the lanes moved to the front and back."""
     axes = [0 if isinstance(v, Batched) else None for v in inputs]
-    moved = [jnp.moveaxis(v.x, -1, 0) if isinstance(v, Batched) else v for v in inputs]
-    out = jax.vmap(lambda *values: primitive.bind(*values, **params), axes, axis_size=lanes)(*moved)
+    lanes_first = [jnp.moveaxis(v.x, -1, 0) if isinstance(v, Batched) else v for v in inputs]
+    bind = lambda *values: primitive.bind(*values, **params)
+    out = jax.vmap(bind, axes, axis_size=lanes)(*lanes_first)
     return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), out)
 
 
 def _apply_rule(primitive, inputs: list, params: dict, shape: tuple[int, ...], lanes: int):
-    """What one operation makes of values of which some are `Lanes`, in arrays [..., lanes]."""
-    name, alone = primitive.name, len(inputs) == 1
+    """Evaluate one primitive for inputs of which some are `Batched`; return arrays [..., lanes].
+
+    shape: of the output for one lane.
+    """
+    name = primitive.name
     if name == "reduce_sum":
         return sum_in_chunks(inputs[0].x, params["axes"])
     if name in UNBATCHED_AXES:
@@ -180,15 +188,15 @@ def _apply_rule(primitive, inputs: list, params: dict, shape: tuple[int, ...], l
     if name in CONCATENATIONS:
         return primitive.bind(*(broadcast_to_lanes(v, lanes) for v in inputs), **params)
     if name in ELEMENTWISE:
-        # (numbers and axes of one go with any size)
+        # elementwise primitives broadcast neither scalars nor axes of length one
         return primitive.bind(
             *(jnp.broadcast_to(broadcast_to_lanes(v, lanes), (*shape, lanes)) for v in inputs),
             **params,
         )
-    if name in SHAPE_RULES and alone:
+    if name in SHAPE_RULES and len(inputs) == 1:
         return SHAPE_RULES[name](inputs[0].x, lanes, **params)
-    if name == "taking":
-        # (its axis is counted from the front)
+    if name == "static_take":
+        # the parameter `axis` counts from the front
         return primitive.bind(inputs[0].x, **params)
     if name == "gather":
         return _gather(inputs[0], inputs[1], lanes, **params)
@@ -198,69 +206,75 @@ def _apply_rule(primitive, inputs: list, params: dict, shape: tuple[int, ...], l
 
 
 def evaluate_jaxpr(closed: core.ClosedJaxpr, inputs: list, lanes: int) -> list:
-    """The outputs of a jaxpr for inputs of which some are `Lanes`."""
+    """Evaluate a jaxpr for inputs of which some are `Batched`; dependent outputs are `Batched`."""
     jaxpr = closed.jaxpr
-    known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*closed.consts, *inputs], strict=True))
-    read = lambda v: v.val if isinstance(v, core.Literal) else known[v]
+    env = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*closed.consts, *inputs], strict=True))
+    read = lambda v: v.val if isinstance(v, core.Literal) else env[v]
     for eqn in jaxpr.eqns:
         values, name, params = [read(v) for v in eqn.invars], eqn.primitive.name, eqn.params
-        mixed = any(isinstance(v, Batched) for v in values)
+        batched = any(isinstance(v, Batched) for v in values)
         if name in CALL_JAXPR_PARAMETERS:
             out = evaluate_jaxpr(params[CALL_JAXPR_PARAMETERS[name]], values, lanes)
-        elif name in ("custom_linear_solve", "linear_solve") and mixed:
+        elif name in ("custom_linear_solve", "linear_solve") and batched:
             out = _solve(values, lanes, **params)
         else:
             out = (
                 eqn.primitive.bind(*values, **params)
-                if not mixed
+                if not batched
                 else _apply_rule(eqn.primitive, values, params, eqn.outvars[0].aval.shape, lanes)
             )
             out = out if eqn.primitive.multiple_results else [out]
-            out = [Batched(x) for x in out] if mixed else out
-        known |= dict(zip(eqn.outvars, out, strict=True))
+            out = [Batched(x) for x in out] if batched else out
+        env |= dict(zip(eqn.outvars, out, strict=True))
     return [read(v) for v in jaxpr.outvars]
 
 
 def _evaluate_batch(function: Callable, lanes: int, flags: list[bool], args):
-    """All lanes first and last to the eye, last in between."""
+    """Evaluate a function for a batch, in tiles of `TILE` lanes on a CPU.
+
+    flags: for each leaf of `args`, whether its first axis is the batch.
+    Inputs and outputs have the lanes first, as `custom_vmap` requires.
+    """
     leaves, tree = jax.tree.flatten(args)
     shapes = [
         jax.ShapeDtypeStruct(jnp.shape(x)[flag:], jnp.result_type(x))
         for x, flag in zip(leaves, flags, strict=True)
     ]
-    closed, made = jax.make_jaxpr(function, return_shape=True)(*tree.unflatten(shapes))
-    gathered = jax.tree.structure(made).unflatten
+    closed, out_shape = jax.make_jaxpr(function, return_shape=True)(*tree.unflatten(shapes))
+    unflatten = jax.tree.structure(out_shape).unflatten
     tile = max(1, min(lanes, TILE) if jax.default_backend() == "cpu" else lanes)
     count = -(-lanes // tile)
 
-    def some(own):
-        own = iter(own)
+    def evaluate_tile(batched_leaves):
+        batched_leaves = iter(batched_leaves)
         out = evaluate_jaxpr(
             closed,
             [
-                Batched(jnp.moveaxis(next(own), 0, -1)) if flag else x
+                Batched(jnp.moveaxis(next(batched_leaves), 0, -1)) if flag else x
                 for x, flag in zip(leaves, flags, strict=True)
             ],
             tile,
         )
         return [jnp.moveaxis(broadcast_to_lanes(x, tile), -1, 0) for x in out]
 
-    own = [x for x, flag in zip(leaves, flags, strict=True) if flag]
+    batch = [x for x, flag in zip(leaves, flags, strict=True) if flag]
     if count == 1:
-        return gathered(some(own))
+        return unflatten(evaluate_tile(batch))
     if count * tile != lanes:
-        # the last lane stands in for those that a whole number of tiles would have more
-        own = [
+        # pad the last tile by copies of the last lane
+        batch = [
             jnp.concatenate([x, jnp.broadcast_to(x[-1:], (count * tile - lanes, *x.shape[1:]))])
-            for x in own
+            for x in batch
         ]
-    out = lax.map(some, [x.reshape(count, tile, *x.shape[1:]) for x in own])
-    return gathered([x.reshape(count * tile, *x.shape[2:])[:lanes] for x in out])
+    out = lax.map(evaluate_tile, [x.reshape(count, tile, *x.shape[1:]) for x in batch])
+    return unflatten([x.reshape(count * tile, *x.shape[2:])[:lanes] for x in out])
 
 
 def with_lanes_last(function: Callable) -> Callable:
-    """The function, whose `jax.vmap` keeps lanes last, on processors a few at a time. Its
-    derivatives are those of the function as it is."""
+    """Return a function whose `jax.vmap` evaluates it with the lanes last.
+
+    Derivatives are those of `function` under JAX's own rules.
+    """
     batched = jax.custom_batching.custom_vmap(function)
 
     @batched.def_vmap
@@ -269,7 +283,7 @@ def with_lanes_last(function: Callable) -> Callable:
         return out, jax.tree.map(lambda _: True, out)
 
     def jvp(values, tangents):
-        return whole(*values), eqx.filter_jvp(function, values, tangents)[1]
+        return primitive(*values), eqx.filter_jvp(function, values, tangents)[1]
 
-    whole = custom_primitive(function.__name__, batched, jvp)
-    return whole
+    primitive = custom_primitive(function.__name__, batched, jvp)
+    return primitive

@@ -1,5 +1,5 @@
-"""Functions that have derivatives of their own, in every transformation and where they are
-differentiated twice; and functions whose closures do."""
+"""Functions with custom derivative rules that survive every transformation and a second
+differentiation, and functions converted so that their closures are differentiable."""
 
 from collections.abc import Callable
 from typing import Any
@@ -13,48 +13,52 @@ from jax.interpreters import ad
 def custom_primitive(
     name: str, function: Callable, jvp: Callable, transpose: Callable | None = None
 ) -> Callable:
-    """The function as an operation of its own; jax.custom_jvp would lose its rule where a scan is
-    linearized and then differentiated again.
+    """Return `function` as a JAX primitive with the given derivative rules.
 
-    jvp(primals, tangents) and transpose(inputs, cotangents) are over trees, None where nothing
-    changes; jvp calls the operation again for its value.
+    `jax.custom_jvp` would lose its rule where a scan is linearized and then differentiated again.
+
+    jvp: jvp(primals, tangents) -> (value, tangent), over pytrees with None for zero tangents; the
+    rule calls the primitive again for the value.
+    transpose: transpose(inputs, cotangents) -> cotangents of the inputs; None: the primitive is not
+    linear, and transposing raises NotImplementedError.
     """
 
-    def shapes(*args):
-        shaped = lambda x: (
+    def abstract_eval(*args):
+        to_struct = lambda x: (
             jax.ShapeDtypeStruct(x.shape, x.dtype) if isinstance(x, jax.core.ShapedArray) else x
         )
-        abstract = lambda x: (
+        to_aval = lambda x: (
             jax.core.ShapedArray(x.shape, x.dtype) if isinstance(x, jax.ShapeDtypeStruct) else x
         )
-        return jax.tree.map(abstract, eqx.filter_eval_shape(function, *jax.tree.map(shaped, args)))
+        out = eqx.filter_eval_shape(function, *jax.tree.map(to_struct, args))
+        return jax.tree.map(to_aval, out)
 
     def not_linear(*_, **__):
         raise NotImplementedError(f"{name} is not linear")
 
-    defined, shaped_like = eqxi.filter_primitive_def(function), eqxi.filter_primitive_def(shapes)
-    backwards = (
+    primitive = eqxi.create_vprim(
+        name,
+        eqxi.filter_primitive_def(function),
+        eqxi.filter_primitive_def(abstract_eval),
+        eqxi.filter_primitive_jvp(jvp),
         not_linear
         if transpose is None
-        else eqxi.filter_primitive_transpose(transpose, materialise_zeros=True)
-    )
-    primitive = eqxi.create_vprim(
-        name, defined, shaped_like, eqxi.filter_primitive_jvp(jvp), backwards
+        else eqxi.filter_primitive_transpose(transpose, materialise_zeros=True),
     )
     return lambda *args: eqxi.filter_primitive_bind(primitive, *args)
 
 
 def is_cotangent_of(x) -> bool:
-    """Return whether an input of a transpose is one whose cotangent is asked for."""
+    """Return whether an input of a transpose rule is one whose cotangent the rule returns."""
     return isinstance(x, ad.UndefinedPrimal)
 
 
 class ClosureConverted(eqx.Module):
-    """A function with all the arrays that it closes over as leaves, so that it can be
-    differentiated by them.
+    """A function whose closed-over arrays are leaves, as `jax.closure_convert` makes it, so that
+    derivatives by these arrays exist.
 
-    (equinox's own refuses arguments on another mesh than the example's, which are the same arrays
-    seen from within `jax.shard_map`.)
+    `equinox.filter_closure_convert` rejects arguments on another mesh than the example's, and under
+    `jax.shard_map` the arguments are on another mesh.
     """
 
     consts: list[Any]
@@ -62,10 +66,10 @@ class ClosureConverted(eqx.Module):
     out: Any = eqx.field(static=True)
 
     @classmethod
-    def from_function(cls, function: Callable, *example) -> "Closed":
-        """`function`, for arguments like these."""
-        made, out, static = eqx.filter_make_jaxpr(function)(*example)
-        return cls(made.consts, made.jaxpr, (jax.tree.structure(out), static))
+    def from_function(cls, function: Callable, *example) -> "ClosureConverted":
+        """Convert `function` for arguments with the shapes and types of `example`."""
+        closed_jaxpr, out, static = eqx.filter_make_jaxpr(function)(*example)
+        return cls(closed_jaxpr.consts, closed_jaxpr.jaxpr, (jax.tree.structure(out), static))
 
     def __call__(self, *args):
         out = jax.core.eval_jaxpr(

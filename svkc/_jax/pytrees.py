@@ -6,12 +6,12 @@ import jax.numpy as jnp
 
 
 def stop_gradient_tree(tree):
-    """The tree with every array in it held fixed in derivatives."""
+    """Apply `lax.stop_gradient` to every array of a pytree."""
     return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
 
 
 def materialise_zeros(x, dx):
-    """The tangent of x: zeros where dx is None."""
+    """Return the tangent `dx` of `x`, with zeros where a leaf of `dx` is None."""
     return jax.tree.map(
         lambda x, d: jnp.zeros_like(x) if d is None and x is not None else d,
         x,
@@ -21,10 +21,10 @@ def materialise_zeros(x, dx):
 
 
 def tree_where(condition, new, old):
-    """The new tree where `which`, else the old one."""
+    """Return `new` where `condition` holds, else `old`, leaf by leaf (`jnp.where`)."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
 
 
 def is_concrete(*values) -> bool:
-    """Whether the values can be looked at: none of them is traced."""
+    """Return whether no leaf of the values is a tracer, so that Python can read the numbers."""
     return not any(isinstance(x, jax.core.Tracer) for v in values for x in jax.tree.leaves(v))

@@ -1,7 +1,7 @@
-"""Rows of an array by an index that is known beforehand, whose derivatives are rows and sums again.
+"""Gather of rows by a static index, whose transpose is a gather and a sum instead of a scatter.
 
-The transpose of jax's own indexing is a scatter, which XLA's CPU backend runs entry by entry, and
-never in one kernel with what is around it.
+The transpose of JAX's indexing is a scatter. XLA's CPU backend runs a scatter entry by entry, and
+does not fuse it with the surrounding operations.
 """
 
 import jax.numpy as jnp
@@ -11,21 +11,24 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Float, Int
 
-# a table of what goes to each row may have so many times the entries that are there and taken; else
-# it is a scatter
+# the transpose gathers from a padded table [rows, most uses of one row]; if that table has more
+# than this many times the entries that are needed, the transpose is a scatter
 MAX_TABLE_RATIO = 8
 
 
 def static_take(
     x: Float[Array, "rows *n"], index: Int[np.ndarray, "*m"] | Int[Array, "*m"]
 ) -> Float[Array, "..."]:
-    """x[index] along the first axis; zeros where the index is one past the last row."""
+    """Return x[index] along the first axis; zeros where the index is one past the last row.
+
+    A numpy index is static and uses the primitive of this module; a JAX index uses JAX's indexing.
+    """
     if not isinstance(index, np.ndarray):
         return jnp.concatenate([x, jnp.zeros_like(x[:1])])[index]
     if index.ndim == 1 and np.array_equal(index, np.arange(x.shape[0])):
         return x
-    taken = static_take_p.bind(x, index=index.astype(np.int32).tobytes(), axis=0)
-    return taken if index.ndim == 1 else taken.reshape(*index.shape, *x.shape[1:])
+    rows = static_take_p.bind(x, index=index.astype(np.int32).tobytes(), axis=0)
+    return rows if index.ndim == 1 else rows.reshape(*index.shape, *x.shape[1:])
 
 
 def _gather_rows(x, *, index: bytes, axis: int):
@@ -34,13 +37,17 @@ def _gather_rows(x, *, index: bytes, axis: int):
         x = lax.concatenate(
             [x, jnp.zeros((*x.shape[:axis], 1, *x.shape[axis + 1 :]), x.dtype)], axis
         )
-    others = tuple(i for i in range(x.ndim) if i != axis)
-    numbers = lax.GatherDimensionNumbers(
-        offset_dims=others, collapsed_slice_dims=(axis,), start_index_map=(axis,)
+    dimension_numbers = lax.GatherDimensionNumbers(
+        offset_dims=tuple(i for i in range(x.ndim) if i != axis),
+        collapsed_slice_dims=(axis,),
+        start_index_map=(axis,),
     )
-    sizes = tuple(1 if i == axis else size for i, size in enumerate(x.shape))
     return lax.gather(
-        x, table[:, None], numbers, sizes, mode=lax.GatherScatterMode.PROMISE_IN_BOUNDS
+        x,
+        table[:, None],
+        dimension_numbers,
+        tuple(1 if i == axis else size for i, size in enumerate(x.shape)),
+        mode=lax.GatherScatterMode.PROMISE_IN_BOUNDS,
     )
 
 
@@ -49,24 +56,24 @@ def _abstract_eval(x, *, index: bytes, axis: int):
 
 
 def _transpose(ct, x, *, index: bytes, axis: int):
-    """For each row of x the sum of what was taken of it."""
+    """Return, for each row of x, the sum of the cotangents of the rows gathered from that row."""
     table, n = np.frombuffer(index, np.int32), x.aval.shape[axis]
     order = np.argsort(table, kind="stable")
     count = np.bincount(table, minlength=n + 1)[:n]
-    most = int(count.max(initial=0))
-    if n * most > MAX_TABLE_RATIO * (n + len(table)):
+    max_count = int(count.max(initial=0))
+    if n * max_count > MAX_TABLE_RATIO * (n + len(table)):
         shape = (*x.aval.shape[:axis], n + 1, *x.aval.shape[axis + 1 :])
-        added = jnp.zeros(shape, ct.dtype).at[(slice(None),) * axis + (table,)].add(ct)
-        return [lax.slice_in_dim(added, 0, n, axis=axis)]
-    # one past the last: nothing
-    back, first = np.full((n, most), len(table), np.int32), np.cumsum(count) - count
+        scattered = jnp.zeros(shape, ct.dtype).at[(slice(None),) * axis + (table,)].add(ct)
+        return [lax.slice_in_dim(scattered, 0, n, axis=axis)]
+    # padding: an index one past the last row of ct gathers zeros
+    uses, first = np.full((n, max_count), len(table), np.int32), np.cumsum(count) - count
     for row in range(n):
-        back[row, : count[row]] = order[first[row] : first[row] + count[row]]
-    parts = static_take_p.bind(ct, index=back.tobytes(), axis=axis)
+        uses[row, : count[row]] = order[first[row] : first[row] + count[row]]
+    terms = static_take_p.bind(ct, index=uses.tobytes(), axis=axis)
     return [
-        parts
-        if most == 1
-        else jnp.sum(parts.reshape(*ct.shape[:axis], n, most, *ct.shape[axis + 1 :]), axis + 1)
+        terms
+        if max_count == 1
+        else jnp.sum(terms.reshape(*ct.shape[:axis], n, max_count, *ct.shape[axis + 1 :]), axis + 1)
     ]
 
 
@@ -75,7 +82,8 @@ def _batch(args, axes, *, index: bytes, axis: int):
     return static_take_p.bind(x, index=index, axis=axis + (lane <= axis)), lane
 
 
-static_take_p = Primitive("taking")
+# `lanes_last` recognises this primitive by its name
+static_take_p = Primitive("static_take")
 static_take_p.def_impl(_gather_rows)
 static_take_p.def_abstract_eval(_abstract_eval)
 ad.deflinear2(static_take_p, _transpose)

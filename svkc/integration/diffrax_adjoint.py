@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from svkc.integration.event_location import EventInfo
-from svkc.integration.integrators import ODEState
+from svkc.integration.ode import ODEState
 from svkc.integration.replay import with_scan_kind
 from svkc.integration.solution import (
     EVENT,

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from svkc._jax.primitive import custom_primitive, is_cotangent_of
 from svkc._jax.pytrees import materialise_zeros
 from svkc.integration.event_location import vector_field_of
-from svkc.integration.integrators import FieldArgs, ODEState
+from svkc.integration.ode import FieldArgs, ODEState
 from svkc.integration.vector_field import VectorField
 
 

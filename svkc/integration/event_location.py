@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.pytrees import tree_where
-from svkc.integration.integrators import FieldArgs, ODEState
+from svkc.integration.ode import FieldArgs, ODEState
 from svkc.integration.vector_field import VectorField
 from svkc.model.chain import State
 from svkc.model.validation import scalar

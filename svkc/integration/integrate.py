@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from svkc._jax.control_flow import buffer_at_set, while_loop
 from svkc._jax.pytrees import tree_where
 from svkc.integration.event_location import Bracket, EventSearch, event_info, update_search
-from svkc.integration.integrators import MAX_STRETCH, ODEState, is_finite, rms_norm
+from svkc.integration.ode import ODEState, is_finite, rms_norm
 from svkc.integration.solution import (
     EVENT,
     LOOP_OPEN,
@@ -33,6 +33,7 @@ from svkc.integration.solution import (
     update_stats,
 )
 from svkc.integration.stabilization import needs_projection
+from svkc.integration.step_size import MAX_STRETCH
 from svkc.integration.vector_field import ProjectionInfo, project_state
 
 

@@ -1,100 +1,39 @@
-"""The state and the arguments of the vector field, integrators of our own as diffrax solvers, and
-one step by itself."""
+"""Integrators that diffrax lacks, a root finder for implicit solvers, and a single step."""
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import diffrax
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import optimistix
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from svkc._jax.lanes_last import with_lanes_last
 from svkc.loops.constrained_dynamics import ArticulatedBodies
 from svkc.loops.forward_dynamics import velocity_and_acceleration
-from svkc.model.chain import Chain, State, Structure, active_dofs
+from svkc.model.chain import Chain, State, active_dofs
 from svkc.model.checked_jit import checked_jit, joint_torques
 from svkc.model.validation import scalar
 from svkc.tree.configuration import integrate
 from svkc.tree.inverse_dynamics import limit_forces
 
-# a step that would leave less than this part of itself before a time to be met goes all the way
-MAX_STRETCH = 1e-6
-
-
-class ODEState(eqx.Module):
-    """What is integrated: q, v, and the work (J) done by control, limits and dampers; None where
-    the scene has none of them."""
-
-    q: Float[Array, " q"]
-    v: Float[Array, " dofs"]
-    work: Float[Array, ""] | None = None
-
-
-class FieldArgs(eqx.Module):
-    """The `args` of the vector field: all it depends on besides time and motion. pivots: of the
-    loops' rows, where they are held (`AbstractDynamics.hold`)."""
-
-    chain: Chain
-    structure: Structure
-    args: Any
-    pivots: Float[Array, "steps dofs"] | None = None
-
-
-def is_finite(y: ODEState) -> Bool[Array, ""]:
-    """Whether every number is."""
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(y)]))
-
-
-class FixedSteps(diffrax.AbstractStepSizeController):
-    """Steps of dt; diffrax is told the times `ts` to shorten them for. A step that is not finite is
-    not taken: it ends the solve."""
-
-    dt: Float[Array, ""]
-    ts: Float[Array, " times"]
-
-    def wrap(self, direction):
-        return self
-
-    def _tnext(self, t):
-        times = jnp.where(self.ts > t, self.ts, jnp.inf)
-        stop = jnp.min(times, initial=jnp.inf)
-        return jnp.where(t + self.dt * (1 + MAX_STRETCH) >= stop, stop, t + self.dt)
-
-    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
-        return self._tnext(t0), None
-
-    def adapt_step_size(
-        self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
-    ):
-        whole = is_finite(y1_candidate)
-        said = diffrax.RESULTS.where(
-            whole, diffrax.RESULTS.successful, diffrax.RESULTS.internal_error
-        )
-        return whole, jnp.where(whole, t1, t0), self._tnext(t1), False, controller_state, said
-
-
-def rms_norm(error: ODEState) -> Float[Array, ""]:
-    """Root mean square over q and v alone: work and guards do not choose the step."""
-    both = jnp.concatenate([error.q, error.v])
-    return jnp.sqrt(jnp.mean(both * both))
-
 
 class RodriguesEuler(diffrax.AbstractSolver):
-    """The paper's integration (39)-(44): first order, orientations turned by Rodrigues' formula,
-    which keeps quaternions at unit length.
+    """The paper's integrator (39)-(44): explicit Euler of first order with fixed steps.
 
-    q(t + dt) = q(t) moved by v dt along the exponential map, v(t + dt) = v(t) + vdot dt. For
-    `svkc.simulate` alone, with dt.
+    q(t + dt) = q(t) exp(v(t) dt) and v(t + dt) = v(t) + vdot(t) dt, where exp is the exponential
+    map of the configuration space. Rodrigues' formula for exp keeps quaternions at unit length.
+
+    Use as `solver` of `svkc.simulate` together with `dt`: the solver estimates no error and
+    handles the states of `svkc.simulate` alone.
     """
 
     term_structure: ClassVar = diffrax.AbstractTerm
     interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
 
-    def _position_velocity(self, before, after):
-        """The velocity that q goes by."""
-        return before
+    def _position_velocity(self, v0, v1):
+        """Return the velocity that moves q, given those at the start and at the end of a step."""
+        return v0
 
     def order(self, terms):
         return 1
@@ -108,33 +47,39 @@ class RodriguesEuler(diffrax.AbstractSolver):
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         dt = t1 - t0
         rate = terms.vf(t0, y0, args)
-        moved = eqx.tree_at(lambda y: y.v, y0, y0.v + dt * rate.v)
+        y1 = eqx.tree_at(lambda y: y.v, y0, y0.v + dt * rate.v)
         if y0.work is not None:
-            moved = eqx.tree_at(lambda y: y.work, moved, y0.work + dt * rate.work)
-        v = jnp.where(
-            active_dofs(args.chain, args.structure), self._position_velocity(y0.v, moved.v), 0
-        )
-        y1 = eqx.tree_at(lambda y: y.q, moved, integrate(args.chain, y0.q, dt * v))
+            y1 = eqx.tree_at(lambda y: y.work, y1, y0.work + dt * rate.work)
+        active = active_dofs(args.chain, args.structure)
+        v = jnp.where(active, self._position_velocity(y0.v, y1.v), 0)
+        y1 = eqx.tree_at(lambda y: y.q, y1, integrate(args.chain, y0.q, dt * v))
         return y1, None, {"y0": y0, "y1": y1}, None, diffrax.RESULTS.successful
 
 
 class SymplecticEuler(RodriguesEuler):
-    """Symplectic Euler: the velocity first, v(t + dt) = v(t) + vdot dt, then q moved by the new one
-    along the exponential map. First order; on conservative open chains the energy's error stays
-    bounded. For `svkc.simulate` alone, with dt.
+    """Symplectic Euler (semi-implicit Euler) of first order with fixed steps.
+
+    v(t + dt) = v(t) + vdot(t) dt, then q(t + dt) = q(t) exp(v(t + dt) dt), where exp is the
+    exponential map of the configuration space. The error of the energy of a conservative open
+    chain stays bounded (Hairer, Lubich and Wanner, Geometric Numerical Integration, I.1 and VI.3).
+
+    Use as `solver` of `svkc.simulate` together with `dt`: the solver estimates no error and
+    handles the states of `svkc.simulate` alone.
     """
 
-    def _moving(self, before, after):
-        return after
+    def _position_velocity(self, v0, v1):
+        return v1
 
 
 class SimplifiedNewton(diffrax.VeryChord):
-    """Newton's iteration with one Jacobian for all stages of a step, for solvers with implicit
-    stages (Hairer and Wanner, Solving Ordinary Differential Equations II, IV.8), ended where what
-    is left, by the last update or by its rate, is below kappa of the tolerance, or below round-off.
+    """Newton's method with one Jacobian for all stages of an implicit step.
 
-    diffrax's own always takes a second update, and finds it diverging where both are round-off: on
-    the high bar it takes five times as many steps.
+    The iteration ends when the remaining error, estimated by the last update or by the rate of
+    convergence, is below kappa times the tolerance, or when the update is round-off (Hairer and
+    Wanner, Solving Ordinary Differential Equations II, IV.8).
+
+    `diffrax.VeryChord` always takes a second update, and reports divergence where both updates are
+    round-off. On the high bar that takes five times as many steps.
     """
 
     def terminate(self, fn, y, args, options, state, tags):
@@ -158,14 +103,18 @@ class SimplifiedNewton(diffrax.VeryChord):
 def step(
     chain: Chain, state: State, tau: Float[Array, " torques"], dt: Float[Array, ""] | float
 ) -> State:
-    """One step of symplectic Euler of dt (s), for loops of one's own: v + vdot dt, then q moved by
-    that along the exponential map.
+    """Take one step of symplectic Euler and return the new state.
 
-    The joint torques tau (N m, N; over every coordinate, or the tree's alone) are held over the
-    step; springs, dampers and ranges of the joints act.
-    Each step takes away a quarter of what loops are open by (Baumgarte's rate 1 / (2 dt)). First
-    order; structure, events, other orders and error
-    control: `svkc.simulate`. ValueError: tau has another size.
+    v(t + dt) = v(t) + vdot(t) dt, then q moves by v(t + dt) dt along the exponential map. For loops
+    of one's own, such as control or reinforcement learning. Springs, dampers and joint limits act.
+    The structure stays. First order; `svkc.simulate` has events, other solvers and error control.
+
+    Each step reduces the gaps of loops by a quarter (Baumgarte stabilization of rate 1 / (2 dt)).
+
+    tau: joint torques (N m, N), constant over the step; over all coordinates or over the tree's.
+    dt: step size (s).
+
+    Raises ValueError if `tau` has neither of these sizes, or if `dt` is not one real number.
     """
     return _step(
         chain, state, joint_torques(chain, tau), jnp.asarray(scalar("dt", dt), state.q.dtype)

@@ -20,7 +20,7 @@ from svkc._jax.primitive import custom_primitive
 from svkc._jax.pytrees import materialise_zeros, stop_gradient_tree
 from svkc.integration.event_adjoint import end_of_phase_tangent, transport_tangent
 from svkc.integration.integrate import integrate_phase
-from svkc.integration.integrators import FieldArgs, ODEState
+from svkc.integration.ode import FieldArgs, ODEState
 from svkc.integration.solution import SUCCESSFUL, PhaseProblem, PhaseSolution, StepperOptions
 from svkc.integration.vector_field import VectorField, project_state
 from svkc.model.validation import integer

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc.integration.event_location import ArmedGuards, EventInfo, EventSearch
-from svkc.integration.integrators import FieldArgs, ODEState
+from svkc.integration.ode import FieldArgs, ODEState
 from svkc.integration.vector_field import ProjectionInfo, VectorField
 from svkc.loops.constraint import largest_gaps
 from svkc.model.chain import State

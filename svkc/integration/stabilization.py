@@ -1,23 +1,28 @@
-"""What is done about the drift of the loops."""
+"""Ways to keep loops closed while errors of integration open them (constraint drift)."""
 
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from svkc.integration.integrators import FieldArgs
+from svkc.integration.ode import FieldArgs
 from svkc.model.validation import integer, scalar
 
 
 class AbstractStabilization(eqx.Module):
-    """What is done about the drift of the loops."""
+    """A way to keep loops closed during integration."""
 
 
 class Projection(AbstractStabilization):
-    """Loop drift is taken away after every step by the change of q and v that closes the loops and
-    is the least in the metric of the inertia: a velocity that is projected loses kinetic energy of
-    second order only.
+    """Project q and v onto the closed loops after every step (coordinate projection).
 
-    iterations: Newton steps on the position; one leaves a gap of the second order in the drift of a
-    step.
+    The projection is the change of least norm in the metric of the mass matrix M: that of an
+    impulse of the loops, paper (29). Projecting a velocity in this metric changes its kinetic
+    energy only in second order. Method: Hairer and Wanner, Solving Ordinary Differential Equations
+    II, VII.2.
+
+    iterations: Newton steps on the positions. One Newton step leaves a gap of second order in the
+        drift of a step; 0 projects the velocity alone.
+
+    Raises ValueError if `iterations` is not an integer of at least 0.
     """
 
     iterations: int = eqx.field(static=True, default=2)
@@ -27,14 +32,28 @@ class Projection(AbstractStabilization):
 
 
 class CoordinatePartitioning(Projection):
-    """Dependent coordinates are functions of the independent ones, solved for at every evaluation
-    of the field as well as after every step: what is integrated is the paper's theta_G, and the
-    rest follows from it. Only dependent coordinates are moved. `iterations` as in `Projection`."""
+    """Compute dependent coordinates from the independent ones, paper (16).
+
+    The dependent coordinates are solved for at every evaluation of the vector field and after every
+    step. Independent coordinates (the paper's theta_G) are integrated and never projected. Method:
+    Wehage and Haug, Journal of Mechanical Design 104 (1982), 247-255.
+
+    iterations: Newton steps on the dependent coordinates, as in `Projection`.
+
+    Raises ValueError if `iterations` is not an integer of at least 0.
+    """
 
 
 class Baumgarte(AbstractStabilization):
-    """Loop drift is pulled back while integrating, as by a critically damped spring of this rate
-    (1/s); nothing is projected."""
+    """Pull open loops back by a critically damped spring while integrating; project nothing.
+
+    The gap g of a loop follows g'' + 2 rate g' + rate^2 g = 0. Method: Baumgarte, Computer Methods
+    in Applied Mechanics and Engineering 1 (1972), 1-16.
+
+    rate: decay rate of the gaps (1/s).
+
+    Raises ValueError if `rate` is not one real number.
+    """
 
     rate: Float[Array, ""] | float = 20.0
 
@@ -43,9 +62,10 @@ class Baumgarte(AbstractStabilization):
 
 
 class NoStabilization(AbstractStabilization):
-    """Nothing is done about loop drift."""
+    """Leave loops to drift apart: integrate the accelerations of paper (33) and nothing else."""
 
 
-def needs_projection(stabilization, scene: FieldArgs) -> bool:
-    """Whether steps are put back onto the loops."""
-    return bool(scene.chain.topology.link_names) and isinstance(stabilization, Projection)
+def needs_projection(stabilization: AbstractStabilization, field_args: FieldArgs) -> bool:
+    """Return whether steps are projected: the scene has loops and the method is a projection."""
+    has_loops = bool(field_args.chain.topology.link_names)
+    return has_loops and isinstance(stabilization, Projection)

@@ -1,4 +1,4 @@
-"""The vector field of one phase, and steps put back onto the loops."""
+"""The vector field of one phase, and the projection of its states onto closed loops."""
 
 from collections.abc import Callable
 
@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from svkc.integration.integrators import FieldArgs, ODEState
+from svkc.integration.ode import FieldArgs, ODEState
 from svkc.integration.stabilization import (
     AbstractStabilization,
     Baumgarte,
@@ -29,8 +29,12 @@ from svkc.tree.traversal import LEVELS_UNROLLED
 
 
 class VectorField(eqx.Module):
-    """The vector field of one phase: qdot, vdot, power. differentiated: or in a loop that nothing
-    differentiates, where a `vmap` keeps lanes last."""
+    """The vector field of one phase: (t, y, field_args) -> dy/dt = (qdot, vdot, power).
+
+    control: joint torques as a function (t, state, args), or None for no torques.
+    differentiated: whether derivatives are taken through this field. False in the stepping loop,
+        which is never differentiated; accelerations may then be batched with lanes last.
+    """
 
     control: Callable | None
     stabilization: AbstractStabilization
@@ -39,24 +43,27 @@ class VectorField(eqx.Module):
 
     @property
     def projects_by_loop_forces(self) -> bool:
-        """Whether steps are put back onto the loops by the loops' forces, without pivots."""
+        """Whether steps are projected by the forces of the loops, without pivots."""
         return (
             not self.dynamics.uses_pivots
             and isinstance(self.stabilization, Projection)
             and not isinstance(self.stabilization, CoordinatePartitioning)
         )
 
-    def __call__(self, t, y: ODEState, scene: FieldArgs) -> ODEState:
-        chain, structure, held = scene.chain, scene.structure, self.stabilization
-        if isinstance(held, CoordinatePartitioning):
-            y, _ = project_state(self, scene, y)
-        tau, power = self.torques(t, y, scene)
-        rate, agree = (
-            held.rate if isinstance(held, Baumgarte) else None,
-            isinstance(held, Projection) and not self.projects_by_loop_forces,
+    def __call__(self, t, y: ODEState, field_args: FieldArgs) -> ODEState:
+        chain, structure = field_args.chain, field_args.structure
+        stabilization = self.stabilization
+        if isinstance(stabilization, CoordinatePartitioning):
+            y, _ = project_state(self, field_args, y)
+        tau, power = self.torques(t, y, field_args)
+        baumgarte = stabilization.rate if isinstance(stabilization, Baumgarte) else None
+        project_velocity = (
+            isinstance(stabilization, Projection) and not self.projects_by_loop_forces
         )
-        if self._batches_lanes_last(chain) and not agree:
-            v, vdot = velocity_and_acceleration_lanes_last(chain, structure, y.q, y.v, tau, rate)
+        if self._batches_lanes_last(chain) and not project_velocity:
+            v, vdot = velocity_and_acceleration_lanes_last(
+                chain, structure, y.q, y.v, tau, baumgarte
+            )
         else:
             v, vdot = velocity_and_acceleration(
                 chain,
@@ -65,9 +72,9 @@ class VectorField(eqx.Module):
                 y.v,
                 tau,
                 dynamics=self.dynamics,
-                baumgarte=rate,
-                project_velocity=agree,
-                pivots=scene.pivots,
+                baumgarte=baumgarte,
+                project_velocity=project_velocity,
+                pivots=field_args.pivots,
             )
         return ODEState(
             configuration_derivative(chain, y.q, jnp.where(active_dofs(chain, structure), v, 0)),
@@ -76,85 +83,99 @@ class VectorField(eqx.Module):
         )
 
     def _batches_lanes_last(self, chain: Chain) -> bool:
-        """Whether it is for speed alone, and accelerations are had by articulated bodies, level by
-        level."""
+        """Return whether a `vmap` of this field computes accelerations with lanes last.
+
+        Lanes last are for articulated bodies whose levels are unrolled; they are never
+        differentiated.
+        """
         return (
             not self.differentiated
             and isinstance(self.dynamics, ArticulatedBodies)
             and len(chain.topology.levels) <= LEVELS_UNROLLED
         )
 
-    def torques(self, t, y: ODEState, scene: FieldArgs):
-        """Joint torques of the control and the limits, and the power of all that is not
-        conservative (None: there is none)."""
-        chain = scene.chain
+    def torques(
+        self, t, y: ODEState, field_args: FieldArgs
+    ) -> tuple[Float[Array, " dofs"], Float[Array, ""] | None]:
+        """Return the joint torques (N m, N) of control and joint limits, and their power (W).
+
+        The power is that of control, joint limits and dampers, None where `y.work` is None.
+        """
+        chain = field_args.chain
         tau = jnp.zeros_like(y.v)
         if self.control is not None:
-            # traced once for all the places that call it
-            asked = eqx.filter_jit(self.control)(t, State(y.q, y.v, scene.structure), scene.args)
-            tau = tau + joint_torques(chain, real_array("control", asked, y.v.dtype))
+            # The jit makes all call sites share one trace.
+            controlled = eqx.filter_jit(self.control)(
+                t, State(y.q, y.v, field_args.structure), field_args.args
+            )
+            tau = tau + joint_torques(chain, real_array("control", controlled, y.v.dtype))
         if chain.limit is not None:
             tau = tau + limit_forces(chain, y.q, y.v)
         if y.work is None:
             return tau, None
-        v = jnp.where(active_dofs(chain, scene.structure), y.v, 0)
+        v = jnp.where(active_dofs(chain, field_args.structure), y.v, 0)
         return tau, tau @ v if chain.damping is None else tau @ v - jnp.sum(chain.damping * v * v)
 
 
 class ProjectionInfo(eqx.Module):
-    """What the loops show as a step is put back onto them: how far each loop is open yet (rad,
-    `chain.length`s) and, where pivots are chosen, |R_mm| / |R_11| and those to go on with."""
+    """What a projection onto the loops has measured.
+
+    gap: what each loop is still open by after the last Newton step (rad, units of `chain.length`).
+    margin: |R_mm| / |R_11| of the pivoted loop Jacobian. None: no pivots were selected.
+    pivots: the pivots to reuse in the next step. None: no pivots were selected.
+    """
 
     gap: Float[Array, "links 2"]
     margin: Float[Array, ""] | None = None
     pivots: Float[Array, "steps dofs"] | None = None
 
     @classmethod
-    def initial(cls, field: VectorField, scene: FieldArgs, q) -> "Seen | None":
-        """Before the first step."""
-        if not needs_projection(field.stabilization, scene):
+    def initial(cls, field: VectorField, field_args: FieldArgs, q) -> "ProjectionInfo | None":
+        """Return the value before the first step. None: steps are not projected."""
+        if not needs_projection(field.stabilization, field_args):
             return None
-        links, dofs = len(scene.chain.link_names), scene.chain.dofs
+        links, dofs = len(field_args.chain.link_names), field_args.chain.dofs
         gap = jnp.zeros((links, 2), q.dtype)
-        # the first evaluation of the field finds no pivots held, and chooses
-        return (
-            cls(gap)
-            if field.projects_by_loop_forces
-            else cls(gap, jnp.ones((), q.dtype), jnp.zeros((min(6 * links, dofs), dofs), q.dtype))
-        )
+        if field.projects_by_loop_forces:
+            return cls(gap)
+        # Zero pivots lack every row, so the first evaluation of the field selects pivots.
+        return cls(gap, jnp.ones((), q.dtype), jnp.zeros((min(6 * links, dofs), dofs), q.dtype))
 
     @property
     def dependent(self) -> Bool[Array, " dofs"]:
-        """Coordinates that depend on the others."""
+        """Mask of the dependent coordinates, those with a pivot."""
         return jnp.any(self.pivots > 0, 0)
 
 
 def project_state(
-    field: VectorField, scene: FieldArgs, y: ODEState
+    field: VectorField, field_args: FieldArgs, y: ODEState
 ) -> tuple[ODEState, ProjectionInfo | None]:
-    """The motion put back: quaternions to unit length, loops closed, velocities in agreement; and
-    what that showed (None: loops are left alone)."""
-    chain, structure, held = scene.chain, scene.structure, field.stabilization
-    if not needs_projection(held, scene):
+    """Normalize the quaternions of a state, close its loops and make its velocities consistent.
+
+    The second result is None, and q is normalized alone, where steps are not projected.
+    """
+    chain, structure = field_args.chain, field_args.structure
+    stabilization = field.stabilization
+    if not needs_projection(stabilization, field_args):
         return eqx.tree_at(lambda y: y.q, y, normalize(chain, y.q)), None
     if field.projects_by_loop_forces:
-        q, v, *seen = project_by_loop_forces(
+        q, v, *info = project_by_loop_forces(
             chain,
             structure,
             y.q,
             y.v,
-            iterations=held.iterations,
+            iterations=stabilization.iterations,
             differentiated=field.differentiated,
         )
     else:
-        q, v, *seen = project(
+        q, v, *info = project(
             chain,
             structure,
             y.q,
             y.v,
-            iterations=held.iterations,
-            dependent_only=isinstance(held, CoordinatePartitioning),
-            pivots=scene.pivots,
+            iterations=stabilization.iterations,
+            dependent_only=isinstance(stabilization, CoordinatePartitioning),
+            pivots=field_args.pivots,
             hold=field.dynamics.hold or 0.0,
         )
-    return eqx.tree_at(lambda y: (y.q, y.v), y, (q, v)), ProjectionInfo(*seen)
+    return eqx.tree_at(lambda y: (y.q, y.v), y, (q, v)), ProjectionInfo(*info)

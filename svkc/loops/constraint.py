@@ -1,8 +1,7 @@
-"""Where the two ends of every virtual link are, how far apart, and how they move: the loop Jacobian
-J_C (paper (9)-(11)).
+"""The loop constraints: frames at both ends of every virtual link, gaps, and the loop Jacobian J_C.
 
-Rows of a loop: three angular, then three linear, the motion of the virtual link less that of its
-real link, in world axes at the real link's end of the joint.
+Each loop has six rows (paper (9)-(11)), three angular, then three linear: the motion of the virtual
+link relative to its real link, in world axes, at the real link's end of the joint.
 """
 
 import equinox as eqx
@@ -31,11 +30,14 @@ from svkc.tree.spatial import (
 
 
 class LoopFrames(eqx.Module):
-    """Both ends of each virtual link. `base`: the joint's frame in the parent, `virtual`: the
-    virtual link, `real`: its real link's end.
+    """Frames at both ends of each virtual link, in world axes.
 
-    Places are relative to `real`'s root (`parent_root`, `real_root`: that and the parent's root,
-    from which twists are given).
+    base_quat: rotation of the joint's frame, fixed in the parent.
+    virtual_quat, virtual_position: the virtual link, which the virtual joint moves.
+    real_quat, real_position: the frame on the real link that a closed loop makes coincide with it.
+    from_parent_root: the virtual link's position from the parent's root. The other positions are
+    from the real link's root (m). Twists of the tree are given about these roots.
+    axes: of each virtual joint three axes of rotation, then three of translation.
     """
 
     base_quat: Float[Array, "links 4"]
@@ -48,7 +50,7 @@ class LoopFrames(eqx.Module):
 
 
 def _virtual_joint_coordinates(chain: Chain, q: Float[Array, " q"]):
-    """Turns [L 3], slides [L 3] and quaternions [L 4] of the virtual joints."""
+    """Return angles [links 3], slides [links 3] and quaternions [links 4] of virtual joints."""
     table, end = chain.topology.links, chain.topology.nq_all
     quat = static_take(q, np.minimum(table.quat, end)) + (table.quat > end).astype(q.dtype)
     return static_take(q, table.angle), static_take(q, table.slide), quat_normalize(quat)
@@ -57,39 +59,39 @@ def _virtual_joint_coordinates(chain: Chain, q: Float[Array, " q"]):
 def _virtual_joint_rotations(
     top: Topology, angle: Float[Array, "links 3"], ball: Float[Array, "links 4"]
 ):
-    """Rotation of each virtual joint and the axes of its three turns, all in the joint's frame;
-    only what some joint of the scene has is computed.
+    """Return the rotation of each virtual joint and its three axes of rotation.
 
-    Turns in sequence about x, then y, then z, each axis carried by the turns before it; a ball's
-    axes are those of the virtual link.
+    Both are in the joint's frame; the rotation is None if no virtual joint of the chain rotates.
+    Rotations are in sequence about x, y and z, and each axis is rotated by those before it. A
+    ball's axes are those of the virtual link.
     """
     eye = jnp.eye(3, dtype=angle.dtype)
     freedoms = np.array(top.link_freedoms, bool).reshape(-1, 6)[:, :3]
     is_ball = np.all(freedoms, axis=1)
-    turn, axes = None, []
+    rotation, axes = None, []
     for k in range(3):
         axis = jnp.broadcast_to(eye[k], (len(is_ball), 3))
-        axes.append(axis if turn is None else quat_rotate(turn, axis))
+        axes.append(axis if rotation is None else quat_rotate(rotation, axis))
         if np.any(freedoms[~is_ball, k]):
-            this = quat_from_axis_angle(eye[k : k + 1], angle[:, k])
-            turn = this if turn is None else quat_multiply(turn, this)
+            rotation_k = quat_from_axis_angle(eye[k : k + 1], angle[:, k])
+            rotation = rotation_k if rotation is None else quat_multiply(rotation, rotation_k)
     axes = jnp.stack(axes, 1)
     if is_ball.any():
-        of_ball = jnp.swapaxes(quat_matrix(ball), -1, -2)
-        axes = jnp.where(is_ball[:, None, None], of_ball, axes)
-        # one that is not a ball holds the identity here
-        turn = ball if turn is None else quat_multiply(ball, turn)
-    return turn, axes
+        ball_axes = jnp.swapaxes(quat_matrix(ball), -1, -2)
+        axes = jnp.where(is_ball[:, None, None], ball_axes, axes)
+        # of joints that are not balls the quaternion is the identity
+        rotation = ball if rotation is None else quat_multiply(ball, rotation)
+    return rotation, axes
 
 
 @jax.jit
 def loop_frames(
     chain: Chain, structure: Structure, kin: Kinematics, q: Float[Array, " q"]
 ) -> LoopFrames:
-    """Frames of both ends of every virtual link, the joint's own turn and slide included.
+    """Return the frames at both ends of every virtual link.
 
-    A joint slides along its parent's axes, then turns: about x, then y, then z (universal: x, y),
-    or by a quaternion (ball).
+    A virtual joint slides along axes fixed in the parent, then rotates: about x, y and z in
+    sequence (universal: x and y), or by a quaternion (ball).
     """
     top = chain.topology
     angle, slide, ball = _virtual_joint_coordinates(chain, q)
@@ -97,14 +99,14 @@ def loop_frames(
     of_parent, of_real = kin.quat[p], kin.quat[r]
     base_quat = quat_normalize(quat_multiply(of_parent, structure.quat))
     base = quat_matrix(base_quat)
-    turn, turning = _virtual_joint_rotations(top, angle, ball)
-    axes = jnp.sum(base[:, None] * turning[:, :, None], -1)
+    rotation, rotation_axes = _virtual_joint_rotations(top, angle, ball)
+    axes = jnp.sum(base[:, None] * rotation_axes[:, :, None], -1)
     from_parent_root = kin.r[p] + quat_rotate(of_parent, structure.pos)
     if np.any(np.array(top.link_freedoms, bool).reshape(-1, 6)[:, 3:]):
         from_parent_root = from_parent_root + matvec(base, slide)
     return LoopFrames(
         base_quat=base_quat,
-        virtual_quat=base_quat if turn is None else quat_multiply(base_quat, turn),
+        virtual_quat=base_quat if rotation is None else quat_multiply(base_quat, rotation),
         virtual_position=from_parent_root + (kin.root_position[p] - kin.root_position[r]),
         real_quat=quat_normalize(quat_multiply(of_real, structure.real_quat)),
         real_position=kin.r[r] + quat_rotate(of_real, structure.real_pos),
@@ -113,83 +115,94 @@ def loop_frames(
     )
 
 
-def frame_gaps(structure: Structure, end: LoopFrames) -> Float[Array, "links 6"]:
-    """Rotation vector (rad) and distance (m) from the real link's end to the virtual link, world
-    axes; zero where not connected."""
-    turn = quat_log(quat_multiply(end.virtual_quat, quat_conjugate(end.real_quat)))
-    gaps = jnp.concatenate([turn, end.virtual_position - end.real_position], -1)
+def frame_gaps(structure: Structure, frames: LoopFrames) -> Float[Array, "links 6"]:
+    """Return the rotation vector (rad) and the distance (m) from real to virtual frame.
+
+    Both are in world axes, and zero for links that are not connected.
+    """
+    rotation = quat_log(quat_multiply(frames.virtual_quat, quat_conjugate(frames.real_quat)))
+    gaps = jnp.concatenate([rotation, frames.virtual_position - frames.real_position], -1)
     return jnp.where(structure.connected[:, None], gaps, 0)
 
 
 def _virtual_motion_subspaces(
-    chain: Chain, structure: Structure, end: LoopFrames
+    chain: Chain, structure: Structure, frames: LoopFrames
 ) -> Float[Array, "links 6 6"]:
-    """Motion of the virtual link for a unit of each of its six freedoms, at its own origin; zero
-    for those it has not."""
-    zero = jnp.zeros_like(end.axes[:, :3])
-    turns = jnp.concatenate([end.axes[:, :3], zero], -1)
-    slides = jnp.concatenate([zero, end.axes[:, 3:]], -1)
+    """Return each virtual joint's motion subspace about the virtual link's origin.
+
+    Freedoms that the joint does not have, and those of links not connected, are zero.
+    """
+    zero = jnp.zeros_like(frames.axes[:, :3])
+    turns = jnp.concatenate([frames.axes[:, :3], zero], -1)
+    slides = jnp.concatenate([zero, frames.axes[:, 3:]], -1)
     S = jnp.concatenate([turns, slides], 1)
     return jnp.where((structure.connected[:, None] & structure.freedoms)[:, :, None], S, 0)
 
 
 def assemble_loop_jacobian(
-    chain: Chain, structure: Structure, kin: Kinematics, end: LoopFrames
+    chain: Chain, structure: Structure, kin: Kinematics, frames: LoopFrames
 ) -> Float[Array, "rows dofs"]:
-    """J_C (paper (11)): six rows a virtual link, zero where not connected; columns of coordinates
-    that cannot move are zero."""
+    """Return J_C (paper (11)), six rows for each virtual link.
+
+    Rows of links that are not connected, and columns of locked coordinates, are zero.
+    """
     top = chain.topology
     above = jnp.asarray(top.ancestor_mask[:, top.dof_row])
     sign = above[structure.parent].astype(kin.r.dtype) - above[structure.real].astype(kin.r.dtype)
-    # the joint's place as seen from the root of each coordinate's tree
+    # the joint's position from the root of each coordinate's tree
     of_parent = above[structure.parent][:, :, None]
-    place = jnp.where(of_parent, end.from_parent_root[:, None, :], end.real_position[:, None, :])
-    tree = sign[:, :, None] * shift_motion(kin.S[None], place)
-    own = _virtual_motion_subspaces(chain, structure, end)
+    position = jnp.where(of_parent, frames.from_parent_root[:, None, :], frames.real_position[:, None, :])
+    tree = sign[:, :, None] * shift_motion(kin.S[None], position)
+    S = _virtual_motion_subspaces(chain, structure, frames)
     count = len(top.link_names)
-    # of each link and coordinate the row in `own`, which is followed by zeros
+    # for each link and coordinate its row in the virtual joints' motion subspaces; rows past the
+    # end read as zero
     source = np.full((count, top.dofs + 1), 6 * count)
     np.put_along_axis(source, top.links.dof, np.arange(6 * count).reshape(-1, 6), 1)
-    virtual = static_take(own.reshape(-1, 6), source[:, top.nv : top.dofs])
+    virtual = static_take(S.reshape(-1, 6), source[:, top.nv : top.dofs])
     J = jnp.concatenate([tree, virtual], 1)
-    moving = structure.connected[:, None, None] & active_dofs(chain, structure)[None, :, None]
-    J = jnp.where(moving, J, 0)
+    active_v = structure.connected[:, None, None] & active_dofs(chain, structure)[None, :, None]
+    J = jnp.where(active_v, J, 0)
     return jnp.swapaxes(J, 1, 2).reshape(-1, top.dofs)
 
 
 def loop_jacobian_dot_v(
     chain: Chain,
     structure: Structure,
-    end: LoopFrames,
+    frames: LoopFrames,
     v: Float[Array, " dofs"],
     *,
     V: Float[Array, "rows 6"],
     A: Float[Array, "rows 6"],
 ) -> Float[Array, " loop_rows"]:
-    """Jdot_C v (paper (21)): the difference of the two ends' velocity-product accelerations. V,
-    A: twists and, with vdot = 0, accelerations of the tree."""
+    """Return Jdot_C v (paper (21)), the relative velocity-product acceleration of the two frames.
+
+    V: twists of the tree. A: spatial accelerations of the tree with vdot = 0.
+    """
     top = chain.topology
     rate = jnp.where(
         structure.connected[:, None] & structure.freedoms, static_take(v, top.links.dof), 0
     )
-    parts = _virtual_motion_subspaces(chain, structure, end) * rate[:, :, None]
+    parts = _virtual_motion_subspaces(chain, structure, frames) * rate[:, :, None]
     slide = jnp.sum(parts[:, 3:], 1)
-    V_parent = shift_motion(V[structure.parent], end.from_parent_root)
+    V_parent = shift_motion(V[structure.parent], frames.from_parent_root)
     V_base = V_parent + slide
     bias = motion_cross(V_parent, slide) + motion_cross(V_base, jnp.sum(parts[:, :3], 1))
-    # turns in sequence carry one another; a ball's axes turn together and add nothing
+    # rotations in sequence move the axes after them; a ball's axes move together and add nothing
     is_ball = np.array([sum(f[:3]) == 3 for f in top.link_freedoms], bool)[:, None]
     x, y, z = parts[:, 0], parts[:, 1], parts[:, 2]
-    carried = motion_cross(x, y + z) + motion_cross(y, z)
-    bias = bias + jnp.where(is_ball, 0, carried)
-    A_virtual = shift_motion(A[structure.parent], end.from_parent_root) + bias
-    A_real = shift_motion(A[structure.real], end.real_position)
+    moved_axes = motion_cross(x, y + z) + motion_cross(y, z)
+    bias = bias + jnp.where(is_ball, 0, moved_axes)
+    A_virtual = shift_motion(A[structure.parent], frames.from_parent_root) + bias
+    A_real = shift_motion(A[structure.real], frames.real_position)
     return jnp.where(structure.connected[:, None], A_virtual - A_real, 0).reshape(-1)
 
 
 def jacobian_scales(chain: Chain) -> tuple[Float[Array, " rows"], Float[Array, " dofs"]]:
-    """Factors of the rows and columns of J_C that leave numbers without units: 1/length for linear
-    rows, length for slides."""
+    """Return the factors of J_C's rows and of its columns that make J_C dimensionless.
+
+    They are 1 / chain.length for linear rows, chain.length for columns of slides, and 1 otherwise.
+    """
     top = chain.topology
     rows = jnp.tile(jnp.where(np.arange(6) < 3, 1, 1 / chain.length), len(top.link_names))
     linear = np.zeros(top.dofs, bool)
@@ -204,8 +217,9 @@ def jacobian_scales(chain: Chain) -> tuple[Float[Array, " rows"], Float[Array, "
 class LoopKinematics(eqx.Module):
     """Kinematics of the tree and of its loops at one configuration.
 
-    kin: the tree's. frames: both ends of each virtual link. J: J_C without units, its rows and
-    columns multiplied by `scales`. row_scale: the factors of the rows.
+    kin: kinematics of the tree. frames: both ends of each virtual link.
+    J: the scaled J_C, its rows and columns multiplied by `jacobian_scales`.
+    row_scale: the factors of the rows.
     """
 
     kin: Kinematics
@@ -214,72 +228,76 @@ class LoopKinematics(eqx.Module):
     structure: Structure
     row_scale: Float[Array, " rows"]
 
-    # a property, as most programs have no use for it: XLA would remove it, but only after it was
-    # traced and lowered
+    # a property, as most programs do not use it: XLA would remove a field only after tracing
     @property
     def gap(self) -> Float[Array, " rows"]:
-        """Return `gap` of each link without units, row by row."""
+        """Return the scaled gap of each link, row by row."""
         return self.row_scale * frame_gaps(self.structure, self.frames).ravel()
 
 
 def loop_kinematics(chain: Chain, structure: Structure, q: Float[Array, " q"]) -> LoopKinematics:
     """Return the kinematics of the tree and of its loops at q."""
     kin = kinematics(chain, q)
-    end = loop_frames(chain, structure, kin, q)
+    frames = loop_frames(chain, structure, kin, q)
     row, column = jacobian_scales(chain)
-    J = row[:, None] * assemble_loop_jacobian(chain, structure, kin, end) * column[None]
-    return LoopKinematics(kin=kin, frames=end, J=J, structure=structure, row_scale=row)
+    J = row[:, None] * assemble_loop_jacobian(chain, structure, kin, frames) * column[None]
+    return LoopKinematics(kin=kin, frames=frames, J=J, structure=structure, row_scale=row)
 
 
 def constraint_bias(
     chain: Chain, structure: Structure, v, loops: LoopKinematics, V, baumgarte=None
 ) -> Float[Array, " rows"]:
-    """Return Jdot_C v without units. baumgarte: rate (1/s) at which gaps are pulled back."""
+    """Return Jdot_C v with scaled rows, plus Baumgarte's terms.
+
+    V: twists of the tree. baumgarte: rate (1/s) of the gaps' decay (None: no such terms).
+    """
     row, column = jacobian_scales(chain)
-    moving = jnp.where(active_dofs(chain, structure), v, 0)
+    active_v = jnp.where(active_dofs(chain, structure), v, 0)
     A = bias_accelerations(chain, loops.kin, V, v)
-    bias = row * loop_jacobian_dot_v(chain, structure, loops.frames, moving, V=V, A=A)
+    bias = row * loop_jacobian_dot_v(chain, structure, loops.frames, active_v, V=V, A=A)
     if baumgarte is not None:
         gaps = frame_gaps(structure, loops.frames).ravel()
-        bias = bias + 2 * baumgarte * (loops.J @ (moving / column)) + baumgarte**2 * row * gaps
+        bias = bias + 2 * baumgarte * (loops.J @ (active_v / column)) + baumgarte**2 * row * gaps
     return bias
 
 
 def gaps_and_rates(
     chain: Chain, state: State
 ) -> tuple[Float[Array, "links 6"], Float[Array, "links 6"]]:
-    """`loop_gaps` and `velocity_gaps` from one pass over the tree."""
+    """Return `loop_gaps` and `loop_gap_rates` from one pass over the tree."""
     kin = kinematics(chain, state.q)
-    end = loop_frames(chain, state.structure, kin, state.q)
-    rates = assemble_loop_jacobian(chain, state.structure, kin, end) @ state.v
-    return frame_gaps(state.structure, end), rates.reshape(-1, 6)
+    frames = loop_frames(chain, state.structure, kin, state.q)
+    rates = assemble_loop_jacobian(chain, state.structure, kin, frames) @ state.v
+    return frame_gaps(state.structure, frames), rates.reshape(-1, 6)
 
 
 def gap_norms(rows: Float[Array, " rows"]) -> Float[Array, "links 2"]:
-    """Of each loop's rows: how long its rotation vector is, and how long the distance."""
+    """Return the norms of each loop's angular and linear rows."""
     return jnp.sqrt(jnp.sum(rows.reshape(-1, 2, 3) ** 2, -1))
 
 
 def largest_norms(x: Float[Array, "links 6"]) -> Float[Array, "2"]:
-    """Return the largest angular and the largest linear part over the loops."""
+    """Return the largest angular and the largest linear norm over the loops."""
     if not len(x):
         return jnp.zeros(2, x.dtype)
     square = jnp.sum(x.reshape(-1, 2, 3) ** 2, -1)
     closed = square == 0
-    # a root that can be differentiated where the loop is closed to the last bit
+    # the derivative of the square root is not finite where a gap is exactly zero
     return jnp.max(jnp.where(closed, 0, jnp.sqrt(jnp.where(closed, 1, square))), 0)
 
 
 def largest_gaps(chain: Chain, state: State) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
-    """The largest over the loops: of the gaps (rad, m) and of their rates (rad/s, m/s)."""
+    """Return the largest gaps over the loops (rad, m) and the largest rates (rad/s, m/s)."""
     gaps, rates = gaps_and_rates(chain, state)
     return largest_norms(gaps), largest_norms(rates)
 
 
 @checked_jit(eager=True)
 def loop_gaps(chain: Chain, state: State) -> Float[Array, "links 6"]:
-    """How far each connected loop is open: rotation vector (rad), then distance (m), in the world;
-    zero where not connected."""
+    """Return each loop's gap: rotation vector (rad), then distance (m), in world axes.
+
+    The gap is that of the virtual link from its real link, and zero where not connected.
+    """
     return gaps_and_rates(chain, state)[0]
 
 
@@ -287,22 +305,30 @@ def loop_gaps(chain: Chain, state: State) -> Float[Array, "links 6"]:
 def loop_jacobian(
     chain: Chain, state: State
 ) -> tuple[Float[Array, "links 3 dofs"], Float[Array, "links 3 dofs"]]:
-    """J_C (paper (11)): linear (m/s) and angular (rad/s) velocity of each connected virtual link
+    """Return J_C (paper (11)) as its linear and its angular rows.
+
+    They are the linear (m/s) and the angular (rad/s) velocity of each connected virtual link
     relative to its real link, for a unit rate of each joint coordinate, at the joint, in world
-    axes."""
+    axes. Rows of links that are not connected are zero.
+    """
     kin = kinematics(chain, state.q)
-    end = loop_frames(chain, state.structure, kin, state.q)
-    J = assemble_loop_jacobian(chain, state.structure, kin, end).reshape(-1, 6, chain.dofs)
+    frames = loop_frames(chain, state.structure, kin, state.q)
+    J = assemble_loop_jacobian(chain, state.structure, kin, frames).reshape(-1, 6, chain.dofs)
     return J[:, 3:], J[:, :3]
 
 
 @checked_jit(eager=True)
 def loop_gap_rates(chain: Chain, state: State) -> Float[Array, "links 6"]:
-    """J_C v: relative twist (rad/s, m/s) across each connected virtual link."""
+    """Return J_C v, the twist of each connected virtual link relative to its real link.
+
+    Each row is angular (rad/s), then linear (m/s), at the joint, in world axes.
+    """
     return gaps_and_rates(chain, state)[1]
 
 
 def gap_tolerance(dtype) -> float:
-    """Largest loop gap, over `chain.length` where it is in metres, that counts as closed:
-    eps^(4/7), 1.1e-9 in float64, 1.1e-4 in float32."""
+    """Return the largest gap of a loop that counts as closed (rad, and m / `chain.length`).
+
+    It is eps^(4/7): 1.1e-9 in float64, 1.1e-4 in float32.
+    """
     return float(np.finfo(dtype).eps ** (4 / 7))

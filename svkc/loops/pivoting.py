@@ -1,7 +1,7 @@
-"""Which columns of a matrix are independent: pivots, rank, and solves with that choice held fixed.
+"""Pivoted QR of the loop Jacobian: pivots, rank, and solves with the pivots held fixed.
 
-Pivots are integers chosen on stop_gradient(J). What follows from them is exact to differentiate
-wherever the rank does not change.
+Pivots are chosen on stop_gradient(J) and have no derivative. Everything computed from them has
+exact derivatives wherever the rank does not change.
 """
 
 import equinox as eqx
@@ -18,11 +18,13 @@ from svkc.model.chain import Structure
 
 
 class PivotedQR(eqx.Module):
-    """Pivoted Gram-Schmidt of a matrix: Q [steps, rows], one-hot pivots P [steps, dofs], |R_kk|,
-    and which steps count.
+    """QR decomposition J P^T = Q^T R of a matrix's pivot columns, with inert steps.
 
-    P is frozen; Q and |R_kk| follow the matrix when it is differentiated, so that Q's rows go on
-    spanning the range of the pivot columns.
+    Q: orthonormal rows, zero for inert steps.
+    P: one-hot rows that pick the pivot columns, zero for inert steps. It has no derivative.
+    diag_R: |R_kk|, in decreasing order.
+    active: the steps that count; they are as many as the rank.
+    Q and diag_R have derivatives by which Q's rows span the pivot columns' range (`frozen_qr`).
     """
 
     Q: Float[Array, "steps rows"]
@@ -32,161 +34,179 @@ class PivotedQR(eqx.Module):
 
 
 def rank_tolerance(dtype) -> float:
-    """|R_kk| / |R_11| below which a row of the scaled J_C counts as redundant: sqrt(eps), 1.5e-8 in
-    float64, 3.5e-4 in float32."""
+    """Return the |R_kk| / |R_11| below which a row of the scaled J_C counts as redundant.
+
+    It is sqrt(eps): 1.5e-8 in float64, 3.5e-4 in float32.
+    """
     return float(np.sqrt(np.finfo(dtype).eps))
 
 
 def release_threshold(dtype) -> float:
-    """The part of the phase's own margin below which a row of the scaled J_C is let go for as long
-    as the mechanism passes a singular configuration: eps^(1/4), 1.2e-4 in float64, 1.9e-2 in
-    float32. Nearer to it round-off would steer the motion; what moves goes on as it moves."""
+    """Return the fraction of the phase's margin below which a row of the scaled J_C is dropped.
+
+    It is eps^(1/4): 1.2e-4 in float64, 1.9e-2 in float32. A mechanism that passes a singular
+    configuration has such weak rows, along which round-off would decide the motion. Weak rows are
+    dropped there; the motion continues by inertia.
+    """
     return float(np.finfo(dtype).eps ** 0.25)
 
 
-def _with_active(selection: PivotedQR, keep: Bool[Array, " steps"]) -> PivotedQR:
+def _with_active(qr: PivotedQR, keep: Bool[Array, " steps"]) -> PivotedQR:
+    """Return the decomposition in which only the steps `keep` are active."""
     return PivotedQR(
-        Q=jnp.where(keep[:, None], selection.Q, 0),
-        P=jnp.where(keep[:, None], selection.P, 0),
-        diag_R=selection.diag_R,
+        Q=jnp.where(keep[:, None], qr.Q, 0),
+        P=jnp.where(keep[:, None], qr.P, 0),
+        diag_R=qr.diag_R,
         active=keep,
     )
 
 
-def drop_below(selection: PivotedQR, floor: Float[Array, ""]) -> PivotedQR:
-    """Steps whose |R_kk| / |R_11| is not above the floor left out: their pivots are independent."""
+def drop_below(qr: PivotedQR, floor: Float[Array, ""]) -> PivotedQR:
+    """Return the decomposition without the steps whose |R_kk| / |R_11| is not above the floor.
+
+    The pivots of these steps become independent coordinates.
+    """
     return _with_active(
-        selection, selection.active & (selection.diag_R > floor * jnp.max(selection.diag_R))
+        qr, qr.active & (qr.diag_R > floor * jnp.max(qr.diag_R))
     )
 
 
 def pivoted_qr(
     J: Float[Array, "rows dofs"],
     rank: Int[Array, ""] | None = None,
-    wanted: Bool[Array, " dofs"] | None = None,
+    independent: Bool[Array, " dofs"] | None = None,
 ) -> PivotedQR:
-    """min(rows, dofs) steps of column-pivoted Gram-Schmidt, orthogonalised twice; steps from `rank`
-    on are inert (None: all are taken).
+    """Return the column-pivoted QR of J by Gram-Schmidt with re-orthogonalisation.
 
-    `wanted`: columns to leave independent, taken as pivots only where nothing else is left.
+    It takes min(rows, dofs) steps.
+
+    rank: number of active steps (None: all whose column is not zero).
+    independent: columns that become pivots only if no other column is left (None: none).
     """
-    frozen = jax.lax.stop_gradient(J)
     rows, dofs = J.shape
     steps = min(rows, dofs)
     weight = (
         None
-        if wanted is None
-        else jnp.where(wanted, rank_tolerance(J.dtype) ** 2, 1).astype(J.dtype)
+        if independent is None
+        else jnp.where(independent, rank_tolerance(J.dtype) ** 2, 1).astype(J.dtype)
     )
 
     def step(k, carry):
-        A, Q, P, size = carry
+        A, Q, P, diag_R = carry
         norms = jnp.sum(A * A, 0) * (1 if weight is None else weight)
-        # the first of those that are equal but for round-off, as mirrored limbs are: the same on
-        # every machine
+        # Of columns equal but for round-off, such as those of mirrored limbs, the first is taken,
+        # so that every machine takes the same.
         pivot = jnp.arange(dofs) == jnp.argmax(
             norms >= (1 - rank_tolerance(J.dtype)) * jnp.max(norms)
         )
         column = jnp.sum(jnp.where(pivot[None], A, 0), 1)
         column = column - (Q @ column) @ Q
         r = jnp.sqrt(jnp.sum(column * column))
-        taken = r > 0 if rank is None else (r > 0) & (k < rank)
-        q = jnp.where(taken, column / jnp.where(taken, r, 1), 0)
+        accept = r > 0 if rank is None else (r > 0) & (k < rank)
+        q = jnp.where(accept, column / jnp.where(accept, r, 1), 0)
         A = jnp.where(pivot[None], 0, A - q[:, None] * (q @ A)[None])
-        here = jnp.arange(steps) == k
-        Q = jnp.where(here[:, None], q[None], Q)
-        P = jnp.where(here[:, None] & pivot[None] & taken, 1, P)
-        return A, Q, P, jnp.where(here, r, size)
+        at_k = jnp.arange(steps) == k
+        Q = jnp.where(at_k[:, None], q[None], Q)
+        P = jnp.where(at_k[:, None] & pivot[None] & accept, 1, P)
+        return A, Q, P, jnp.where(at_k, r, diag_R)
 
     start = (
-        frozen,
+        jax.lax.stop_gradient(J),
         jnp.zeros((steps, rows), J.dtype),
         jnp.zeros((steps, dofs), J.dtype),
         jnp.zeros(steps, J.dtype),
     )
-    _, Q, P, size = jax.lax.fori_loop(0, steps, step, start)
-    Q, size = frozen_qr(J, Q, P, size)
-    return PivotedQR(Q=Q, P=P, diag_R=size, active=jnp.any(P > 0, 1))
+    _, Q, P, diag_R = jax.lax.fori_loop(0, steps, step, start)
+    Q, diag_R = frozen_qr(J, Q, P, diag_R)
+    return PivotedQR(Q=Q, P=P, diag_R=diag_R, active=jnp.any(P > 0, 1))
 
 
 def refactor(J: Float[Array, "rows dofs"], P: Float[Array, "steps dofs"]) -> PivotedQR:
-    """The same with pivots that were chosen before: only their columns are orthogonalised, nothing
-    is searched for."""
-    used = jnp.any(P > 0, 1)
+    """Return the QR of J for given pivots P, without a search for pivots."""
+    active = jnp.any(P > 0, 1)
     columns = P @ jax.lax.stop_gradient(J).T
 
     def step(k, carry):
-        Q, size = carry
+        Q, diag_R = carry
         column = columns[k]
         for _ in range(2):
             column = column - (Q @ column) @ Q
         r = jnp.sqrt(jnp.sum(column * column))
-        here = (jnp.arange(used.shape[0]) == k) & (r > 0)
-        return jnp.where(here[:, None], (column / jnp.where(r > 0, r, 1))[None], Q), jnp.where(
-            here, r, size
+        at_k = (jnp.arange(active.shape[0]) == k) & (r > 0)
+        return jnp.where(at_k[:, None], (column / jnp.where(r > 0, r, 1))[None], Q), jnp.where(
+            at_k, r, diag_R
         )
 
-    none = jnp.zeros((used.shape[0], J.shape[0]), J.dtype), jnp.zeros(used.shape[0], J.dtype)
-    Q, size = jax.lax.fori_loop(0, used.shape[0], step, none)
-    Q, size = frozen_qr(J, Q, P, size)
-    return PivotedQR(Q=Q, P=P, diag_R=size, active=used & (size > 0))
+    start = jnp.zeros((active.shape[0], J.shape[0]), J.dtype), jnp.zeros(active.shape[0], J.dtype)
+    Q, diag_R = jax.lax.fori_loop(0, active.shape[0], step, start)
+    Q, diag_R = frozen_qr(J, Q, P, diag_R)
+    return PivotedQR(Q=Q, P=P, diag_R=diag_R, active=active & (diag_R > 0))
 
 
 def _frozen_qr_jvp(primals, tangents):
-    """Derivatives of Q = R^-T (J P^T)^T with R frozen, and of the diagonal of the R that J has,
-    which is that of Cholesky's factor of Q Q^T times R's."""
+    """Return the derivatives of Q and diag_R with respect to J, for fixed pivots.
+
+    From J P^T = Q^T R, with R held fixed: Q = R^-T P J^T and dQ = R^-T P dJ^T. The rows of such a Q
+    span the pivot columns' range but do not stay orthonormal, and R is no longer the factor of J.
+    That factor follows from the Gram matrix of the pivot columns, R^T (Q Q^T) R = R^T L L^T R with
+    the Cholesky factor L of Q Q^T: it is L^T R, with diagonal L_kk R_kk. As dL_kk / L_kk is half of
+    (L^-1 d(Q Q^T) L^-T)_kk, d log |R_kk| = (L^-1 dQ . L^-1 Q)_k, a dot product of rows.
+    """
     J, _, P, _ = primals
-    Q, size = frozen_qr(*primals)
+    Q, diag_R = frozen_qr(*primals)
     unused = jnp.diag(jnp.where(jnp.any(P > 0, 1), 0, 1).astype(J.dtype))
     dQ = solve_triangular(
         jax.lax.stop_gradient(Q @ J @ P.T) + unused, (tangents[0] @ P.T).T, trans=1
     )
     L = jnp.linalg.cholesky(Q @ Q.T + unused)
     along = jnp.sum(solve_triangular(L, dQ, lower=True) * solve_triangular(L, Q, lower=True), 1)
-    return (Q, size), (dQ, size * along)
+    return (Q, diag_R), (dQ, diag_R * along)
 
 
-# Q and size of J with the pivots P, as they were found
-frozen_qr = custom_primitive("following", lambda J, Q, P, size: (Q, size), _frozen_qr_jvp)
+# Returns Q and diag_R, already computed from J with the pivots P, with the derivatives above.
+frozen_qr = custom_primitive("frozen_qr", lambda J, Q, P, diag_R: (Q, diag_R), _frozen_qr_jvp)
 
 
-def count_rank(size: Float[Array, " steps"]) -> Int[Array, ""]:
-    """Steps whose |R_kk| is above the tolerance."""
+def count_rank(diag_R: Float[Array, " steps"]) -> Int[Array, ""]:
+    """Return the rank: how many |R_kk| are above `rank_tolerance` times |R_11|."""
     return jnp.sum(
-        size > rank_tolerance(size.dtype) * jnp.maximum(size[0], jnp.finfo(size.dtype).tiny)
+        diag_R > rank_tolerance(diag_R.dtype) * jnp.maximum(diag_R[0], jnp.finfo(diag_R.dtype).tiny)
     ).astype(jnp.int32)
 
 
-def pivot_ratio(selection: PivotedQR) -> Float[Array, ""]:
-    """|R_mm| / |R_11|, 1 where no row counts."""
-    size, used = selection.diag_R, selection.active
-    return jnp.min(jnp.where(used, size, jnp.inf), initial=1, where=used) / jnp.where(
-        jnp.any(used), jnp.max(size), 1
+def pivot_ratio(qr: PivotedQR) -> Float[Array, ""]:
+    """Return |R_mm| / |R_11| of the m active steps, and 1 if no step is active."""
+    diag_R, active = qr.diag_R, qr.active
+    return jnp.min(jnp.where(active, diag_R, jnp.inf), initial=1, where=active) / jnp.where(
+        jnp.any(active), jnp.max(diag_R), 1
     )
 
 
 def pivoted_qr_with_rank(J: Float[Array, "rows dofs"]) -> tuple[PivotedQR, Int[Array, ""]]:
-    """Return the selection of J with its own rank, and the rank, by one search for pivots."""
+    """Return the qr of J with its own rank, and the rank, by one search for pivots."""
     full = pivoted_qr(jax.lax.stop_gradient(J))
     rank = count_rank(full.diag_R)
-    # later steps do not change earlier ones, and are round-off, which must not be differentiated
+    # Steps past the rank do not change earlier ones. They are round-off, whose derivative is not
+    # finite.
     first = _with_active(
         full, full.active & (jnp.arange(full.active.shape[0], dtype=jnp.int32) < rank)
     )
-    Q, size = frozen_qr(J, first.Q, first.P, first.diag_R)
-    return PivotedQR(Q=Q, P=first.P, diag_R=size, active=first.active), rank
+    Q, diag_R = frozen_qr(J, first.Q, first.P, first.diag_R)
+    return PivotedQR(Q=Q, P=first.P, diag_R=diag_R, active=first.active), rank
 
 
 def lacks_pivots(P: Float[Array, "steps dofs"], rank: Int[Array, ""]) -> Bool[Array, ""]:
-    """Return whether fewer pivots are held than the rank, as before the first choice."""
+    """Return whether P has fewer pivots than the rank, as before the first choice of pivots."""
     return jnp.sum(jnp.any(P > 0, 1), dtype=jnp.int32) < rank
 
 
 def solve_pivot_block(
     B: Float[Array, "steps steps"], x: Float[Array, "steps *n"], trans: bool = False
 ) -> Float[Array, "steps *n"]:
-    """B^-1 x, or B^-T x, for a B that the frozen choice leaves upper triangular in value but not in
-    derivative."""
+    """Return B^-1 x, or B^-T x, for the block B = J_S of `pivot_blocks`.
+
+    B is upper triangular in value, but its derivative is not, as the pivots are fixed.
+    """
     triangle = jax.lax.stop_gradient(B)
     return jax.lax.custom_linear_solve(
         lambda y: (B.T if trans else B) @ y,
@@ -197,8 +217,10 @@ def solve_pivot_block(
 
 
 def solve_positive(A: Float[Array, "n n"], x: Float[Array, "n *m"]) -> Float[Array, "n *m"]:
-    """A^-1 x by Cholesky for a symmetric positive A; the derivative is one more solve with the same
-    factor."""
+    """Return A^-1 x for a symmetric positive definite A, by Cholesky.
+
+    A derivative costs one more solve with the same factor.
+    """
     inverse = cholesky_solver(jax.lax.stop_gradient(A))
     return jax.lax.custom_linear_solve(
         lambda y: A @ y, x, solve=lambda _, y: inverse(y), symmetric=True
@@ -206,38 +228,43 @@ def solve_positive(A: Float[Array, "n n"], x: Float[Array, "n *m"]) -> Float[Arr
 
 
 def pivot_blocks(
-    selection: PivotedQR, J: Float[Array, "rows dofs"]
+    qr: PivotedQR, J: Float[Array, "rows dofs"]
 ) -> tuple[Float[Array, "steps dofs"], Float[Array, "steps steps"]]:
-    """J_Cm = Q J_C, m independent rows (12), and J_S, its pivot columns in order (14), with ones on
-    the unused diagonal."""
-    Jm = selection.Q @ J
-    return Jm, Jm @ selection.P.T + jnp.diag(jnp.where(selection.active, 0, 1).astype(J.dtype))
+    """Return J_Cm = Q J_C and J_S, for the J_C from which the decomposition was computed.
+
+    J_Cm has the m independent rows (paper (12)), J_S its pivot columns in order (14). J_S has ones
+    on the diagonal of inert steps.
+    """
+    Jm = qr.Q @ J
+    return Jm, Jm @ qr.P.T + jnp.diag(jnp.where(qr.active, 0, 1).astype(J.dtype))
 
 
-# part of the phase's own margin below which a configuration is near a singular one; elsewhere the
-# motion depends on no choice of pivots
+# Fraction of the phase's margin below which a configuration counts as near a singular one. Elsewhere
+# the motion does not depend on the choice of pivots.
 NEAR_SINGULAR = 0.1
 
 
 def select_pivots(structure: Structure, J: Float[Array, "rows dofs"], pivots=None) -> PivotedQR:
-    """The pivots of J_C, with the rank of the phase and the coordinates that are asked to be
-    independent; without rows that are too weak just now.
+    """Return the pivoted QR of J_C with the phase's rank, without the rows to be dropped.
 
-    pivots [steps, dofs]: one-hot, chosen before (None: to be chosen now); near a singular
-    configuration, or where they are too few, new ones are.
+    Coordinates in `structure.independent` become pivots only if no other is left. Rows below
+    `release_threshold` are dropped.
+
+    pivots [steps, dofs]: one-hot pivots chosen earlier (None: choose now). Near a singular
+    configuration, and if they are fewer than the rank, new ones are chosen.
     """
-    new = lambda: pivoted_qr(J, structure.rank, structure.independent)
+    choose = lambda: pivoted_qr(J, structure.rank, structure.independent)
     if pivots is None:
-        selection = new()
+        qr = choose()
     else:
-        held = refactor(J, pivots)
-        near = (pivot_ratio(held) < NEAR_SINGULAR * structure.margin) | lacks_pivots(
+        kept = refactor(J, pivots)
+        near = (pivot_ratio(kept) < NEAR_SINGULAR * structure.margin) | lacks_pivots(
             pivots, structure.rank
         )
-        # (one lane near is enough to choose for all)
-        selection = jax.lax.cond(
+        # under `vmap`, one lane near a singular configuration makes all lanes compute new pivots
+        qr = jax.lax.cond(
             unvmap_any(near),
-            lambda: jax.tree.map(lambda a, b: jnp.where(near, a, b), new(), held),
-            lambda: held,
+            lambda: jax.tree.map(lambda a, b: jnp.where(near, a, b), choose(), kept),
+            lambda: kept,
         )
-    return drop_below(selection, release_threshold(J.dtype) * structure.margin)
+    return drop_below(qr, release_threshold(J.dtype) * structure.margin)

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from svkc._jax.control_flow import unvmap_any
-from svkc.integration.integrators import ODEState, is_finite
+from svkc.integration.ode import ODEState, is_finite
 from svkc.model.chain import Chain, State, Structure
 from svkc.simulation.phase import PhaseOutcome, RunState
 from svkc.simulation.records import RESULTS, Events

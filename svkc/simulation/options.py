@@ -12,9 +12,11 @@ import optimistix
 from jaxtyping import Array, Float
 
 from svkc._jax.pytrees import is_concrete
-from svkc.integration.integrators import FixedSteps, SimplifiedNewton, rms_norm
+from svkc.integration.integrators import SimplifiedNewton
+from svkc.integration.ode import rms_norm
 from svkc.integration.replay import Replay
 from svkc.integration.stabilization import AbstractStabilization, Projection
+from svkc.integration.step_size import FixedSteps
 from svkc.integration.vector_field import VectorField
 from svkc.loops.constrained_dynamics import AbstractDynamics, Dynamics, default_dynamics
 from svkc.loops.constraint import gap_tolerance

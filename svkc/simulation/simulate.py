@@ -20,7 +20,7 @@ from svkc._jax.functions import call_with_comparable
 from svkc._jax.primitive import ClosureConverted
 from svkc._jax.pytrees import stop_gradient_tree
 from svkc.integration.event_location import GuardValues, event_tolerance
-from svkc.integration.integrators import FieldArgs, ODEState
+from svkc.integration.ode import FieldArgs, ODEState
 from svkc.model.chain import Chain, State
 from svkc.simulation.apply_events import apply_events, reevaluated_guards
 from svkc.simulation.certificate import certificate, evaluations_per_step

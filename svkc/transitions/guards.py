@@ -1,5 +1,8 @@
-"""Guards: a function of the user, and those that measure the mechanism itself: bodies that touch, a
-support that would have to pull, a joint that carries too much."""
+"""Guards: functions of the motion whose zeros are events.
+
+A guard is a function of the user, or measures the mechanism: bodies that touch, a support that would
+have to pull, an overloaded joint.
+"""
 
 import abc
 from collections.abc import Callable
@@ -22,31 +25,34 @@ from svkc.tree.spatial import quat_conjugate, quat_rotate
 
 
 class AbstractGuard(eqx.Module):
-    """A number that changes with the motion; its zero is an event."""
+    """A real function of the motion; an event happens when the function crosses zero."""
 
     # Whether `value` reads tau. Such a guard measures loads and is not re-evaluated after a change
-    # of structure: a link that is overloaded from the start of a phase breaks at once.
+    # of structure, so that a link that is overloaded from the start of a phase breaks at once.
     needs_torques: eqx.AbstractClassVar[bool]
-    # the value with which a run begins; a guard that needs no torques is evaluated there instead
+    # the guard's value before the first phase; a guard that needs no torques is evaluated instead
     initial_value: eqx.AbstractClassVar[float]
 
     @abc.abstractmethod
     def value(self, chain: Chain, t, state: State, args, tau: Float[Array, " dofs"]):
         """Return the guard's value.
 
-        tau: joint torques of the moment (N m, N); zeros where no guard of the run needs them.
+        tau: joint torques at this time (N m, N); zeros if no guard of the run needs torques.
         """
 
     def closure_convert(self, t, state: State, args) -> "AbstractGuard":
-        """Return the guard with every array that it reads as a leaf, so that it can be
-        differentiated by them. t, state, args: examples."""
+        """Return the guard with every array that it closes over as a leaf, so that derivatives with
+        respect to these arrays exist.
+
+        t, state, args: example arguments for tracing.
+        """
         return self
 
 
 class UserGuard(AbstractGuard):
-    """A function (t, state, args) -> real."""
+    """A guard that is a function (t, state, args) -> real number of the user."""
 
-    # the leaf is the function itself, by which two runs are compared
+    # a leaf, so that `simulate` can compare functions by their code and values
     function: Callable
     needs_torques: ClassVar[bool] = False
     initial_value: ClassVar[float] = 1.0
@@ -59,20 +65,25 @@ class UserGuard(AbstractGuard):
 
 
 class LinkGuard(AbstractGuard):
-    """A guard that measures a virtual link. `simulate` evaluates it with its own chain; called as a
-    function it uses the chain it was made with."""
+    """A guard that measures a virtual link.
+
+    `simulate` passes its own chain to `value`. A direct call uses the guard's own `chain`.
+    """
 
     chain: Chain
     link: int = eqx.field(static=True)
 
     def __call__(self, t, state: State, args=None, tau=None) -> Float[Array, ""]:
-        """Return the value; tau None: no torques."""
+        """Return the guard's value with the guard's own chain.
+
+        tau: joint torques (N m, N) over every coordinate, or the tree's; None: zeros.
+        """
         tau = jnp.zeros_like(state.v) if tau is None else joint_torques(self.chain, tau)
         return self.value(self.chain, t, state, args, tau)
 
 
 class Touch(LinkGuard):
-    """See `touch`."""
+    """The guard that `touch` returns."""
 
     needs_torques: ClassVar[bool] = False
     initial_value: ClassVar[float] = 1.0
@@ -81,26 +92,25 @@ class Touch(LinkGuard):
 
     def value(self, chain, t, state, args, tau):
         s, kin, i = state.structure, kinematics(chain, state.q), self.link
-        end = loop_frames(chain, s, kin, state.q)
+        frames = loop_frames(chain, s, kin, state.q)
         p, r = s.parent[i], s.real[i]
         origin = (
             kin.r[p]
             + quat_rotate(kin.quat[p], s.pos[i])
             + (kin.root_position[p] - kin.root_position[r])
         )
-        away = quat_rotate(quat_conjugate(end.base_quat[i]), end.real_position[i] - origin)[
-            np.array(self.axes)
-        ]
+        offset = quat_rotate(quat_conjugate(frames.base_quat[i]), frames.real_position[i] - origin)
+        offset = offset[np.array(self.axes)]
         if len(self.axes) == 1:
-            return away[0] - self.distance
-        square = jnp.sum(away * away)
-        return (
-            jnp.where(square == 0, 0, jnp.sqrt(jnp.where(square == 0, 1, square))) - self.distance
-        )
+            return offset[0] - self.distance
+        squared = jnp.sum(offset * offset)
+        # the derivative of sqrt at zero is not finite
+        norm = jnp.where(squared == 0, 0, jnp.sqrt(jnp.where(squared == 0, 1, squared)))
+        return norm - self.distance
 
 
 class Leaves(LinkGuard):
-    """See `leaves`."""
+    """The guard that `leaves` returns."""
 
     needs_torques: ClassVar[bool] = True
     initial_value: ClassVar[float] = 1.0
@@ -110,14 +120,14 @@ class Leaves(LinkGuard):
         s, i = state.structure, self.link
         kin = kinematics(chain, state.q)
         normal = quat_rotate(loop_frames(chain, s, kin, state.q).base_quat[i], self.axis)
-        push = jnp.sum(loop_forces(chain, state, tau).force[i] * normal)
-        # a link that is not connected counts as pressed, so that one that would have to pull from
-        # the first is seen to leave
-        return jnp.where(s.connected[i], push, self.initial_value)
+        normal_force = jnp.sum(loop_forces(chain, state, tau).force[i] * normal)
+        # positive while the link is cut, so that a link that would have to pull as soon as it
+        # connects crosses zero
+        return jnp.where(s.connected[i], normal_force, self.initial_value)
 
 
 class Overload(LinkGuard):
-    """See `overload`."""
+    """The guard that `overload` returns."""
 
     needs_torques: ClassVar[bool] = True
     initial_value: ClassVar[float] = -1.0
@@ -125,19 +135,26 @@ class Overload(LinkGuard):
     torque: Float[Array, ""]
 
     def value(self, chain, t, state, args, tau):
-        carried = loop_forces(chain, state, tau)
-        size = lambda x: jnp.sqrt(jnp.maximum(jnp.sum(x[self.link] ** 2), jnp.finfo(x.dtype).tiny))
-        return jnp.maximum(size(carried.force) / self.force, size(carried.torque) / self.torque) - 1
+        load = loop_forces(chain, state, tau)
+        norm = lambda x: jnp.sqrt(jnp.maximum(jnp.sum(x[self.link] ** 2), jnp.finfo(x.dtype).tiny))
+        return jnp.maximum(norm(load.force) / self.force, norm(load.torque) / self.torque) - 1
 
 
 def touch(chain: Chain, link: str, distance=0.01, axes: str | None = None) -> Touch:
-    """A guard: how far the real end of a virtual link is from its place in the parent, less
-    `distance` (m). Falls through zero as they come together.
+    """Return a guard that falls through zero when the two ends of a virtual link come close.
 
-    axes: those of the joint's frame in the parent that count, such as "xy" for a bar along z; by
-    default the ones the joint does not slide along. With one axis alone, "z", the height over that
-    plane, with its sign. Use with direction=False, and with a distance that is not passed within
-    one step.
+    The guard's value (m) is the distance between the link's point on the real link and its point on
+    the parent, less `distance`. Use the guard with direction=False, and choose a distance that the
+    points do not enter and leave within one step.
+
+    link: name of a virtual link.
+    distance: distance between the points at the event (m).
+    axes: axes of the joint's frame in the parent along which the distance is measured, such as "xy"
+        for a bar along z; None: the axes along which the joint cannot slide. Along a single axis
+        the distance has a sign: "z" measures the height above the plane z = 0.
+
+    Raises ValueError for an unknown link, a distance that is not one finite number, or axes that
+    are not distinct letters of "xyz".
     """
     check_chain(chain)
     slot = link_index(chain, link)
@@ -156,36 +173,53 @@ def touch(chain: Chain, link: str, distance=0.01, axes: str | None = None) -> To
         or set(axes) - set("xyz")
         or len(set(axes)) < len(axes)
     ):
-        raise ValueError(f"touch: axes: expected some of 'xyz', got {axes!r}")
+        raise ValueError(f"touch: axes: expected distinct letters of 'xyz', got {axes!r}")
     distance = jnp.asarray(
         scalar("touch: distance", finite_array("touch: distance", distance)), chain.q_load.dtype
     )
-    kept = tuple("xyz".index(a) for a in axes)
-    return Touch(chain=chain, link=slot, distance=distance, axes=kept)
+    indices = tuple("xyz".index(a) for a in axes)
+    return Touch(chain=chain, link=slot, distance=distance, axes=indices)
 
 
 def leaves(chain: Chain, link: str, axis=(0.0, 0.0, 1.0)) -> Leaves:
-    """A guard: the force (N) with which a virtual link's parent pushes its real link along `axis`
-    (in the joint's frame in the parent). It falls through zero where the parent would have to pull:
-    with direction=False and cut=link the link holds in one direction only."""
+    """Return a guard that falls through zero when a virtual link would have to pull.
+
+    The guard's value (N) is the force of the link's parent on its real link along `axis`. With
+    direction=False and cut=link the link is a support that can push but not pull.
+
+    link: name of a virtual link.
+    axis: direction in which the support pushes, in the joint's frame in the parent; its length does
+        not matter.
+
+    Raises ValueError for an unknown link, or an axis that is not three finite numbers, not all
+    zero.
+    """
     check_chain(chain)
     axis = np.asarray(finite_array("leaves: axis", axis), float)
-    size = float(np.linalg.norm(axis))
-    if axis.shape != (3,) or not 0 < size < np.inf:
+    norm = float(np.linalg.norm(axis))
+    if axis.shape != (3,) or not 0 < norm < np.inf:
         raise ValueError(f"leaves: axis: expected three numbers that are not all zero, got {axis}")
-    return Leaves(chain, link_index(chain, link), jnp.asarray(axis / size, chain.q_load.dtype))
+    return Leaves(chain, link_index(chain, link), jnp.asarray(axis / norm, chain.q_load.dtype))
 
 
 def overload(chain: Chain, link: str, force=None, torque=None) -> Overload:
-    """A guard: what a virtual link carries, over the most it can (force N, torque N m), less one.
-    It rises through zero where the joint breaks; use with direction=True and cut=link. Where loops
-    are redundant the load is the least one (`loop_forces`)."""
+    """Return a guard that rises through zero when a virtual link is overloaded.
+
+    The guard's value is the larger one of |force| / `force` and |torque| / `torque`, less one. With
+    direction=True and cut=link the joint breaks under the load. In redundant loops the load is the
+    least-norm one (see `loop_forces`).
+
+    link: name of a virtual link.
+    force: largest force (N); None: unlimited.
+    torque: largest torque (N m); None: unlimited.
+
+    Raises ValueError for an unknown link, a limit that is not a positive number, or no limit.
+    """
     if force is None and torque is None:
         raise ValueError("overload: give the largest force (N), the largest torque (N m), or both")
     check_chain(chain)
-    given = (("overload: force", force), ("overload: torque", torque))
     limits = [
         jnp.asarray(np.inf if x is None else positive_scalar(name, x), chain.q_load.dtype)
-        for name, x in given
+        for name, x in (("overload: force", force), ("overload: torque", torque))
     ]
     return Overload(chain, link_index(chain, link), *limits)

@@ -1,5 +1,5 @@
-"""A consistent state from what the user knows of it: names to numbers, loops closed, velocities
-made to agree."""
+"""The initial state of a chain: the user's values by name or as arrays, the loops closed by Newton's
+method, the velocity projected onto the closed loops (`Chain.state`)."""
 
 import dataclasses
 import functools
@@ -43,8 +43,10 @@ _PLACE_SCHEDULE, _ASSEMBLE_SCHEDULE = (
 
 
 def _set_values(array, at, values):
-    """Return the array with values at an index; on the host where nothing is traced, as each
-    operation that jax is given eagerly is a program of its own."""
+    """Return the array with values set at an index.
+
+    Concrete arrays are set with numpy: JAX compiles a program for every eager operation.
+    """
     if not is_concrete(array, values):
         return jnp.asarray(array).at[at].set(values)
     out = np.array(array)
@@ -53,8 +55,12 @@ def _set_values(array, at, values):
 
 
 def _full_vector(chain: Chain, quantity: str, value, default):
-    """Return the full vector of a user's array or dict for `what`, q or v, and which coordinates
-    the dict named."""
+    """Return the full vector of a user's array or dict, and the mask of scalar coordinates and
+    velocities that the dict names.
+
+    quantity: "q" or "v".
+    default: values of the coordinates that the user does not give.
+    """
     top = chain.topology
     tree_size, widths, start, model_entries = (
         (top.nq, Q_SIZE, top.q_start, top.model_q)
@@ -80,21 +86,23 @@ def _full_vector(chain: Chain, quantity: str, value, default):
         return out, named
     value = finite_array(quantity, value, default.dtype)
     if top.cut_joints and value.shape == (len(model_entries),):
-        # as for the plain tree
+        # the size in the model itself, in which no joint is cut
         return _set_values(default, np.array(model_entries, int), value), named
     if value.shape == (tree_size,):
         return _set_values(default, slice(tree_size), value), named
     if value.shape != default.shape:
         raise ValueError(
-            f"{quantity}: got shape {value.shape}, expected ({tree_size},) for the tree or {default.shape}"
-            " for every coordinate"
+            f"{quantity}: got shape {value.shape}, expected ({tree_size},) for the tree or"
+            f" {default.shape} for every coordinate"
         )
     return value, named
 
 
 def _check_quaternions(chain: Chain, q):
-    """Unit quaternions where that can be seen: to a thousandth, beyond which a normalised one would
-    be a guess."""
+    """Raise ValueError if a quaternion of a concrete q deviates from unit length by more than 1e-3.
+
+    Smaller deviations are round-off, which normalising removes.
+    """
     first, _ = chain.topology.quaternion_starts
     if isinstance(q, jax.core.Tracer) or not len(first):
         return
@@ -107,8 +115,11 @@ def _check_quaternions(chain: Chain, q):
 
 
 def _place_cuttable_bodies(chain: Chain, structure: Structure, q, v, links_to_place):
-    """Bodies that may be cut, put where the joints that hold them say, in position and velocity,
-    all else as it is."""
+    """Return q and v with the bodies of cuttable joints placed by the coordinates of these joints.
+
+    Coordinates and velocities of all other bodies stay unchanged.
+    links_to_place: mask of the virtual links that replace the cuttable joints.
+    """
     top = chain.topology
     movable = np.zeros(top.dofs, bool)
     for row in top.link_child:
@@ -133,13 +144,14 @@ def _place_cuttable_bodies(chain: Chain, structure: Structure, q, v, links_to_pl
 def _close_and_project(
     chain: Chain, structure: Structure, q, v, held: HeldCoordinates, q_is_complete: bool
 ) -> tuple[State, Float[Array, " links"]]:
-    """Return the state with its loops closed, and how far each loop is still open (rad, or
+    """Return the state with its loops closed, and the residual gap of each loop (rad, or in
     `chain.length`s).
 
-    Named coordinates are held at first; what that leaves open is closed with all of them free. The
-    same goes for velocities.
-    whole: q says where every body is; else those that may be cut are put where their joint's
-    coordinates say.
+    The first Newton steps hold the coordinates that the user named; further steps change all
+    coordinates, for loops that the first steps could not close. Velocities are projected likewise.
+
+    q_is_complete: whether q gives the poses of all bodies. Otherwise the bodies of cuttable joints
+        are placed by the coordinates of these joints first.
     """
     links_to_place = (np.array(chain.topology.link_child, int) >= 0) & (not q_is_complete)
     if links_to_place.any():
@@ -157,7 +169,7 @@ def _close_and_project(
 
 
 def assemble(chain: Chain, q, v, connected) -> State:
-    """See `Chain.state`."""
+    """Return a consistent state; see `Chain.state`."""
     top = chain.topology
     structure = eqx.tree_at(
         lambda s: s.connected, chain.structure, jnp.asarray(connection_mask(chain, connected))
@@ -170,8 +182,8 @@ def assemble(chain: Chain, q, v, connected) -> State:
     ]
     if float64_inputs and chain.q_load.dtype == np.float32:
         warnings.warn(
-            f"state: {' and '.join(float64_inputs)} in float64, kept in float32: jax_enable_x64 was off when"
-            " the chain was loaded",
+            f"state: {' and '.join(float64_inputs)} in float64, kept in float32: jax_enable_x64 was"
+            " off when the chain was loaded",
             stacklevel=3,
         )
     q, held_q = _full_vector(chain, "q", q, chain.q_load)
@@ -180,7 +192,7 @@ def assemble(chain: Chain, q, v, connected) -> State:
     _check_quaternions(chain, q)
     if not len(top.link_names):
         return State(normalize(chain, q), v, structure)
-    # (where no joint can be cut it is all the same, and one program)
+    # True for every chain without cuttable joints, so that one program serves all inputs
     q_is_complete = max(top.link_child, default=-1) < 0 or (
         user_q is not None
         and not isinstance(user_q, dict)
@@ -191,7 +203,8 @@ def assemble(chain: Chain, q, v, connected) -> State:
 
 
 def _q_mask_to_dofs(chain: Chain, held_q: np.ndarray) -> np.ndarray:
-    """Held entries of q (one number a joint) as entries of v."""
+    """Return the mask over v of the joints that a mask over q selects; joints of one freedom
+    only."""
     held = np.zeros(chain.dofs, bool)
     scalar_q, scalar_v = chain.topology.scalar_coordinates
     held[scalar_v] = held_q[scalar_q]
@@ -199,8 +212,12 @@ def _q_mask_to_dofs(chain: Chain, held_q: np.ndarray) -> np.ndarray:
 
 
 def check_closed(chain: Chain, state: State, residual_gaps: Float[Array, " links"]) -> State:
-    """The state; ValueError (or an error raised at run time, under jit) where a loop is open,
-    saying which and by how much. worst: of each loop's gaps."""
+    """Return the state.
+
+    residual_gaps: largest gap of each loop (rad, or in `chain.length`s).
+
+    Raises ValueError that lists the open loops and their gaps (a runtime error under jit).
+    """
     limit = gap_tolerance(state.q.dtype)
     if not is_concrete(residual_gaps, state):
         return eqx.error_if(

@@ -1,8 +1,8 @@
-"""Newton's method on a structure: its rank, its loops closed, velocities that keep them, and the
-velocity after an impact (paper, section V-C).
+"""Newton's method for a change of structure: closes the loops, decides their rank, and projects the
+velocity, with or without an impact (paper, section V-C).
 
-A caller lists the iterations that it needs. One loop over one body takes them all, so that
-kinematics, loop Jacobian and pivots are compiled once.
+A caller lists the kinds of iterations in a `Schedule`. One scan with one body runs them all, so that
+kinematics, loop Jacobian and pivoting are compiled once.
 """
 
 import dataclasses
@@ -31,15 +31,16 @@ from svkc.transitions.placement import joint_coordinates, with_coordinates
 from svkc.tree.configuration import integrate, normalize
 
 # kinds of iterations
-READ_COORDINATES = 0  # set the coordinates of virtual joints to what the poses of their bodies say
-# a Newton step that closes the loops by the least change of scaled coordinates; held coordinates
-# stay, or not
+READ_COORDINATES = 0  # compute the coordinates of virtual joints from the poses of their bodies
+# a Newton step that closes the loops by the least change of scaled coordinates, with and without
+# held coordinates
 CLOSE_HELD, CLOSE = 1, 2
-# look at q and move a copy of it a few degrees away; close its loops; decide the rank
+# record the pivots at q and perturb a copy of q by a few degrees; close the loops of the copy;
+# decide the rank
 PERTURB, CLOSE_PERTURBED, DECIDE_RANK = 3, 4, 5
-# project the velocity by its least change; held velocities stay, or not
+# project the velocity by its least change, with and without held velocities
 PROJECT_VELOCITY_HELD, PROJECT_VELOCITY = 6, 7
-IMPACT = 8  # project the velocity in the metric of the inertia
+IMPACT = 8  # project the velocity in the metric of the mass matrix
 
 RANK_SEARCH = (PERTURB, *(CLOSE_PERTURBED,) * 12, DECIDE_RANK)
 CONNECTION = (CLOSE, CLOSE, IMPACT)
@@ -52,13 +53,16 @@ class Schedule(eqx.Module):
 
     @property
     def steps_before_rank(self) -> int:
-        """Return how many iterations come before the rank is known, in which every row counts."""
+        """Return the number of iterations before the search for the rank; they use all rows."""
         return self.kinds.index(PERTURB) if PERTURB in self.kinds else 0
 
 
 class HeldCoordinates(eqx.Module):
-    """Coordinates and velocities that stay in held iterations, and links whose coordinates are
-    read. None: there are none."""
+    """Coordinates that iterations of the held kinds do not change; None: no coordinates.
+
+    q, v: masks for positions (by degree of freedom) and for velocities.
+    read_links: virtual links whose coordinates READ_COORDINATES sets.
+    """
 
     q: Bool[Array, " dofs"] | None = None
     v: Bool[Array, " dofs"] | None = None
@@ -66,14 +70,16 @@ class HeldCoordinates(eqx.Module):
 
 
 class NewtonState(eqx.Module):
-    """The state of the iteration: the motion, the rank of the structure with its margin, and what
-    has been found.
+    """The state of the iteration.
 
-    `probe`: the copy of q in the search for the rank; `size`, `open`: |R_kk| of the loop Jacobian
-    and how far each loop is open (rad, or `chain.length`s), at the start and at the end of the
-    search; `left`: how far each loop is open in the last iteration; `wrench`: impulse of each loop
-    on its real link from the parent, at the joint, angular first (N m s, N s); `lost`: energy lost
-    (J).
+    rank, margin: rank m of the loop Jacobian, and |R_mm| / |R_11|.
+    probe: the perturbed copy of q in the search for the rank.
+    search_diag_R: |R_kk| of the loop Jacobian at the start and at the end of the search.
+    search_gaps: largest gap of each loop there (rad, or in `chain.length`s).
+    residual_gaps: largest gap of each loop at the last evaluation of the loops.
+    spatial_impulse: impulse of each loop on its real link from the parent, at the joint, angular
+        part first (N m s, N s).
+    energy_lost: kinetic energy lost in the impact (J).
     """
 
     q: Float[Array, " q"]
@@ -88,7 +94,7 @@ class NewtonState(eqx.Module):
     energy_lost: Float[Array, ""]
 
     @classmethod
-    def init(cls, chain: Chain, structure: Structure, q, v) -> "Newton":
+    def init(cls, chain: Chain, structure: Structure, q, v) -> "NewtonState":
         """Return the state before the first iteration."""
         links, dtype, q = len(chain.link_names), q.dtype, normalize(chain, q)
         gaps, zero = jnp.zeros((2, links), dtype), jnp.zeros((), dtype)
@@ -106,13 +112,14 @@ class NewtonState(eqx.Module):
             energy_lost=zero,
         )
 
-    def record_rank_search(self, kind, diag_R, gaps) -> "Newton":
-        """Record both ends of the search for the rank, and decide the rank at its end."""
-        places = jnp.stack([kind == PERTURB, kind == DECIDE_RANK])[:, None]
+    def record_rank_search(self, kind, diag_R, gaps) -> "NewtonState":
+        """Return the state with the pivots and gaps of this iteration recorded if the iteration
+        starts or ends the search for the rank, and with the rank if it ends the search."""
+        rows = jnp.stack([kind == PERTURB, kind == DECIDE_RANK])[:, None]
         recorded = dataclasses.replace(
             self,
-            search_diag_R=jnp.where(places, diag_R[None], self.search_diag_R),
-            search_gaps=jnp.where(places, gaps[None], self.search_gaps),
+            search_diag_R=jnp.where(rows, diag_R[None], self.search_diag_R),
+            search_gaps=jnp.where(rows, gaps[None], self.search_gaps),
         )
         rank, margin = recorded.rank_and_margin()
         return dataclasses.replace(
@@ -122,8 +129,10 @@ class NewtonState(eqx.Module):
         )
 
     def rank_and_margin(self) -> tuple[Int[Array, ""], Float[Array, ""]]:
-        """Return the larger rank m of both ends, and |R_mm| / |R_11| there. The second end does not
-        count where its loops are open."""
+        """Return the larger rank m of the two ends of the search, and |R_mm| / |R_11| there.
+
+        The second end is left out if its loops are open.
+        """
         diag_R, eps = self.search_diag_R, jnp.finfo(self.search_diag_R.dtype)
         closed = jnp.max(self.search_gaps[1]) < eps.eps**0.75
         rank = jnp.where(
@@ -135,13 +144,15 @@ class NewtonState(eqx.Module):
 
 
 def _is_any_of(kind, *kinds: int) -> Bool[Array, ""]:
+    """Return whether a traced kind is one of these kinds."""
     return functools.reduce(jnp.logical_or, [kind == k for k in kinds])
 
 
 class _Iteration(eqx.Module):
-    """One iteration of any kind among `kinds`; what no kind among them needs is not compiled.
+    """The body of the scan: one iteration of one of `kinds`. Parts that none of `kinds` needs are
+    not compiled.
 
-    `away`: the change of q to a configuration nearby, from which the rank is searched for.
+    perturbation: the change of q by which the search for the rank starts.
     """
 
     chain: Chain
@@ -151,8 +162,10 @@ class _Iteration(eqx.Module):
     kinds: tuple[int, ...] = eqx.field(static=True)
 
     def __call__(self, current: NewtonState, kind, rank_known) -> NewtonState:
-        """Return the state after one more iteration. ranked: whether only as many rows count as the
-        rank of `now`."""
+        """Return the state after one more iteration.
+
+        rank_known: whether to use as many rows as the rank of `current`, instead of all rows.
+        """
         chain, structure = self.chain, self.structure
         q_eval = current.q
         if DECIDE_RANK in self.kinds:
@@ -161,7 +174,7 @@ class _Iteration(eqx.Module):
             )
         loops = loop_kinematics(chain, structure, q_eval)
         J = self._zero_held_columns(loops.J, kind)
-        all_pivots, selection = self._select(J, current, kind, rank_known)
+        all_pivots, qr = self._pivots(J, current, kind, rank_known)
         is_velocity_step, residual = (
             _is_any_of(kind, PROJECT_VELOCITY_HELD, PROJECT_VELOCITY),
             loops.gap,
@@ -170,7 +183,7 @@ class _Iteration(eqx.Module):
             residual = jnp.where(
                 is_velocity_step, loops.J @ (current.v / jacobian_scales(chain)[1]), residual
             )
-        step = -least_norm_change(chain, selection, J, residual[:, None])[:, 0]
+        step = -least_norm_change(chain, qr, J, residual[:, None])[:, 0]
         residual_gaps = jnp.max(jnp.abs(loops.gap).reshape(-1, 6), 1)
         if DECIDE_RANK in self.kinds:
             current = current.record_rank_search(kind, all_pivots.diag_R, residual_gaps)
@@ -182,7 +195,7 @@ class _Iteration(eqx.Module):
         if IMPACT in self.kinds:
             v, spatial_impulse, energy_lost = jax.lax.cond(
                 kind == IMPACT,
-                lambda: velocity_after_impact(chain, structure, loops, selection, current.v),
+                lambda: velocity_after_impact(chain, structure, loops, qr, current.v),
                 lambda: (v, spatial_impulse, energy_lost),
             )
         q, probe = self._updated_configuration(loops, q_eval, kind, step), current.probe
@@ -200,28 +213,27 @@ class _Iteration(eqx.Module):
         )
 
     def _zero_held_columns(self, J, kind) -> Float[Array, "rows dofs"]:
-        """Return J with the columns of coordinates zero that this iteration holds."""
+        """Return J with zero columns for the coordinates that this iteration holds."""
         for which, mask in ((CLOSE_HELD, self.held.q), (PROJECT_VELOCITY_HELD, self.held.v)):
             if mask is not None and which in self.kinds:
                 J = jnp.where(mask[None] & (kind == which), 0, J)
         return J
 
-    def _select(self, J, current: NewtonState, kind, rank_known) -> tuple[PivotedQR, PivotedQR]:
-        """Return the pivots of J, and those among them that are large enough to divide by."""
+    def _pivots(self, J, current: NewtonState, kind, rank_known) -> tuple[PivotedQR, PivotedQR]:
+        """Return the pivoted QR of J, and the same without pivots too small to divide by."""
         independent, max_rank, dtype = None, min(J.shape), J.dtype
         if self.structure.independent is not None and IMPACT in self.kinds:
             independent = self.structure.independent & (kind == IMPACT)
         all_pivots = pivoted_qr(J, jnp.where(rank_known, current.rank, max_rank), independent)
         weak_threshold = jnp.where(rank_known, release_threshold(dtype) * current.margin, 0)
-        # along weaker steps a gap is of second order, and dividing by them would only amplify
-        # round-off
+        # along weaker pivots a gap is of second order, and dividing by them amplifies round-off
         threshold = jnp.where(
             kind == IMPACT, weak_threshold, jnp.maximum(rank_tolerance(dtype), weak_threshold)
         )
         return all_pivots, drop_below(all_pivots, threshold)
 
     def _updated_configuration(self, loops: LoopKinematics, q, kind, step) -> Float[Array, " q"]:
-        """Return the configuration after this iteration, moved from the one at which it was."""
+        """Return the configuration after this iteration, from the one at which it evaluates."""
         chain = self.chain
         delta = jnp.where(_is_any_of(kind, CLOSE_HELD, CLOSE, CLOSE_PERTURBED), step, 0)
         q_next = integrate(chain, q, jnp.where(kind == PERTURB, self.perturbation, delta))
@@ -245,10 +257,12 @@ def _iterate(
     *,
     steps_before_rank: int,
 ) -> NewtonState:
-    """Take the iterations of a schedule. unranked: how many of them take every row, whatever the
-    rank of the structure."""
+    """Run the iterations of a schedule.
+
+    steps_before_rank: the number of first iterations that use all rows, whatever the rank.
+    """
     kinds, active = schedule.kinds, active_dofs(chain, structure)
-    # a fixed direction without pattern, as q itself may be singular
+    # a fixed direction without symmetry, as q itself may be singular
     perturbation = 0.05 * np.sin(1.0 + 2.3 * np.arange(chain.dofs)) * jacobian_scales(chain)[1]
     perturbation = jnp.where(active, perturbation, 0).astype(q.dtype)
     iteration = _Iteration(chain, structure, held=held, perturbation=perturbation, kinds=kinds)
@@ -269,7 +283,7 @@ def _iterate(
 def _solve(
     chain: Chain, structure: Structure, q, v, held: HeldCoordinates, schedule: Schedule
 ) -> NewtonState:
-    # until the search has ended every row counts, in the search too
+    """Run a schedule. All rows are used until the search for the rank has ended."""
     steps_before_rank = (
         schedule.steps_before_rank + len(RANK_SEARCH) if DECIDE_RANK in schedule.kinds else 0
     )
@@ -277,8 +291,8 @@ def _solve(
 
 
 def _solve_jvp(primals, tangents):
-    """Return the tangent of the iterations that move q or v, with the rank that was found; the
-    search for the rank has no part in derivatives."""
+    """Return the solution and its tangent: that of the iterations that change q or v, at the rank
+    of the solution. The search for the rank is not differentiated."""
     solution = solve_structure(*primals)
     chain, structure, q, v, held, schedule = primals
     with_rank = eqx.tree_at(
@@ -313,15 +327,17 @@ def _solve_jvp(primals, tangents):
     )
 
 
-# solve_structure(chain, structure, q, v, held, schedule) -> Newton: the state of the iteration
-# after a schedule
+# solve_structure(chain, structure, q, v, held, schedule) -> NewtonState after the schedule
 solve_structure = custom_primitive("solve_structure", _solve, _solve_jvp)
 
 
 @jax.jit
 def decide_rank(chain: Chain, structure: Structure, q: Float[Array, " q"]) -> Structure:
-    """Return the structure with its rank m: the larger one of those at q and at a closed
-    configuration nearby, as q itself may be singular."""
+    """Return the structure with its rank and margin.
+
+    The rank is the larger one of those at q and at a closed configuration nearby, as q itself may
+    be singular.
+    """
     if not len(chain.topology.link_names):
         return structure
     constants = jax.lax.stop_gradient((chain, structure, q))

@@ -43,13 +43,13 @@ TWO_DEVICES = """
 import jax, jax.numpy as jnp, numpy as np
 jax.config.update("jax_num_cpu_devices", 2)
 from jax.sharding import Mesh, PartitionSpec
-from svkc._jax.batched_lapack import factor_positive
+from svkc._jax.batched_lapack import cholesky_solver
 
 rng = np.random.default_rng(0)
 A = rng.normal(size=(2 * 127, 24, 24)).astype(np.float32)
 A = A @ A.transpose(0, 2, 1) + 24 * np.eye(24, dtype=np.float32)
 x = rng.normal(size=A.shape).astype(np.float32)
-one = lambda A, x: jax.lax.fori_loop(0, 300, lambda _, y: x + 0.1 * factor_positive(A)(y), x)
+one = lambda A, x: jax.lax.fori_loop(0, 300, lambda _, y: x + 0.1 * cholesky_solver(A)(y), x)
 spec = PartitionSpec("lanes")
 lanes = jax.vmap(one)
 on = lambda devices: Mesh(np.array(devices), ("lanes",))

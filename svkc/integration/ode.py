@@ -1,0 +1,46 @@
+"""The state and the arguments of the ordinary differential equation of one phase."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from svkc.model.chain import Chain, Structure
+
+
+class ODEState(eqx.Module):
+    """The integrated state: q, v and the work (J) done by control, joint limits and dampers.
+
+    work: None where the scene has neither control nor joint limits nor dampers.
+    """
+
+    q: Float[Array, " q"]
+    v: Float[Array, " dofs"]
+    work: Float[Array, ""] | None = None
+
+
+class FieldArgs(eqx.Module):
+    """The `args` of the vector field: everything it depends on besides time and state.
+
+    args: the user's `args`, passed on to control and guards.
+    pivots: pivots of the loops' rows that are reused instead of selected anew
+        (`AbstractDynamics.hold`). None: select pivots at every evaluation.
+    """
+
+    chain: Chain
+    structure: Structure
+    args: Any
+    pivots: Float[Array, "steps dofs"] | None = None
+
+
+def is_finite(y: ODEState) -> Bool[Array, ""]:
+    """Return whether every number of a state is finite."""
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(y)]))
+
+
+def rms_norm(y: ODEState) -> Float[Array, ""]:
+    """Return the root mean square over q and v. Work does not influence the step size."""
+    both = jnp.concatenate([y.q, y.v])
+    return jnp.sqrt(jnp.mean(both * both))
