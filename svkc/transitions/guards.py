@@ -1,7 +1,7 @@
 """Guards: functions of the motion whose zeros are events.
 
-A guard is a function of the user, or measures the mechanism: bodies that touch, a support that would
-have to pull, an overloaded joint.
+A guard is a function of the user, or measures the mechanism: bodies that touch, a support that
+would have to pull, an overloaded joint.
 """
 
 import abc

@@ -1,5 +1,5 @@
-"""The initial state of a chain: the user's values by name or as arrays, the loops closed by Newton's
-method, the velocity projected onto the closed loops (`Chain.state`)."""
+"""The initial state of a chain (`Chain.state`): the user's values by name or as arrays, the loops
+closed by Newton's method, the velocity projected onto the closed loops."""
 
 import dataclasses
 import functools

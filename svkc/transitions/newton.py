@@ -1,8 +1,8 @@
 """Newton's method for a change of structure: closes the loops, decides their rank, and projects the
 velocity, with or without an impact (paper, section V-C).
 
-A caller lists the kinds of iterations in a `Schedule`. One scan with one body runs them all, so that
-kinematics, loop Jacobian and pivoting are compiled once.
+A caller lists the kinds of iterations in a `Schedule`. One scan with one body runs them all, so
+that kinematics, loop Jacobian and pivoting are compiled once.
 """
 
 import dataclasses

@@ -1,4 +1,4 @@
-"""Coordinates of virtual joints, and placements of virtual links, from the poses of their bodies."""
+"""Coordinates of virtual joints and placements of virtual links from the poses of their bodies."""
 
 import equinox as eqx
 import jax.numpy as jnp

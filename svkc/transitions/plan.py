@@ -1,4 +1,4 @@
-"""The events of a run as tables, checked against the chain."""
+"""The events of a run as static tables and differentiable data, validated against the chain."""
 
 import dataclasses
 from collections.abc import Callable
@@ -24,7 +24,15 @@ from svkc.transitions.spare_links import (
 
 
 class Plan(eqx.Module):
-    """A list of events as tables: which are timed, and what each does."""
+    """The events of a run as tables.
+
+    times: of the timed events (s).
+    guards: of the events with a guard.
+    timed, guarded: indices of the timed events and of the events with a guard in the user's list.
+    directions: of the guards: True rising, False falling, None either.
+    actions: what each event changes, without its grips, which hold differentiable data.
+    grips: grips that each event makes.
+    """
 
     times: Float[Array, " timed"]
     guards: tuple[AbstractGuard, ...]
@@ -36,19 +44,20 @@ class Plan(eqx.Module):
 
     @property
     def has_binds(self) -> bool:
+        """Whether any event binds or unbinds a spare slot."""
         return any(self.grips) or any(a.unbind for a in self.actions)
 
     def slots_to_unbind(self, chain: Chain, structure: Structure) -> Bool[Array, "events links"]:
-        """Spare slots that each event would empty now."""
+        """Return the mask of spare slots that each event would unbind in this structure."""
         none = jnp.zeros(len(chain.link_names), bool)
         rows = []
         for action in self.actions:
             row = none
-            for what in action.unbind:
+            for slot_or_pair in action.unbind:
                 slots = (
-                    np.array(chain.link_names) == what
-                    if isinstance(what, str)
-                    else bound_between(chain, structure, *what)
+                    np.array(chain.link_names) == slot_or_pair
+                    if isinstance(slot_or_pair, str)
+                    else bound_between(chain, structure, *slot_or_pair)
                 )
                 row = row | slots
             rows.append(row)
@@ -65,10 +74,12 @@ class Plan(eqx.Module):
 
     @property
     def has_locks(self) -> bool:
+        """Whether any event locks or unlocks a joint."""
         return any(a.lock or a.unlock for a in self.actions)
 
     def action_mask(self, chain: Chain, action_name: str) -> np.ndarray:
-        """[events, links or dofs] Boolean of one part of the actions."""
+        """Return the mask [events, links or dofs] of one field of `Action`: dofs for "lock" and
+        "unlock", links for the others. Raises ValueError for unknown names."""
         if action_name in ("lock", "unlock"):
             table = np.zeros((len(self.actions), chain.dofs), bool)
             for row, action in zip(table, self.actions, strict=True):
@@ -81,65 +92,65 @@ class Plan(eqx.Module):
         return table
 
     def grip_mask(self, chain: Chain) -> np.ndarray:
-        """[events, links] Boolean of the spare slots an event may bind."""
+        """Return the mask [events, links] of the spare slots that each event may bind."""
         return (
             np.array([bool(g) for g in self.grips], bool)[:, None]
             & np.array(chain.topology.link_spare, bool)[None]
         )
 
     def armed(self, chain: Chain, structure: Structure) -> Bool[Array, " guards"]:
-        """Guards whose action would change something now, or that have none."""
-        rows = list(self.guarded)
-        on, off = (self.action_mask(chain, what)[rows] for what in ("connect", "cut"))
-        c = structure.connected[None]
-        change = jnp.any(on & ~c, 1) | jnp.any(off & c, 1)
+        """Return which guards are armed: those whose action would change the structure or stop the
+        run, and those without an action."""
+        rows, connected = list(self.guarded), structure.connected[None]
+        connect, cut = (self.action_mask(chain, name)[rows] for name in ("connect", "cut"))
+        changes = jnp.any(connect & ~connected, 1) | jnp.any(cut & connected, 1)
         if self.has_locks:
-            on, off = (self.action_mask(chain, what)[rows] for what in ("lock", "unlock"))
-            change = (
-                change
-                | jnp.any(on & ~structure.locked[None], 1)
-                | jnp.any(off & structure.locked[None], 1)
+            lock, unlock = (self.action_mask(chain, name)[rows] for name in ("lock", "unlock"))
+            changes = (
+                changes
+                | jnp.any(lock & ~structure.locked[None], 1)
+                | jnp.any(unlock & structure.locked[None], 1)
             )
         if self.has_binds:
-            empties = jnp.any(
-                self.slots_to_unbind(chain, structure)[np.array(rows)] & structure.connected[None],
-                1,
-            )
-            held = lambda g: jnp.any(bound_between(chain, structure, g.parent, g.real))
-            grips = [
+            slots = self.slots_to_unbind(chain, structure)[np.array(rows)]
+            unbinds = jnp.any(slots & connected, 1)
+            exists = lambda g: jnp.any(bound_between(chain, structure, g.parent, g.real))
+            binds = [
                 (
-                    jnp.any(~jnp.stack([held(g) for g in self.grips[i]]))
+                    jnp.any(~jnp.stack([exists(g) for g in self.grips[i]]))
                     if self.grips[i]
                     else jnp.zeros((), bool)
                 )
                 for i in rows
             ]
-            change = change | empties | jnp.stack(grips)
+            changes = changes | unbinds | jnp.stack(binds)
         always = [
             (a := self.actions[i]).stop
             or not (a.connect + a.cut + a.lock + a.unlock + a.unbind + self.grips[i])
             for i in rows
         ]
-        return change | np.array(always, bool)
+        return changes | np.array(always, bool)
 
     def crossed(
         self, before: Float[Array, " guards"], after: Float[Array, " guards"]
     ) -> Bool[Array, " guards"]:
-        """Guards that went through zero; one that starts at zero has not."""
-        up, down = (before < 0) & (after >= 0), (before > 0) & (after <= 0)
+        """Return which guards crossed zero in their direction between two values. A guard that
+        starts at zero has not crossed."""
+        rises, falls = (before < 0) & (after >= 0), (before > 0) & (after <= 0)
         either = np.array([d is None for d in self.directions], bool)
-        upward = np.array([d is True for d in self.directions], bool)
-        return jnp.where(either, up | down, jnp.where(upward, up, down))
+        rising = np.array([d is True for d in self.directions], bool)
+        return jnp.where(either, rises | falls, jnp.where(rising, rises, falls))
 
 
 def make_plan(chain: Chain, events: tuple, dtype) -> Plan:
-    """Tables of the events; ValueError for names the chain does not have."""
+    """Return the tables of these events. Raises ValueError for names that the chain does not
+    have."""
     timed = tuple(i for i, e in enumerate(events) if isinstance(e, At))
     guarded = tuple(i for i, e in enumerate(events) if isinstance(e, When))
     times = [events[i].time for i in timed]
     if any(np.shape(t) != () for t in times):
         raise ValueError("at: time must be one number; for a time in each lane use vmap")
-    # on the host where nothing is traced, as a program of its own would be compiled to stack them
+    # concrete times are stacked by numpy: JAX compiles a program for every eager operation
     times = (
         np.array(times, dtype)
         if is_concrete(*times)
@@ -151,26 +162,35 @@ def make_plan(chain: Chain, events: tuple, dtype) -> Plan:
         timed=timed,
         guarded=guarded,
         directions=tuple(events[i].direction for i in guarded),
-        # what is static and what can be differentiated, apart
+        # actions are static; the grips hold differentiable data
         actions=tuple(
             dataclasses.replace(e.action, bind=()) if e.action.bind else e.action for e in events
         ),
         grips=tuple(tuple(_validate_grip(chain, g, dtype) for g in e.action.bind) for e in events),
     )
-    for what in ("connect", "cut", "lock", "unlock"):
-        plan.action_mask(chain, what)
-    for action in plan.actions:
-        for what in action.unbind:
-            spare_slot(chain, what) if isinstance(what, str) else body_rows(chain, *what)
+    _check_names(chain, plan)
     return plan
 
 
+def _check_names(chain: Chain, plan: Plan) -> None:
+    """Raise ValueError if an action names a link, joint, slot or body that the chain lacks."""
+    for action_name in ("connect", "cut", "lock", "unlock"):
+        plan.action_mask(chain, action_name)
+    for action in plan.actions:
+        for slot_or_pair in action.unbind:
+            if isinstance(slot_or_pair, str):
+                spare_slot(chain, slot_or_pair)
+            else:
+                body_rows(chain, *slot_or_pair)
+
+
 def _as_guard(guard: Callable) -> AbstractGuard:
-    """Return a function of the user as a guard, and a guard as it is."""
+    """Wrap a function of the user as a guard; return a guard unchanged."""
     return guard if isinstance(guard, AbstractGuard) else UserGuard(guard)
 
 
 def _validate_grip(chain: Chain, grip: Grip, dtype) -> Grip:
+    """Return the grip with its point as an array. Raises ValueError for an invalid grip."""
     body_rows(chain, grip.parent, grip.real)
     spare_link_freedoms(grip.joint)
     rotation_to_axis(grip.axis)

@@ -1,4 +1,8 @@
-"""Spare virtual links: run-time data that says between which two bodies, where and how."""
+"""Spare virtual links: slots that are bound to two bodies at run time.
+
+The bodies, the joint and the placement of a spare link are data of the `Structure`, so that binding
+a slot does not compile a new program.
+"""
 
 from typing import Any
 
@@ -15,16 +19,24 @@ from svkc.model.virtual_link import joint_freedoms
 
 
 def _hashable(x):
+    """Return an iterable as a tuple: static fields must be hashable."""
     return tuple(x) if np.iterable(x) else x
 
 
 class Grip(eqx.Module):
-    """A joint to be made between two bodies with a spare slot (`svkc.load(..., spare=n)`), where
-    they are: `bind=` of an event.
+    """A joint that an event makes between two bodies with a spare slot (`bind=` of `svkc.at` and
+    `svkc.when`).
 
-    parent, real: body names; joint: any but universal and pairs of turns, for whose coordinates a
-    slot has no room; axis: of the joint, in the parent; real_pos (m): the point in the real link,
-    differentiable; slot: name of the slot, None: the first that is free.
+    The joint is made at the current poses of the bodies. The chain needs spare slots
+    (`svkc.load(..., spare=n)`). `simulate` raises ValueError for unknown names and invalid values.
+
+    parent, real: names of the two bodies.
+    joint: name of the joint, or six Booleans for its freedoms, as for `svkc.VirtualLink`; joints
+        with two rotations, such as "universal", are refused, as a slot has no room for their
+        coordinates.
+    axis: axis of the joint in the frame of the parent.
+    real_pos: point of the joint in the frame of the real link (m); differentiable.
+    slot: name of the spare slot; None: the first free slot.
     """
 
     parent: str = eqx.field(static=True)
@@ -36,7 +48,8 @@ class Grip(eqx.Module):
 
 
 def spare_link_freedoms(joint) -> tuple[bool, ...]:
-    """The joint's six Booleans; ValueError for those a spare slot has no coordinates for."""
+    """Return the joint's six freedoms. Raises ValueError for a joint with two rotations, for which
+    a spare slot has no coordinates."""
     freedoms = joint_freedoms(joint)
     if sum(freedoms[:3]) == 2:
         raise ValueError(
@@ -46,7 +59,8 @@ def spare_link_freedoms(joint) -> tuple[bool, ...]:
 
 
 def rotation_to_axis(axis) -> np.ndarray:
-    """The shortest turn of z onto an axis, wxyz; ValueError for no axis."""
+    """Return the quaternion (wxyz) of the smallest rotation that takes z to an axis. Raises
+    ValueError for an axis of zero length."""
     axis = np.asarray(finite_array("bind: axis", axis), float)
     if axis.shape != (3,) or not 0 < np.linalg.norm(axis) < np.inf:
         raise ValueError(f"bind: axis: expected three numbers that are not all zero, got {axis}")
@@ -56,30 +70,34 @@ def rotation_to_axis(axis) -> np.ndarray:
 
 
 def as_placement(name: str, value, dtype):
-    """A place: three numbers, finite where that can be seen."""
-    place = finite_array(f"bind: {name}", value, dtype)
-    if place.shape != (3,):
-        raise ValueError(f"bind: {name}: expected three numbers (m), got shape {place.shape}")
-    return place
+    """Return a point (m) as an array. Raises ValueError if it is not three finite numbers."""
+    point = finite_array(f"bind: {name}", value, dtype)
+    if point.shape != (3,):
+        raise ValueError(f"bind: {name}: expected three numbers (m), got shape {point.shape}")
+    return point
 
 
 def set_links(
-    structure: Structure, at: Bool[Array, " links"], *, rows, freedoms, quat, pos, real_pos
+    structure: Structure, links: Bool[Array, " links"], *, rows, freedoms, quat, pos, real_pos
 ) -> Structure:
-    """The structure with the links in the mask `at` between two rows, by such a joint, at such a
-    place."""
+    """Return the structure with new bodies, joint and placement of the links in the mask `links`.
+
+    rows: rows of the parent and of the real link among the bodies.
+    quat, pos: orientation and position of the joint in the parent (wxyz, m).
+    real_pos: position of the joint in the real link (m).
+    """
     dtype = structure.pos.dtype
-    wide = at[:, None]
+    column = links[:, None]
     return eqx.tree_at(
         lambda s: (s.parent, s.real, s.freedoms, s.quat, s.pos, s.real_pos),
         structure,
         (
-            jnp.where(at, jnp.asarray(rows[0], structure.parent.dtype), structure.parent),
-            jnp.where(at, jnp.asarray(rows[1], structure.real.dtype), structure.real),
-            jnp.where(wide, np.array(freedoms)[None], structure.freedoms),
-            jnp.where(wide, jnp.asarray(quat, dtype)[None], structure.quat),
-            jnp.where(wide, jnp.asarray(pos, dtype)[None], structure.pos),
-            jnp.where(wide, jnp.asarray(real_pos, dtype)[None], structure.real_pos),
+            jnp.where(links, jnp.asarray(rows[0], structure.parent.dtype), structure.parent),
+            jnp.where(links, jnp.asarray(rows[1], structure.real.dtype), structure.real),
+            jnp.where(column, np.array(freedoms)[None], structure.freedoms),
+            jnp.where(column, jnp.asarray(quat, dtype)[None], structure.quat),
+            jnp.where(column, jnp.asarray(pos, dtype)[None], structure.pos),
+            jnp.where(column, jnp.asarray(real_pos, dtype)[None], structure.real_pos),
         ),
     )
 
@@ -87,7 +105,7 @@ def set_links(
 def bound_between(
     chain: Chain, structure: Structure, parent: str, real: str
 ) -> Bool[Array, " links"]:
-    """Spare slots that are bound between these two bodies and connected."""
+    """Return the mask of the connected spare slots that are bound between two bodies."""
     p, r = body_rows(chain, parent, real)
     return (
         jnp.asarray(np.array(chain.topology.link_spare, bool))
@@ -100,8 +118,11 @@ def bound_between(
 def bind_grip(
     chain: Chain, structure: Structure, grip: Grip
 ) -> tuple[Structure, Bool[Array, " links"], Bool[Array, ""]]:
-    """The structure with a slot bound as wished, the slot to connect (none where the two bodies are
-    held already), and whether none was free."""
+    """Return the structure with a slot bound as the grip says, the mask of the slot to connect, and
+    whether no slot was free.
+
+    The mask is empty if a connected slot joins the two bodies already.
+    """
     spare = jnp.asarray(np.array(chain.topology.link_spare, bool))
     rows = body_rows(chain, grip.parent, grip.real)
     if grip.slot is None:
@@ -109,8 +130,8 @@ def bind_grip(
         slot = free & (jnp.cumsum(free, dtype=jnp.int32) == 1)
     else:
         slot = (jnp.arange(spare.shape[0]) == spare_slot(chain, grip.slot)) & ~structure.connected
-    held = jnp.any(bound_between(chain, structure, grip.parent, grip.real))
-    slot = slot & ~held
+    already_bound = jnp.any(bound_between(chain, structure, grip.parent, grip.real))
+    slot = slot & ~already_bound
     bound = set_links(
         structure,
         slot,
@@ -120,11 +141,11 @@ def bind_grip(
         pos=jnp.zeros(3, structure.pos.dtype),
         real_pos=grip.real_pos,
     )
-    return bound, slot, ~held & ~jnp.any(slot)
+    return bound, slot, ~already_bound & ~jnp.any(slot)
 
 
 def cleared(structure: Structure, slots: Bool[Array, " links"]) -> Structure:
-    """The structure with these slots bound to nothing."""
+    """Return the structure with these spare slots bound to no bodies."""
     zero = jnp.zeros(3, structure.pos.dtype)
     return set_links(
         structure,
@@ -149,21 +170,31 @@ def bind(
     pos=(0.0, 0.0, 0.0),
     real_pos=(0.0, 0.0, 0.0),
 ) -> State:
-    """A spare slot put between two bodies, not connected yet: run-time data, no retrace. Connect it
-    with here=True, or at this placement.
+    """Return the state with a spare slot bound to two bodies, but not connected.
 
-    joint: any but universal and pairs of turns, whose coordinates a spare slot has no room for.
-    axis: of the joint, in the parent. pos, real_pos (m): in the two bodies. ValueError: not a spare
-    slot, unknown bodies. In a run: `svkc.at(t, bind=svkc.Grip(...))`.
+    The slot is run-time data: binding does not retrace. `svkc.connect` then connects the slot, at
+    the placement given here or, with here=True, at the current poses of the bodies. During a run
+    use `svkc.at(t, bind=svkc.Grip(...))`.
+
+    name: spare slot.
+    parent, real: names of the two bodies.
+    joint: name of the joint, or six Booleans for its freedoms, as for `svkc.VirtualLink`; joints
+        with two rotations, such as "universal", are refused, as a slot has no room for their
+        coordinates.
+    axis: axis of the joint in the frame of the parent.
+    pos, real_pos: point of the joint in the frames of the parent and of the real link (m).
+
+    Raises ValueError if `name` is not a spare slot, for unknown bodies, and for an invalid joint,
+    axis or point.
     """
     check_state(chain, state)
-    at = jnp.asarray(np.arange(len(chain.link_names)) == spare_slot(chain, name))
+    slot = jnp.asarray(np.arange(len(chain.link_names)) == spare_slot(chain, name))
     pos, real_pos = (
-        as_placement(what, x, state.q.dtype) for what, x in (("pos", pos), ("real_pos", real_pos))
+        as_placement(key, x, state.q.dtype) for key, x in (("pos", pos), ("real_pos", real_pos))
     )
     structure = set_links(
         state.structure,
-        at,
+        slot,
         rows=body_rows(chain, parent, real),
         freedoms=spare_link_freedoms(joint),
         quat=rotation_to_axis(axis),
