@@ -162,7 +162,7 @@ class Chain(eqx.Module):
         mask[table[table < self.dofs]] = True
         return mask
 
-    def motors(self, u) -> Float[Array, " dofs"]:
+    def motors(self, u: Any) -> Float[Array, " dofs"]:
         """Joint torques (N m, N) of the model's actuators for the controls u: gear times u, each
         clipped to its range."""
         u = real_array("u", u, self.gear.dtype)
@@ -174,7 +174,7 @@ class Chain(eqx.Module):
         force = jnp.clip(force, self.force_range[:, 0], self.force_range[:, 1])
         return force @ self.gear
 
-    def state(self, q=None, v=None, connected=None) -> State:
+    def state(self, q: Any = None, v: Any = None, connected: Any = None) -> State:
         """A consistent state: loops closed by Newton's method, velocities made to agree with them.
 
         q, v: arrays over the tree (or over every coordinate), or dicts by joint name, whose entries

@@ -42,10 +42,10 @@ class Topology:
     link_actuated: tuple[bool, ...] = ()
 
     @functools.cached_property
-    def _hash(self):
+    def _hash(self) -> int:
         return hash(tuple(getattr(self, f.name) for f in dataclasses.fields(self)))
 
-    def __hash__(self):
+    def __hash__(self) -> int:
         return self._hash
 
     @functools.cached_property
