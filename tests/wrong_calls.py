@@ -164,7 +164,7 @@ CASES = {
     "state and chain are float64": single,
     "states: ... lanes": crowded,
     "... has schema": lambda s: s.file(metadata=np.array('{"schema": 99}')),
-    "... is not a whole trajectory": lambda s: s.file(metadata=None),
+    "... is not a complete trajectory": lambda s: s.file(metadata=None),
     "... lacks": lambda s: s.file(ts=None),
     "...: expected a function": lambda s: s.simulate(control=3),
     "...: expected finite": lambda s: s.four.state([np.nan, 0, 0]),

@@ -1,4 +1,4 @@
-"""Commands that look at models and saved runs."""
+"""Commands that inspect a model or a saved run."""
 
 import pathlib
 import webbrowser
@@ -7,7 +7,7 @@ from svkc.cli.run import print_report
 
 
 def info(path: str) -> int:
-    """What a model is to svkc."""
+    """Print what svkc reads from a model; return the exit status."""
     import svkc
     from svkc._jax.compilation_cache import use_cache
 
@@ -33,12 +33,17 @@ def info(path: str) -> int:
         print(f"left out: {line}")
     _print_suggestions(chain)
     print(
-        f"compiled programs: {cache_folder or 'not kept'} (SVKC_CACHE_DIR names another folder, or off)"
+        f"compiled programs: {cache_folder or 'not kept'}"
+        " (SVKC_CACHE_DIR names another folder, or off)"
     )
     return 0
 
 
 def _load_state(chain):
+    """Return the state at the load pose.
+
+    If the loops cannot be closed, print the reason and return None.
+    """
     try:
         return chain.state()
     except ValueError as error:
@@ -47,8 +52,7 @@ def _load_state(chain):
 
 
 def _print_suggestions(chain):
-    """Joints that can be cut, and bodies at the ends of the tree, which could hold on to
-    something."""
+    """Print which joints can be cut, and which bodies at the ends of the tree could be held."""
     from svkc.mjcf.cuttable_joints import cuttable_joints
 
     def cut(name):
@@ -76,10 +80,13 @@ def _print_suggestions(chain):
 
 
 def view(path: pathlib.Path, show: bool) -> int:
-    """A run that was saved with its chain: the table, the certificate, the curves and the page."""
+    """Print and draw a run that was saved with its chain; return the exit status.
+
+    show: whether to open the page in a browser.
+    """
     import jax
 
-    # what was computed in float64 is read as such
+    # runs saved in float64 are loaded in float64
     jax.config.update("jax_enable_x64", True)
     import svkc
     from svkc._jax.compilation_cache import use_cache

@@ -1,5 +1,4 @@
-"""The command line. `svkc` alone, or `python -m svkc`, runs the high bar: two hands, one hand,
-flight."""
+"""The command line's arguments. `svkc` alone, or `python -m svkc`, runs the high bar."""
 
 import argparse
 import math
@@ -10,7 +9,7 @@ from svkc.cli import inspect, run
 
 
 def _event_parser(kind: str):
-    """Reads NAME@TIME."""
+    """Return a function that parses NAME@TIME to (kind, link, seconds)."""
 
     def read(text: str):
         link, _, time = text.rpartition("@")
@@ -80,9 +79,9 @@ def _add_run_options(parser: argparse.ArgumentParser):
 
 
 def main(argv=None) -> int:
-    """Entry point."""
+    """Parse the command line, run the command, and return the exit status."""
     argv = list(sys.argv[1:] if argv is None else argv)
-    # alone it is the main job, and a scene's name is enough
+    # `run` is the default command
     if (
         not argv
         or argv[0] in run.SCENES

@@ -1,5 +1,7 @@
-"""Commands that run a scene or a model. jax and the rest are imported where they are used, so that
-help is quick."""
+"""Commands that run a scene or a model.
+
+jax is imported where it is used, so that `--help` is fast.
+"""
 
 import gc
 import itertools
@@ -39,7 +41,7 @@ def _walking():
     return *walking(), ()
 
 
-# name: how to make it with its events, until when (s), what happens
+# name: function that returns chain, state and events; end time (s); description
 SCENES = {
     "high_bar": (_high_bar, 1.8, "two hands on a bar, one, flight (the paper's Fig. 20)"),
     "swing": (_swing, 2.0, "the seat of a swing gives way as the thighs slide off (Fig. 21)"),
@@ -60,7 +62,7 @@ SCENES = {
 
 
 def scenes() -> int:
-    """The scenes that ship."""
+    """Print the scenes that ship; return the exit status."""
     width = max(map(len, SCENES))
     for name, (_, end, what) in SCENES.items():
         print(f"{name:<{width}}  {end:.1f} s  {what}")
@@ -71,9 +73,9 @@ def scenes() -> int:
 def run(
     name: str, *, t1: float | None, events, ignore, out: pathlib.Path, video: bool, quiet: bool
 ) -> int:
-    """Run one scene or model; print the table of its phases and write its pictures.
+    """Run one scene or model, print its report, write its pictures; return the exit status.
 
-    events: (kind, link, time), instead of the scene's own.
+    events: (kind, link, time), which replace the scene's own.
     """
     cache_folder = _configure_process()
     import svkc
@@ -102,21 +104,19 @@ def run(
     print_report(chain, traj)
     _print_times(times, cache_folder)
     _print_files(written, missing)
-    # what ended early is kept and said, and the shell is told
+    # a run that ended early is written as well; the exit status tells the shell
     return 0 if traj.result in (svkc.RESULTS.successful, svkc.RESULTS.stopped) else 1
 
 
 def _configure_process() -> pathlib.Path | None:
-    """Set up jax and the garbage collector of the command's own process; return the folder of
-    compiled programs."""
+    """Configure jax and the garbage collector; return the folder of compiled programs."""
     import jax
 
     jax.config.update("jax_enable_x64", True)
     from svkc._jax.compilation_cache import use_cache
 
     cache_folder = use_cache()
-    # tracing makes very many small objects that stay: the collector would look through all of them
-    # again and again
+    # tracing makes very many small objects that stay, which the collector would scan repeatedly
     gc.freeze()
     gc.set_threshold(100_000, 20, 50)
     return cache_folder
@@ -136,7 +136,10 @@ def _progress_bar(quiet: bool):
 
 
 def _print_times(times: list[float], cache_folder: pathlib.Path | None):
-    """Print the seconds between the four times, and where compiled programs are kept."""
+    """Print the seconds of loading, of the first run and of a second run, and the cache folder.
+
+    times: four clock readings.
+    """
     load, first, second = (b - a for a, b in itertools.pairwise(times))
     print(
         f"load and close the loops {load:.1f} s, first run with compilation"
@@ -147,7 +150,7 @@ def _print_times(times: list[float], cache_folder: pathlib.Path | None):
 
 
 def _print_files(written: list[pathlib.Path], missing: list[str]):
-    """Print what could not be drawn, what was written, and how to look at it."""
+    """Print which pictures failed, which files were written, and how to open them."""
     print("\n".join(missing) + "\n" * bool(missing) + "wrote " + ", ".join(map(str, written)))
     print(
         f"look: open {written[-1]}"
@@ -156,7 +159,7 @@ def _print_files(written: list[pathlib.Path], missing: list[str]):
 
 
 def _simulate(chain, state, events, end: float, quiet: bool):
-    """The run, to its end on the clock. Phases of long runs show how far they are."""
+    """Run the scene and wait for the result. Runs longer than 10 s show their progress."""
     import diffrax
     import jax
     import jax.numpy as jnp
@@ -173,12 +176,13 @@ def _simulate(chain, state, events, end: float, quiet: bool):
 
 
 def _next_stage(progress, description: str):
+    """Advance the progress bar to the next stage."""
     progress.update()
     progress.set_description(description)
 
 
 def _prepare_run(name: str, t1: float | None, events, ignore):
-    """Chain, state, events and end of the run that was asked for."""
+    """Return chain, state, events and end time for the arguments of the command."""
     from svkc.model.validation import positive_scalar
 
     chain, state, scene_events, end = _load_scene(name, ignore)
@@ -188,8 +192,10 @@ def _prepare_run(name: str, t1: float | None, events, ignore):
 
 
 def _load_scene(name: str, ignore):
-    """Chain, state, events and end of a scene that ships, or of a model file at its load pose for
-    two seconds."""
+    """Return chain, state, events and end time of a scene or of a model file.
+
+    A model file starts at its load pose and runs for two seconds.
+    """
     import svkc
 
     if name in SCENES:
@@ -202,7 +208,7 @@ def _load_scene(name: str, ignore):
 
 
 def _requested_events(chain, events):
-    """The events of --release and --catch."""
+    """Return the events of `--release` and `--catch`."""
     import svkc
 
     for _, link, _ in events:
@@ -220,7 +226,10 @@ def _requested_events(chain, events):
 def _write_results(
     chain, traj, out: pathlib.Path, stem: str, video: bool, options: dict
 ) -> tuple[list, list[str]]:
-    """The run and its pictures: what was written, and a line for each that could not be."""
+    """Save the run and draw its pictures.
+
+    Return the files written, and a message for each failure.
+    """
     import svkc
 
     written, missing = [out / f"{stem}.npz"], []
@@ -246,8 +255,7 @@ def _write_results(
 
 
 def print_report(chain, traj):
-    """Freedoms, rank, mobility, steps and energy before and after each event, then the
-    certificate."""
+    """Print a table of the phases, the event times, and the run's report."""
     p, report = traj.phases, traj.report()
     names = {
         i: (

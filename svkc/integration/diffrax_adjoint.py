@@ -1,4 +1,8 @@
-"""The integration of one phase by diffrax's own loop, for diffrax's own adjoints."""
+"""Integrate one phase by `diffrax.diffeqsolve`, for the adjoints of diffrax.
+
+Separate from the stepping loop of svkc: this module alone adapts steps with projection to
+diffrax's solver interface.
+"""
 
 import functools
 from typing import Any, ClassVar
@@ -6,6 +10,7 @@ from typing import Any, ClassVar
 import diffrax
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from svkc.integration.event_location import EventInfo
 from svkc.integration.ode import ODEState
@@ -24,18 +29,21 @@ from svkc.integration.vector_field import VectorField, project_state
 
 
 class _ProjectedInterpolation(diffrax.AbstractLocalInterpolation):
-    """The inner solver's dense output, drawn to the settled end of the step."""
+    """The wrapped solver's dense output plus a linear part that ends at the projected state.
 
-    t0: Any
-    t1: Any
+    shift: the change of the step's end by the projection.
+    """
+
+    t0: Float[Array, ""]
+    t1: Float[Array, ""]
     inner: Any
     shift: ODEState
 
     def evaluate(self, t0, t1=None, left=True):
         def at(t):
-            part = (t - self.t0) / (self.t1 - self.t0)
+            fraction = (t - self.t0) / (self.t1 - self.t0)
             return jax.tree.map(
-                lambda y, s: y + part * s, self.inner.evaluate(t, left=left), self.shift
+                lambda y, s: y + fraction * s, self.inner.evaluate(t, left=left), self.shift
             )
 
         if t1 is None:
@@ -44,13 +52,15 @@ class _ProjectedInterpolation(diffrax.AbstractLocalInterpolation):
 
 
 def _make_interpolation(cls, *, t0, t1, inner, shift):
-    return _ProjectedInterpolation(t0=t0, t1=t1, inner=cls(t0=t0, t1=t1, **inner), shift=shift)
+    """Return the interpolation of one step. cls: interpolation class of the wrapped solver."""
+    interpolation = cls(t0=t0, t1=t1, **inner)
+    return _ProjectedInterpolation(t0=t0, t1=t1, inner=interpolation, shift=shift)
 
 
 class ProjectedSolver(diffrax.AbstractWrappedSolver):
-    """Any diffrax solver, its steps settled, for diffrax's own adjoints."""
+    """A diffrax solver whose steps are projected onto the closed loops."""
 
-    # diffrax takes a wrapper for what it wraps and asks for it; the inner solver has its own
+    # diffrax reads `scan_kind` from wrapped solvers too; this placeholder satisfies it.
     scan_kind: ClassVar[str] = "inner"
 
     solver: diffrax.AbstractSolver
@@ -80,61 +90,63 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
         return self.solver.func(terms, t0, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        fresh = True if needs_projection(self.field.stabilization, args) else made_jump
-        raw, error, dense, solver_state, result = self.solver.step(
-            terms, t0, t1, y0, args, solver_state, made_jump=fresh
+        # Projection moved the state, so the FSAL derivative is stale: re-evaluate.
+        stale = True if needs_projection(self.field.stabilization, args) else made_jump
+        y_solver, error, dense_info, solver_state, result = self.solver.step(
+            terms, t0, t1, y0, args, solver_state, made_jump=stale
         )
-        y1, _ = project_state(self.field, args, raw)
-        shift = jax.tree.map(lambda a, b: a - b, y1, raw)
-        return y1, error, {"inner": dense, "shift": shift}, solver_state, result
+        y1, _ = project_state(self.field, args, y_solver)
+        shift = jax.tree.map(lambda a, b: a - b, y1, y_solver)
+        return y1, error, {"inner": dense_info, "shift": shift}, solver_state, result
 
 
 def integrate_with_diffrax(
     start: ODEState,
     times,
-    world: PhaseProblem,
-    how: StepperOptions,
+    problem: PhaseProblem,
+    options: StepperOptions,
     adjoint: diffrax.AbstractAdjoint,
-    found: EventInfo | None,
+    event: EventInfo | None,
 ) -> PhaseSolution:
-    """Integrate one phase by `diffrax.diffeqsolve` and return its path.
+    """Integrate one phase by `diffrax.diffeqsolve`, which differentiates by `adjoint`.
 
-    times: the start, the end and the save times. found: the event at the end, None: none.
+    times: start, end and save times.
+    event: the event at the end, located beforehand. None: there are no guards.
     """
-    t0, stop, at = times
-    # diffrax sets `scan_kind` for the adjoint, but not through a wrapper
+    t0, stop, save_ts = times
+    # diffrax sets `scan_kind` for these adjoints, but not through a wrapper.
     kind = {diffrax.ForwardMode: "lax", diffrax.DirectAdjoint: "bounded"}.get(type(adjoint))
-    saveat = diffrax.SaveAt(subs=[diffrax.SubSaveAt(t1=True), diffrax.SubSaveAt(ts=at)])
+    saveat = diffrax.SaveAt(subs=[diffrax.SubSaveAt(t1=True), diffrax.SubSaveAt(ts=save_ts)])
     solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(world.field),
-        ProjectedSolver(with_scan_kind(how.solver, kind), world.field),
+        diffrax.ODETerm(problem.field),
+        ProjectedSolver(with_scan_kind(options.solver, kind), problem.field),
         t0=t0,
         t1=stop,
-        dt0=how.first_step,
+        dt0=options.first_step,
         y0=start,
-        args=world.field_args,
+        args=problem.field_args,
         saveat=saveat,
-        stepsize_controller=how.controller,
+        stepsize_controller=options.controller,
         adjoint=adjoint,
-        max_steps=how.max_steps,
+        max_steps=options.max_steps,
         throw=False,
-        progress_meter=how.progress_meter,
+        progress_meter=options.progress_meter,
     )
-    (end, saved), result = solution.ys, solution.result._value
+    (y_end, ys), result = solution.ys, solution.result._value
     result = jnp.where(result == diffrax.RESULTS.internal_error._value, NON_FINITE, result)
-    if found is not None:
-        result = jnp.where((result == SUCCESSFUL) & found.occurred, EVENT, result)
+    if event is not None:
+        result = jnp.where((result == SUCCESSFUL) & event.occurred, EVENT, result)
     accepted = jnp.asarray(solution.stats["num_accepted_steps"], jnp.int32)
     rejected = jnp.asarray(solution.stats["num_rejected_steps"], jnp.int32)
     return PhaseSolution(
         t=solution.ts[0][0],
-        y=jax.tree.map(lambda x: x[0], end),
-        ys=saved,
+        y=jax.tree.map(lambda x: x[0], y_end),
+        ys=ys,
         step_ts=jnp.zeros(0, t0.dtype),
-        checkpoints=saved,
+        checkpoints=ys,
         accepted=accepted,
         rejected=rejected,
         result=result,
         stats=Stats.attempts_only(t0.dtype, accepted + rejected),
-        event=found,
+        event=event,
     )

@@ -1,7 +1,7 @@
 """Event location: guards, the bracket about a root, and the search for the root.
 
-The search is a state machine that is advanced by one evaluation of the guards; the stepping loop
-makes the evaluations.
+The search is a state machine that takes one evaluation of the guards per call. The stepping loop
+makes the evaluations, so that its program holds one step of the solver only.
 """
 
 import equinox as eqx
@@ -15,14 +15,19 @@ from svkc.model.chain import State
 from svkc.model.validation import scalar
 from svkc.transitions.plan import Plan
 
-# how often a bracket may be narrowed
+# the most iterations of the root finder
 MAX_ITERATIONS = 200
 
 
 class Bracket(eqx.Module):
-    """Two times, at the first a function is below zero, at the second not: narrowed to round-off by
-    false position with the Illinois weight, every third time by bisection. `fine`: how narrow;
-    `last`: which end has moved (1: b, -1: a)."""
+    """An interval [a, b] with fa < 0 <= fb that shrinks about a root of a function.
+
+    The root finder is the Illinois method (Dowell and Jarratt, BIT 11 (1971), 168-174), with a
+    bisection at every third iteration.
+
+    tol: the length at which the bracket has converged.
+    last_side: the end that moved last, 1 for b, -1 for a, 0 for neither.
+    """
 
     a: Float[Array, ""]
     b: Float[Array, ""]
@@ -34,26 +39,28 @@ class Bracket(eqx.Module):
 
     @staticmethod
     def around(a, b, fa, fb) -> "Bracket":
-        """From the two times and the function there."""
+        """Return the bracket [a, b] before the first iteration. Its tolerance is round-off."""
         eps = jnp.finfo(fb.dtype).eps
-        fine = 2 * eps * jnp.maximum(jnp.abs(a), jnp.abs(b)) + eps * (b - a)
+        tol = 2 * eps * jnp.maximum(jnp.abs(a), jnp.abs(b)) + eps * (b - a)
         zero = jnp.zeros((), jnp.int32)
-        return Bracket(a=a, b=b, fa=fa, fb=fb, tol=fine, last_side=zero, count=zero)
+        return Bracket(a=a, b=b, fa=fa, fb=fb, tol=tol, last_side=zero, count=zero)
 
     def not_converged(self) -> Bool[Array, ""]:
-        """Whether to go on."""
+        """Return whether another iteration is needed."""
         return (self.b - self.a > self.tol) & (self.count < MAX_ITERATIONS)
 
     def next_point(self) -> Float[Array, ""]:
-        """The time to look at next."""
+        """Return the point of the next evaluation: by the secant, or the midpoint."""
         weight = self.fb - self.fa
         secant = self.b - self.fb * (self.b - self.a) / jnp.where(weight == 0, 1, weight)
-        c = jnp.where((self.count % 3 == 2) | (weight == 0), self.a + (self.b - self.a) / 2, secant)
+        bisect = (self.count % 3 == 2) | (weight == 0)
+        c = jnp.where(bisect, self.a + (self.b - self.a) / 2, secant)
         return jnp.clip(c, self.a + self.tol / 4, self.b - self.tol / 4)
 
     def update(self, c, fc) -> "Bracket":
-        """With what the function is at c."""
+        """Return the bracket shrunk by the value fc of the function at c."""
         right = fc >= 0
+        # Illinois weights: an end that stays twice in a row counts half.
         fa = jnp.where(right & (self.last_side == 1), self.fa / 2, self.fa)
         fb = jnp.where(~right & (self.last_side == -1), self.fb / 2, self.fb)
         return Bracket(
@@ -67,32 +74,42 @@ class Bracket(eqx.Module):
         )
 
 
-# a guard that at the rate it crosses zero with would change this little over a step, measured by
-# its size, touches zero rather than crosses it
+# A guard only touches zero (grazes) if, at its rate there, it would change over a step by less than
+# this fraction of its magnitude.
 GRAZING_THRESHOLD = 1e-5
 
 
 class GuardValues(eqx.Module):
-    """The values of all guards. Torques are evaluated where one of the guards needs them."""
+    """The values of all guards of a plan, as a function of time, state and field arguments.
+
+    Torques are evaluated only if a guard needs them.
+    """
 
     plan: Plan
     field: VectorField
 
-    def __call__(self, t, y: ODEState, scene: FieldArgs) -> Float[Array, " guards"]:
-        state = State(y.q, y.v, scene.structure)
+    def __call__(self, t, y: ODEState, field_args: FieldArgs) -> Float[Array, " guards"]:
+        chain, state = field_args.chain, State(y.q, y.v, field_args.structure)
         guards = self.plan.guards
         tau = (
-            self.field.torques(t, y, scene)[0]
+            self.field.torques(t, y, field_args)[0]
             if any(g.needs_torques for g in guards)
             else jnp.zeros_like(y.v)
         )
-        values = [g.value(scene.chain, t, state, scene.args, tau) for g in guards]
+        values = [g.value(chain, t, state, field_args.args, tau) for g in guards]
         return jnp.stack([jnp.asarray(scalar("guard", x), y.q.dtype) for x in values])
 
 
 class EventInfo(eqx.Module):
-    """The guards that fired, which guard values go on, the first guard, whether there was one, it
-    jumped over zero, or it only touched it."""
+    """The outcome of an event search.
+
+    fired: guards that crossed zero at the event.
+    values: values of the guards for the next phase, 0 for those that fired.
+    first: index of the guard whose root was located.
+    occurred: whether an event ended the phase. The other fields are valid only then.
+    jumps: whether guard `first` is discontinuous there.
+    grazing: whether guard `first` touches zero without crossing it.
+    """
 
     fired: Bool[Array, " guards"]
     values: Float[Array, " guards"]
@@ -103,18 +120,24 @@ class EventInfo(eqx.Module):
 
 
 def event_tolerance(t: Float[Array, ""]) -> Float[Array, ""]:
-    """Events this close (s) to the earliest happen together with it: sqrt(eps), 1.5e-8 in float64,
-    relative from t = 1 s on."""
+    """Return the time (s) within which events are simultaneous with the earliest one.
+
+    sqrt(eps), 1.5e-8 in float64, absolute up to t = 1 s and relative beyond.
+    """
     return jnp.finfo(t.dtype).eps ** 0.5 * jnp.maximum(1, jnp.abs(t))
 
 
 def vector_field_of(guards: GuardValues | VectorField) -> VectorField:
-    """Return the field of the guards, or the field itself where there are no guards."""
+    """Return the vector field of the guards, or the argument if there are no guards."""
     return guards if isinstance(guards, VectorField) else guards.field
 
 
 class ArmedGuards(eqx.Module):
-    """Guards, their values at the start of a phase, and which of them may end it."""
+    """The guards of a phase.
+
+    initial_values: values at the start of the phase.
+    armed: mask of the guards that may end the phase.
+    """
 
     evaluate: GuardValues
     initial_values: Float[Array, " guards"]
@@ -122,10 +145,18 @@ class ArmedGuards(eqx.Module):
 
 
 class EventSearch(eqx.Module):
-    """For the first zero in the step from the loop's t, over a span of time: guards that crossed
-    it, by the side they are on then, and their sizes; the bracket and, at its right end, the motion
-    and the guards; the guards just after that. on: begun; narrow: the bracket is to be made smaller
-    yet."""
+    """The search for the first root of the guards in the step that starts at the loop's t.
+
+    step_size: size of that step.
+    sides: sign of each guard that crossed zero after its crossing, 0 for all others.
+    magnitudes: larger of the absolute values of each guard at the two ends of the step.
+    bracket: interval that holds the first root of the guards that crossed.
+    y, values: state and guards at `bracket.b`.
+    values_after: guards just after `bracket.b`, valid once the search is done.
+    active: whether a search is under way.
+    narrowing: whether the bracket has yet to converge.
+    done: whether the search has just ended.
+    """
 
     step_size: Float[Array, ""]
     sides: Float[Array, " guards"]
@@ -138,8 +169,25 @@ class EventSearch(eqx.Module):
     narrowing: Bool[Array, ""]
     done: Bool[Array, ""]
 
+    @staticmethod
+    def inactive(t0, y: ODEState, values: Float[Array, " guards"]) -> "EventSearch":
+        """Return the search before any guard has crossed zero."""
+        no = jnp.zeros((), bool)
+        return EventSearch(
+            step_size=t0,
+            sides=jnp.zeros_like(values),
+            magnitudes=values,
+            bracket=Bracket.around(t0, t0, t0, t0),
+            y=y,
+            values=values,
+            values_after=values,
+            active=no,
+            narrowing=no,
+            done=no,
+        )
+
     def next_time(self) -> Float[Array, ""]:
-        """The time to be looked at next."""
+        """Return the time of the next evaluation: in the bracket, then just after its right end."""
         b = self.bracket.b
         return jnp.where(self.narrowing, self.bracket.next_point(), b + event_tolerance(b))
 
@@ -151,67 +199,75 @@ def update_search(
     t0,
     t1,
     y: ODEState,
-    keep,
-    scene: FieldArgs,
-    watched: ArmedGuards,
+    keep_step: Bool[Array, ""],
+    field_args: FieldArgs,
+    armed_guards: ArmedGuards,
 ) -> tuple[Float[Array, " guards"], EventSearch]:
-    """The guards after a try of a step from t0 to t1, and the search for their first zero: begun,
-    narrowed, or done once they are known just after it.
+    """Evaluate the guards after an attempted step from t0 to t1, and advance the event search.
 
-    before: the guards at t0; y: where the try has led to; keep: whether the step holds.
+    A search starts if a guard crosses zero in a step that is kept. The search then narrows the
+    bracket, and ends with one evaluation just after the root. Return the values of the guards after
+    the step, or at the root once the search is done, and the search.
+
+    before: values of the guards at t0.
+    y: state at t1.
+    keep_step: whether the step-size controller keeps the step.
     """
-    values = watched.evaluate(t1, y, scene)
-    # a guard at zero is not armed before it has left it by more than round-off
-    values = jnp.where(
-        (before == 0) & (jnp.abs(values) < jnp.finfo(values.dtype).eps ** 0.75), 0, values
+    values = armed_guards.evaluate(t1, y, field_args)
+    # A guard at zero is armed once it has left zero by more than round-off.
+    round_off = jnp.finfo(values.dtype).eps ** 0.75
+    values = jnp.where((before == 0) & (jnp.abs(values) < round_off), 0, values)
+    crossed = armed_guards.evaluate.plan.crossed(before, values)
+    crossed = crossed & armed_guards.armed & keep_step & ~old.active
+    starts = jnp.any(crossed)
+    new_sides = jnp.where(crossed, jnp.where(values >= before, 1, -1), 0).astype(values.dtype)
+    sides = jnp.where(starts, new_sides, old.sides)
+    # The bracketed function is negative before the first of the crossings, not negative after it.
+    bracketed = lambda values: jnp.max(jnp.where(sides != 0, sides * values, -jnp.inf))
+    bracket = tree_where(old.narrowing, old.bracket.update(t1, bracketed(values)), old.bracket)
+    bracket = tree_where(
+        starts, Bracket.around(t0, t1, bracketed(before), bracketed(values)), bracket
     )
-    crossed = watched.evaluate.plan.crossed(before, values) & watched.armed & keep & ~old.active
-    begun = jnp.any(crossed)
-    side = jnp.where(
-        begun,
-        jnp.where(crossed, jnp.where(values >= before, 1, -1), 0).astype(values.dtype),
-        old.sides,
-    )
-    # the largest of the guards that crossed: positive where one has
-    passed = lambda values: jnp.max(jnp.where(side != 0, side * values, -jnp.inf))
-    bracket = tree_where(old.narrowing, old.bracket.update(t1, passed(values)), old.bracket)
-    bracket = tree_where(begun, Bracket.around(t0, t1, passed(before), passed(values)), bracket)
-    at_right = begun | (old.narrowing & (passed(values) >= 0))
+    at_right_end = starts | (old.narrowing & (bracketed(values) >= 0))
+    magnitudes = jnp.maximum(jnp.abs(before), jnp.abs(values))
     done = old.active & ~old.narrowing
-    on = begun | (old.active & ~done)
+    active = starts | (old.active & ~done)
     search = EventSearch(
-        step_size=jnp.where(begun, t1 - t0, old.step_size),
-        sides=side,
-        magnitudes=jnp.where(begun, jnp.maximum(jnp.abs(before), jnp.abs(values)), old.magnitudes),
+        step_size=jnp.where(starts, t1 - t0, old.step_size),
+        sides=sides,
+        magnitudes=jnp.where(starts, magnitudes, old.magnitudes),
         bracket=bracket,
-        y=tree_where(at_right, y, old.y),
-        values=jnp.where(at_right, values, old.values),
+        y=tree_where(at_right_end, y, old.y),
+        values=jnp.where(at_right_end, values, old.values),
         values_after=jnp.where(done, values, old.values_after),
-        active=on,
-        narrowing=on & bracket.not_converged(),
+        active=active,
+        narrowing=active & bracket.not_converged(),
         done=done,
     )
     return jnp.where(done, search.values, values), search
 
 
-def event_info(search: EventSearch, guards: Float[Array, " guards"], t) -> EventInfo:
-    """Which guards fired, where a search that ended at t has looked for that. guards: their values
-    there."""
-    crossed, passed = search.sides != 0, search.sides * search.values
-    first = jnp.argmax(jnp.where(crossed, passed, -jnp.inf)).astype(jnp.int32)
-    fired = (crossed & (search.sides * search.values_after >= 0)) | (
-        jnp.arange(crossed.shape[0], dtype=jnp.int32) == first
-    )
-    value, grown, large = (
-        jnp.abs(passed[first]),
-        jnp.abs(search.values_after - search.values)[first],
-        GRAZING_THRESHOLD * search.magnitudes[first],
-    )
-    jumps = search.done & (value > grown) & (value > large)
-    flat = search.done & ~jumps & (grown / event_tolerance(t) * search.step_size < large)
+def event_info(search: EventSearch, guard_values: Float[Array, " guards"], t) -> EventInfo:
+    """Return which guards fired in a search that ended at t.
+
+    guard_values: values of the guards at t.
+    """
+    crossed, beyond = search.sides != 0, search.sides * search.values
+    first = jnp.argmax(jnp.where(crossed, beyond, -jnp.inf)).astype(jnp.int32)
+    crossed_after = crossed & (search.sides * search.values_after >= 0)
+    fired = crossed_after | (jnp.arange(crossed.shape[0], dtype=jnp.int32) == first)
     fired = fired & search.done
-    # zero: not armed, until it has left zero
-    values = jnp.where(fired, 0, guards)
+    value = jnp.abs(beyond[first])
+    change = jnp.abs(search.values_after - search.values)[first]
+    threshold = GRAZING_THRESHOLD * search.magnitudes[first]
+    jumps = search.done & (value > change) & (value > threshold)
+    change_in_step = change / event_tolerance(t) * search.step_size
     return EventInfo(
-        fired=fired, values=values, first=first, occurred=search.done, jumps=jumps, grazing=flat
+        fired=fired,
+        # A guard at zero is not armed until it has left zero.
+        values=jnp.where(fired, 0, guard_values),
+        first=first,
+        occurred=search.done,
+        jumps=jumps,
+        grazing=search.done & ~jumps & (change_in_step < threshold),
     )

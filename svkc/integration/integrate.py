@@ -1,8 +1,7 @@
-"""The steps of one phase: forward until its end, or until a guard has gone through zero; then, from
-the same step's begin, to where it was zero.
+"""Integrate one phase; if a guard changes sign, locate the root by re-taking that step.
 
-One loop does both, so that a program holds the field, the solver's stages and the way back onto the
-loops once. Nothing here is differentiated.
+One loop takes the steps and locates the root, so that its program holds the vector field, the
+stages of the solver and the projection once. Nothing in this module is differentiated.
 """
 
 import dataclasses
@@ -15,7 +14,7 @@ from jaxtyping import Array, Float
 
 from svkc._jax.control_flow import buffer_at_set, while_loop
 from svkc._jax.pytrees import tree_where
-from svkc.integration.event_location import Bracket, EventSearch, event_info, update_search
+from svkc.integration.event_location import EventSearch, event_info, update_search
 from svkc.integration.ode import ODEState, is_finite, rms_norm
 from svkc.integration.solution import (
     EVENT,
@@ -38,261 +37,268 @@ from svkc.integration.vector_field import ProjectionInfo, project_state
 
 
 def integrate_phase(
-    start: ODEState, times, world: PhaseProblem, how: StepperOptions
+    start: ODEState, times, problem: PhaseProblem, options: StepperOptions
 ) -> PhaseSolution:
-    """From times = (t0, stop, save times) to `stop`, or to where a guard was zero first."""
-    _, stop, at = times
-    world = PhaseProblem(world.field_args, dataclasses.replace(world.field, differentiated=False))
+    """Integrate one phase to its scheduled end, or to the first event.
 
-    def going(s: StepperState):
-        more = (s.t < stop) & (s.accepted + s.rejected < how.max_steps)
+    times: start, scheduled end and save times.
+    """
+    _, stop, save_ts = times
+    problem = PhaseProblem(
+        problem.field_args, dataclasses.replace(problem.field, differentiated=False)
+    )
+
+    def cond_fun(s: StepperState):
+        unfinished = (s.t < stop) & (s.accepted + s.rejected < options.max_steps)
         if s.search is not None:
-            more = (more | s.search.active) & ~s.search.done
-        return more & (s.result == SUCCESSFUL)
+            unfinished = (unfinished | s.search.active) & ~s.search.done
+        return unfinished & (s.result == SUCCESSFUL)
 
-    begin, buffers = (
-        _init_stepper(start, times, world, how),
-        lambda s: (s.step_ts, s.checkpoints, s.ys),
-    )
     end = while_loop(
-        going, lambda s: _body_fun(s, times, world, how), begin, buffers=buffers, kind="lax"
+        cond_fun,
+        lambda s: _body_fun(s, times, problem, options),
+        _init_stepper(start, times, problem, options),
+        buffers=lambda s: (s.step_ts, s.checkpoints, s.ys),
+        kind="lax",
     )
-    how.progress_meter.close(end.progress_meter_state)
-    # of times that are equal the first one's row is written
-    saved = jax.tree.map(lambda x: x[jnp.searchsorted(at, at)], end.ys) if at.shape[0] else end.ys
-    short = jnp.where(end.t < stop, MAX_STEPS, SUCCESSFUL)
-    fired = None if how.armed_guards is None else event_info(end.search, end.guard_values, end.t)
-    if fired is not None:
-        short = jnp.where(fired.occurred, EVENT, short)
-    result = jnp.where(end.result == SUCCESSFUL, short, end.result)
+    options.progress_meter.close(end.progress_meter_state)
+    ys = end.ys
+    if save_ts.shape[0]:
+        # The loop writes the first row of equal save times only.
+        ys = jax.tree.map(lambda x: x[jnp.searchsorted(save_ts, save_ts)], ys)
+    event, stopped = None, jnp.where(end.t < stop, MAX_STEPS, SUCCESSFUL)
+    if options.armed_guards is not None:
+        event = event_info(end.search, end.guard_values, end.t)
+        stopped = jnp.where(event.occurred, EVENT, stopped)
+    result = jnp.where(end.result == SUCCESSFUL, stopped, end.result)
     return PhaseSolution(
         t=end.t,
         y=end.y,
-        ys=saved,
+        ys=ys,
         step_ts=end.step_ts,
         checkpoints=end.checkpoints,
         accepted=end.accepted,
         rejected=end.rejected,
         result=result.astype(jnp.int32),
         stats=end.stats,
-        event=fired,
+        event=event,
     )
 
 
-def _init_stepper(start: ODEState, times, world: PhaseProblem, how: StepperOptions) -> StepperState:
-    t0, stop, at = times
-    term, no, zero = diffrax.ODETerm(world.field), jnp.zeros((), bool), jnp.zeros((), jnp.int32)
-    first, controller = how.controller.init(
+def _init_stepper(
+    start: ODEState, times, problem: PhaseProblem, options: StepperOptions
+) -> StepperState:
+    """Return the state of the stepping loop before the first step."""
+    (t0, stop, save_ts), field, field_args = times, problem.field, problem.field_args
+    term, zero = diffrax.ODETerm(field), jnp.zeros((), jnp.int32)
+    t1, controller_state = options.controller.init(
         term,
         t0,
         stop,
         start,
-        how.first_step,
-        world.field_args,
-        func=how.solver.func,
-        error_order=how.solver.error_order(term),
+        options.first_step,
+        field_args,
+        func=options.solver.func,
+        error_order=options.solver.error_order(term),
     )
     rows = lambda n: jax.tree.map(lambda x: jnp.broadcast_to(x[None], (n, *x.shape)), start)
-    values, search, seen = (
-        None,
-        None,
-        ProjectionInfo.initial(world.field, world.field_args, start.q),
-    )
-    if how.armed_guards is not None:
-        values = how.armed_guards.initial_values
-        search = EventSearch(
-            step_size=t0,
-            sides=jnp.zeros_like(values),
-            magnitudes=values,
-            bracket=Bracket.around(t0, t0, t0, t0),
-            y=start,
-            values=values,
-            values_after=values,
-            active=no,
-            narrowing=no,
-            done=no,
-        )
+    info = ProjectionInfo.initial(field, field_args, start.q)
+    guard_values, search = None, None
+    if options.armed_guards is not None:
+        guard_values = options.armed_guards.initial_values
+        search = EventSearch.inactive(t0, start, guard_values)
     return StepperState(
         t=t0,
         y=start,
-        tnext=_clip_to_save_time(t0, first, times),
-        step_size=first - t0,
-        made_jump=no,
-        solver_state=how.solver.init(term, t0, first, start, world.field_args),
-        controller_state=controller,
-        progress_meter_state=how.progress_meter.init(),
-        guard_values=values,
+        tnext=_clip_to_save_time(t0, t1, times),
+        step_size=t1 - t0,
+        made_jump=jnp.zeros((), bool),
+        solver_state=options.solver.init(term, t0, t1, start, field_args),
+        controller_state=controller_state,
+        progress_meter_state=options.progress_meter.init(),
+        guard_values=guard_values,
         search=search,
-        step_ts=jnp.full(how.max_steps, jnp.inf, t0.dtype),
-        checkpoints=rows(how.max_steps // how.checkpoint_interval),
-        ys=rows(at.shape[0]),
+        step_ts=jnp.full(options.max_steps, jnp.inf, t0.dtype),
+        checkpoints=rows(options.max_steps // options.checkpoint_interval),
+        ys=rows(save_ts.shape[0]),
         accepted=zero,
         rejected=zero,
         result=jnp.asarray(SUCCESSFUL, jnp.int32),
-        stats=Stats.zeros(t0.dtype, seen is not None and seen.pivots is not None),
-        projection_info=seen,
+        stats=Stats.zeros(t0.dtype, info is not None and info.pivots is not None),
+        projection_info=info,
     )
 
 
 def _clip_to_save_time(t, proposed, times) -> Float[Array, ""]:
-    """The end of a step from t: as proposed, or the next time to be met."""
-    _, stop, at = times
-    limit = jnp.minimum(stop, jnp.min(jnp.where(at > t, at, jnp.inf), initial=jnp.inf))
+    """Return the end of a step from t: the proposed one, clipped to the next save time or stop."""
+    _, stop, save_ts = times
+    next_save_t = jnp.min(jnp.where(save_ts > t, save_ts, jnp.inf), initial=jnp.inf)
+    limit = jnp.minimum(stop, next_save_t)
     return jnp.where(t + (proposed - t) * (1 + MAX_STRETCH) >= limit, limit, proposed)
 
 
-def _attempt_step(s: StepperState, t1, world: PhaseProblem, how: StepperOptions) -> StepAttempt:
-    """A step of the solver to t1, settled, and what the controller says of it."""
-    term, stabilization = diffrax.ODETerm(world.field), world.field.stabilization
-    # a step begins with the rate where the one before was settled to, not with one remembered from
-    # where it was before that
-    fresh = True if needs_projection(stabilization, world.field_args) else s.made_jump
-    y, error, _, solver, solved = how.solver.step(
-        term, s.t, t1, s.y, world.field_args, s.solver, made_jump=fresh
+def _attempt_step(
+    s: StepperState, t1, problem: PhaseProblem, options: StepperOptions
+) -> StepAttempt:
+    """Take one step of the solver to t1, project it, and let the controller judge its error."""
+    field, field_args, controller = problem.field, problem.field_args, options.controller
+    term = diffrax.ODETerm(field)
+    # Projection moved the state, so the FSAL derivative is stale: re-evaluate.
+    stale = True if needs_projection(field.stabilization, field_args) else s.made_jump
+    y_solver, error, _, solver_state, solver_result = options.solver.step(
+        term, s.t, t1, s.y, field_args, s.solver_state, made_jump=stale
     )
-    raw, (y, seen) = y, project_state(world.field, world.field_args, y)
-    if error is not None and world.field.projects_by_loop_forces:
-        # without pivots nothing else shows that loops lose rank
+    y, info = project_state(field, field_args, y_solver)
+    if error is not None and field.projects_by_loop_forces:
+        # Reject a step that projection moves by more than 1000 times its tolerance: without pivots
+        # nothing else shows that loops lose rank.
+        correction = jax.tree.map(lambda new, old: jnp.abs(new - old), y, y_solver)
         error = jax.tree.map(
-            lambda e, new, old: jnp.maximum(
-                jnp.abs(e), PROJECTION_ERROR_WEIGHT * jnp.abs(new - old)
-            ),
-            error,
-            y,
-            raw,
+            lambda e, d: jnp.maximum(jnp.abs(e), PROJECTION_ERROR_WEIGHT * d), error, correction
         )
-    whole, order = is_finite(y), how.solver.error_order(term)
-    why = jnp.where(whole, LOOP_OPEN, NON_FINITE)
-    if seen is not None:
-        whole = whole & (jnp.max(seen.gap) <= how.gap)
-    error = jax.tree.map(lambda x: jnp.where(whole & jnp.isfinite(x), x, jnp.inf), error)
-    keep, t, ahead, jumped, controller, said = how.controller.adapt_step_size(
-        s.t, t1, s.y, y, world.field_args, error, error_order=order, controller_state=s.controller
+    ok = is_finite(y)
+    failure = jnp.where(ok, LOOP_OPEN, NON_FINITE)
+    if info is not None:
+        ok = ok & (jnp.max(info.gap) <= options.gap_tolerance)
+    error = jax.tree.map(lambda x: jnp.where(ok & jnp.isfinite(x), x, jnp.inf), error)
+    keep_step, t, proposed, made_jump, controller_state, controller_result = (
+        controller.adapt_step_size(
+            s.t,
+            t1,
+            s.y,
+            y,
+            field_args,
+            error,
+            error_order=options.solver.error_order(term),
+            controller_state=s.controller_state,
+        )
     )
-    keep, length = jnp.asarray(keep), ahead - t
-    if isinstance(how.controller, diffrax.PIDController):
-        # the length asked for before a step was much shortened, where that step says no more than
-        # that it may grow as far as it ever may
-        grown = keep & (length >= 0.99 * how.controller.factormax * (t1 - s.t))
-        length = jnp.where(grown, jnp.maximum(length, s.step_size), length)
-    failed = keep & (solved._value != SUCCESSFUL)
-    result = jnp.where(failed, solved._value, said._value)
-    # what is not finite, or open, is never kept: it ends the run where the step has to be of that
-    # length, or when there is no shorter one
-    result = jnp.where(~whole & (keep | (result != SUCCESSFUL)), why, result).astype(jnp.int32)
-    estimate = jnp.asarray(jnp.inf, t.dtype) if error is None else rms_norm(error)
+    keep_step = jnp.asarray(keep_step)
+    failed = keep_step & (solver_result._value != SUCCESSFUL)
+    result = jnp.where(failed, solver_result._value, controller_result._value)
+    # A step that is not ok ends the phase if the controller keeps it or has no shorter one.
+    result = jnp.where(~ok & (keep_step | (result != SUCCESSFUL)), failure, result)
     return StepAttempt(
         t=t,
         y=y,
-        keep_step=keep & whole,
-        step_size=length,
-        made_jump=jnp.asarray(jumped),
-        solver_state=solver,
-        controller_state=controller,
-        result=result,
-        error_norm=estimate,
-        projection_info=seen,
+        keep_step=keep_step & ok,
+        step_size=_unclipped_step_size(s, controller, keep_step, t1 - s.t, proposed - t),
+        made_jump=jnp.asarray(made_jump),
+        solver_state=solver_state,
+        controller_state=controller_state,
+        result=result.astype(jnp.int32),
+        error_norm=jnp.asarray(jnp.inf, t.dtype) if error is None else rms_norm(error),
+        projection_info=info,
     )
 
 
-def _attempt_and_locate(
-    s: StepperState, world: PhaseProblem, how: StepperOptions
+def _unclipped_step_size(s: StepperState, controller, keep_step, taken, proposed):
+    """Return the size of the next step, as if the last one had not been clipped to a save time.
+
+    A PID controller bounds the growth from the step `taken`. Where `proposed` reaches that bound,
+    the size proposed before the clipping is restored.
+    """
+    if not isinstance(controller, diffrax.PIDController):
+        return proposed
+    at_bound = keep_step & (proposed >= 0.99 * controller.factormax * taken)
+    return jnp.where(at_bound, jnp.maximum(proposed, s.step_size), proposed)
+
+
+def _locate_event(
+    s: StepperState, attempt: StepAttempt, t1, problem: PhaseProblem, options: StepperOptions
 ) -> tuple[StepAttempt, Array, EventSearch, Array]:
-    """Take a try of a step and look at the guards there. Return it, the values of the guards, the
-    search for the zero of one, and whether that search goes on or has just ended."""
-    t1 = jnp.where(s.search.active, s.search.next_time(), s.tnext)
-    tried = _attempt_step(s, t1, world, how)
-    guards, search = update_search(
+    """Evaluate the guards after an attempt to t1 and advance the event search.
+
+    Return the attempt as the loop takes it, the values of the guards, the search, and whether the
+    loop stands still because a root is being located.
+    """
+    guard_values, search = update_search(
         s.search,
         s.guard_values,
         t0=s.t,
         t1=t1,
-        y=tried.y,
-        keep=tried.keep_step,
-        scene=world.field_args,
-        watched=how.armed_guards,
+        y=attempt.y,
+        keep_step=attempt.keep_step,
+        field_args=problem.field_args,
+        armed_guards=options.armed_guards,
     )
-    still = s.search.active | search.active
-    blind = tried.keep_step & jnp.any(jnp.isnan(guards))
-    t, y = tree_where(search.done, (search.bracket.b, search.y), (tried.t, tried.y))
-    tried = dataclasses.replace(
-        tried,
-        t=t,
-        y=y,
-        keep_step=(tried.keep_step & ~blind & ~still) | search.done,
-        result=jnp.where(blind, NON_FINITE, tried.result),
-    )
-    return tried, guards, search, still
+    locating = s.search.active | search.active
+    land = search.done
+    guard_is_nan = attempt.keep_step & jnp.any(jnp.isnan(guard_values))
+    advance = (attempt.keep_step & ~guard_is_nan & ~locating) | land
+    t, y = tree_where(land, (search.bracket.b, search.y), (attempt.t, attempt.y))
+    result = jnp.where(guard_is_nan, NON_FINITE, attempt.result)
+    attempt = dataclasses.replace(attempt, t=t, y=y, keep_step=advance, result=result)
+    return attempt, guard_values, search, locating
 
 
 def _write_states(
-    s: StepperState, tried: StepAttempt, t, at, accepted, every: int
+    s: StepperState, attempt: StepAttempt, t, save_ts, accepted, interval: int
 ) -> tuple[ODEState, ODEState]:
-    """Return the saved states and the kept ones, with the state after a try written in where it is
-    one of them. t, accepted: the time and the number of steps after it."""
-    saved, kept = s.ys, s.checkpoints
-    if at.shape[0]:
-        place = jnp.minimum(jnp.sum(at < t, dtype=jnp.int32), at.shape[0] - 1)
-        saved = _write_row(saved, place, tried.y, tried.keep_step & (at[place] == t))
-    if kept.q.shape[0]:
-        kept = _write_row(
-            kept, accepted // every - 1, tried.y, tried.keep_step & (accepted % every == 0)
-        )
-    return saved, kept
+    """Write the state after an attempt into the saved states and the checkpoints it belongs to.
+
+    t, accepted: time and number of accepted steps after the attempt.
+    interval: number of steps between checkpoints.
+    """
+    ys, checkpoints = s.ys, s.checkpoints
+    if save_ts.shape[0]:
+        i = jnp.minimum(jnp.sum(save_ts < t, dtype=jnp.int32), save_ts.shape[0] - 1)
+        ys = _write_row(ys, i, attempt.y, attempt.keep_step & (save_ts[i] == t))
+    if checkpoints.q.shape[0]:
+        is_checkpoint = attempt.keep_step & (accepted % interval == 0)
+        checkpoints = _write_row(checkpoints, accepted // interval - 1, attempt.y, is_checkpoint)
+    return ys, checkpoints
 
 
-def _body_fun(s: StepperState, times, world: PhaseProblem, how: StepperOptions) -> StepperState:
-    """One try: kept, or to be made shorter; or one more look at the step in which a guard went
-    through zero."""
-    t0, stop, at = times
-    if (
-        s.projection_info is not None
-        and s.projection_info.pivots is not None
-        and world.field.dynamics.hold is not None
-    ):
-        world = eqx.tree_at(
-            lambda w: w.field_args.pivots,
-            world,
-            s.projection_info.pivots,
-            is_leaf=lambda x: x is None,
+def _body_fun(
+    s: StepperState, times, problem: PhaseProblem, options: StepperOptions
+) -> StepperState:
+    """Attempt one step and advance if it is kept; or evaluate the guards once to locate a root."""
+    (t0, stop, save_ts), info = times, s.projection_info
+    if info is not None and info.pivots is not None and problem.field.dynamics.hold is not None:
+        problem = eqx.tree_at(
+            lambda p: p.field_args.pivots, problem, info.pivots, is_leaf=lambda x: x is None
         )
     if s.search is None:
-        tried = _attempt_step(s, s.tnext, world, how)
-        guards, search, still = None, None, jnp.zeros((), bool)
+        attempt = _attempt_step(s, s.tnext, problem, options)
+        guard_values, search, locating = None, None, jnp.zeros((), bool)
     else:
-        tried, guards, search, still = _attempt_and_locate(s, world, how)
-    moved = lambda new, old: tree_where(tried.keep_step, new, old)
-    # while a zero is looked for, nothing else goes on
-    next_ = lambda new, old: tree_where(still, old, new)
-    t, accepted = moved(tried.t, s.t), s.accepted + tried.keep_step.astype(jnp.int32)
-    saved, kept = _write_states(s, tried, t, at, accepted, how.checkpoint_interval)
-    result = next_(tried.result, s.result)
+        t1 = jnp.where(s.search.active, s.search.next_time(), s.tnext)
+        attempt = _attempt_step(s, t1, problem, options)
+        attempt, guard_values, search, locating = _locate_event(s, attempt, t1, problem, options)
+    moves = lambda new, old: tree_where(attempt.keep_step, new, old)
+    stands_still = lambda new, old: tree_where(locating, old, new)
+    t, accepted = moves(attempt.t, s.t), s.accepted + attempt.keep_step.astype(jnp.int32)
+    ys, checkpoints = _write_states(s, attempt, t, save_ts, accepted, options.checkpoint_interval)
+    result = stands_still(attempt.result, s.result)
+    progress = (t - t0) / jnp.where(stop > t0, stop - t0, 1)
     return StepperState(
+        # These move when the loop advances.
         t=t,
-        y=moved(tried.y, s.y),
-        tnext=next_(_clip_to_save_time(t, t + tried.step_size, times), s.tnext),
-        step_size=next_(tried.step_size, s.step_size),
-        made_jump=moved(tried.made_jump, s.made_jump),
-        solver_state=moved(tried.solver, s.solver),
-        controller_state=next_(tried.controller, s.controller),
-        progress_meter_state=how.progress_meter.step(
-            s.progress_meter_state, (t - t0) / jnp.where(stop > t0, stop - t0, 1)
-        ),
-        guard_values=None if guards is None else moved(guards, s.guard_values),
-        search=search,
-        step_ts=_write_row(s.step_ts, s.accepted, t, tried.keep_step),
-        checkpoints=kept,
-        ys=saved,
-        accepted=accepted,
-        rejected=s.rejected + (~tried.keep_step & ~still).astype(jnp.int32),
+        y=moves(attempt.y, s.y),
+        made_jump=moves(attempt.made_jump, s.made_jump),
+        solver_state=moves(attempt.solver_state, s.solver_state),
+        guard_values=None if guard_values is None else moves(guard_values, s.guard_values),
+        projection_info=moves(attempt.projection_info, info),
+        # These stand still while a root is located.
+        tnext=stands_still(_clip_to_save_time(t, t + attempt.step_size, times), s.tnext),
+        step_size=stands_still(attempt.step_size, s.step_size),
+        controller_state=stands_still(attempt.controller_state, s.controller_state),
         result=result,
-        stats=update_stats(s, tried, result, world.field_args),
-        projection_info=moved(tried.projection_info, s.projection_info),
+        # These are updated by every attempt.
+        progress_meter_state=options.progress_meter.step(s.progress_meter_state, progress),
+        search=search,
+        step_ts=_write_row(s.step_ts, s.accepted, t, attempt.keep_step),
+        checkpoints=checkpoints,
+        ys=ys,
+        accepted=accepted,
+        rejected=s.rejected + (~attempt.keep_step & ~locating).astype(jnp.int32),
+        stats=update_stats(s, attempt, result, problem.field_args),
     )
 
 
-def _write_row(rows, i, new, pred):
-    """Rows of numbers with new ones at i."""
-    # the index of a row that is not to be written may be anything
+def _write_row(rows, i, row, pred):
+    """Write a row at index i in place where `pred` holds."""
+    # The index of a row that is not written may be out of bounds.
     i = jnp.where(pred, i, 0)
-    return jax.tree.map(lambda x, b: buffer_at_set(b, i, x, pred=pred), new, rows)
+    return jax.tree.map(lambda x, b: buffer_at_set(b, i, x, pred=pred), row, rows)

@@ -83,20 +83,24 @@ class SimplifiedNewton(diffrax.VeryChord):
     """
 
     def terminate(self, fn, y, args, options, state, tags):
-        size, again = state.diffsize, state.step >= 2
-        rate = size / state.diffsize_prev
-        near = (size <= self.kappa) | (
-            self.norm(state.diff) <= 100 * jnp.finfo(size.dtype).eps * self.norm(y)
+        update = state.diffsize
+        rate = update / state.diffsize_prev
+        round_off = 100 * jnp.finfo(update.dtype).eps * self.norm(y)
+        small = (update <= self.kappa) | (self.norm(state.diff) <= round_off)
+        # The rate of convergence needs two updates.
+        has_rate = state.step >= 2
+        remaining_error = update * rate / (1 - rate)
+        converged = ((state.step >= 1) & small) | (
+            has_rate & (rate < 1) & (remaining_error <= self.kappa)
         )
-        close = ((state.step >= 1) & near) | (
-            again & (rate < 1) & (size * rate / (1 - rate) <= self.kappa)
-        )
-        diverging = again & ~close & ~(rate < 2)
+        diverging = has_rate & ~converged & ~(rate < 2)
         failed = state.result != optimistix.RESULTS.successful
         result = optimistix.RESULTS.where(
             diverging, optimistix.RESULTS.nonlinear_divergence, optimistix.RESULTS.successful
         )
-        return failed | close | diverging, optimistix.RESULTS.where(failed, state.result, result)
+        return failed | converged | diverging, optimistix.RESULTS.where(
+            failed, state.result, result
+        )
 
 
 @checked_jit

@@ -1,4 +1,4 @@
-"""The problem, the options, the state and the solution of the integration of one phase."""
+"""The problem, the options, the state of the stepping loop and the solution of one phase."""
 
 from typing import Any
 
@@ -13,27 +13,37 @@ from svkc.integration.vector_field import ProjectionInfo, VectorField
 from svkc.loops.constraint import largest_gaps
 from svkc.model.chain import State
 
+# result codes of a phase: these of svkc, and diffrax's own
 NON_FINITE, LOOP_OPEN = -1, -2
-# by articulated bodies a step may be moved, as it is put back onto the loops, by 1 / MOVED of what
-# it may err by
-PROJECTION_ERROR_WEIGHT = 1e-3
 SUCCESSFUL, EVENT, MAX_STEPS = (
     diffrax.RESULTS.successful._value,
     diffrax.RESULTS.event_occurred._value,
     diffrax.RESULTS.max_steps_reached._value,
 )
+# Projection by the loops' forces adds this fraction of its correction to the error estimate.
+PROJECTION_ERROR_WEIGHT = 1e-3
 
 
 class PhaseProblem(eqx.Module):
-    """What the motion depends on besides its start: the scene, and the vector field with all that
-    it closes over."""
+    """Everything the motion of a phase depends on besides its start and its times.
+
+    field: the vector field, with the arrays that control closes over as leaves.
+    """
 
     field_args: FieldArgs
     field: VectorField
 
 
 class StepperOptions(eqx.Module):
-    """What finds the steps: nothing of it is differentiated."""
+    """How steps are chosen. None of these fields is differentiated.
+
+    armed_guards: guards that may end the phase. None: no event can.
+    controller: step-size controller of diffrax.
+    first_step: size of the first step (s). None: the controller chooses.
+    gap_tolerance: steps that leave a larger loop gap are rejected (rad, units of `chain.length`).
+    max_steps: the most attempted steps of a phase.
+    checkpoint_interval: one state in so many steps is stored.
+    """
 
     solver: diffrax.AbstractSolver
     armed_guards: ArmedGuards | None
@@ -46,10 +56,16 @@ class StepperOptions(eqx.Module):
 
 
 class Stats(eqx.Module):
-    """What a run has cost and shown: tries, and of the steps that were kept the sum of their
-    estimated errors (root mean square over q and v; inf: the solver gives none), the least |R_mm| /
-    |R_11| of the loops, how often the dependent coordinates changed (-1: not looked at), the loop
-    that could not be closed (-1: none), and the largest of the loops' gaps (rad, m)."""
+    """Statistics of the steps of a phase.
+
+    attempts: attempted steps, those of event location included. All other fields are of the steps
+        that were kept.
+    error: sum of their estimated errors, root mean square over q and v. inf: no estimates.
+    margin: least |R_mm| / |R_11| of the loop Jacobian.
+    swaps: changes of the dependent coordinates. -1: not counted.
+    loop: index of a loop that could not be closed. -1: none.
+    gap: largest gaps of the loops (rad, m).
+    """
 
     attempts: Int[Array, ""]
     error: Float[Array, ""]
@@ -59,29 +75,43 @@ class Stats(eqx.Module):
     gap: Float[Array, "2"]
 
     @classmethod
-    def zeros(cls, dtype, looked: bool) -> "Tally":
-        """Before the first step."""
+    def zeros(cls, dtype, counts_swaps: bool) -> "Stats":
+        """Return the statistics before the first step."""
         zero = jnp.zeros((), jnp.int32)
         return cls(
             attempts=zero,
             error=jnp.zeros((), dtype),
             margin=jnp.ones((), dtype),
-            swaps=zero if looked else zero - 1,
+            swaps=zero if counts_swaps else zero - 1,
             loop=zero - 1,
             gap=jnp.zeros(2, dtype),
         )
 
     @classmethod
-    def attempts_only(cls, dtype, tries: Int[Array, ""]) -> "Tally":
-        """Return the tally of a loop that counts tries alone."""
-        no, one = jnp.asarray(-1, jnp.int32), jnp.ones((), dtype)
-        gap = jnp.zeros(2, dtype)
-        return cls(attempts=tries, error=jnp.inf * one, margin=one, swaps=no, loop=no, gap=gap)
+    def attempts_only(cls, dtype, attempts: Int[Array, ""]) -> "Stats":
+        """Return the statistics of a loop that counts its attempts alone."""
+        unknown, one = jnp.asarray(-1, jnp.int32), jnp.ones((), dtype)
+        return cls(
+            attempts=attempts,
+            error=jnp.inf * one,
+            margin=one,
+            swaps=unknown,
+            loop=unknown,
+            gap=jnp.zeros(2, dtype),
+        )
 
 
 class PhaseSolution(eqx.Module):
-    """Where a solve ended, the states at the times asked for, the times of its steps (inf: not
-    taken), one state in `every`, diffrax's result code."""
+    """The solution of one phase.
+
+    t, y: time and state at its end.
+    ys: states at the save times.
+    step_ts: times at the ends of the steps, inf in unused rows.
+    checkpoints: states after every `checkpoint_interval` steps.
+    accepted, rejected: numbers of steps.
+    result: result code, diffrax's or one of this module.
+    event: the event at the end. None: there are no guards.
+    """
 
     t: Float[Array, ""]
     y: ODEState
@@ -96,8 +126,14 @@ class PhaseSolution(eqx.Module):
 
 
 class StepperState(eqx.Module):
-    """What goes from step to step. length: what the controller asks for, before a time to be met
-    shortens it; times, kept, saved: as in `Path`, but buffers within the loop."""
+    """The state of the stepping loop.
+
+    tnext: end of the next step, clipped at save times.
+    step_size: size that the controller proposed, before clipping.
+    guard_values: values of the guards at t.
+    step_ts, checkpoints, ys: as in `PhaseSolution`, as buffers of the loop.
+    projection_info: that of the last projection. None: steps are not projected.
+    """
 
     t: Float[Array, ""]
     y: ODEState
@@ -120,7 +156,14 @@ class StepperState(eqx.Module):
 
 
 class StepAttempt(eqx.Module):
-    """What a try has led to."""
+    """One attempted step.
+
+    t: end of the step if it is kept, else its start.
+    y: projected state at the end of the step.
+    keep_step: whether the loop advances to (t, y).
+    step_size: size that the controller proposes for the next step.
+    error_norm: root mean square of the estimated error over q and v. inf: no estimate.
+    """
 
     t: Float[Array, ""]
     y: ODEState
@@ -135,34 +178,39 @@ class StepAttempt(eqx.Module):
 
 
 def update_stats(
-    s: StepperState, tried: StepAttempt, result: Int[Array, ""], scene: FieldArgs
+    s: StepperState, attempt: StepAttempt, result: Int[Array, ""], field_args: FieldArgs
 ) -> Stats:
-    """With one more try. result: how the run stands after it."""
-    old, kept = s.stats, tried.keep_step
-    margin, swaps, gap = old.margin, old.swaps, old.gap
-    if tried.projection_info is not None and tried.projection_info.pivots is not None:
-        margin = jnp.where(kept, jnp.minimum(margin, tried.projection_info.margin), margin)
-        # the first choice of a phase is no change
-        swapped = jnp.any(s.projection_info.dependent) & jnp.any(
-            s.projection_info.dependent != tried.projection_info.dependent
-        )
-        swaps = swaps + (kept & swapped).astype(jnp.int32)
-    loop = old.loop
-    if tried.projection_info is not None:
-        widest = jnp.argmax(jnp.max(tried.projection_info.gap, 1)).astype(jnp.int32)
+    """Return the statistics after one more attempt.
+
+    result: result code of the loop after the attempt.
+    """
+    old, keep_step, info = s.stats, attempt.keep_step, attempt.projection_info
+    margin, swaps, loop, gap = old.margin, old.swaps, old.loop, old.gap
+    if info is not None and info.pivots is not None:
+        margin = jnp.where(keep_step, jnp.minimum(margin, info.margin), margin)
+        dependent = s.projection_info.dependent
+        # The first selection of a phase is not a swap.
+        swapped = jnp.any(dependent) & jnp.any(dependent != info.dependent)
+        swaps = swaps + (keep_step & swapped).astype(jnp.int32)
+    if info is not None:
+        widest = jnp.argmax(jnp.max(info.gap, 1)).astype(jnp.int32)
         loop = jnp.where(result == LOOP_OPEN, widest, loop)
-    if len(scene.chain.link_names):
-        gap = jnp.where(kept, jnp.maximum(gap, _max_gaps(tried, scene)), gap)
-    error = old.error + jnp.where(kept, tried.error, 0)
+    if len(field_args.chain.link_names):
+        gap = jnp.where(keep_step, jnp.maximum(gap, _max_gaps(attempt, field_args)), gap)
     return Stats(
-        attempts=old.attempts + 1, error=error, margin=margin, swaps=swaps, loop=loop, gap=gap
+        attempts=old.attempts + 1,
+        error=old.error + jnp.where(keep_step, attempt.error_norm, 0),
+        margin=margin,
+        swaps=swaps,
+        loop=loop,
+        gap=gap,
     )
 
 
-def _max_gaps(tried: StepAttempt, scene: FieldArgs) -> Float[Array, "2"]:
-    """The largest of the loops' gaps (rad, m) at the end of a try."""
-    if tried.projection_info is None:
-        return largest_gaps(scene.chain, State(tried.y.q, tried.y.v, scene.structure))[0]
-    return jnp.max(tried.projection_info.gap, 0) * jnp.stack(
-        [jnp.ones_like(scene.chain.length), scene.chain.length]
-    )
+def _max_gaps(attempt: StepAttempt, field_args: FieldArgs) -> Float[Array, "2"]:
+    """Return the largest gaps of the loops (rad, m) at the end of an attempt."""
+    chain, y = field_args.chain, attempt.y
+    if attempt.projection_info is None:
+        return largest_gaps(chain, State(y.q, y.v, field_args.structure))[0]
+    units = jnp.stack([jnp.ones_like(chain.length), chain.length])
+    return jnp.max(attempt.projection_info.gap, 0) * units

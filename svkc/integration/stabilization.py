@@ -62,7 +62,7 @@ class Baumgarte(AbstractStabilization):
 
 
 class NoStabilization(AbstractStabilization):
-    """Leave loops to drift apart: integrate the accelerations of paper (33) and nothing else."""
+    """Leave the loops to drift: integrate the constrained accelerations and correct nothing."""
 
 
 def needs_projection(stabilization: AbstractStabilization, field_args: FieldArgs) -> bool:

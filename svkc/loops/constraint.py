@@ -161,8 +161,8 @@ def assemble_loop_jacobian(
     np.put_along_axis(source, top.links.dof, np.arange(6 * count).reshape(-1, 6), 1)
     virtual = static_take(S.reshape(-1, 6), source[:, top.nv : top.dofs])
     J = jnp.concatenate([tree, virtual], 1)
-    active_v = structure.connected[:, None, None] & active_dofs(chain, structure)[None, :, None]
-    J = jnp.where(active_v, J, 0)
+    active = structure.connected[:, None, None] & active_dofs(chain, structure)[None, :, None]
+    J = jnp.where(active, J, 0)
     return jnp.swapaxes(J, 1, 2).reshape(-1, top.dofs)
 
 

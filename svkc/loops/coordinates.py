@@ -1,7 +1,7 @@
-"""Which coordinates are independent, and what follows from it: H, W, S, Hdot v (paper, section II).
+"""Coordinate partitioning: independent coordinates and H, W, S, Hdot v (paper, section II).
 
-Rows in metres and columns of slides are divided by the chain's `length`, so that pivots and rank
-have no units.
+Pivots and rank are those of the scaled J_C (`jacobian_scales`), so that they do not depend on
+units.
 """
 
 import equinox as eqx
@@ -17,13 +17,13 @@ from svkc.tree.kinematics import twists
 
 
 class Coordinates(eqx.Module):
-    """The paper's matrices, over every joint coordinate (rows of dependent, locked and unconnected
-    coordinates' columns are zero).
+    """The paper's matrices, over every joint coordinate.
 
-    `W` [dofs, dofs]: all velocities from the independent ones (16); `bias` [dofs]: Hdot v_G (21) on
-    the dependent ones;
-    `independent`, `dependent`: the choice theta_G, theta_S; `actuated`: theta_A; `selection`: the
-    pivots; `J`: the scaled J_C.
+    `W`: all velocities from the independent ones (16). Columns of dependent and of locked
+    coordinates, and of those of links not connected, are zero.
+    `bias`: Hdot v_G (21), zero for coordinates that are not dependent.
+    `independent`, `dependent`, `actuated`: the masks of theta_G, theta_S and theta_A.
+    `selection`: the pivoted QR of `J`. `J`: the scaled J_C.
     The paper's smaller matrices are rows and columns of these: W[: chain.nv, independent],
     H[dependent][:, independent], S[actuated][:, independent].
     """
@@ -38,43 +38,43 @@ class Coordinates(eqx.Module):
 
     @property
     def H(self) -> Float[Array, "dofs dofs"]:
-        """The derivative of theta_S by theta_G (17): the dependent rows of W."""
+        """Return the derivative of theta_S with respect to theta_G (17): W's dependent rows."""
         return jnp.where(self.dependent[:, None], self.W, 0)
 
     @property
     def S(self) -> Float[Array, "dofs dofs"]:
-        """The derivative of theta_A by theta_G (paper (6)): the actuated rows of W."""
+        """Return the derivative of theta_A with respect to theta_G (6): W's actuated rows."""
         return jnp.where(self.actuated[:, None], self.W, 0)
 
     @property
     def Hdot_v(self) -> Float[Array, " dofs"]:
-        """The part of the dependent accelerations that velocities make (21)."""
+        """Return the velocity-product part of the dependent accelerations (21)."""
         return self.bias
 
 
 def dependent_velocities(
-    chain: Chain, selection: PivotedQR, J: Float[Array, "rows dofs"], v: Float[Array, " dofs"]
+    chain: Chain, qr: PivotedQR, J: Float[Array, "rows dofs"], v: Float[Array, " dofs"]
 ) -> Float[Array, " dofs"]:
-    """W v_G (16): the dependent velocities as the independent ones ask for."""
+    """Return W v_G (16): v with its dependent velocities computed from the independent ones."""
     _, column = jacobian_scales(chain)
-    Jm, JS = pivot_blocks(selection, J)
-    return v - column * (selection.P.T @ solve_pivot_block(JS, Jm @ (v / column)))
+    Jm, JS = pivot_blocks(qr, J)
+    return v - column * (qr.P.T @ solve_pivot_block(JS, Jm @ (v / column)))
 
 
 def partition_coordinates(
     chain: Chain,
     structure: Structure,
-    selection: PivotedQR,
+    qr: PivotedQR,
     J: Float[Array, "rows dofs"],
     bias: Float[Array, " rows"],
 ) -> Coordinates:
-    """W and Hdot v from the loops' rows and the choice of pivots: (14)-(21)."""
+    """Return W and Hdot v from the scaled J_C, its pivoted QR and Jdot_C v (paper (14)-(21))."""
     _, column = jacobian_scales(chain)
-    Jm, JS = pivot_blocks(selection, J)
-    dependent = jnp.any(selection.P > 0, 0)
+    Jm, JS = pivot_blocks(qr, J)
+    dependent = jnp.any(qr.P > 0, 0)
     independent = active_dofs(chain, structure) & ~dependent
-    solved = solve_pivot_block(JS, jnp.concatenate([Jm, (selection.Q @ bias)[:, None]], 1))
-    from_pivots = selection.P.T @ solved
+    JS_inverse_rows = solve_pivot_block(JS, jnp.concatenate([Jm, (qr.Q @ bias)[:, None]], 1))
+    from_pivots = qr.P.T @ JS_inverse_rows
     W = jnp.where(independent[None], jnp.eye(len(column), dtype=J.dtype) - from_pivots[:, :-1], 0)
     W = column[:, None] * W / column[None]
     return Coordinates(
@@ -83,7 +83,7 @@ def partition_coordinates(
         independent=independent,
         dependent=dependent,
         actuated=chain.actuated,
-        selection=selection,
+        selection=qr,
         J=J,
     )
 
@@ -91,14 +91,16 @@ def partition_coordinates(
 def closed_coordinates(
     chain: Chain, structure: Structure, v: Float[Array, " dofs"], loops: LoopKinematics, V
 ) -> Coordinates:
-    """Return `constrain` at one state. V: twists of the tree (`twists`)."""
+    """Return the coordinates of a chain with virtual links. V: twists of the tree."""
     bias = constraint_bias(chain, structure, v, loops, V)
     return partition_coordinates(chain, structure, select_pivots(structure, loops.J), loops.J, bias)
 
 
 def open_coordinates(chain: Chain, structure: Structure) -> Coordinates:
-    """The coordinates of a chain without virtual links: every joint that is not locked is
-    independent."""
+    """Return the coordinates of a chain without virtual links.
+
+    Every coordinate that is not locked is independent.
+    """
     n, dtype = chain.dofs, chain.q_load.dtype
     free = jnp.ones(n, bool) if structure.locked is None else ~structure.locked
     none = jnp.zeros((0, n), dtype)
@@ -117,8 +119,10 @@ def open_coordinates(chain: Chain, structure: Structure) -> Coordinates:
 
 @checked_jit(eager=True)
 def coordinates(chain: Chain, state: State) -> Coordinates:
-    """H, W, S (without units, rad or m per rad or m), Hdot v (rad/s^2, m/s^2) and the selection, as
-    the paper names them (section II)."""
+    """Return the coordinate partitioning of a state, as the paper names it (section II).
+
+    H, W and S are in rad or m per rad or m, Hdot v in rad/s^2 and m/s^2.
+    """
     if not len(chain.link_names):
         return open_coordinates(chain, state.structure)
     loops = loop_kinematics(chain, state.structure, state.q)
@@ -127,27 +131,29 @@ def coordinates(chain: Chain, state: State) -> Coordinates:
 
 
 def with_independent(chain: Chain, state: State, *names: str) -> State:
-    """The state with these joint coordinates asked to be independent (theta_G), as far as the loops
-    let them be; no names: the choice is svkc's again.
+    """Return the state with these joint coordinates preferred as independent (theta_G).
 
-    names: of joints, virtual links, or single coordinates (`chain.dof_names`). The motion does not
-    depend on it. ValueError: unknown names.
+    They are independent as far as the loops allow. The motion does not depend on the choice.
+
+    names: joints, virtual links, or single coordinates (`chain.dof_names`). Without names no
+    coordinate is preferred.
+    Raises ValueError if a name is unknown.
     """
     check_state(chain, state)
     mask = np.zeros(chain.dofs, bool)
     for name in names:
-        here = np.array(
+        named = np.array(
             [
                 isinstance(name, str) and name in (n, n.rpartition(".")[0] or n)
                 for n in chain.dof_names
             ]
         )
-        if not here.any():
+        if not named.any():
             raise ValueError(
                 f"no joint coordinate {name!r}; coordinates: {', '.join(chain.dof_names)}"
             )
-        mask |= here
-    wanted = jnp.asarray(mask) if names else None
+        mask |= named
+    independent = jnp.asarray(mask) if names else None
     return eqx.tree_at(
-        lambda s: s.structure.independent, state, wanted, is_leaf=lambda x: x is None
+        lambda s: s.structure.independent, state, independent, is_leaf=lambda x: x is None
     )

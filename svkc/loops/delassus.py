@@ -1,9 +1,9 @@
-"""Accelerations of a closed chain by articulated bodies and the forces of its loops: no pivots are
-chosen.
+"""Accelerations of a closed chain by articulated bodies and loop forces, without pivots.
 
-What a force in one loop row does in all others is Delassus' matrix D = J M^-1 J^T over the tree's
-coordinates. Virtual joints have coordinates without inertia: along them nothing is carried, so the
-rows are seen across them alone; the three rows that a ball turns in are not in D at all.
+Delassus' matrix D = J M^-1 J^T, over the tree's coordinates, is the relative acceleration of every
+loop row for a unit force in each. Virtual joints have coordinates without inertia, along which a
+loop transmits no force, so that the rows are projected onto the complement of the virtual joints'
+motion subspaces. The three angular rows of a ball vanish there and are left out of D.
 """
 
 from collections.abc import Callable
@@ -21,150 +21,164 @@ from svkc.tree.articulated_body import articulated_inertias, delassus_matrix, so
 from svkc.tree.kinematics import Kinematics
 from svkc.tree.spatial import inverse_positive, matvec
 
-# of the forces' error, along a row with 1e-6 of the others' inverse inertia, each leaves 1e-4
-# (float64)
+# Steps of iterative refinement. Each leaves 1e-4 (float64) of the forces' error along a row whose
+# inverse inertia is 1e-6 of the others'.
 REFINEMENTS = 2
-# the joint that turns as it likes
 BALL_FREEDOMS = (True, True, True, False, False, False)
-# rows from which LAPACK factors D: the inverse by halves is compiled for each size, and its
-# operations grow with the rows
+# Rows from which D is factored by LAPACK. Block inversion is compiled for each size, and its
+# operations grow with the rows.
 LAPACK_MIN_ROWS = 36
 
 
 class VirtualJoints(eqx.Module):
-    """The virtual joints' own coordinates, link by link, as many as the freest has: their motion S
-    [links, row, freedom], and (S^T S)^-1; where each stands among the coordinates of virtual joints
-    (`count`: nowhere)."""
+    """Motion subspaces of the virtual joints, padded to the d freedoms of the freest.
+
+    S: motion subspace of each link. gram_inverse: (S^T S)^-1.
+    dof: index of each freedom among the virtual joints' coordinates (padding: `count`).
+    count: number of these coordinates.
+    """
 
     S: Float[Array, "links 6 d"]
-    inverse: Float[Array, "links d d"]
-    place: np.ndarray
+    gram_inverse: Float[Array, "links d d"]
+    dof: np.ndarray
     count: int
 
-    def across(self, x: Float[Array, "*n rows"]) -> Float[Array, "*n rows"]:
-        """The part of the rows that virtual joints cannot follow."""
-        rates = self.along(x)
-        return x - matvec(_align_batch_axes(self.S, rates), rates).reshape(x.shape)
-
-    def part(self, links: np.ndarray) -> "Joints":
-        """Those of some links."""
-        S, inverse, place = self.S[links], self.inverse[links], self.place[links]
-        return VirtualJoints(S=S, inverse=inverse, place=place, count=self.count)
-
-    def along(self, x: Float[Array, "*n rows"]) -> Float[Array, "*n links d"]:
-        """The rates of virtual joints that follow the rows best."""
+    def rates(self, x: Float[Array, "*n rows"]) -> Float[Array, "*n links d"]:
+        """Return S^+ x, the joint rates that fit the loop rows x best."""
         x = x.reshape(*x.shape[:-1], -1, 6)
         return matvec(
-            _align_batch_axes(self.inverse, x),
+            _align_batch_axes(self.gram_inverse, x),
             matvec(_align_batch_axes(jnp.swapaxes(self.S, -1, -2), x), x),
         )
 
-    def of(self, x: Float[Array, " virtual"]) -> Float[Array, "links d"]:
-        """What stands for each freedom of each link; zero for those that are none."""
-        return static_take(x, np.minimum(self.place, self.count))
+    def reject(self, x: Float[Array, "*n rows"]) -> Float[Array, "*n rows"]:
+        """Return x - S S^+ x, the part of the loop rows that the joints cannot follow."""
+        rates = self.rates(x)
+        return x - matvec(_align_batch_axes(self.S, rates), rates).reshape(x.shape)
 
-    def order(self, rates: Float[Array, "links d"]) -> Float[Array, " virtual"]:
-        """The same in the order of the coordinates."""
-        flat = self.place.ravel()
+    def subset(self, links: np.ndarray) -> "VirtualJoints":
+        """Return the virtual joints of some links."""
+        S, gram_inverse, dof = self.S[links], self.gram_inverse[links], self.dof[links]
+        return VirtualJoints(S=S, gram_inverse=gram_inverse, dof=dof, count=self.count)
+
+    def gather(self, x: Float[Array, " virtual"]) -> Float[Array, "links d"]:
+        """Return x, over the virtual joints' coordinates, by link; zero for padding."""
+        return static_take(x, np.minimum(self.dof, self.count))
+
+    def scatter(self, rates: Float[Array, "links d"]) -> Float[Array, " virtual"]:
+        """Return rates, by link, over the virtual joints' coordinates."""
+        flat = self.dof.ravel()
         return static_take(
             rates.ravel(), np.argsort(flat, kind="stable")[: np.sum(flat < self.count)]
         )
 
 
 class DelassusRows(NamedTuple):
-    """The rows of J that are in D: all six of `whole` links, then the last three of those with a
-    ball; where each row of J is among them (past their end: nowhere)."""
+    """The rows of J that are in D: first six of each `full_links`, then three of each free ball.
 
-    whole: np.ndarray
-    kept: np.ndarray
-    back: np.ndarray
+    full_links: links with all six rows in D. rows: their indices in J.
+    position: of each row of J its index in D (not in D: the size of D).
+    """
 
-    def fill(self, x: Float[Array, " kept"]) -> Float[Array, " rows"]:
-        """All rows of J, zero where they are not in D."""
-        return static_take(x, self.back)
+    full_links: np.ndarray
+    rows: np.ndarray
+    position: np.ndarray
+
+    def expand(self, x: Float[Array, " delassus"]) -> Float[Array, " rows"]:
+        """Return x over all rows of J, zero for rows that are not in D."""
+        return static_take(x, self.position)
 
 
-def delassus_rows(chain: Chain, locked: bool) -> DelassusRows:
-    """A declared ball turns freely where none of its coordinates is locked; what a spare slot holds
-    is known at run time alone."""
+def delassus_rows(chain: Chain, any_locked: bool) -> DelassusRows:
+    """Return the rows of J that are in D.
+
+    The angular rows of a declared ball are left out unless some joint may be locked. Those of a
+    spare slot are kept, as its joint is known at run time only.
+    """
     top = chain.topology
-    free = np.array(
+    is_free_ball = np.array(
         [
-            tuple(f) == BALL_FREEDOMS and not spare
+            tuple(f) == BALL_FREEDOMS and not spare and not any_locked
             for f, spare in zip(top.link_freedoms, top.link_spare, strict=True)
         ],
         bool,
     )
-    free = free & (not locked)
-    six = np.arange(6 * len(free)).reshape(-1, 6)
-    kept = np.concatenate([six[~free].ravel(), six[free][:, 3:].ravel()])
-    back = np.full(six.size, len(kept))
-    back[kept] = np.arange(len(kept))
-    return DelassusRows(np.flatnonzero(~free), kept, back)
+    of_link = np.arange(6 * len(is_free_ball)).reshape(-1, 6)
+    rows = np.concatenate([of_link[~is_free_ball].ravel(), of_link[is_free_ball][:, 3:].ravel()])
+    position = np.full(of_link.size, len(rows))
+    position[rows] = np.arange(len(rows))
+    return DelassusRows(np.flatnonzero(~is_free_ball), rows, position)
 
 
 def _align_batch_axes(
     A: Float[Array, "links i j"], x: Float[Array, "*n links k"]
 ) -> Float[Array, "*m links i j"]:
+    """Return A with an axis of size 1 for each batch axis of x."""
     return A.reshape(*(1,) * (x.ndim - 2), *A.shape)
 
 
 def virtual_joints(chain: Chain, J: Float[Array, "rows dofs"]) -> VirtualJoints:
-    """From the columns of the virtual joints in J."""
-    place, count = np.sort(chain.topology.links.dof - chain.nv, 1), chain.dofs - chain.nv
-    place = place[:, : max(1, np.max(np.sum(place < count, 1)))]
-    own = jnp.concatenate([J[:, chain.nv :], jnp.zeros_like(J[:, :1])], 1).reshape(-1, 6, count + 1)
-    S = jnp.swapaxes(own[np.arange(len(place))[:, None], :, np.minimum(place, count)], -1, -2)
-    still = jnp.where(jnp.all(S == 0, 1), 1, 0).astype(J.dtype)
-    G = (
+    """Return the virtual joints, with the motion subspaces in the columns of J."""
+    dof, count = np.sort(chain.topology.links.dof - chain.nv, 1), chain.dofs - chain.nv
+    dof = dof[:, : max(1, np.max(np.sum(dof < count, 1)))]
+    columns = jnp.concatenate([J[:, chain.nv :], jnp.zeros_like(J[:, :1])], 1)
+    columns = columns.reshape(-1, 6, count + 1)
+    S = jnp.swapaxes(columns[np.arange(len(dof))[:, None], :, np.minimum(dof, count)], -1, -2)
+    is_padding = jnp.where(jnp.all(S == 0, 1), 1, 0).astype(J.dtype)
+    gram = (
         jnp.sum(S[:, :, :, None] * S[:, :, None], 1)
-        + still[:, :, None] * np.eye(place.shape[1], dtype=J.dtype)[None]
+        + is_padding[:, :, None] * np.eye(dof.shape[1], dtype=J.dtype)[None]
     )
-    return VirtualJoints(S=S, inverse=inverse_positive(G), place=place, count=count)
+    return VirtualJoints(S=S, gram_inverse=inverse_positive(gram), dof=dof, count=count)
 
 
-def _regularized_inverse(D: Float[Array, "kept kept"]) -> Callable:
-    """Return x -> (D + a little)^-1 x."""
-    most = jnp.max(jnp.where(np.eye(D.shape[0], dtype=bool), D, 0))
-    # (none where no loop is closed)
-    little = jnp.finfo(D.dtype).eps ** 0.625 * jnp.where(most > 0, most, 1)
-    raised = D + little * jnp.eye(D.shape[0], dtype=D.dtype)
+def _regularized_inverse(D: Float[Array, "delassus delassus"]) -> Callable:
+    """Return x -> (D + regularization)^-1 x, regularized by a multiple of D's largest entry."""
+    largest = jnp.max(jnp.where(np.eye(D.shape[0], dtype=bool), D, 0))
+    # the largest entry is zero if no loop is closed
+    regularization = jnp.finfo(D.dtype).eps ** 0.625 * jnp.where(largest > 0, largest, 1)
+    regularized = D + regularization * jnp.eye(D.shape[0], dtype=D.dtype)
     if D.shape[0] >= LAPACK_MIN_ROWS:
-        return cholesky_solver(raised)
-    inverse = inverse_positive(raised)
+        return cholesky_solver(regularized)
+    inverse = inverse_positive(regularized)
     return lambda x: matvec(inverse, x)
 
 
 def loop_force_solver(
     chain: Chain, kin: Kinematics, J: Float[Array, "rows dofs"], free: Bool[Array, " nv"] | None
 ) -> Callable:
-    """(force, rate) -> (x, mu) with M x + J^T mu = force and J x = rate, of rows that need not be
-    independent. free: joints not locked (None: all).
+    """Return (force, rate) -> (x, mu) with M x + J^T mu = force and J x = rate.
 
-    D + a little is factored, and the forces refined against D (the proximal form): where rows
-    repeat one another, or nearly so, the forces stay finite and the motion is that of the others.
+    The rows of J may be dependent. D is regularized and factored, and the forces are refined
+    against D itself (the proximal form): forces of dependent rows stay finite, and the motion is
+    that of the independent ones.
+
+    free: coordinates that are not locked (None: all).
     """
-    top, nv, tree = chain.topology, chain.nv, J[:, : chain.nv]
-    bodies, own, held = (
+    top, nv, J_tree = chain.topology, chain.nv, J[:, : chain.nv]
+    bodies, joints, in_D = (
         articulated_inertias(chain, kin, free),
         virtual_joints(chain, J),
         delassus_rows(chain, free is not None),
     )
-    some, six = own.part(held.whole), 6 * len(held.whole)
-    across = lambda x: jnp.concatenate([some.across(x[..., :six]), x[..., six:]], -1) if six else x
-    D = across(across(delassus_matrix(top, bodies, static_take(tree, held.kept))).T)
-    nearly = _regularized_inverse(D)
+    full_joints, n = joints.subset(in_D.full_links), 6 * len(in_D.full_links)
+    # free balls have no joint rates in their three linear rows
+    reject = lambda x: jnp.concatenate([full_joints.reject(x[..., :n]), x[..., n:]], -1) if n else x
+    D = reject(reject(delassus_matrix(top, bodies, static_take(J_tree, in_D.rows))).T)
+    solve_regularized = _regularized_inverse(D)
 
     def solve(force, rate):
-        # what acts on virtual joints is carried by the loops
-        carried = -matvec(own.S, matvec(own.inverse, own.of(force[nv:]))).ravel()
-        alone = solve_mass_matrix(top, bodies, force[:nv] + carried @ tree)
-        left = across(static_take(rate - tree @ alone, held.kept))
-        z = nearly(left)
+        # a force on a virtual joint, which has no inertia, is transmitted by its loop
+        transmitted = -matvec(
+            joints.S, matvec(joints.gram_inverse, joints.gather(force[nv:]))
+        ).ravel()
+        unconstrained = solve_mass_matrix(top, bodies, force[:nv] + transmitted @ J_tree)
+        residual = reject(static_take(rate - J_tree @ unconstrained, in_D.rows))
+        z = solve_regularized(residual)
         for _ in range(REFINEMENTS):
-            z = z + nearly(left - D @ z)
-        mu = carried + held.fill(across(z))
-        x = solve_mass_matrix(top, bodies, force[:nv] + mu @ tree)
-        return jnp.concatenate([x, own.order(own.along(rate - tree @ x))]), -mu
+            z = z + solve_regularized(residual - D @ z)
+        mu = transmitted + in_D.expand(reject(z))
+        x = solve_mass_matrix(top, bodies, force[:nv] + mu @ J_tree)
+        return jnp.concatenate([x, joints.scatter(joints.rates(rate - J_tree @ x))]), -mu
 
     return solve

@@ -183,7 +183,7 @@ def pivot_ratio(qr: PivotedQR) -> Float[Array, ""]:
 
 
 def pivoted_qr_with_rank(J: Float[Array, "rows dofs"]) -> tuple[PivotedQR, Int[Array, ""]]:
-    """Return the qr of J with its own rank, and the rank, by one search for pivots."""
+    """Return the pivoted QR of J with its own rank, and that rank, by one search for pivots."""
     full = pivoted_qr(jax.lax.stop_gradient(J))
     rank = count_rank(full.diag_R)
     # Steps past the rank do not change earlier ones. They are round-off, whose derivative is not

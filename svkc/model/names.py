@@ -33,14 +33,14 @@ def link_index(chain: Chain, name: str) -> int:
     return chain.link_names.index(name)
 
 
-def joint_slice(chain: Chain, name: str, joint_sizes, joint_starts) -> slice:
+def joint_slice(chain: Chain, name: str, widths, starts) -> slice:
     """Where a joint of the tree, or one that may be cut, stands in q (sizes=Q_SIZE) or v;
     ValueError naming those there are."""
     top = chain.topology
     for joint, link, freedom in top.cut_joints:
         if joint == name:
             ball = sum(top.link_freedoms[link][:3]) == 3
-            if joint_sizes is V_SIZE:
+            if widths is V_SIZE:
                 first = top.links.dof[link, freedom]
                 return slice(int(first), int(first) + (3 if ball else 1))
             first = (
@@ -52,7 +52,7 @@ def joint_slice(chain: Chain, name: str, joint_sizes, joint_starts) -> slice:
     if not isinstance(name, str) or name not in top.joint_names:
         raise ValueError(f"no joint {name!r}; joints: {', '.join(top.joint_names)}")
     row = top.joint_row[top.joint_names.index(name)]
-    return slice(joint_starts[row], joint_starts[row] + joint_sizes[top.kind[row]])
+    return slice(starts[row], starts[row] + widths[top.kind[row]])
 
 
 def body_rows(chain: Chain, *bodies: str) -> list[int]:

@@ -1,4 +1,4 @@
-"""The scenes that ship: MJCF files and a few lines of Python each."""
+"""The scenes that ship with svkc: MJCF files, and functions that load them with virtual links."""
 
 from svkc.scenes.figure import BAR_HEIGHT as BAR_HEIGHT, FOLDER as FOLDER, PALM as PALM
 from svkc.scenes.high_bar import (

@@ -13,39 +13,46 @@ from svkc.scenes.figure import (
     hanging_base_pose,
 )
 
-RADIUS = 0.02  # m: of bars and of the rails that carry them
-SPACING = 0.5  # m: from bar to bar
-HAND = 0.18  # m: from the middle to each hand, along the bars; half the shoulders' width
+BAR_RADIUS = 0.02  # m: bars, and the rails that carry them
+BAR_SPACING = 0.5  # m: distance between bars
+HAND_Y = 0.18  # m: y of each hand, half the shoulders' width
 
 
 def brachiation(**options) -> tuple[Chain, State]:
-    """The 16-joint figure under three bars, hanging from the first by its right hand, swung back
-    and at rest.
+    """Return the 16-joint figure under three bars, and a state at rest.
 
-    Bars along y under two rails, `SPACING` apart along x, `BAR_HEIGHT` above the ground. Virtual
-    links "right_hand_bar1" (holds),
-    "left_hand_bar2", "right_hand_bar3": hinges about the bars. Mobility 17 with one hand on a bar,
-    12 with two. `options` go to `svkc.load`.
+    The figure hangs from the first bar.
+
+    The right hand holds the first bar; the figure is swung back by 0.9 rad. Bars lie along y under
+    two rails, `BAR_SPACING` apart along x, `BAR_HEIGHT` above the ground. The virtual links
+    "right_hand_bar1" (connected), "left_hand_bar2" and "right_hand_bar3" are hinges about the bars.
+    Mobility is 17 with one hand on a bar, 12 with two.
+
+    options: keyword arguments of `svkc.load`.
     """
     spec = figure16()
     for bar in range(3):
-        x = bar * SPACING
+        x = bar * BAR_SPACING
         ends = (x, -0.6, BAR_HEIGHT), (x, 0.6, BAR_HEIGHT)
-        add_rod(spec, *ends, radius=RADIUS, name=f"bar{bar + 1}")
-    rail = BAR_HEIGHT + 2 * RADIUS
+        add_rod(spec, *ends, radius=BAR_RADIUS, name=f"bar{bar + 1}")
+    rail = BAR_HEIGHT + 2 * BAR_RADIUS
     for y in (-0.6, 0.6):
-        add_rod(spec, (-SPACING / 2, y, rail), (2.5 * SPACING, y, rail), radius=RADIUS)
+        add_rod(spec, (-BAR_SPACING / 2, y, rail), (2.5 * BAR_SPACING, y, rail), radius=BAR_RADIUS)
     hands = [
-        hand_on_bar(f"{side}_hand_bar{bar + 1}", side, x=bar * SPACING, y=y, connected=bar == 0)
-        for bar, (side, y) in enumerate((("right", -HAND), ("left", HAND), ("right", -HAND)))
+        hand_on_bar(f"{side}_hand_bar{bar + 1}", side, x=bar * BAR_SPACING, y=y, connected=bar == 0)
+        for bar, (side, y) in enumerate((("right", -HAND_Y), ("left", HAND_Y), ("right", -HAND_Y)))
     ]
     chain = load(spec, virtual_links=hands, **options)
     return chain, hanging_state(chain, angle=0.9)
 
 
 def hanging_state(chain: Chain, angle: float) -> State:
-    """Hanging from the first bar by the right hand, the whole figure turned back by `angle` (rad)
-    about the bar, at rest, the left arm half way up."""
+    """Return the state at rest in which the right hand holds the first bar.
+
+    The left arm is half raised.
+
+    angle: rotation of the figure about the bar, backwards (rad).
+    """
     q = {
         "base": hanging_base_pose(ARM_LENGTH, angle),
         "right_shoulder_flexion": np.pi - 0.1,

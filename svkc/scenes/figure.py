@@ -1,4 +1,4 @@
-"""What several scenes share: the 16-joint figure, bars, and how the figure hangs from a bar."""
+"""Parts that several scenes share: the 16-joint figure, bars, hands on bars, the hanging pose."""
 
 import pathlib
 
@@ -10,7 +10,7 @@ FOLDER = pathlib.Path(__file__).parent
 BAR_HEIGHT = 2.6  # m: bars above the ground
 SHOULDER_ABOVE_HIPS = 0.5155  # m: the shoulders above the hips
 ARM_LENGTH = 0.2817 + 0.2689  # m: from the shoulder to the wrist
-PALM = 0.0681  # m: from the wrist to the palm's centre
+PALM = 0.0681  # m: from the wrist to the palm's center
 
 
 def figure16():
@@ -21,7 +21,7 @@ def figure16():
 
 
 def add_rod(spec, start, end, radius: float, name: str = ""):
-    """Add a steel rod between two points (m) of the ground; nothing collides with it."""
+    """Add a steel rod between two points of the ground frame (m), without collisions."""
     import mujoco
 
     spec.worldbody.add_geom(
@@ -36,7 +36,10 @@ def add_rod(spec, start, end, radius: float, name: str = ""):
 
 
 def hand_on_bar(name: str, side: str, *, x: float, y: float, connected: bool) -> VirtualLink:
-    """Return a virtual link that holds a palm at a bar along y: a hinge about the bar."""
+    """Return a virtual link that holds a palm on a bar along y: a hinge about the bar.
+
+    x, y: position of the hand on the bar (m).
+    """
     return VirtualLink(
         name,
         "world",
@@ -51,11 +54,12 @@ def hand_on_bar(name: str, side: str, *, x: float, y: float, connected: bool) ->
 
 
 def hanging_base_pose(arm: float, angle: float) -> list[float]:
-    """Return the base's pose, (x, y, z) in m and a quaternion, of the figure that hangs from the
-    bar above the origin.
+    """Return the base's position (m) and quaternion for a figure that hangs from a bar.
 
-    arm: how far the shoulders are below the wrists (m). angle: of the whole figure about the bar,
-    backwards (rad).
+    The bar is above the origin.
+
+    arm: vertical distance from wrists to shoulders at angle zero (m).
+    angle: rotation of the figure about the bar, backwards (rad).
     """
     distance = arm + PALM + SHOULDER_ABOVE_HIPS
     quaternion = [np.cos(angle / 2), 0.0, np.sin(angle / 2), 0.0]

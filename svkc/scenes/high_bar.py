@@ -17,11 +17,13 @@ HALF_GRIP_WIDTH = 0.30  # m: half the distance between the hands
 
 
 def high_bar(**options) -> tuple[Chain, State]:
-    """The high bar of the paper's Fig. 20: the 16-joint figure, a hinge about the bar at each hand,
-    and a swing to start with.
+    """Return the high bar of the paper's Fig. 20, and a state at rest, swung back by 1.7 rad.
 
-    24 joint freedoms with both hands on the bar, 23 with one, 22 in flight. `options` go to
-    `svkc.load`.
+    The 16-joint figure holds the bar with both hands, each by a hinge about the bar (virtual links
+    "right_hand_grip", "left_hand_grip"). There are 24 joint freedoms with both hands on the bar, 23
+    with one, 22 in flight.
+
+    options: keyword arguments of `svkc.load`.
     """
     spec = figure16()
     add_rod(spec, (0, -1.2, BAR_HEIGHT), (0, 1.2, BAR_HEIGHT), radius=0.014, name="bar")
@@ -36,8 +38,10 @@ def high_bar(**options) -> tuple[Chain, State]:
 
 
 def hanging_state(chain: Chain, angle: float) -> State:
-    """Hanging from the bar by both hands, the whole figure turned by `angle` (rad) about the bar,
-    at rest."""
+    """Return the state at rest in which both hands hold the bar.
+
+    angle: rotation of the figure about the bar, backwards (rad).
+    """
     spread = np.arcsin((HALF_GRIP_WIDTH - 0.18) / ARM_LENGTH)
     q = {"base": hanging_base_pose(ARM_LENGTH * np.cos(spread), angle)}
     for side in ("right", "left"):

@@ -10,22 +10,23 @@ from svkc.scenes.figure import PALM, figure16
 from svkc.transitions.events import When, when
 from svkc.transitions.guards import touch
 
-# m: pivot above the ground, plate under it; half the distance of the rods; half the depth of the
-# plate
-PIVOT_HEIGHT, ROD_LENGTH, HALF_WIDTH, PLATE_EDGE = 3.2, 2.0, 0.33, 0.2
-HANDS_BELOW_PIVOT, THIGH_ABOVE_PLATE = (
-    1.3,
-    0.07,
-)  # m: hands under the pivot; thigh's axis above the plate
+PIVOT_HEIGHT = 3.2  # m: pivot above the ground
+ROD_LENGTH = 2.0  # m: plate below the pivot
+HALF_WIDTH = 0.33  # m: half the distance between the rods
+PLATE_EDGE = 0.2  # m: half the depth of the plate
+HANDS_BELOW_PIVOT = 1.3  # m: hands below the pivot, along the rods
+THIGH_ABOVE_PLATE = 0.07  # m: axis of a thigh above the plate
 
 
 def swing(angle: float = 0.6, **options) -> tuple[Chain, State]:
-    """The 16-joint figure sits on a swing: a ball joint between each hand and its rod, a slide
-    along the plate at each thigh.
+    """Return the 16-joint figure on a swing, at rest.
 
-    30 joint freedoms and the swing's own one; the seat gives way where a slide is cut, as when a
-    thigh has passed the plate's edge: two fewer after both have. State: at rest, the swing turned
-    by `angle` (rad) about its pivot. `options` go to `svkc.load`.
+    Each hand holds a rod by a ball joint; each thigh slides along the plate by a slide. There are
+    30 joint freedoms and the swing's own one. Where a slide is cut, the seat gives way: two joint
+    freedoms fewer after both slides are cut.
+
+    angle: rotation of the swing about its pivot (rad).
+    options: keyword arguments of `svkc.load`.
     """
     spec, links = model_and_links()
     chain = load(spec, virtual_links=links, **options)
@@ -33,7 +34,7 @@ def swing(angle: float = 0.6, **options) -> tuple[Chain, State]:
 
 
 def model_and_links():
-    """The model, an `mujoco.MjSpec`, and its virtual links."""
+    """Return the model, a `mujoco.MjSpec`, and its virtual links."""
     import mujoco
 
     spec = figure16()
@@ -88,11 +89,10 @@ def model_and_links():
 
 
 def seat_events(chain: Chain) -> list[When]:
-    """The seat gives way: each thigh's slide is cut as the thigh passes the front or the back edge
-    of the plate."""
+    """Return events that cut each thigh's slide as the thigh passes an edge of the plate."""
 
     def beyond(link):
-        along = touch(chain, link, 0.0, axes="z")  # the slide's own axis
+        along = touch(chain, link, 0.0, axes="z")  # z is the axis of the slide
         return lambda t, state, args: jnp.abs(along(t, state)) - PLATE_EDGE
 
     return [
@@ -102,7 +102,7 @@ def seat_events(chain: Chain) -> list[When]:
 
 
 def _sitting(chain: Chain, angle: float) -> State:
-    """Thighs along the plate, trunk upright, hands on the rods."""
+    """Return the state with thighs along the plate, trunk upright, hands on the rods."""
     c, s = np.cos(angle), np.sin(angle)
     hips = np.array([-0.17, THIGH_ABOVE_PLATE - ROD_LENGTH])
     place = [c * hips[0] + s * hips[1], 0, PIVOT_HEIGHT - s * hips[0] + c * hips[1]]
@@ -114,8 +114,7 @@ def _sitting(chain: Chain, angle: float) -> State:
             f"{side}_shoulder_flexion": 0.7,
         }
         q |= {f"{side}_shoulder_abduction": 0.4, f"{side}_elbow": 1.0}
-    # the joints named first are what the hands' loops move, so only the seat is held to what is
-    # said
+    # named coordinates are binding, an array is a guess: the hands' loops have to move the arms
     seated = chain.state(
         {k: x for k, x in q.items() if "shoulder" not in k and "elbow" not in k}, connected=()
     )

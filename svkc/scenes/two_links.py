@@ -1,5 +1,4 @@
-"""The example of the paper's section VII-A (Figs. 14 and 18): a free-flying chain of two links that
-gets attached to the ground."""
+"""The example of the paper's section VII-A (Figs. 14 and 18): a free-flying chain of two links."""
 
 from svkc.mjcf.load import load
 from svkc.model.chain import Chain, State
@@ -15,11 +14,14 @@ _MJCF = f"""<mujoco model="two_links"><option gravity="{{}}"/><worldbody><body n
 
 
 def two_links(gravity=(0.0, -9.81, 0.0), connected: bool = True) -> tuple[Chain, State]:
-    """A free base, Link 1 one metre along y on a hinge about z, and virtual Link 1v one further
-    metre along y, a hinge about z to the ground.
+    """Return a free-flying chain of two links and its state at rest, as drawn in the paper.
 
-    theta_1..6 are the base's, theta_7 Link 1's, theta_8 that of Link 1v, counted against z as the
-    paper's J_C (45) does. State: as pictured, at rest.
+    Link 1 is on a hinge about z, one metre along y from the free base. Virtual Link 1v, one metre
+    further along y, is a hinge about z to the ground. theta_1..6 are the base's coordinates,
+    theta_7 is that of Link 1, theta_8 that of Link 1v, counted about -z as in the paper's J_C (45).
+
+    gravity: acceleration of gravity (m/s^2).
+    connected: whether Link 1v is connected.
     """
     end = VirtualLink(
         "link1v",

@@ -1,4 +1,4 @@
-"""Walking on flat ground: the paper's first example of a structure that varies (section V-A)."""
+"""Standing on flat ground: the paper's first example of a varying structure (section V-A)."""
 
 import jax.numpy as jnp
 import mujoco
@@ -8,19 +8,22 @@ from svkc.model.chain import Chain, State
 from svkc.model.virtual_link import VirtualLink
 from svkc.scenes.figure import figure16
 
-STRIDE, HIP_HEIGHT = 0.33, 0.906  # m: from foot to foot where both stand; the hips above the ground
+STRIDE = 0.33  # m: distance of the feet along x when both stand
+HIP_HEIGHT = 0.906  # m: hips above the ground
 HALF_HIP_WIDTH = 0.085  # m: half the distance between the hips, and between the feet
-# m: the ankle above the ground; the sole's point that holds ahead of the ankle
-THIGH_LENGTH, SHANK_LENGTH, ANKLE_HEIGHT, SOLE_OFFSET = 0.4222, 0.434, 0.075, 0.04
+ANKLE_HEIGHT = 0.075  # m: ankle above the ground
+SOLE_OFFSET = 0.04  # m: point of the sole that is welded to the ground, ahead of the ankle
+THIGH_LENGTH, SHANK_LENGTH = 0.4222, 0.434  # m
 
 
 def walking(**options) -> tuple[Chain, State]:
-    """The 16-joint figure on the ground, with a weld from the ground to the sole of each foot:
-    standing at rest, the right foot a stride behind.
+    """Return the 16-joint figure standing at rest, the right foot a stride behind the left one.
 
-    22 joint freedoms; mobility 11 with both feet on the ground (legs that move in parallel planes
-    make one row redundant), 16 with one, 22 with none. A weld also carries moments and friction:
-    the ground of this scene is one that feet do not slide or tilt on. `options` go to `svkc.load`.
+    A weld holds the sole of each foot to the ground. There are 22 joint freedoms; mobility is 11
+    with both feet on the ground (legs in parallel planes make one row redundant), 16 with one, 22
+    with none. A weld also carries moments and friction: feet neither slide nor tilt in this scene.
+
+    options: keyword arguments of `svkc.load`.
     """
     spec = figure16()
     floor = {"pos": [1.55, 0, -0.02], "size": [2.35, 0.6, 0.02], "rgba": [0.75, 0.75, 0.78, 1]}
@@ -54,8 +57,11 @@ def walking(**options) -> tuple[Chain, State]:
 
 
 def leg_angles(forward, down) -> dict:
-    """Angles (rad) of a leg whose ankle is this far (m) ahead of and below its hip, trunk upright,
-    foot flat; out of reach: stretched."""
+    """Return the angles (rad) of a leg by inverse kinematics, for an upright trunk and a flat foot.
+
+    forward, down: position of the ankle relative to the hip (m). Out of reach, the leg is
+        stretched.
+    """
     reach = forward * forward + down * down
     cosine = jnp.clip(
         (reach - THIGH_LENGTH**2 - SHANK_LENGTH**2) / (2 * THIGH_LENGTH * SHANK_LENGTH),

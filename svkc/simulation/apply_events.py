@@ -1,4 +1,4 @@
-"""The change of structure that the events at the end of a phase make."""
+"""The change of structure by the events at the end of a phase."""
 
 import equinox as eqx
 import jax
@@ -17,118 +17,137 @@ from svkc.transitions.spare_links import bind_grip, cleared
 from svkc.transitions.transition import CONNECT_TOLERANCE, change_structure, release_constraints
 
 
-def reevaluated_guards(made: Plan) -> np.ndarray:
-    """Return which guards are re-evaluated after a change of structure, so that a guard is compared
-    within one phase: all but those that need torques."""
-    return np.array([not g.needs_torques for g in made.guards], bool)
+def reevaluated_guards(plan: Plan) -> np.ndarray:
+    """Return which guards are re-evaluated after a change of structure: all but those that need
+    torques. A crossing is thus detected between two values of one structure."""
+    return np.array([not g.needs_torques for g in plan.guards], bool)
 
 
 def apply_events(
     chain: Chain,
     run: RunState,
-    ended: State,
-    solved: PhaseOutcome,
+    end_state: State,
+    outcome: PhaseOutcome,
     fired: Bool[Array, " events"],
-    made: Plan,
+    plan: Plan,
 ):
-    """The change of structure that all events of this instant make together; one record row for
-    each of them."""
-    happened, full, emptying = jnp.any(fired), jnp.zeros((), bool), None
-    masks = _masks(chain, ended.structure, fired, made)
-    if made.has_binds:
-        structure, gripped, full, emptying = _bound(chain, ended.structure, fired, made)
-        ended = State(ended.q, ended.v, structure)
-        masks["connected"] = (masks["connected"] | gripped) & ~emptying
-        masks["here"] = masks["here"] | gripped
+    """Apply the events that fired at the end of a phase, all in one change of structure.
 
-    def changed():
-        done = _change(chain, ended, masks, made)
-        if emptying is None:
-            return done
-        structure = cleared(done.state.structure, emptying)
-        return eqx.tree_at(lambda d: d.state.structure, done, structure)
+    end_state: the state at the end of the phase.
+    fired: which events of the plan fired.
 
-    def same():
-        return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), eqx.filter_eval_shape(changed))
+    Returns the state after the change, the records of events, and the result of the run so far.
+    """
+    any_fired, any_no_slot, to_clear = jnp.any(fired), jnp.zeros((), bool), None
+    masks = _new_masks(chain, end_state.structure, fired, plan)
+    if plan.has_binds:
+        structure, to_connect, any_no_slot, to_clear = _bind_slots(
+            chain, end_state.structure, fired, plan
+        )
+        end_state = State(end_state.q, end_state.v, structure)
+        masks["connected"] = (masks["connected"] | to_connect) & ~to_clear
+        masks["at_current_pose"] = masks["at_current_pose"] | to_connect
 
-    done = jax.lax.cond(unvmap_any(happened), changed, same)
-    # what a change makes of numbers that are not is not taken
-    sound = is_finite(ODEState(done.state.q, done.state.v)) & ~jnp.isnan(done.initial_gap)
-    after = jax.tree.map(lambda new, old: jnp.where(happened & sound, new, old), done.state, ended)
-    mine = made.action_mask(chain, "connect") | made.grip_mask(chain)
-    events, overflow = _recorded(run.events, solved.t, fired, mine, done)
-    stops = jnp.any(fired & np.array([a.stop for a in made.actions], bool))
-    result = RESULTS.where(stops, RESULTS.stopped, solved.result)
-    result = RESULTS.where(
-        happened & (done.initial_gap > CONNECT_TOLERANCE), RESULTS.not_in_place, result
+    def apply():
+        change = _change_structure(chain, end_state, masks, plan)
+        if to_clear is None:
+            return change
+        structure = cleared(change.state.structure, to_clear)
+        return eqx.tree_at(lambda c: c.state.structure, change, structure)
+
+    def skip():
+        return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), eqx.filter_eval_shape(apply))
+
+    change = jax.lax.cond(unvmap_any(any_fired), apply, skip)
+    # a change that is not finite is discarded, so that the run keeps its last finite state
+    finite = is_finite(ODEState(change.state.q, change.state.v)) & ~jnp.isnan(change.initial_gap)
+    after = jax.tree.map(
+        lambda new, old: jnp.where(any_fired & finite, new, old), change.state, end_state
     )
-    result = RESULTS.where(sound, result, RESULTS.non_finite)
-    result = RESULTS.where(full, RESULTS.no_slot, result)
+    connects = plan.action_mask(chain, "connect") | plan.grip_mask(chain)
+    events, overflow = _write_events(run.events, outcome.t, fired, connects, change)
+    stops = jnp.any(fired & np.array([a.stop for a in plan.actions], bool))
+    result = RESULTS.where(stops, RESULTS.stopped, outcome.result)
+    result = RESULTS.where(
+        any_fired & (change.initial_gap > CONNECT_TOLERANCE), RESULTS.not_in_place, result
+    )
+    result = RESULTS.where(finite, result, RESULTS.non_finite)
+    result = RESULTS.where(any_no_slot, RESULTS.no_slot, result)
     result = RESULTS.where(overflow, RESULTS.max_events, result)
     return after, events, result
 
 
-def _masks(chain: Chain, structure: Structure, fired: Bool[Array, " events"], made: Plan) -> dict:
-    """Return the connected links, the locked joints, and the new links whose joint is made where
-    the bodies are, after the events of this instant. None: no event has to do with that."""
-    any_of = lambda what: jnp.any(fired[:, None] & made.action_mask(chain, what), 0)
+def _new_masks(
+    chain: Chain, structure: Structure, fired: Bool[Array, " events"], plan: Plan
+) -> dict:
+    """Return the arguments of `change_structure` after these events: the connected links, the
+    locked joints, and the new links made at the current poses of their bodies. None: no event of
+    the plan changes them."""
+    any_of = lambda name: jnp.any(fired[:, None] & plan.action_mask(chain, name), 0)
+    locked = at_current_pose = None
+    if plan.has_locks:
+        locked = (structure.locked | any_of("lock")) & ~any_of("unlock")
+    if plan.has_binds or plan.action_mask(chain, "at_current_pose").any():
+        at_current_pose = any_of("at_current_pose")
     return {
         "connected": (structure.connected | any_of("connect")) & ~any_of("cut"),
-        "locked": (structure.locked | any_of("lock")) & ~any_of("unlock")
-        if made.has_locks
-        else None,
-        "here": any_of("here") if made.action_mask(chain, "here").any() or made.has_binds else None,
+        "locked": locked,
+        "at_current_pose": at_current_pose,
     }
 
 
-def _change(chain: Chain, ended: State, masks: dict, made: Plan) -> StructureChange:
-    """Change the structure: with an impact, where an event of the plan can make one."""
-    if made.needs_impact(chain):
-        return change_structure(chain, ended, masks["connected"], masks["locked"], masks["here"])
-    return release_constraints(chain, ended, masks["connected"], masks["locked"])
+def _change_structure(chain: Chain, end_state: State, masks: dict, plan: Plan) -> StructureChange:
+    """Change the structure; the impact is compiled only if an event of the plan needs one."""
+    if plan.needs_impact(chain):
+        return change_structure(chain, end_state, **masks)
+    return release_constraints(chain, end_state, masks["connected"], masks["locked"])
 
 
-def _recorded(
+def _write_events(
     events: Events,
     t,
     fired: Bool[Array, " events"],
-    mine: Bool[np.ndarray, "events links"],
-    done: StructureChange,
+    connects: Bool[np.ndarray, "events links"],
+    change: StructureChange,
 ) -> tuple[Events, Bool[Array, ""]]:
-    """Return the records with a row for each event that fired, and whether there were too few rows.
+    """Return the records with a row for each event that fired, and whether rows were lacking.
 
-    mine: the links that each event connects, whose impulses are written in its row.
+    connects: the links that each event connects, whose impulses are written in the event's row.
     """
     r, count, capacity = events, jnp.sum(fired, dtype=jnp.int32), events.time.shape[0]
-    place = r.count + jnp.cumsum(fired, dtype=jnp.int32) - 1
+    row = r.count + jnp.cumsum(fired, dtype=jnp.int32) - 1
     rows = jnp.arange(capacity, dtype=jnp.int32)
-    hit = (rows[:, None] == place[None]) & fired[None]
-    written = jnp.any(hit, 1)
+    # [rows, events]
+    row_of_event = (rows[:, None] == row[None]) & fired[None]
+    written = jnp.any(row_of_event, 1)
     first = written & (rows == r.count)
-    mine = jnp.any(hit[:, :, None] & mine[None], 1)[:, :, None]
+    connects = jnp.any(row_of_event[:, :, None] & connects[None], 1)[:, :, None]
     return Events(
         time=jnp.where(written, t, r.time),
-        which=jnp.where(written, jnp.argmax(hit, 1).astype(jnp.int32), r.which),
-        impulse=jnp.where(mine, done.impulse[None], r.impulse),
-        angular_impulse=jnp.where(mine, done.angular_impulse[None], r.angular_impulse),
-        energy_lost=jnp.where(first, done.energy_lost, r.energy_lost),
+        which=jnp.where(written, jnp.argmax(row_of_event, 1).astype(jnp.int32), r.which),
+        impulse=jnp.where(connects, change.impulse[None], r.impulse),
+        angular_impulse=jnp.where(connects, change.angular_impulse[None], r.angular_impulse),
+        energy_lost=jnp.where(first, change.energy_lost, r.energy_lost),
         count=jnp.minimum(r.count + count, capacity),
     ), r.count + count > capacity
 
 
-def _bound(chain: Chain, structure: Structure, fired: Bool[Array, " events"], made: Plan):
-    """The structure with the slots that the events of this instant bind, the slots to connect,
-    whether one was lacking, and the slots to empty."""
-    emptying = jnp.any(fired[:, None] & made.slots_to_unbind(chain, structure), 0)
-    gripped, full = jnp.zeros(len(chain.link_names), bool), jnp.zeros((), bool)
-    for event, wishes in enumerate(made.grips):
-        for wish in wishes:
-            # slots given to others at this instant are no longer free
-            taken = eqx.tree_at(lambda s: s.connected, structure, structure.connected | gripped)
-            bound, slot, lacking = bind_grip(chain, taken, wish)
+def _bind_slots(chain: Chain, structure: Structure, fired: Bool[Array, " events"], plan: Plan):
+    """Return the structure with the spare slots bound by the events that fired, the mask of slots
+    to connect, whether a grip had no free slot, and the mask of slots to clear."""
+    to_clear = jnp.any(fired[:, None] & plan.slots_to_unbind(chain, structure), 0)
+    to_connect, any_no_slot = jnp.zeros(len(chain.link_names), bool), jnp.zeros((), bool)
+    for event, grips in enumerate(plan.grips):
+        for grip in grips:
+            # a slot that an earlier grip of this instant has bound is no longer free
+            occupied = eqx.tree_at(
+                lambda s: s.connected, structure, structure.connected | to_connect
+            )
+            bound, slot, no_slot = bind_grip(chain, occupied, grip)
             bound = eqx.tree_at(lambda s: s.connected, bound, structure.connected)
             structure = jax.tree.map(
                 lambda new, old, e=event: jnp.where(fired[e], new, old), bound, structure
             )
-            gripped, full = gripped | (slot & fired[event]), full | (lacking & fired[event])
-    return structure, gripped, full, emptying
+            to_connect = to_connect | (slot & fired[event])
+            any_no_slot = any_no_slot | (no_slot & fired[event])
+    return structure, to_connect, any_no_slot, to_clear

@@ -1,4 +1,8 @@
-"""Trajectories on disk: one npz, written whole or not at all."""
+"""Trajectories on disk: one .npz file for each run, written atomically.
+
+A file holds every array of the trajectory by name, a JSON line of metadata, and, if the user passes
+the chain, the chain's model and arrays.
+"""
 
 import dataclasses
 import json
@@ -19,11 +23,11 @@ from svkc.model.virtual_link import VirtualLink
 from svkc.simulation.records import RESULTS, Events, Phases
 from svkc.simulation.trajectory import Trajectory
 
-# Raise it whenever a stored array is added, renamed or changes its meaning: files of every other
-# schema are refused.
+# Increase the schema whenever a stored array is added, renamed or changes its meaning: files of
+# every other schema are refused.
 SCHEMA = 4
-_CODES = ("result", "derivative")
-_PARTS = {
+_RESULT_CODES = ("result", "derivative")
+_NESTED = {
     "states": State,
     "final": State,
     "structure": Structure,
@@ -33,31 +37,38 @@ _PARTS = {
 
 
 def _flatten(node, prefix: str = "") -> dict[str, np.ndarray]:
-    """{"states.q": array, ...}; parts that are None are left out."""
+    """Return {"states.q": array, ...}. Fields that are None are left out."""
     out = {}
     for field in dataclasses.fields(node):
         value, name = getattr(node, field.name), prefix + field.name
-        if field.name in _PARTS:
+        if field.name in _NESTED:
             out |= _flatten(value, name + ".")
-        elif field.name not in _CODES and value is not None:
+        elif field.name not in _RESULT_CODES and value is not None:
             out[name] = np.asarray(value)
     return out
 
 
 def _build(cls, arrays: dict[str, Any], prefix: str = "", **known):
+    """Return an object of a class from the arrays that `_flatten` returns.
+
+    known: fields that are not stored as arrays.
+    """
     fields = dict(known)
     for field in dataclasses.fields(cls):
         name = prefix + field.name
-        if field.name in _PARTS:
-            fields[field.name] = _build(_PARTS[field.name], arrays, name + ".")
+        if field.name in _NESTED:
+            fields[field.name] = _build(_NESTED[field.name], arrays, name + ".")
         elif field.name not in fields:
             fields[field.name] = jnp.asarray(arrays[name]) if name in arrays else None
     return cls(**fields)
 
 
 def save(traj: Trajectory, path, chain=None, options=None) -> None:
-    """Writes one .npz: every array by name, and a JSON line of metadata (schema, result, versions,
-    certificate, options; names and model of the chain)."""
+    """Write one .npz file; see `Trajectory.save`.
+
+    The metadata are the schema, the results, the versions, the certificate and the options, and the
+    names and the model of the chain.
+    """
     import svkc
 
     if chain is not None:
@@ -68,25 +79,25 @@ def save(traj: Trajectory, path, chain=None, options=None) -> None:
         "jax": jax.__version__,
         "units": "SI, rad, wxyz",
     }
-    meta |= {name: np.asarray(getattr(traj, name)._value).tolist() for name in _CODES}
+    meta |= {name: np.asarray(getattr(traj, name)._value).tolist() for name in _RESULT_CODES}
     certify = Trajectory.report
     for _ in range(np.ndim(traj.ts) - 1):
-        # lanes
+        # a batch of runs
         certify = jax.vmap(certify)
     report = certify(jax.tree.map(jnp.asarray, traj))
     meta["certificate"] = {
         f.name: np.asarray(getattr(report, f.name)).tolist()
         for f in dataclasses.fields(report)
-        if f.name not in _CODES
+        if f.name not in _RESULT_CODES
     }
     meta["options"] = options or {}
     arrays = _flatten(traj)
     if chain is not None:
         meta |= {"bodies": chain.body_names, "joints": chain.joint_names, "links": chain.link_names}
-        meta |= {"model": chain.model.text, "arguments": _plain(chain.model.arguments)}
+        meta |= {"model": chain.model.text, "arguments": _as_json(chain.model.arguments)}
         arrays |= {f"chain.{i}": np.asarray(x) for i, x in enumerate(jax.tree.leaves(chain))}
     path = pathlib.Path(path)
-    # beside it, as readable as any file that the user makes
+    # in the same folder, so that os.replace is atomic; `tempfile` would deny other users access
     temporary = path.with_name(f"{path.name}.{os.getpid()}.{threading.get_ident()}.part")
     try:
         with open(temporary, "wb") as file:
@@ -97,42 +108,47 @@ def save(traj: Trajectory, path, chain=None, options=None) -> None:
         raise
 
 
-def _named(cls, prefix: str = "") -> set[str]:
-    """The names of all arrays that `_build` looks for, but for those that may be None."""
+def _array_names(cls, prefix: str = "") -> set[str]:
+    """Return the names of all arrays that `_build` needs; fields that may be None are left out."""
     out = set()
     for field in dataclasses.fields(cls):
-        if field.name in _PARTS:
-            out |= _named(_PARTS[field.name], prefix + field.name + ".")
-        elif field.name not in (*_CODES, "locked", "independent"):
+        if field.name in _NESTED:
+            out |= _array_names(_NESTED[field.name], prefix + field.name + ".")
+        elif field.name not in (*_RESULT_CODES, "locked", "independent"):
             out.add(prefix + field.name)
     return out
 
 
-def _check_whole(path, arrays: dict[str, Any], names: set[str]) -> None:
+def _check_complete(path, arrays: dict[str, Any], names: set[str]) -> None:
+    """Raise ValueError if one of the named arrays is missing."""
     missing = names - set(arrays)
     if missing:
         raise ValueError(
-            f"{path} lacks {', '.join(sorted(missing))}; it is not a trajectory written by svkc"
+            f"{path} lacks {', '.join(sorted(missing))}; it is not a trajectory file written by svkc"
         )
 
 
-def _plain(value):
-    """What load was given, as JSON has it."""
+def _as_json(value):
+    """Return an argument of `load` as JSON values."""
     if isinstance(value, VirtualLink):
         value = dataclasses.asdict(value)
     if isinstance(value, dict):
-        return {key: _plain(x) for key, x in value.items()}
+        return {key: _as_json(x) for key, x in value.items()}
     if isinstance(value, (list, tuple, set, frozenset, np.ndarray, jax.Array)):
-        return [_plain(x) for x in value]
+        return [_as_json(x) for x in value]
     return value.item() if isinstance(value, np.generic) else value
 
 
 def load_chain(path) -> Chain:
-    """The chain that a trajectory was saved with: loaded from its MJCF as it was then, with the
-    floats that it had. Files of meshes are read where they were.
+    """Return the chain that a trajectory was saved with.
 
-    ValueError: saved without a chain, or with one that came from a compiled model, which says not
-    what it was compiled from; no whole file (as above).
+    The chain is loaded from the stored MJCF with the stored arguments of `svkc.load`; its arrays
+    are then replaced by the stored ones. Mesh files are read from their original paths.
+
+    path: file that `Trajectory.save` wrote with a chain.
+
+    Raises ValueError if the file was saved without a chain or with a chain loaded from a compiled
+    model (MjModel), is incomplete, or has another schema; FileNotFoundError if there is no file.
     """
     arrays, meta, _ = _read(path)
     if not meta.get("model"):
@@ -140,33 +156,42 @@ def load_chain(path) -> Chain:
             f"{path} holds no model; save with traj.save(path, chain), the chain loaded from a"
             " path, text or MjSpec"
         )
-    given = meta["arguments"]
-    given["virtual_links"] = [VirtualLink(**link) for link in given["virtual_links"]]
-    leaves, how = jax.tree.flatten(load(meta["model"], **given))
-    return jax.tree.unflatten(how, [jnp.asarray(arrays[f"chain.{i}"]) for i in range(len(leaves))])
+    arguments = meta["arguments"]
+    arguments["virtual_links"] = [VirtualLink(**link) for link in arguments["virtual_links"]]
+    leaves, treedef = jax.tree.flatten(load(meta["model"], **arguments))
+    stored = [jnp.asarray(arrays[f"chain.{i}"]) for i in range(len(leaves))]
+    return jax.tree.unflatten(treedef, stored)
 
 
 def load_trajectory(path) -> Trajectory:
-    """The trajectory that `Trajectory.save` wrote. ValueError: not such a file, cut short, or of
-    another schema. FileNotFoundError: no file."""
+    """Return a trajectory, or a batch of trajectories, that `Trajectory.save` wrote.
+
+    path: file that `Trajectory.save` wrote.
+
+    Raises ValueError if the file is not one of svkc, is incomplete, or has another schema;
+    FileNotFoundError if there is no file.
+    """
     arrays, _, codes = _read(path)
     arrays = {name: x for name, x in arrays.items() if not name.startswith("chain.")}
-    _check_whole(path, arrays, _named(Trajectory))
+    _check_complete(path, arrays, _array_names(Trajectory))
     code = lambda value: eqx.tree_at(lambda item: item._value, RESULTS.successful, value)
     build = lambda arrays, codes: _build(
         Trajectory, arrays, **{name: code(value) for name, value in codes.items()}
     )
     for _ in range(arrays["ts"].ndim - 1):
-        # lanes
+        # a batch of runs
         build = jax.vmap(build)
     try:
         return build(arrays, {name: jnp.asarray(code) for name, code in codes.items()})
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{path} is not a whole trajectory written by svkc: {error}") from error
+        raise ValueError(
+            f"{path} is not a complete trajectory file written by svkc: {error}"
+        ) from error
 
 
 def _read(path) -> tuple[dict[str, np.ndarray], dict, dict[str, np.ndarray]]:
-    """Arrays, metadata and result codes of a file of ours."""
+    """Return the arrays, the metadata and the result codes of a file. Raises as
+    `load_trajectory` does."""
     if not isinstance(path, str | bytes | os.PathLike):
         raise ValueError(f"load_trajectory: expected a path, got {path!r}")
     try:
@@ -175,13 +200,17 @@ def _read(path) -> tuple[dict[str, np.ndarray], dict, dict[str, np.ndarray]]:
         meta = json.loads(str(arrays.pop("metadata")))
         schema = int(meta["schema"])
         codes = (
-            {name: np.asarray(meta[name], np.int32) for name in _CODES} if schema == SCHEMA else {}
+            {name: np.asarray(meta[name], np.int32) for name in _RESULT_CODES}
+            if schema == SCHEMA
+            else {}
         )
     except FileNotFoundError:
         raise
-    # whatever the readers of zip, npy and JSON say of what is none
+    # the readers of zip, npy and JSON raise exceptions of many types for a damaged file
     except Exception as error:
-        raise ValueError(f"{path} is not a whole trajectory written by svkc: {error}") from error
+        raise ValueError(
+            f"{path} is not a complete trajectory file written by svkc: {error}"
+        ) from error
     if schema != SCHEMA:
         raise ValueError(
             f"{path} has schema {schema}, this version reads schema {SCHEMA}; load it with the"

@@ -24,7 +24,7 @@ class PhaseRecords(eqx.Module):
     work: Float[Array, "*phases"]
     accepted: Int[Array, "*phases"]
     rejected: Int[Array, "*phases"]
-    tally: Stats
+    stats: Stats
 
 
 class Events(eqx.Module):
@@ -71,7 +71,7 @@ def empty_phase_records(rows: int, state: State) -> PhaseRecords:
         work=jnp.zeros(rows, dtype),
         accepted=jnp.zeros(rows, jnp.int32),
         rejected=jnp.zeros(rows, jnp.int32),
-        tally=repeat(Stats.zeros(dtype, True), rows),
+        stats=repeat(Stats.zeros(dtype, True), rows),
     )
 
 
@@ -95,7 +95,7 @@ def write_phase_row(
         work=work,
         accepted=path.accepted,
         rejected=path.rejected,
-        tally=path.stats,
+        stats=path.stats,
     )
     write = lambda old, new: jnp.where(
         row.reshape(-1, *(1,) * jnp.ndim(new)), jnp.asarray(new)[None], old

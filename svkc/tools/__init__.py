@@ -1,1 +1,1 @@
-"""What is built on runs: rollouts, accuracy, checks of gradients."""
+"""Tools built on runs: batches, accuracy and tuning, gradient checks."""

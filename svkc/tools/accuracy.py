@@ -1,5 +1,7 @@
-"""The dial turned on a scene of one's own: which integrator, step and way against drift is the
-fastest that holds an error."""
+"""Accuracy of runs: an error estimate, and a search for the fastest options that reach a target.
+
+These functions call `simulate`. They are no part of a run.
+"""
 
 import dataclasses
 import sys
@@ -27,7 +29,17 @@ from svkc.tree.configuration import difference
 
 @dataclasses.dataclass(frozen=True)
 class Candidate:
-    """Options of `simulate` under a name, and what they were found to cost and to give."""
+    """Named options of `simulate`, with the cost and accuracy that `tune` measured for them.
+
+    name: label in the table.
+    options: keyword arguments of `simulate`.
+    seconds: shortest computing time of a run (s), without compilation.
+    error: `configuration_error` relative to the reference run (rad, m).
+    gap: largest loop gap of the run (m or rad, the larger number).
+    energy_drift: energy drift of the run (J).
+    steps: accepted and rejected steps.
+    result: name of the run's result code.
+    """
 
     name: str
     options: dict[str, Any]
@@ -41,8 +53,12 @@ class Candidate:
 
 @dataclasses.dataclass(frozen=True)
 class Tuning:
-    """`best`: options to give to `simulate` (None: no candidate holds the target); `table`: every
-    candidate, the fastest that hold it first. Printed, it is that table."""
+    """The result of `tune`. `str` of a `Tuning` is a table of all candidates.
+
+    target: largest error that was allowed (rad, m).
+    best: options of the fastest candidate that reached the target. None if no candidate did.
+    table: all measured candidates, those that reached the target first, each group by seconds.
+    """
 
     target: float
     best: dict[str, Any] | None
@@ -72,8 +88,14 @@ class Tuning:
 
 
 def default_candidates(dtype, span: float) -> list[Candidate]:
-    """From fast to exact: fixed steps of low order, adaptive ones of higher order, with and without
-    projection, by articulated bodies; an implicit one."""
+    """Return the candidates of `tune`, from fast to accurate.
+
+    They are explicit solvers with fixed steps, explicit solvers with adaptive steps (with
+    projection, without stabilization, and with articulated bodies), and one implicit solver.
+
+    dtype: dtype of the state. Tolerances go down to 1e-10 in float64, to 1e-5 in float32.
+    span: duration of the run (s). A fixed step is at most a quarter of the span.
+    """
     candidates = []
     for steps in (1e-2, 1e-3):
         for solver in (SymplecticEuler(), RodriguesEuler(), diffrax.Heun(), diffrax.Tsit5()):
@@ -106,8 +128,14 @@ def default_candidates(dtype, span: float) -> list[Candidate]:
 
 
 def configuration_error(chain: Chain, run: Trajectory, reference: Trajectory) -> float:
-    """Root mean square, over coordinates and save times, of how far two runs are apart in
-    configuration (rad, m); the largest over the save times."""
+    """Return the distance between the configurations of two runs.
+
+    The distance at one save time is the root mean square over the coordinates of the tree (rad, m).
+    The result is the largest distance over the save times.
+
+    run: the run to judge.
+    reference: a run with the same save times.
+    """
     errors = jax.vmap(lambda a, b: difference(chain, a, b)[: chain.nv])(
         reference.states.q, run.states.q
     )
@@ -115,11 +143,16 @@ def configuration_error(chain: Chain, run: Trajectory, reference: Trajectory) ->
 
 
 def estimate_error(chain: Chain, state: State, t1, **options) -> float:
-    """Integration error of a run, by a second one with half its dt, or with a 32nd of its
-    tolerances: `error_between` the two.
+    """Return an estimate of a run's integration error from a second, finer run.
 
-    options: of `simulate`. An estimate of the first run's error where the second one's is much
-    smaller.
+    The finer run has half the step (`dt`), or tolerances (`rtol`, `atol`) divided by 32. The result
+    is the `configuration_error` between the two runs (rad, m). The estimate is good if the finer
+    run's own error is much smaller.
+
+    t1: end time (s).
+    options: keyword arguments of `simulate`.
+
+    Raises what `simulate` raises.
     """
     run = simulate(chain, state, t1, **options)
     if "dt" in options:
@@ -140,15 +173,21 @@ def tune(
     show: bool = True,
     **common,
 ) -> Tuning:
-    """Runs candidates on this scene and tells the fastest whose configuration stays within `target`
-    (rad, m; root mean square over the coordinates, largest over the save times) of a run with much
-    smaller tolerances.
+    """Measure candidate options on this scene and return them, the fastest sufficient one first.
 
-    options: the candidates (None: fixed and adaptive steps of several orders, `candidates`). show:
-    print each as it is found, and the table in the end. call: ts, events, control, args and
-    whatever else of `simulate` all runs share. Seconds are those of computing alone, the least of
-    `repeats` runs; what takes ten times the best so far is not repeated. ValueError: a target that
-    is not positive, or no reference that holds.
+    A candidate is sufficient if its `configuration_error` relative to a reference run is at most
+    `target`. The reference run is Dopri8 with a relative tolerance of target / 1000.
+
+    t1: end time (s).
+    target: allowed error (rad, m; root mean square over coordinates, largest over save times).
+    options: the candidates. None: `default_candidates`.
+    repeats: timed runs of each candidate, after one that compiles. The shortest run counts. A
+        candidate that takes ten times as long as the best so far is not repeated.
+    show: whether to print progress and the final table.
+    call: keyword arguments of `simulate` that all runs share, such as `ts`, `events`, `control`,
+        `args`.
+
+    Raises ValueError if `target` is not positive or if the reference run fails.
     """
     check_state(chain, state)
     target, t1, repeats = (
@@ -195,8 +234,10 @@ def tune(
 def _measure(
     run: Callable, candidate: Candidate, *, error: Callable, repeats: int, limit: float
 ) -> Candidate:
-    """Return a candidate with what it costs and gives. limit (s): what takes longer is not
-    repeated."""
+    """Run a candidate and return it with its measured cost and accuracy.
+
+    limit: seconds after which a candidate is not repeated.
+    """
     run_once = lambda: jax.block_until_ready(run(**candidate.options))
     traj, seconds = run_once(), np.inf
     for _ in range(repeats):

@@ -1,4 +1,4 @@
-"""Derivatives checked against central differences."""
+"""Derivatives by automatic differentiation, compared with extrapolated central differences."""
 
 import dataclasses
 from collections.abc import Callable
@@ -12,13 +12,18 @@ from svkc.model.validation import check_function, integer, positive_scalar
 
 
 class GradientCheck(eqx.Module):
-    """What `check_grad` found: the worst entry. `error`: its difference, over the largest entry of
-    its output leaf in either of the two derivatives.
+    """The result of `check_grad`: the entry of the derivative with the largest error.
 
-    `output`, `input`: paths of the two leaves; `derivative`, `difference`: both values, along the
-    direction tried; `uncertainty`: what the difference itself is good for, over the same size;
-    `modes`: largest difference between forward and reverse mode, over the same size (0 where only
-    one was asked).
+    error: |derivative - difference|, relative to the largest entry of the output leaf in either
+        one.
+    output: path of the output leaf (and entry), such as "f(x)['a'][3]".
+    input: path of the input leaf, such as "x.q".
+    derivative: directional derivative by automatic differentiation.
+    difference: directional derivative by central differences.
+    uncertainty: estimated error of the difference, relative to the same number as `error`.
+    modes: largest difference between forward and reverse mode, over all entries, relative to the
+        size of the output leaf's derivative. Zero unless `mode` is "both".
+    mode: the mode that was checked: "forward", "reverse" or "both".
     """
 
     error: float
@@ -42,15 +47,21 @@ class GradientCheck(eqx.Module):
 def check_grad(
     f: Callable, x, mode: str = "both", directions: int = 2, step: float = 0.05, seed: int = 0
 ) -> GradientCheck:
-    """The derivative of f at x against central differences, Richardson-extrapolated (Ridders),
-    along random directions; says which entry is worst.
+    """Compare the derivative of f at x with central differences and return the worst entry.
 
-    f: of one argument; x and f(x): any pytrees, of which floats count. For every float leaf of x by
-    itself, `directions` random directions, as long as the leaf (one, where it is zero). mode:
-    "forward", "reverse", or "both", which compares the two. step: the first step of the
-    differences, as a part of the direction; it is halved seven times and the best estimate taken.
-    float64, or the differences are worth little.
-    ValueError: no floats in x, an unknown mode, or f not finite.
+    For every floating-point leaf of x, the derivative is taken along random directions. A direction
+    is as long as the leaf (of length one if the leaf is zero). Differences are extrapolated to step
+    zero by Ridders' method. Use float64: in float32 the differences have few correct digits.
+
+    f: function of one argument.
+    x: a pytree. Floating-point leaves of x and of f(x) are differentiated, others are ignored.
+    mode: "forward", "reverse", or "both", which also compares the two modes with each other.
+    directions: number of random directions for each leaf.
+    step: first step of the differences, as a multiple of the direction. It is halved seven times.
+    seed: seed of the random directions.
+
+    Raises ValueError if x or f(x) has no floating-point arrays, if f(x) is not finite, or if an
+    option is invalid.
     """
     check_function("f", f, optional=False)
     integer("directions", directions, 1)
@@ -61,7 +72,7 @@ def check_grad(
         jax.tree.map(lambda leaf: jnp.asarray(leaf) if isinstance(leaf, float) else leaf, x),
         eqx.is_inexact_array,
     )
-    # (without weak types, which would compile the same program again for every parameter)
+    # weak types would compile the program again for every parameter
     differentiable = jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype), differentiable)
     leaves = jax.tree_util.tree_flatten_with_path(differentiable)[0]
     if not any(leaf.size for _, leaf in leaves):
@@ -109,7 +120,7 @@ def check_grad(
 
 
 def _direction(differentiable, index: int, rng: np.random.Generator):
-    """Return a random direction of one leaf, as long as the leaf (one, where it is zero)."""
+    """Return a random direction in one leaf, as long as this leaf (one if the leaf is zero)."""
     leaves, structure = jax.tree.flatten(differentiable)
     leaf, along = leaves[index], rng.normal(size=leaves[index].shape)
     along = along / np.linalg.norm(along) * (np.linalg.norm(leaf) or 1.0)
@@ -120,7 +131,7 @@ def _direction(differentiable, index: int, rng: np.random.Generator):
 
 
 def _directional_derivative(gradient, direction) -> float:
-    """Return the derivative along a direction, from the leaves of a gradient."""
+    """Return the inner product of a gradient (a list of leaves) and a direction."""
     return sum(
         float(jnp.vdot(g, d)) for g, d in zip(gradient, jax.tree.leaves(direction), strict=True)
     )
@@ -131,11 +142,11 @@ def _compare_leaf(
 ) -> GradientCheck:
     """Compare the derivatives of one output leaf along one direction with the difference.
 
-    ahead: the derivative in forward mode; back: the weighted sum of the derivative's entries in
-    reverse mode; None: not asked for.
+    forward: the leaf's derivative in forward mode, or None.
+    reverse: sum of the derivative's entries times `weight`, in reverse mode, or None.
     """
     if forward is None:
-        # one number for the whole leaf: reverse mode has no more for one pass
+        # one pass of reverse mode gives one number for all entries of the leaf
         weighted_sum = lambda x: np.asarray(np.sum(weight * x))
         return _worst_entry(
             np.asarray(reverse), weighted_sum(difference), weighted_sum(uncertainty), 0.0, *paths
@@ -151,10 +162,10 @@ def _compare_leaf(
     )
 
 
-# (compiled once for a function, however many points it is checked at)
+# compiled once for a function, however many points it is checked at
 @eqx.filter_jit
 def _outputs(f, differentiable, static):
-    """The floats of f(x) by their paths."""
+    """Return the floating-point leaves of f(x), by path."""
     floats = jax.tree_util.tree_flatten_with_path(
         eqx.filter(f(eqx.combine(differentiable, static)), eqx.is_inexact_array)
     )[0]
@@ -163,18 +174,20 @@ def _outputs(f, differentiable, static):
 
 @eqx.filter_jit
 def _forward_derivative(f, differentiable, static, direction):
+    """Return the directional derivative of `_outputs` in forward mode."""
     return jax.jvp(lambda free: _outputs(f, free, static), (differentiable,), (direction,))[1]
 
 
 @eqx.filter_jit
 def _weighted_gradient(f, differentiable, static, weights):
+    """Return the gradient of the weighted sum of `_outputs`, as a list of leaves."""
     return jax.tree.leaves(
         jax.vjp(lambda free: _outputs(f, free, static), differentiable)[1](weights)[0]
     )
 
 
 def _reverse_gradients(f, differentiable, static, weights):
-    """For each output leaf, the gradient of its entries summed with random weights."""
+    """Return, for each output leaf, the gradient of the weighted sum of its entries."""
     shapes = eqx.filter_eval_shape(_outputs, f, differentiable, static)
     weights_of = lambda output: {
         name: jnp.asarray(w if name == output else np.zeros_like(w), shapes[name].dtype)
@@ -186,8 +199,12 @@ def _reverse_gradients(f, differentiable, static, weights):
 
 
 def _central_differences(value, differentiable, direction, step):
-    """Central differences at eight halved steps, extrapolated to zero; for every entry the estimate
-    that changed least, and by how much."""
+    """Return central differences extrapolated to step zero, and an estimate of their errors.
+
+    Ridders' method: eight halved steps fill a Neville tableau. For every entry, the estimate that
+    changed least between neighbours in the tableau is returned, with that change as its
+    uncertainty.
+    """
     evaluate = lambda h: value(
         jax.tree.map(lambda x, d: x + jnp.asarray(h, x.dtype) * d, differentiable, direction)
     )
@@ -195,7 +212,7 @@ def _central_differences(value, differentiable, direction, step):
     for h in step / 2.0 ** np.arange(8):
         after, before = evaluate(h), evaluate(-h)
         if not all(np.isfinite(x).all() for x in (*after.values(), *before.values())):
-            # so far away f is not defined: begin again, nearer
+            # f is not defined this far from x: restart with smaller steps
             table, best, uncertainty = [], {}, {}
             continue
         row = [
@@ -217,7 +234,7 @@ def _central_differences(value, differentiable, direction, step):
                 best[name] = np.where(better, new, best.get(name, new))
                 uncertainty[name] = np.where(better, change, uncertainty.get(name, change))
         table.append(row)
-    # (not finite at every step tried, and so worth nothing)
+    # NaN where f was not finite at every step
     undefined = {name: np.full(np.shape(leaf), np.nan) for name, leaf in after.items()}
     return undefined | best, undefined | uncertainty
 
@@ -225,11 +242,11 @@ def _central_differences(value, differentiable, direction, step):
 def _worst_entry(
     derivative, difference, uncertainty, modes: float, output: str, input: str
 ) -> GradientCheck:
-    """Return the worst entry of one leaf."""
+    """Return the entry of one leaf whose derivative differs most from the difference."""
     scale = max(
         np.abs(x[np.isfinite(x)]).max(initial=0) for x in map(np.asarray, (derivative, difference))
     )
-    # both nothing: what is within the round-off of differences is no error
+    # where both are zero, the round-off of differences is no error
     scale = scale if scale > 1e-9 else 1.0
     errors = np.abs(derivative - difference)
     errors = np.where(np.isfinite(errors), errors, np.inf).ravel()

@@ -1,5 +1,4 @@
-"""Many runs at once: lanes dealt to chunks, chunks to processes and devices, finished chunks
-kept."""
+"""Batches of runs: lanes are distributed over chunks, and chunks over devices and processes."""
 
 import hashlib
 import json
@@ -30,27 +29,33 @@ def rollout(
     chain: Chain, states, t1, *, data: Any = None, lane: Callable | None = None, cost=None,
     chunk: int | None = None, out=None, devices=None, progress: bool = True, **options,
 ) -> Trajectory:  # fmt: skip
-    """`svkc.simulate` for every lane of `states`, a State with a leading axis: a trajectory with a
-    leading axis, lanes in the order given.
+    """Run `svkc.simulate` for every lane of `states` and return one batched trajectory.
 
-    data, lane: what differs between lanes besides the state. `lane(chain, data of one lane)` gives
-    a dict of arguments of `simulate` (events, args, control, t1, or `chain` itself with other
-    floats); data: a pytree with the lanes as leading axis.
-    Functions are compared as in `simulate`, `lane` too: it may be a lambda in the call itself.
-    cost: [lanes], how long each may take (any unit): lanes alike go together, so that the short do
-    not wait for the long.
-    chunk: lanes at once on one device (default: 64 on a CPU, 4096 on another device, and no more
-    than there are). Memory of a chunk grows with its lanes.
-    devices: default all of this process; each goes its own way through its lanes. On a CPU there
-    are as many as `jax.config.update("jax_num_cpu_devices", n)` asked for before the first use of
-    jax.
-    out: folder for finished chunks, chunk_00000.npz and so on, each a trajectory
-    (`svkc.load_trajectory`); a run that was interrupted goes on from them. Under `jax.distributed`
-    each process takes its share of the chunks, and all get the whole result.
-    options: of `simulate`, for all lanes; `throw` is False by default: lanes that fail say so in
-    `result`.
-    ValueError: leading axes that differ, or a folder of another rollout. RuntimeError: a chunk does
-    not fit into memory, or another process is gone; the chunks that were finished are kept.
+    Lanes are the elements of a batch: the leading axis of `states` and of the result, in equal
+    order. Each device runs its lanes without waiting for other devices. Under `jax.distributed`,
+    each process runs a share of the chunks, and every process returns the complete trajectory.
+
+    states: a State with a leading axis of lanes.
+    t1: end time (s).
+    data: pytree with a leading axis of lanes: the data in which lanes differ.
+    lane: function (chain, data of one lane) that returns a dict of arguments of `simulate`, such as
+        events, args, control, t1, or `chain` with other floats. Lambdas written in the call share a
+        compiled program if their code and the data that they read are equal, as in `simulate`.
+    cost: expected duration of each lane, in any unit [lanes]. Lanes of similar cost share a chunk,
+        so that short runs do not wait for long ones.
+    chunk: lanes that one device runs at once. Default: 64 on a CPU, else 4096, and at most the
+        number of lanes. Memory grows in proportion.
+    out: folder for finished chunks (chunk_00000.npz and so on, readable by `svkc.load_trajectory`).
+        A call with equal arguments continues an interrupted rollout from this folder.
+    devices: devices to use. Default: all of this process. For several CPU devices call
+        `jax.config.update("jax_num_cpu_devices", n)` before the first use of jax.
+    progress: whether to print progress.
+    options: further arguments of `simulate`, for all lanes. `throw` is False by default: the result
+        codes of failed lanes are in `result`.
+
+    Raises ValueError if leading axes differ, if an option is invalid, or if `out` holds another
+    rollout. Raises RuntimeError if a chunk does not fit into memory or if another process ended
+    early. In both cases finished chunks stay in `out`.
     """
     check_chain(chain)
     lanes = _count_lanes(states, data, cost)
@@ -79,8 +84,10 @@ def rollout(
 
 
 def _prepare_devices(devices, chunk: int | None, lanes: int) -> tuple[list[jax.Device], int]:
-    """Return the devices and how many lanes each takes at once. ValueError: no device or no count
-    of lanes."""
+    """Return the devices and how many lanes each runs at once.
+
+    Raises ValueError if either is invalid.
+    """
     if chunk is not None:
         chunk = integer("chunk", chunk, 1)
     if devices is None:
@@ -94,8 +101,10 @@ def _prepare_devices(devices, chunk: int | None, lanes: int) -> tuple[list[jax.D
 
 
 def _assign_chunks(order: np.ndarray, size: int) -> np.ndarray:
-    """Return the lanes of each chunk, [chunks size]; the last one is filled up with its last lane.
-    ValueError: fewer chunks than processes."""
+    """Return the lanes of each chunk [chunks size]. The last lane fills up the last chunk.
+
+    Raises ValueError if there are fewer chunks than processes.
+    """
     chunks = np.pad(order, (0, -len(order) % size), mode="edge").reshape(-1, size)
     if len(chunks) < jax.process_count():
         raise ValueError(
@@ -106,8 +115,10 @@ def _assign_chunks(order: np.ndarray, size: int) -> np.ndarray:
 
 
 def _chunk_runner(chain: Chain, t1, lane: Callable | None, options: dict, devices) -> Callable:
-    """Return the function that runs a chunk, (states, data) of its lanes, on the devices. Equal
-    functions share a compiled program."""
+    """Return the function that runs a chunk: (states, data) of its lanes -> Trajectory.
+
+    Functions with equal code and data share a compiled program.
+    """
     common = {"throw": False, "adjoint": Replay(every=1 << 30), **options}
     mesh = Mesh(np.array(devices), ("lanes",))
     functions = {"control": options.get("control"), "events": options.get("events", ())}
@@ -120,6 +131,7 @@ def _chunk_runner(chain: Chain, t1, lane: Callable | None, options: dict, device
 
 
 def _count_lanes(states, data, cost) -> int:
+    """Return the number of lanes. Raise ValueError if leading axes differ."""
     if not isinstance(states, State):
         raise ValueError(
             f"states: expected a svkc.State with a leading axis, got {type(states).__name__}"
@@ -140,8 +152,11 @@ def _count_lanes(states, data, cost) -> int:
 
 @eqx.filter_jit
 def _run_chunk(common, lanes, mesh: Mesh) -> Trajectory:
-    """The run of one chunk: a piece for each device, without a word between them, so that none
-    waits for another's steps."""
+    """Run the lanes of one chunk on all devices of the mesh.
+
+    `shard_map` instead of a sharded `vmap`: devices exchange nothing, so none waits for the steps
+    of another.
+    """
     arrays, static = eqx.partition(common, eqx.is_array)
 
     def run_lane(fixed, state, data):
@@ -164,11 +179,14 @@ def _run_chunk(common, lanes, mesh: Mesh) -> Trajectory:
 
 
 def _prepare_folder(folder: pathlib.Path, inputs, size: int) -> pathlib.Path:
-    """The folder, made, with what it is the rollout of; ValueError where it is another's."""
+    """Create the folder and label it with a hash of the rollout's arguments.
+
+    Raises ValueError if the folder is labelled with another hash.
+    """
     digest = hashlib.sha256()
     for path, leaf in jax.tree_util.tree_leaves_with_path(inputs):
         digest.update(jax.tree_util.keystr(path).encode())
-        # functions and solvers by their names; the folder cannot tell whether they were rewritten
+        # functions and solvers are hashed by name: a changed body is not noticed
         digest.update(
             np.ascontiguousarray(leaf).tobytes()
             if eqx.is_array_like(leaf)
@@ -191,8 +209,10 @@ def _prepare_folder(folder: pathlib.Path, inputs, size: int) -> pathlib.Path:
 def _load_or_run(
     run: Callable, lanes, path: pathlib.Path | None, chain: Chain, chunk: int
 ) -> Trajectory:
-    """One chunk, read where it was finished before; on the host, so that the device is free for the
-    next."""
+    """Return one chunk as numpy arrays, loaded from its file if that exists, else run and saved.
+
+    The result is moved to the host so that the device's memory is free for the next chunk.
+    """
     if path is not None and path.exists():
         return load_trajectory(path)
     try:
@@ -211,6 +231,7 @@ def _load_or_run(
 
 
 def _print_progress(done: int, chunks: int, lanes: int, seconds: float) -> None:
+    """Print how many chunks are done, the seconds so far, and the estimated remaining seconds."""
     remaining = seconds / done * (chunks - done)
     end = "\n" if done == chunks else ""
     print(
@@ -223,7 +244,7 @@ def _print_progress(done: int, chunks: int, lanes: int, seconds: float) -> None:
 
 
 def _gather_chunks(done: dict[int, Trajectory], count: int) -> list[Trajectory]:
-    """Every chunk in order, those of the other processes too."""
+    """Return all chunks in order, including those of other processes."""
     if jax.process_count() == 1:
         return [done[i] for i in range(count)]
     from jax.experimental import multihost_utils
@@ -231,7 +252,7 @@ def _gather_chunks(done: dict[int, Trajectory], count: int) -> list[Trajectory]:
     processes, process = jax.process_count(), jax.process_index()
     chunks = []
     for first in range(0, count, processes):
-        # who has no chunk in a round sends one again
+        # all processes take part in every round; one without a new chunk sends an old one
         own_chunk = done.get(first + process, next(iter(done.values())))
         try:
             round_chunks = multihost_utils.process_allgather(own_chunk)

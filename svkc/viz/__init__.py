@@ -1,1 +1,1 @@
-"""Pictures: strobe, animation, curves, the page."""
+"""Pictures of runs: strobe, animation, plots, HTML page."""

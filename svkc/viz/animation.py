@@ -1,4 +1,4 @@
-"""Moving pictures of a run by MuJoCo's offscreen renderer: gif by Pillow, mp4 by imageio-ffmpeg."""
+"""Animations of a run, by MuJoCo's offscreen renderer: gif by Pillow, mp4 by imageio-ffmpeg."""
 
 import pathlib
 import warnings
@@ -17,12 +17,14 @@ from svkc.viz.shapes import (
 )
 
 GL_PACKAGES = "libegl1 libgl1"
-FLASH_DURATION = 0.3  # s: for how long the links that an event changed are drawn large
+FLASH_DURATION = 0.3  # s after an event during which connected links are drawn large
 
 
 def _use_offscreen_context():
-    """Give MuJoCo's renderer an offscreen GL context whose library is on this machine;
-    RuntimeError naming the packages otherwise."""
+    """Make MuJoCo's renderer use the first offscreen GL context whose library is installed.
+
+    Raises RuntimeError, which names the missing packages, if there is none.
+    """
     import importlib
 
     for module in ("mujoco.egl", "mujoco.osmesa"):
@@ -39,7 +41,7 @@ def _use_offscreen_context():
 
 
 def write_gif(path: pathlib.Path, images: Iterator, fps: float):
-    """An animation that repeats, 96 colours a frame, rare ones too."""
+    """Write a repeating gif with 96 colors a frame."""
     from PIL import Image
 
     first, *others = (image.quantize(96, Image.Quantize.MAXCOVERAGE) for image in images)
@@ -47,7 +49,10 @@ def write_gif(path: pathlib.Path, images: Iterator, fps: float):
 
 
 def write_mp4(path: pathlib.Path, images: Iterator, fps: float):
-    """H.264 by the ffmpeg that imageio-ffmpeg brings. RuntimeError: it is not installed."""
+    """Write H.264 with imageio-ffmpeg's ffmpeg.
+
+    Raises RuntimeError if imageio-ffmpeg is not installed.
+    """
     try:
         import imageio_ffmpeg
     except ImportError as error:
@@ -59,7 +64,7 @@ def write_mp4(path: pathlib.Path, images: Iterator, fps: float):
         str(path), first.size, fps=fps, macro_block_size=2, quality=7, ffmpeg_log_level="error"
     )
     with warnings.catch_warnings():
-        # jax warns of forks, for threads that hold locks; this one becomes ffmpeg at once
+        # jax warns of forks, because threads may hold locks; this fork executes ffmpeg at once
         warnings.simplefilter("ignore", RuntimeWarning)
         writer.send(None)
     try:
@@ -70,10 +75,16 @@ def write_mp4(path: pathlib.Path, images: Iterator, fps: float):
 
 
 def frames(chain: Chain, traj: Trajectory, *, fps: float, size, trails, **view) -> Iterator:
-    """Yield PIL images `1/fps` s apart, the nearest saved state to each: links that hold as
-    spheres, paths of the bodies in `trails`, a strip below.
+    """Yield PIL images `1/fps` s apart, each showing the saved state nearest in time.
 
-    view: arguments of `_camera`. ValueError: no such body or camera. RuntimeError: no GL library.
+    Connected links are drawn as spheres. A strip below the image holds time, links and events.
+
+    size: (width, height) in pixels.
+    trails: names of bodies whose paths are drawn.
+    view: arguments of `_choose_camera`.
+
+    Raises ValueError if a body or camera does not exist, RuntimeError if no GL library is
+    installed.
     """
     import mujoco
     from PIL import Image
@@ -108,16 +119,17 @@ def frames(chain: Chain, traj: Trajectory, *, fps: float, size, trails, **view) 
 
 
 def _set_buffer(model, size):
-    """Make the offscreen buffer at least `size` (width, height), without shadows' and samples'
-    cost."""
+    """Make the offscreen buffer at least `size`, without shadows and multisampling."""
     model.vis.quality.shadowsize = model.vis.quality.offsamples = 0
     buffer = model.vis.global_
     buffer.offwidth, buffer.offheight = np.maximum(size, (buffer.offwidth, buffer.offheight))
 
 
 def _set_poses(model, data, positions: np.ndarray, R: np.ndarray):
-    """Write the places of geoms and cameras, from those of the bodies in svkc: MuJoCo's tree may be
-    another one where joints can be cut."""
+    """Set poses of geoms and cameras from svkc's body poses.
+
+    MuJoCo's own kinematics cannot be used: its tree is another one where joints can be cut.
+    """
     geoms = model.geom_bodyid, model.geom_pos, model.geom_quat, data.geom_xpos, data.geom_xmat
     cameras = model.cam_bodyid, model.cam_pos, model.cam_quat, data.cam_xpos, data.cam_xmat
     for bodies, pos, quat, xpos, xmat in (geoms, cameras):
@@ -127,7 +139,7 @@ def _set_poses(model, data, positions: np.ndarray, R: np.ndarray):
 
 
 def _choose_camera(model, positions, *, camera, lookat, distance, azimuth, elevation):
-    """Return the model's camera of that name, or one that sees all places where bodies are."""
+    """Return the model's camera of that name, or a free camera that sees all body positions."""
     import mujoco
 
     if camera is not None:
@@ -147,13 +159,14 @@ def _choose_camera(model, positions, *, camera, lookat, distance, azimuth, eleva
 
 
 def _rgba(hexadecimal: str, alpha: float):
+    """Return a color #rrggbb and an opacity as four floats in 0 to 1."""
     return np.array(
         [int(hexadecimal[k : k + 2], 16) / 255 for k in (1, 3, 5)] + [alpha], np.float32
     )
 
 
 def _draw_links(scene, positions: dict[int, np.ndarray], large: bool):
-    """A red sphere where each connected virtual link is, larger just after an event."""
+    """Add a red sphere at each connected virtual link, larger just after an event."""
     import mujoco
 
     for position in positions.values():
@@ -174,7 +187,7 @@ def _draw_links(scene, positions: dict[int, np.ndarray], large: bool):
 
 
 def _draw_trail(scene, path: np.ndarray, hexadecimal: str):
-    """Where a body's origin has been."""
+    """Add the path of a body's origin as a thin line."""
     import mujoco
 
     for a, b in zip(path, path[1:], strict=False):
@@ -193,8 +206,7 @@ def _draw_trail(scene, path: np.ndarray, hexadecimal: str):
 
 
 def _add_caption(image, t: float, start: float, end: float, links: list[str], events):
-    """A strip below the picture: the time, what holds, the last event, and a line of time with a
-    mark at each event."""
+    """Return the image with a strip below: time, connected links, last event, time line."""
     from PIL import Image, ImageDraw, ImageFont
 
     width, strip, margin = image.width, 58, 10

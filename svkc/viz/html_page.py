@@ -1,5 +1,7 @@
-"""A run as one HTML page of its own: bodies in three dimensions, a timeline with its events,
-numbers beside it. Nothing is read from a network."""
+"""A run as one self-contained HTML page: bodies in three dimensions, a time line, numbers.
+
+The page reads nothing from a network. The browser's part is in `web/`.
+"""
 
 import base64
 import dataclasses
@@ -23,8 +25,11 @@ FOLDER = pathlib.Path(__file__).parent / "web"
 
 @dataclasses.dataclass(frozen=True)
 class Page:
-    """A run's page: `text` is the HTML file. A notebook shows it in a frame `height` pixels
-    high."""
+    """The page of a run. Jupyter shows it in a frame.
+
+    text: the HTML file.
+    height: height of the frame (pixels).
+    """
 
     text: str
     height: int = 480
@@ -38,15 +43,20 @@ class Page:
 
 
 def show(chain: Chain, traj: Trajectory, *, title: str = "svkc", height: int = 480) -> Page:
-    """The page of a run; as the last line of a notebook's cell it is shown below it:
-    `svkc.show(chain, traj)`. `svkc.render(chain, traj, "run.html")` writes the same page to a
-    file.
+    """Return the page of a run, which a notebook displays.
 
-    Bodies move in straight lines and turn at constant rates between the saved times: save 40 a
-    second or so. ValueError: a batch of runs.
+    As the last line of a notebook cell the page is displayed below the cell. `svkc.render(chain,
+    traj, "run.html")` writes the page to a file. Between save times the page interpolates positions
+    linearly and orientations at constant angular velocity: save about 40 states a second.
+
+    traj: one run, not a batch.
+    title: title of the page.
+    height: height of the notebook's frame (pixels).
+
+    Raises ValueError if `traj` is a batch of runs.
     """
     text = _read_web_file("page.html")
-    # the run comes last: nothing in it is taken for a place to put something in
+    # the run is inserted last, so that no placeholder is replaced inside its strings
     parts = {
         "three": _read_web_file("three.min.js"),
         "page": _read_web_file("page.js"),
@@ -59,22 +69,23 @@ def show(chain: Chain, traj: Trajectory, *, title: str = "svkc", height: int = 4
 
 
 def write_page(chain: Chain, traj: Trajectory, path: pathlib.Path) -> pathlib.Path:
-    """Writes the page to a file, of whose name its title is made."""
+    """Write the page to a file, with the file's stem as its title, and return the path."""
     path.write_text(show(chain, traj, title=path.stem).text, encoding="utf-8")
     return path
 
 
 def _read_web_file(name: str) -> str:
+    """Return the text of a file in `web/`."""
     return (FOLDER / name).read_text(encoding="utf-8")
 
 
 def _script_json(data) -> str:
-    """JSON that can stand inside a <script>: no name in it ends the script."""
+    """Return JSON that is safe inside a <script>: no string in it can end the script."""
     return json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
 
 
 def _json_numbers(x):
-    """Lists of numbers; null for what is not finite."""
+    """Return nested lists of numbers, with None for non-finite ones, which JSON lacks."""
     x = np.asarray(x, float)
     values = x.astype(object)
     values[~np.isfinite(x)] = None
@@ -82,13 +93,14 @@ def _json_numbers(x):
 
 
 def _base64(x, dtype) -> str:
+    """Return the array's little-endian bytes in base64."""
     return base64.b64encode(
         np.ascontiguousarray(x, np.dtype(dtype).newbyteorder("<")).tobytes()
     ).decode()
 
 
 def _run_data(chain: Chain, traj: Trajectory) -> dict:
-    """All that the page knows of a run."""
+    """Return the data of a run that the page's script reads."""
     check_single_run(traj)
     ts, states, gaps = _saved_frames(chain, traj)
     positions, quats, energies = jax.jit(jax.vmap(lambda s: (*poses(chain, s), energy(chain, s))))(
@@ -111,8 +123,10 @@ def _run_data(chain: Chain, traj: Trajectory) -> dict:
 
 
 def _saved_frames(chain: Chain, traj: Trajectory) -> tuple[np.ndarray, State, np.ndarray]:
-    """The saved times up to the end of the run, which may have come early, with states and gaps
-    there; the end is one of them."""
+    """Return save times, states and gaps up to the end of the run.
+
+    The run may end before the last save time. Its end is the last frame.
+    """
     ts, end = np.asarray(traj.ts, float), float(traj.t_final)
     keep = np.flatnonzero(ts <= end)
     ts, states, gaps = (
@@ -131,8 +145,10 @@ def _saved_frames(chain: Chain, traj: Trajectory) -> tuple[np.ndarray, State, np
 
 
 def _phase_rows(chain: Chain, traj: Trajectory, ts: np.ndarray, states: State) -> list[dict]:
-    """From when, with what mobility, held by which links. What an event at the very end leaves is a
-    phase too."""
+    """Return start (s), mobility and connected links of each phase.
+
+    The structure that an event at the end of the run leaves is added as a phase.
+    """
     p, final = traj.phases, traj.final.structure
     rows = [
         {
@@ -160,13 +176,13 @@ def _phase_rows(chain: Chain, traj: Trajectory, ts: np.ndarray, states: State) -
             }
         )
         connected_rows.append(np.asarray(final.connected))
-    # a row of the topology as a body
+    # the body number of each row of the topology
     body_of_row = {row: i for i, row in enumerate(chain.topology.body_row)}
     bounds = [row["start"] for row in rows] + [np.inf]
     for row, connected, start, stop in zip(
         rows, connected_rows, bounds[:-1], bounds[1:], strict=True
     ):
-        # where links hold is known where a state was saved
+        # placements of links are known only at save times
         saved = np.flatnonzero((ts >= start) & (ts < stop))
         s = (
             jax.tree.map(lambda x, k=saved: np.asarray(x[k[0]]), states.structure)
@@ -181,7 +197,7 @@ def _phase_rows(chain: Chain, traj: Trajectory, ts: np.ndarray, states: State) -
 
 
 def _link_ends(s: Structure, link: int, body: dict) -> list:
-    """Body and place in it, of the parent's end and the real link's."""
+    """Return [body, position in its frame] of a virtual link's parent end and real end."""
     return [
         [body[int(row[link])], _json_numbers(pos[link])]
         for row, pos in ((s.parent, s.pos), (s.real, s.real_pos))
@@ -189,10 +205,10 @@ def _link_ends(s: Structure, link: int, body: dict) -> list:
 
 
 def _event_rows(chain: Chain, traj: Trajectory, begin: float) -> list[dict]:
-    """What happened, one line an instant, and the energy (J) that it cost."""
+    """Return time (s), description and lost energy (J) of each instant with events."""
     e = traj.events
     times, lost = (np.asarray(x[: int(e.count)], float) for x in (e.time, e.energy_lost))
-    # what rounding leaves of a cut is no loss
+    # a cut loses no energy: a loss within round-off is shown as zero
     rounding = 100 * float(jnp.finfo(traj.ts.dtype).eps * jnp.max(jnp.abs(traj.phases.energy)))
     instants = [
         (time, text, float(lost[times == time].sum()))
@@ -206,8 +222,7 @@ def _event_rows(chain: Chain, traj: Trajectory, begin: float) -> list[dict]:
 
 
 def _geoms(model) -> tuple[list[dict], list[dict]]:
-    """What MuJoCo's own viewer shows at first: geoms of the groups 0 to 2; meshes, and heightfields
-    as such, once each."""
+    """Return the visible geoms, and the meshes that they use, each mesh once."""
     import mujoco
 
     kinds = mujoco.mjtGeom
@@ -220,7 +235,7 @@ def _geoms(model) -> tuple[list[dict], list[dict]]:
         )
         rgba = model.geom_rgba[g]
         if material >= 0 and np.array_equal(rgba, np.array([0.5, 0.5, 0.5, 1], np.float32)):
-            # MuJoCo's rule: the material's colour, unless the geom has one of its own
+            # MuJoCo's rule: the material's color, unless the geom has one of its own
             rgba = model.mat_rgba[material]
         if model.geom_group[g] > 2 or rgba[3] == 0:
             continue
@@ -248,6 +263,7 @@ def _geoms(model) -> tuple[list[dict], list[dict]]:
 
 
 def _mesh(model, i: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices and faces of a mesh."""
     first, count, face, faces = (
         int(x[i])
         for x in (model.mesh_vertadr, model.mesh_vertnum, model.mesh_faceadr, model.mesh_facenum)
@@ -256,7 +272,7 @@ def _mesh(model, i: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _heightfield(model, i: int) -> tuple[np.ndarray, np.ndarray]:
-    """Its upper surface."""
+    """Return vertices and faces of a height field's upper surface."""
     rows, columns, first = (
         int(x[i]) for x in (model.hfield_nrow, model.hfield_ncol, model.hfield_adr)
     )

@@ -1,4 +1,4 @@
-"""Flat pictures of a run by matplotlib: a strobe, curves over time."""
+"""Plots of a run by matplotlib: a strobe, and curves over time."""
 
 import functools
 import pathlib
@@ -19,8 +19,10 @@ from svkc.viz.shapes import (
 
 
 def strobe(chain: Chain, traj: Trajectory, path: pathlib.Path, frames: int) -> pathlib.Path:
-    """Draw poses over one another in the plane of x and z, a colour for each structure, links that
-    hold as rings; return the file's path."""
+    """Draw several poses in the x-z plane, save the picture, and return its path.
+
+    Each structure has a color. Connected links are rings.
+    """
     from matplotlib.figure import Figure
 
     ts = np.asarray(traj.ts)
@@ -36,7 +38,7 @@ def strobe(chain: Chain, traj: Trajectory, path: pathlib.Path, frames: int) -> p
     ground_shapes, body_shapes = [s for s in shapes if s[0] == 0], [s for s in shapes if s[0] != 0]
     low, high = _axis_limits(ground_shapes, positions)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-    # points a metre
+    # points per metre
     scale = 72 * min(9 / (high[0] - low[0]), 6.7 / (high[1] - low[1]))
     draw = functools.partial(_draw_shapes, axes, scale=scale)
     draw(ground_shapes, positions[0], R[0], color="#9a9aa2", alpha=0.8)
@@ -54,8 +56,10 @@ def strobe(chain: Chain, traj: Trajectory, path: pathlib.Path, frames: int) -> p
 
 
 def _structures(traj: Trajectory) -> tuple[np.ndarray, list[tuple[int, ...]]]:
-    """Return each phase's start (s) and connected links, without the phases of no length between
-    events of one instant."""
+    """Return each phase's start (s) and connected links.
+
+    Phases of zero duration, between events at one instant, are left out.
+    """
     p = traj.phases
     phases = [i for i in range(int(p.count)) if p.stop[i] > p.start[i]] or [0]
     links = [tuple(np.flatnonzero(p.connected[i]).tolist()) for i in phases]
@@ -63,10 +67,10 @@ def _structures(traj: Trajectory) -> tuple[np.ndarray, list[tuple[int, ...]]]:
 
 
 def _axis_limits(ground_shapes, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest and the highest x and z (m) that are shown.
+    """Return the lowest and the highest visible x and z (m).
 
-    What is fixed is shown no further than a metre beyond what moves: a long floor would make the
-    figure small.
+    Shapes on the ground are shown at most a metre beyond the bodies: a long floor would make the
+    bodies small.
     """
     points = positions[:, 1:, [0, 2]].reshape(-1, 2)
     ends = np.array([end for _, *ends, _ in ground_shapes for end in ends]).reshape(-1, 3)[
@@ -77,11 +81,11 @@ def _axis_limits(ground_shapes, positions: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _draw_shapes(axes, shapes, positions, R, *, scale: float, color: str, alpha: float):
-    """Draw shapes as thick lines where their bodies are. scale: points a metre."""
+    """Draw shapes as thick lines at the poses of their bodies. scale: points per metre."""
     for body, a, b, radius in shapes:
         ends = np.array([positions[body] + R[body] @ x for x in (a, b)])
         if np.hypot(*(ends[1] - ends[0])[[0, 2]]) * scale < 1:
-            # seen end-on: a line of no length would not be drawn
+            # seen end-on: matplotlib does not draw a line of zero length
             ends[1, 0] = ends[0, 0] + 1 / scale
         axes.plot(
             ends[:, 0],
@@ -89,23 +93,21 @@ def _draw_shapes(axes, shapes, positions, R, *, scale: float, color: str, alpha:
             color=color,
             alpha=alpha,
             solid_capstyle="round",
-            # limbs at two thirds of their thickness, so that poses can be told apart
+            # two thirds of the true thickness, so that poses can be told apart
             linewidth=max(1.0, 1.3 * radius * scale),
         )
 
 
 def _add_legend(axes, chain: Chain, starts, structures, colors: dict):
-    """Name each structure by the links that hold, and the times from which it is there."""
+    """Name each structure by its connected links and the times at which it starts."""
     from matplotlib.transforms import ScaledTranslation
 
-    for structure, color in colors.items():
-        starts_of_structure = [
-            f"{t:.2f}" for t, s in zip(starts, structures, strict=True) if s == structure
-        ]
-        times = ", ".join(starts_of_structure[:6]) + ", ..." * (len(starts_of_structure) > 6)
+    for structure, structure_color in colors.items():
+        begins = [f"{t:.2f}" for t, s in zip(starts, structures, strict=True) if s == structure]
+        times = ", ".join(begins[:6]) + ", ..." * (len(begins) > 6)
         links = ", ".join(chain.link_names[k] for k in structure) or "nothing"
-        axes.plot([], [], color=color, linewidth=5, label=f"{links} from {times} s")
-    # below the picture: inside it would hide limbs
+        axes.plot([], [], color=structure_color, linewidth=5, label=f"{links} from {times} s")
+    # below the picture: inside, the legend would hide limbs
     below = axes.transAxes + ScaledTranslation(0, -0.6, axes.figure.dpi_scale_trans)
     axes.legend(
         loc="upper center",
@@ -118,9 +120,13 @@ def _add_legend(axes, chain: Chain, starts, structures, colors: dict):
 
 
 def curves(traj: Trajectory, chain: Chain | None = None):
-    """Return a matplotlib figure over time: coordinates, energy, loop gaps, mobility, events as
-    lines with their names; with the chain, kinetic and potential energy at every saved time and the
-    joints' names, without it energy at the phases' ends alone."""
+    """Return a matplotlib figure of coordinates, energy, loop gaps and mobility over time.
+
+    Events are numbered lines.
+
+    chain: adds joint names, and kinetic and potential energy at the save times. Without a chain,
+        the energy is shown at the ends of phases alone.
+    """
     from matplotlib.figure import Figure
 
     ts, p, count = np.asarray(traj.ts), traj.phases, int(traj.phases.count)
@@ -141,22 +147,25 @@ def curves(traj: Trajectory, chain: Chain | None = None):
 
 
 def _plot_coordinates(axes, ts, traj: Trajectory, chain: Chain | None):
-    """Draw joints' coordinates, by name where they are few; quaternions' and positions' too."""
+    """Plot all coordinates.
+
+    A legend names them if the tree has at most eight, one for each joint.
+    """
     axes.plot(ts, np.asarray(traj.states.q), linewidth=0.8)
     axes.set_ylabel("q (m, rad)")
     if chain is not None and chain.nq == len(chain.joint_names) <= 8:
-        # the tree's come first; virtual joints' go without a name
+        # coordinates of the tree come first; those of virtual joints have no label
         axes.legend(axes.lines[: chain.nq], chain.joint_names, fontsize=7)
 
 
 def _plot_energies(axes, ts, traj: Trajectory, chain: Chain | None):
-    """Draw the energy at the phases' ends; with the chain, kinetic and potential energy too."""
+    """Plot the energy at the ends of phases; with a chain, kinetic and potential energy too."""
     if chain is not None:
         for name, energy_of in (("kinetic", kinetic_energy), ("potential", potential_energy)):
             values = jax.jit(jax.vmap(lambda s, of=energy_of: of(chain, s)))(traj.states)
             axes.plot(ts, np.asarray(values), linewidth=1, label=name)
     p, count = traj.phases, int(traj.phases.count)
-    # a gap in the line after each phase
+    # NaN breaks the line after each phase
     gap = np.full((count, 1), np.nan)
     ends = np.stack([p.start, p.stop], 1)[:count]
     times, values = (np.hstack([x, gap]).ravel() for x in (ends, np.asarray(p.energy)[:count]))
@@ -166,7 +175,7 @@ def _plot_energies(axes, ts, traj: Trajectory, chain: Chain | None):
 
 
 def _mark_events(figure, panels, events: list[tuple[float, str]]):
-    """Draw a line at each event in every panel, numbered at the top, and name them below."""
+    """Draw a numbered line at each event in every panel, and name the events below."""
     for number, (t, _) in enumerate(events, 1):
         for panel in panels:
             panel.axvline(t, color="0.6", linewidth=0.8, linestyle="--")

@@ -12,7 +12,7 @@ from svkc.viz.shapes import check_single_run
 
 
 def _require_packages() -> None:
-    """RuntimeError: what draws is not installed."""
+    """Raise RuntimeError if matplotlib or Pillow is not installed."""
     for name in ("matplotlib", "PIL"):
         try:
             __import__(name)
@@ -27,15 +27,26 @@ def render(
     trails=(), camera: str | None = None, lookat=None, distance=None, azimuth: float = 90,
     elevation: float = -8,
 ) -> pathlib.Path:  # fmt: skip
-    """Writes a picture of the run by the ending of `path`: .png a strobe of `frames` poses seen
-    from the side; .gif and .mp4 an animation of `fps` frames a second of size (width, height) in
-    pixels, with a strip below that names the time, what holds and the events; .html a page of its
-    own to turn, play and go through (`svkc.show` in a notebook).
+    """Write a picture of a run in the format of the path's suffix, and return the path.
 
-    Of animations: trails: names of bodies whose paths are drawn; camera: the model's own of that
-    name, else lookat (m), distance (m), azimuth and elevation (deg) place one. ValueError: another
-    ending, a batch, no such body or camera, what is no number. RuntimeError: no GL library, no
-    matplotlib, pillow or imageio-ffmpeg (names the packages).
+    .png: a strobe of several poses in the x-z plane. .gif, .mp4: an animation, with a strip below
+    that shows time, connected links and events. .html: an interactive page, as by `svkc.show`.
+
+    traj: one run, not a batch.
+    path: file to write; its suffix is .png, .gif, .mp4 or .html.
+    fps: frames per second of an animation.
+    frames: number of poses of a strobe.
+    size: (width, height) of an animation (pixels).
+    trails: names of bodies whose paths are drawn in an animation.
+    camera: name of a camera of the model, for an animation. None: a free camera, as follows.
+    lookat: point at which the free camera looks (m, ground frame). None: the middle of the motion.
+    distance: distance of the free camera from `lookat` (m). None: far enough to see the whole
+        motion.
+    azimuth, elevation: direction of the free camera (degrees), as in MuJoCo.
+
+    Raises ValueError if the suffix is unknown, `traj` is a batch, a name does not exist, or a
+    number is invalid. Raises RuntimeError, which names the missing packages, if a GL library,
+    matplotlib, Pillow or imageio-ffmpeg is not installed.
     """
     from svkc.viz import animation, plots
 
@@ -74,8 +85,15 @@ def render(
 
 
 def plot(traj: Trajectory, chain: Chain | None = None):
-    """A matplotlib figure: coordinates, energy, loop gaps, mobility over time, events as lines;
-    names and energies in full where the chain is given."""
+    """Return a matplotlib figure of coordinates, energy, loop gaps and mobility over time.
+
+    Events are numbered lines.
+
+    traj: one run, not a batch.
+    chain: adds joint names, and kinetic and potential energy at every save time.
+
+    Raises ValueError if `traj` is a batch, RuntimeError if matplotlib is not installed.
+    """
     from svkc.viz.plots import curves
 
     check_single_run(traj)

@@ -1,5 +1,4 @@
-"""What every picture of a run shows: bodies where they are, thick lines for their shapes, what
-holds, what happened and when."""
+"""Geometry and labels that all pictures of a run share: body poses, shapes, links, events."""
 
 import jax
 import numpy as np
@@ -9,12 +8,12 @@ from svkc.model.chain import Chain, State
 from svkc.simulation.trajectory import Trajectory
 from svkc.tree.kinematics import poses
 
-# one for each structure, or each body that leaves a trail
+# of structures in a strobe, and of trails in an animation
 COLORS = ("#1f5fa8", "#d9822b", "#2f8f4e", "#8e3b8e", "#b03030")
 
 
 def check_single_run(traj) -> None:
-    """ValueError for what is no trajectory, or one of many lanes."""
+    """Raise ValueError if the argument is not a trajectory, or a batch of trajectories."""
     if not isinstance(traj, Trajectory):
         raise ValueError(f"traj: expected one run of svkc.simulate, got {type(traj).__name__}")
     if np.ndim(traj.ts) != 1:
@@ -25,13 +24,15 @@ def check_single_run(traj) -> None:
 
 
 def color(i: int) -> str:
-    """As #rrggbb."""
+    """Return color number i of a repeating palette, as #rrggbb."""
     return COLORS[i % len(COLORS)]
 
 
 def segments(chain: Chain) -> list[tuple[int, np.ndarray, np.ndarray, float]]:
-    """(body, one end, other end, half thickness) of everything that can be drawn as a thick line,
-    in the body's frame (m)."""
+    """Return (body, end, other end, radius) for each geom that can be drawn as a thick line.
+
+    Ends are in the body's frame (m). Planes and height fields are left out.
+    """
     import mujoco
 
     model, lines = chain.model.model, []
@@ -47,8 +48,7 @@ def segments(chain: Chain) -> list[tuple[int, np.ndarray, np.ndarray, float]]:
                 float(np.mean(size)) if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID else size[0],
             )
         elif kind in (mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_MESH):
-            # of a mesh size is the half of its box; along the longest side, as thick as the
-            # shortest
+            # along the longest side, as thick as the shortest; `size` of a mesh is half its box
             longest = int(np.argmax(size))
             half, radius = R[:, longest] * size[longest], float(np.min(size))
         else:
@@ -65,8 +65,10 @@ def segments(chain: Chain) -> list[tuple[int, np.ndarray, np.ndarray, float]]:
 
 
 def positions_and_rotations(chain: Chain, states: State) -> tuple[np.ndarray, np.ndarray]:
-    """Positions [times bodies 3] (m) and rotations [times bodies 3 3] of the body frames in the
-    world."""
+    """Return positions (m) and rotation matrices of the body frames.
+
+    Shapes are [times bodies 3] and [times bodies 3 3]; both are relative to the ground.
+    """
     positions, quats = jax.jit(jax.vmap(lambda s: poses(chain, s)))(states)
     w, x, y, z = np.moveaxis(np.asarray(quats, float), -1, 0)
     R = np.array(
@@ -82,8 +84,12 @@ def positions_and_rotations(chain: Chain, states: State) -> tuple[np.ndarray, np
 def connected_link_positions(
     chain: Chain, states: State, positions, R
 ) -> list[dict[int, np.ndarray]]:
-    """At each of these states, where each connected virtual link holds: {link: place in the world
-    (m)}."""
+    """Return, for each state, the positions of the connected links: {link: position}.
+
+    Positions are in the ground frame (m).
+
+    positions, R: result of `positions_and_rotations`.
+    """
     rows, s = {row: body for body, row in enumerate(chain.topology.body_row)}, states.structure
     connected, real, real_pos = (
         np.asarray(s.connected),
@@ -98,15 +104,17 @@ def connected_link_positions(
 
 
 def event_descriptions(traj: Trajectory, chain: Chain | None = None) -> list[tuple[float, str]]:
-    """(time in s, what was connected and cut) of each instant at which there were events; by the
-    links' numbers where no chain is given."""
+    """Return (time in s, description) for each instant with events.
+
+    A description lists what was connected and cut, by link name, or by link number without a chain.
+    """
     p, e, descriptions = traj.phases, traj.events, []
     starts, connected = np.asarray(p.start)[: int(p.count)], np.asarray(p.connected)[: int(p.count)]
     times = np.asarray(e.time)[: int(e.count)]
     link_name = (lambda k: chain.link_names[k]) if chain is not None else (lambda k: f"link {k}")
     for time in np.unique(times):
         before = connected[max(int(np.sum(starts < time)) - 1, 0)]
-        # what an event at the very end leaves is no phase any more
+        # the structure after an event at the end of the run has no phase
         after = (
             connected[int(np.sum(starts <= time)) - 1]
             if np.any(starts >= time)

@@ -55,7 +55,7 @@ def test_what_is_wrong_is_said(tmp_path):
         "expected NAME@TIME": ("run --release pin",),
         "--t1: got -1.0, expected a positive number": ("run --t1 -1", tmp_path / "rod.xml"),
         "no.npz": ("run --out", tmp_path / "no.npz", tmp_path / "rod.xml"),
-        "is not a whole trajectory": ("view", tmp_path / "no.npz"),
+        "is not a complete trajectory": ("view", tmp_path / "no.npz"),
         "No such file": ("view", tmp_path / "nothing.npz"),
         "invalid choice": ("dance",),
     }

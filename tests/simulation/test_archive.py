@@ -84,7 +84,7 @@ def test_save_and_load(run, tmp_path):
     (tmp_path / "cut.npz").write_bytes(whole[: len(whole) // 2])
     (tmp_path / "text.npz").write_text("no")
     for name in ("cut.npz", "text.npz"):
-        with pytest.raises(ValueError, match="not a whole trajectory"):
+        with pytest.raises(ValueError, match="not a complete trajectory"):
             svkc.load_trajectory(tmp_path / name)
     assert [p.name for p in tmp_path.glob("*.part")] == []
 
