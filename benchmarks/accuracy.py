@@ -22,8 +22,7 @@ import numpy as np
 
 ROOT = pathlib.Path(__file__).parent.parent
 
-# (puts the tests' references on the path)
-import soft_loops
+import soft_loops  # first: adds the references of the tests to the path
 
 # isort: split
 import maximal
@@ -50,22 +49,22 @@ INTEGRATORS = {
     "Dopri8, Munthe-Kaas": (MuntheKaas(diffrax.Dopri8()), ADAPTIVE),
     "Kvaerno5": (diffrax.Kvaerno5(), ADAPTIVE[:3]),
 }
-# no orientations in space
+# planar problems have no orientations in space
 SKIPPED = {
     (name, f"{solver}, Munthe-Kaas")
     for name in ("n_four_bar", "andrews")
     for solver in ("Tsit5", "Dopri8")
 }
-# on what has loops: with every integrator, at some of its settings, and in float32 with Tsit5
+# on problems with loops: with every integrator, at some of its settings, and in float32
 STABILIZATIONS = {
-    "exact": {"stabilization": svkc.stabilization.CoordinatePartitioning()},
+    "coordinate partitioning": {"stabilization": svkc.stabilization.CoordinatePartitioning()},
     "Baumgarte": {"stabilization": svkc.stabilization.Baumgarte()},
-    "drift": {"stabilization": svkc.stabilization.NoStabilization()},
+    "no stabilization": {"stabilization": svkc.stabilization.NoStabilization()},
 }
-# with Dopri8
+# on problems with loops: with Dopri8
 METHODS = STABILIZATIONS | {
-    "pivots never new": {"dynamics": svkc.dynamics.CompositeBodies(hold=0.0)},
-    "pivots always new": {"dynamics": svkc.dynamics.CompositeBodies(hold=None)},
+    "pivots fixed": {"dynamics": svkc.dynamics.CompositeBodies(hold=0.0)},
+    "pivots re-selected": {"dynamics": svkc.dynamics.CompositeBodies(hold=None)},
     "articulated bodies": {"dynamics": svkc.dynamics.ArticulatedBodies()},
     "unit vectors": {"dynamics": svkc.dynamics.UnitVectors()},
 }
@@ -93,9 +92,9 @@ class Problem:
                 **call,
             )
             self.exact = np.asarray(fine.final.q[: chain.nq])
-            happened = zip(fine.events.time, fine.events.which[: fine.events.count], strict=False)
+            events = zip(fine.events.time, fine.events.which[: fine.events.count], strict=False)
             self.released = [
-                (float(time), call["events"][which].action.cut) for time, which in happened
+                (float(time), call["events"][which].action.cut) for time, which in events
             ]
 
     def error(self, q) -> float:
@@ -296,10 +295,10 @@ def list_curves(name: str, loops: bool):
         yield "float64", "Dopri8", INTEGRATORS["Dopri8"][0], (1e-8,), {}
         yield (
             "float64",
-            "Dopri8, pivots always new",
+            "Dopri8, pivots re-selected",
             INTEGRATORS["Dopri8"][0],
             (1e-8,),
-            METHODS["pivots always new"],
+            METHODS["pivots re-selected"],
         )
         return
     stabilizations = STABILIZATIONS if loops else {}
@@ -438,7 +437,7 @@ if __name__ == "__main__":
     head = [
         "problem",
         "dtype",
-        "way",
+        "method",
         "dt or rtol",
         "s per s",
         "error",

@@ -256,7 +256,7 @@ def main():
     count = sum(x.size for x in jax.tree.leaves(p))
     rows, _ = measure_case(f"high bar, {count} parameters", loss, p)
     articulated = high_bar_loss(dynamics=svkc.dynamics.ArticulatedBodies())[0]
-    rows += measure_case("high bar, by bodies", articulated, p)[0]
+    rows += measure_case("high bar, articulated bodies", articulated, p)[0]
     loss, p = falling_loss()
     count = sum(x.size for x in jax.tree.leaves(p))
     try:

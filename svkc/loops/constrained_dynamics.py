@@ -1,5 +1,4 @@
-"""Accelerations and multipliers of a chain with loops, and the choice among the ways to compute
-them."""
+"""Methods to compute the accelerations of a chain with loops, each an `AbstractDynamics`."""
 
 import abc
 from collections.abc import Callable
@@ -26,20 +25,20 @@ from svkc.tree.mass_matrix import mass_matrix_crba, mass_matrix_unit_vectors
 def reduced_mass_matrix(
     chain: Chain, co: Coordinates, M: Float[Array, "nv nv"]
 ) -> Float[Array, "dofs dofs"]:
-    """A = W^T M W (23), ones on the diagonal of coordinates that are not independent."""
+    """Return A = W^T M W (paper (23)), with ones on the diagonal of other coordinates."""
     W = co.W[: chain.nv]
     return W.T @ (M @ W) + jnp.diag(jnp.where(co.independent, 0, 1).astype(M.dtype))
 
 
 class AbstractDynamics(eqx.Module):
-    """How accelerations are computed. All ways agree; they differ in what they cost.
+    """A method to compute accelerations. All methods give the same ones, at different cost.
 
-    uses_pivots: whether dependent coordinates are chosen. Where they are not, `svkc.stabilization.Projection()`
+    uses_pivots: whether dependent coordinates are qr. Where they are not, `svkc.stabilization.Projection()`
     puts steps back onto the loops without pivots too.
-    hold: dependent coordinates are chosen at every evaluation (None), or held until, at the end of
+    hold: dependent coordinates are qr at every evaluation (None), or held until, at the end of
     a step, the least |R_kk| / |R_11| of their columns is below this part of what a new choice has
     (default 0.3); 0 holds them until the structure changes. Held only where steps are projected by
-    pivots; near a singular configuration, and in what is differentiated, they are chosen at every
+    pivots; near a singular configuration, and in what is differentiated, they are qr at every
     evaluation, as the motion does not depend on the choice.
     """
 
@@ -57,24 +56,32 @@ class AbstractDynamics(eqx.Module):
         loops: LoopKinematics,
         selection: PivotedQR | None = None,
     ) -> Callable:
-        """Return solve: (force [dofs], bias [rows]) -> the x with M x = force + J_C^T lambda and
-        J_C x + bias = 0 (paper, section III-B).
+        """Return solve: (force [dofs], bias [rows]) -> x on a chain with virtual links.
 
-        selection: the pivots of `loops.J`; None where `uses_pivots` is False.
+        x solves M x = force + J_C^T lambda and J_C x + bias = 0 (paper, section III-B).
+
+        loops: kinematics of the tree and of its loops.
+        selection: the pivoted QR of `loops.J`; not used if `uses_pivots` is False.
         """
 
     @abc.abstractmethod
     def prepare_open(self, chain: Chain, structure: Structure, kin: Kinematics) -> Callable:
-        """Return solve: force [nv] -> the x with M x = force, zero for locked joints, on a chain
-        without virtual links."""
+        """Return solve: force [nv] -> x on a chain without virtual links.
+
+        x solves M x = force and is zero for locked coordinates.
+
+        kin: kinematics of the tree.
+        """
 
 
 class ArticulatedBodies(AbstractDynamics):
-    """Articulated bodies and the forces of the loops, without pivots.
+    """Articulated bodies and loop forces by Delassus' matrix, without pivots.
 
-    The fastest way, and the one for batches. The forces square the loops' conditioning near
-    singular configurations. With `Projection()` the certificate has the margin of the phases' ends
-    alone, and counts no swaps. hold: for the stabilizations that choose pivots all the same.
+    The fastest method, and the one for batches. Delassus' matrix squares the condition number of
+    J_C near singular configurations. With `svkc.stabilization.Projection` the report knows the
+    margin at the ends of phases only, and counts no changes of pivots.
+
+    hold: for stabilizations that choose pivots whatever the method; see `CompositeBodies`.
     """
 
     uses_pivots: ClassVar[bool] = False
@@ -87,7 +94,7 @@ class ArticulatedBodies(AbstractDynamics):
             jnp.where(active[None], rows / column[None], 0),
             None if static.locked is None else active[: chain.nv],
         )
-        # every row as it is, whether or not it repeats others
+        # all rows, dependent ones included
         used = jnp.ones(loops.J.shape[0], bool)
         return _implicit_solve(chain, structure, loops, solve, lambda x: x, used)
 
@@ -99,23 +106,21 @@ class ArticulatedBodies(AbstractDynamics):
 
 
 class AbstractMassMatrix(AbstractDynamics):
-    """The tree's inertia matrix, reduced to the independent coordinates, as the paper has it."""
+    """The mass matrix of the tree, reduced to the independent coordinates (paper (23), (24))."""
 
     @abc.abstractmethod
-    def inertia(self, chain: Chain, kin: Kinematics) -> Float[Array, "nv nv"]:
-        """Return the inertia matrix of the tree."""
+    def mass_matrix(self, chain: Chain, kin: Kinematics) -> Float[Array, "nv nv"]:
+        """Return the mass matrix of the tree."""
 
     def prepare(self, chain, structure, loops, selection=None):
-        chosen, rows, frozen, static = jax.lax.stop_gradient(
+        qr, rows, frozen, static = jax.lax.stop_gradient(
             (selection, loops.J, (chain, loops.kin), structure)
         )
-        solve = _solve_by_partitioning(*frozen, static, chosen, rows, self.inertia)
-        return _implicit_solve(
-            chain, structure, loops, solve, lambda x: chosen.Q @ x, chosen.active
-        )
+        solve = _solve_by_partitioning(*frozen, static, qr, rows, self.mass_matrix)
+        return _implicit_solve(chain, structure, loops, solve, lambda x: qr.Q @ x, qr.active)
 
     def prepare_open(self, chain, structure, kin):
-        M = self.inertia(*jax.lax.stop_gradient((chain, kin)))
+        M = self.mass_matrix(*jax.lax.stop_gradient((chain, kin)))
         if structure.locked is not None:
             free = ~structure.locked
             M = jnp.where(free[:, None] & free[None], M, jnp.eye(chain.nv, dtype=M.dtype))
@@ -123,25 +128,25 @@ class AbstractMassMatrix(AbstractDynamics):
 
 
 class CompositeBodies(AbstractMassMatrix):
-    """The inertia matrix by composite bodies (Featherstone section 6.2)."""
+    """The mass matrix by composite rigid bodies (Featherstone section 6.2)."""
 
     uses_pivots: ClassVar[bool] = True
 
-    def inertia(self, chain, kin):
+    def mass_matrix(self, chain, kin):
         return mass_matrix_crba(chain, kin)
 
 
 class UnitVectors(AbstractMassMatrix):
-    """The inertia matrix column by column from inverse dynamics: the paper's own way."""
+    """The mass matrix column by column from inverse dynamics, which is the paper's method."""
 
     uses_pivots: ClassVar[bool] = True
 
-    def inertia(self, chain, kin):
+    def mass_matrix(self, chain, kin):
         return mass_matrix_unit_vectors(chain, kin)
 
 
 def default_dynamics(chain: Chain) -> AbstractDynamics:
-    """Return articulated bodies for a chain without virtual links, else composite ones."""
+    """Return `ArticulatedBodies` for a chain without virtual links, else `CompositeBodies`."""
     return CompositeBodies() if chain.topology.link_names else ArticulatedBodies()
 
 
@@ -158,11 +163,12 @@ DEPRECATED_SPELLINGS = (
 
 
 class Dynamics(eqx.Module):
-    """The older spelling of the classes in `svkc.dynamics`.
+    """Deprecated: choose one of the classes in `svkc.dynamics` by a function.
 
-    inertia: `svkc.by_bodies`, `svkc.inertia_by_composites`, `svkc.inertia_by_unit_vectors`; None
-    (default): articulated bodies where the scene has no loops, else composite ones. hold: as in
-    `svkc.dynamics.CompositeBodies`.
+    inertia: `svkc.by_bodies`, `svkc.inertia_by_composites`, `svkc.inertia_by_unit_vectors`, or None
+    (default) for `default_dynamics`.
+    hold: as in `svkc.dynamics.CompositeBodies`.
+    Raises ValueError if inertia is anything else.
     """
 
     inertia: Callable | None = eqx.field(static=True, default=None)
@@ -179,7 +185,7 @@ class Dynamics(eqx.Module):
         _check_hold(self.hold)
 
     def resolved(self, chain: Chain) -> AbstractDynamics:
-        """Return the object of `svkc.dynamics` that this one stands for."""
+        """Return the equivalent object of `svkc.dynamics`."""
         if self.inertia is None:
             return type(default_dynamics(chain))(hold=self.hold)
         return next(new for old, new in DEPRECATED_SPELLINGS if old is self.inertia)(hold=self.hold)
@@ -194,67 +200,74 @@ def _implicit_solve(
     chain: Chain,
     structure: Structure,
     loops: LoopKinematics,
-    factored: Callable,
-    pick: Callable,
-    used: Bool[Array, " picked"],
+    factor_solve: Callable,
+    select_rows: Callable,
+    active_rows: Bool[Array, " selected"],
 ) -> Callable:
-    """Return (force, bias) -> x by `factored`, whose derivatives are those of the equations that
-    x solves, with M x by Newton-Euler.
+    """Return (force, bias) -> x by `factor_solve`, differentiated as an implicit function.
 
-    A derivative is one more solve with the same factors: recursions for M and the search for pivots
-    have no part in it. pick: the rows that are solved for, of all. used: which of them count.
+    The derivatives are those of the equations M x = force + J^T mu, J x + bias = 0, with M x by
+    Newton-Euler. Each costs one more solve with the same factors; neither the recursions for M nor
+    the search for pivots is differentiated.
+
+    factor_solve: (force, -bias) -> (x, mu) on selected rows, which has no derivative.
+    select_rows: the linear map from all loop rows to the selected ones.
+    active_rows: which of the selected rows count.
     """
     nv, column = chain.nv, jacobian_scales(chain)[1]
     active = active_dofs(chain, structure)
 
     def equations(unknown):
         x, mu = unknown
-        held = pick(loops.J) / column[None]
-        moving = jnp.where(active, x, 0)
+        J = select_rows(loops.J) / column[None]
+        active_x = jnp.where(active, x, 0)
         force = (
-            append_virtual_joints(chain, mass_matrix_product(chain, loops.kin, moving[:nv]))
-            + held.T @ mu
+            append_virtual_joints(chain, mass_matrix_product(chain, loops.kin, active_x[:nv]))
+            + J.T @ mu
         )
-        return jnp.where(active, force, x), held @ x + jnp.where(used, 0, mu)
+        return jnp.where(active, force, x), J @ x + jnp.where(active_rows, 0, mu)
 
     def solve(force: Float[Array, " dofs"], bias: Float[Array, " rows"]) -> Float[Array, " dofs"]:
-        # jax transposes the solve only where both sides take part in the derivative
-        right = (
-            jnp.where(active, force, 0) + 0 * jnp.sum(bias),
-            -pick(bias) + 0 * jnp.sum(force),
-        )
+        force, bias = _link_tangents(force, bias)
+        right_sides = jnp.where(active, force, 0), -select_rows(bias)
         return jax.lax.custom_linear_solve(
-            equations, right, solve=lambda _, right: factored(*right), symmetric=True
+            equations, right_sides, solve=lambda _, sides: factor_solve(*sides), symmetric=True
         )[0]
 
     return solve
 
 
+def _link_tangents(a: Float[Array, "..."], b: Float[Array, "..."]):
+    """Return (a, b), each made to depend on the other with derivative zero.
+
+    `custom_linear_solve` is transposed only if every right-hand side has a tangent.
+    """
+    return a + 0 * jnp.sum(b), b + 0 * jnp.sum(a)
+
+
 def _solve_by_partitioning(
-    chain: Chain, kin: Kinematics, structure: Structure, chosen: PivotedQR, J, inertia: Callable
+    chain: Chain, kin: Kinematics, structure: Structure, qr: PivotedQR, J, mass_matrix: Callable
 ) -> Callable:
-    """The solution through W, A and b, as the paper has it."""
+    """Return (force, rate) -> (x, mu) through W and A (paper (16), (23), (24))."""
     nv, (_, column) = chain.nv, jacobian_scales(chain)
-    co = partition_coordinates(chain, structure, chosen, J, jnp.zeros(J.shape[0], J.dtype))
-    tree, W = inertia(chain, kin), co.W
-    A_inverse = cholesky_solver(reduced_mass_matrix(chain, co, tree))
-    _, JS = pivot_blocks(chosen, J)
+    co = partition_coordinates(chain, structure, qr, J, jnp.zeros(J.shape[0], J.dtype))
+    M, W = mass_matrix(chain, kin), co.W
+    A_inverse = cholesky_solver(reduced_mass_matrix(chain, co, M))
+    _, JS = pivot_blocks(qr, J)
 
     def solve(force, rate):
-        x = column * (chosen.P.T @ batched_solve_triangular(JS, rate))
-        x = x + W @ A_inverse(W.T @ (force - append_virtual_joints(chain, tree @ x[:nv])))
-        rest = column * (force - append_virtual_joints(chain, tree @ x[:nv]))
-        return x, jnp.where(
-            chosen.active, batched_solve_triangular(JS, chosen.P @ rest, trans=True), rate
-        )
+        x = column * (qr.P.T @ batched_solve_triangular(JS, rate))
+        x = x + W @ A_inverse(W.T @ (force - append_virtual_joints(chain, M @ x[:nv])))
+        rest = column * (force - append_virtual_joints(chain, M @ x[:nv]))
+        return x, jnp.where(qr.active, batched_solve_triangular(JS, qr.P @ rest, trans=True), rate)
 
     return solve
 
 
 def _implicit_open_solve(
-    chain: Chain, structure: Structure, kin: Kinematics, factored: Callable
+    chain: Chain, structure: Structure, kin: Kinematics, factor_solve: Callable
 ) -> Callable:
-    """Return force -> x by `factored`, with derivatives as in `_implicit_solve`."""
+    """Return force -> x by `factor_solve`, differentiated as in `_implicit_solve`."""
     locked = structure.locked
     free = jnp.ones(chain.nv, bool) if locked is None else ~locked
 
@@ -265,7 +278,7 @@ def _implicit_open_solve(
         return jax.lax.custom_linear_solve(
             equations,
             jnp.where(free, force, 0),
-            solve=lambda _, x: factored(x),
+            solve=lambda _, x: factor_solve(x),
             symmetric=True,
         )
 

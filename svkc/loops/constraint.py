@@ -151,7 +151,9 @@ def assemble_loop_jacobian(
     sign = above[structure.parent].astype(kin.r.dtype) - above[structure.real].astype(kin.r.dtype)
     # the joint's position from the root of each coordinate's tree
     of_parent = above[structure.parent][:, :, None]
-    position = jnp.where(of_parent, frames.from_parent_root[:, None, :], frames.real_position[:, None, :])
+    position = jnp.where(
+        of_parent, frames.from_parent_root[:, None, :], frames.real_position[:, None, :]
+    )
     tree = sign[:, :, None] * shift_motion(kin.S[None], position)
     S = _virtual_motion_subspaces(chain, structure, frames)
     count = len(top.link_names)

@@ -1,4 +1,4 @@
-"""The acceleration of any structure (paper, section III-B) and the forces its loops carry."""
+"""Forward dynamics of any structure (paper, section III-B) and the wrenches in its loops."""
 
 import functools
 
@@ -43,28 +43,29 @@ def velocity_and_acceleration(
     project_velocity: bool = False,
     pivots=None,
 ) -> tuple[Float[Array, " dofs"], Float[Array, " dofs"]]:
-    """Velocity and acceleration: steps 1 to 5 of section III-B. On an open chain W is the identity
-    and nothing of the closure is computed.
+    """Return the velocity and the acceleration (paper, section III-B, steps 1 to 5).
 
-    baumgarte: rate (1/s) at which open loops are pulled back; None: not at all. agree: near a
-    singular configuration dependent velocities are those of the independent ones, for there the
-    stages of a step would make their errors grow. pivots: as `choose` takes them.
+    The velocity is v unless `project_velocity` changes it. On an open chain nothing of the loop
+    constraints is computed.
+
+    baumgarte: rate (1/s) of the gaps' decay (None: no such terms).
+    project_velocity: near a singular configuration compute the dependent velocities from the
+    independent ones, as the errors of v would grow there from stage to stage of a step.
+    pivots: as in `select_pivots`.
     """
     if chain.topology.link_names:
         loops = loop_kinematics(chain, structure, q)
         kin, J = loops.kin, loops.J
-        selection = (
+        qr = (
             select_pivots(structure, J, pivots)
             if project_velocity or dynamics.uses_pivots
             else None
         )
         if project_velocity:
-            near = pivot_ratio(selection) < NEAR_SINGULAR * structure.margin
+            near = pivot_ratio(qr) < NEAR_SINGULAR * structure.margin
             v = jnp.where(
                 near,
-                dependent_velocities(
-                    chain, selection, J, jnp.where(active_dofs(chain, structure), v, 0)
-                ),
+                dependent_velocities(chain, qr, J, jnp.where(active_dofs(chain, structure), v, 0)),
                 v,
             )
     else:
@@ -75,22 +76,23 @@ def velocity_and_acceleration(
     if loops is None:
         return v, dynamics.prepare_open(chain, structure, kin)(force)
     rates = constraint_bias(chain, structure, v, loops, V, baumgarte)
-    return v, dynamics.prepare(chain, structure, loops, selection)(force, rates)
+    return v, dynamics.prepare(chain, structure, loops, qr)(force, rates)
 
 
 @with_lanes_last
 def velocity_and_acceleration_lanes_last(
     chain: Chain, structure: Structure, q, v, tau, baumgarte
 ) -> tuple[Float[Array, " dofs"], Float[Array, " dofs"]]:
-    """`moving` by articulated bodies, without pivots, under a `vmap` that keeps its lanes last."""
-    way = ArticulatedBodies()
-    return velocity_and_acceleration(chain, structure, q, v, tau, dynamics=way, baumgarte=baumgarte)
+    """Return `velocity_and_acceleration` by articulated bodies; a `vmap` keeps lanes last."""
+    return velocity_and_acceleration(
+        chain, structure, q, v, tau, dynamics=ArticulatedBodies(), baumgarte=baumgarte
+    )
 
 
 def acceleration(
     chain: Chain, structure: Structure, q, v, tau: Float[Array, " dofs"], dynamics: AbstractDynamics
 ) -> Float[Array, " dofs"]:
-    """The acceleration alone, for the velocity as it is."""
+    """Return the acceleration at v."""
     return velocity_and_acceleration(chain, structure, q, v, tau, dynamics=dynamics)[1]
 
 
@@ -98,33 +100,41 @@ def acceleration(
 def forward_dynamics(
     chain: Chain, state: State, tau: Float[Array, " torques"]
 ) -> Float[Array, " dofs"]:
-    """Accelerations (rad/s^2, m/s^2) of every joint coordinate for the joint torques tau (N m, N),
-    loops kept (paper, section III-B).
+    """Return the acceleration of every joint coordinate (rad/s^2, m/s^2), with loops kept closed.
 
-    Springs and dampers of the joints act too. tau: over every coordinate, or the tree's alone. By
-    articulated bodies, or composites where there are loops.
+    The forces of the joints' springs and dampers are added to tau. Computed by articulated bodies
+    on chains without virtual links, and by composite rigid bodies otherwise (paper, section III-B).
+
+    tau: joint torques (N m, N) over every coordinate, or over the tree's.
+    Raises ValueError if tau has neither length.
     """
     tau = joint_torques(chain, tau)
     return acceleration(chain, state.structure, state.q, state.v, tau, default_dynamics(chain))
 
 
 def constraint_forces(
-    chain: Chain, selection: PivotedQR, J: Float[Array, "rows dofs"], excess: Float[Array, " dofs"]
+    chain: Chain, qr: PivotedQR, J: Float[Array, "rows dofs"], force: Float[Array, " dofs"]
 ) -> Float[Array, "links 6"]:
-    """Lambda with J_C^T lambda = excess, of least norm where loops are redundant: wrench (N m, N)
-    on the virtual link, at the joint."""
+    """Return the lambda with J_C^T lambda = force, of least norm if loops are redundant.
+
+    It is the wrench (N m, N) on each virtual link, at the joint.
+
+    force: generalized force over every coordinate.
+    """
     row, column = jacobian_scales(chain)
-    _, JS = pivot_blocks(selection, J)
-    mu = solve_pivot_block(JS, selection.P @ (column * excess), trans=True)
-    return (row * (selection.Q.T @ mu)).reshape(-1, 6)
+    _, JS = pivot_blocks(qr, J)
+    mu = solve_pivot_block(JS, qr.P @ (column * force), trans=True)
+    return (row * (qr.Q.T @ mu)).reshape(-1, 6)
 
 
 class LoopForces(eqx.Module):
-    """Wrench of each connected virtual link, on `real` from `parent`, at the joint, in world axes;
-    unpacks as force, torque.
+    """Wrench of each connected virtual link, on `real` from `parent`, at the joint, in world axes.
 
-    `unique`: nothing but the motion decides it. Where loops are redundant some wrenches are not:
-    they are the least in norm (rows over `chain.length`).
+    Unpacks as force, torque.
+
+    force: in N. torque: in N m, about the joint.
+    unique: whether the motion determines the wrench. Redundant loops have wrenches that it does
+    not determine; theirs are of least norm, with torques divided by `chain.length`.
     """
 
     force: Float[Array, "links 3"]
@@ -137,9 +147,11 @@ class LoopForces(eqx.Module):
 
 @checked_jit(eager=True)
 def loop_forces(chain: Chain, state: State, tau: Float[Array, " torques"]) -> LoopForces:
-    """Force (N) and torque (N m) that each connected virtual link carries for the joint torques
-    tau: on `real` from `parent`, at the joint, in world axes, and whether the motion alone decides
-    it."""
+    """Return the wrench that each connected virtual link transmits for the joint torques tau.
+
+    tau: joint torques (N m, N) over every coordinate, or over the tree's.
+    Raises ValueError if tau has neither length.
+    """
     tau = joint_torques(chain, tau)
     if not len(chain.link_names):
         return LoopForces(
@@ -150,16 +162,15 @@ def loop_forces(chain: Chain, state: State, tau: Float[Array, " torques"]) -> Lo
     kin, J = loops.kin, loops.J
     V = twists(chain, kin, v)
     vdot = acceleration(chain, s, q, v, tau, default_dynamics(chain))
-    needed = append_virtual_joints(chain, rnea(chain, kin, V, v, vdot[:nv]))
-    selection = select_pivots(s, J)
-    wrench = -constraint_forces(chain, selection, J, needed - passive_forces(chain, q, v) - tau)
-    return LoopForces(wrench[:, 3:], wrench[:, :3], ~self_stressed(s, selection))
+    force = append_virtual_joints(chain, rnea(chain, kin, V, v, vdot[:nv]))
+    qr = select_pivots(s, J)
+    wrench = -constraint_forces(chain, qr, J, force - passive_forces(chain, q, v) - tau)
+    return LoopForces(wrench[:, 3:], wrench[:, :3], ~self_stressed(s, qr))
 
 
-def self_stressed(structure: Structure, selection: PivotedQR) -> Bool[Array, " links"]:
-    """Links that take part in a self-stress: wrenches of all loops together, J_C^T lambda = 0, that
-    no motion tells of."""
-    # a row's length within the range of J_C: 1 where no vector orthogonal to that range has a part
-    # in it
-    inside = jnp.sum(selection.Q**2, 0).reshape(-1, 6)
-    return structure.connected & jnp.any(inside < 1 - rank_tolerance(inside.dtype), 1)
+def self_stressed(structure: Structure, qr: PivotedQR) -> Bool[Array, " links"]:
+    """Return the links that take part in a self-stress, a lambda with J_C^T lambda = 0."""
+    # squared length of each row's unit vector within the range of J_C: below 1 if a self-stress
+    # has a component along the row
+    in_range = jnp.sum(qr.Q**2, 0).reshape(-1, 6)
+    return structure.connected & jnp.any(in_range < 1 - rank_tolerance(in_range.dtype), 1)

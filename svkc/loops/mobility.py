@@ -1,4 +1,4 @@
-"""How free a structure is (paper (13)): freedoms, rank, redundant rows."""
+"""Mobility of a structure (paper (13)): freedoms, rank, redundant rows."""
 
 import equinox as eqx
 import jax
@@ -14,10 +14,14 @@ from svkc.model.checked_jit import checked_jit
 
 
 class Mobility(eqx.Module):
-    """`freedoms` N_F = N_J - m (13), `joint_freedoms` N_J, `rank` m of the phase, `redundant`: rows
-    of each loop that those before it already imply, `independent`: the coordinates chosen as
-    theta_G, `margin`: |R_mm| / |R_11|, how far the weakest row that counts is from being redundant.
-    Printed, it is a table with the names."""
+    """Mobility of a structure. `str` gives a table with the names of links and coordinates.
+
+    freedoms: mobility N_F = N_J - m (paper (13)). joint_freedoms: N_J. rank: m of the phase.
+    redundant: number of rows of each loop that depend on those of the loops before it.
+    independent: mask of theta_G.
+    margin: |R_mm| / |R_11| of the pivoted QR of J_C, the distance from a lower rank.
+    connected: which virtual links are connected.
+    """
 
     freedoms: Int[Array, ""]
     joint_freedoms: Int[Array, ""]
@@ -32,12 +36,14 @@ class Mobility(eqx.Module):
     def __str__(self) -> str:
         if isinstance(self.rank, jax.core.Tracer) or self.rank.ndim:
             return repr(self)
-        chosen = ", ".join(n for n, on in zip(self.dof_names, self.independent, strict=True) if on)
+        independent = ", ".join(
+            n for n, on in zip(self.dof_names, self.independent, strict=True) if on
+        )
         lines = [
             f"joint freedoms (N_J)      {int(self.joint_freedoms):4d}",
             f"rank of the loops (m)     {int(self.rank):4d}   margin {float(self.margin):.2e}",
             f"mobility (N_F = N_J - m)  {int(self.freedoms):4d}",
-            f"independent coordinates: {chosen or 'none'}",
+            f"independent coordinates: {independent or 'none'}",
         ]
         for name, on, rows in zip(self.link_names, self.connected, self.redundant, strict=True):
             lines.append(
@@ -49,32 +55,32 @@ class Mobility(eqx.Module):
 
 @checked_jit(eager=True)
 def mobility(chain: Chain, state: State) -> Mobility:
-    """Freedoms of the structure that the state is under, with the rank its phase decided on."""
+    """Return the mobility of the state's structure, with the rank that its phase has."""
     active = active_dofs(chain, state.structure)
     joint_freedoms = jnp.sum(active, dtype=jnp.int32)
     links = len(chain.link_names)
     if not links:
         zero = jnp.zeros((), jnp.int32)
-        one, none = jnp.ones((), state.q.dtype), jnp.zeros(0, jnp.int32)
+        unit_margin, none = jnp.ones((), state.q.dtype), jnp.zeros(0, jnp.int32)
         return Mobility(
             freedoms=joint_freedoms,
             joint_freedoms=joint_freedoms,
             rank=zero,
             redundant=none,
             independent=active,
-            margin=one,
+            margin=unit_margin,
             connected=none > 0,
             link_names=(),
             dof_names=chain.dof_names,
         )
     J = loop_kinematics(chain, state.structure, state.q).J
-    # of the first loop's rows, the first two loops', and so on
-    upto = np.arange(6 * links)[None] < 6 * np.arange(1, links + 1)[:, None]
+    # ranks of the rows of the first loop, of the first two loops, and so on
+    first_loops = np.arange(6 * links)[None] < 6 * np.arange(1, links + 1)[:, None]
     ranks = jax.lax.map(
         lambda rows: count_rank(
             pivoted_qr(jnp.where(rows[:, None], jax.lax.stop_gradient(J), 0)).diag_R
         ),
-        jnp.asarray(upto),
+        jnp.asarray(first_loops),
     )
     rows = jnp.where(state.structure.connected, 6, 0).astype(jnp.int32)
     redundant = rows - jnp.diff(ranks, prepend=jnp.zeros(1, jnp.int32))

@@ -66,9 +66,7 @@ def drop_below(qr: PivotedQR, floor: Float[Array, ""]) -> PivotedQR:
 
     The pivots of these steps become independent coordinates.
     """
-    return _with_active(
-        qr, qr.active & (qr.diag_R > floor * jnp.max(qr.diag_R))
-    )
+    return _with_active(qr, qr.active & (qr.diag_R > floor * jnp.max(qr.diag_R)))
 
 
 def pivoted_qr(

@@ -1,4 +1,4 @@
-"""Projection onto closed loops, by the smallest change."""
+"""Projection of configuration and velocity onto closed loops."""
 
 import functools
 
@@ -27,48 +27,51 @@ from svkc.tree.configuration import integrate, normalize
 
 
 def least_norm_change(
-    chain: Chain, selection: PivotedQR, J, x: Float[Array, "rows n"]
+    chain: Chain, qr: PivotedQR, J, x: Float[Array, "rows n"]
 ) -> Float[Array, "dofs n"]:
-    """Return the y (m, rad, or their rates) with J y = x whose sum of squares, in coordinates
-    without units, is least."""
-    Jm, _ = pivot_blocks(selection, J)
-    gram = Jm @ Jm.T + jnp.diag(jnp.where(selection.active, 0, 1).astype(J.dtype))
-    return jacobian_scales(chain)[1][:, None] * (Jm.T @ solve_positive(gram, selection.Q @ x))
+    """Return the y (m, rad, or their rates) with J y = x of least norm in scaled coordinates."""
+    Jm, _ = pivot_blocks(qr, J)
+    gram = Jm @ Jm.T + jnp.diag(jnp.where(qr.active, 0, 1).astype(J.dtype))
+    return jacobian_scales(chain)[1][:, None] * (Jm.T @ solve_positive(gram, qr.Q @ x))
 
 
 def dependent_change(
-    chain: Chain, selection: PivotedQR, J, x: Float[Array, "rows n"]
+    chain: Chain, qr: PivotedQR, J, x: Float[Array, "rows n"]
 ) -> Float[Array, "dofs n"]:
-    """Return the y (m, rad, or their rates) with J y = x that moves dependent coordinates only
-    (16)."""
-    _, JS = pivot_blocks(selection, J)
-    return jacobian_scales(chain)[1][:, None] * (
-        selection.P.T @ solve_pivot_block(JS, selection.Q @ x)
-    )
+    """Return the y (m, rad, or their rates) with J y = x that is zero for independent coordinates.
+
+    (Paper (16).)
+    """
+    _, JS = pivot_blocks(qr, J)
+    return jacobian_scales(chain)[1][:, None] * (qr.P.T @ solve_pivot_block(JS, qr.Q @ x))
 
 
 def inertia_metric_change(
     chain: Chain,
     structure: Structure,
     loops: LoopKinematics,
-    selection: PivotedQR,
+    qr: PivotedQR,
     x: Float[Array, "rows n"],
 ) -> Float[Array, "dofs n"]:
-    """Return the y (m, rad, or their rates) with J y = x whose y^T M y is least: that of an impulse
-    of the loops (29)."""
+    """Return the y (m, rad, or their rates) with J y = x and least y^T M y.
+
+    Velocities change so under an impulse of the loops (paper (29)).
+    """
     none = jnp.zeros(chain.dofs, x.dtype)
-    solve = CompositeBodies().prepare(chain, structure, loops, selection)
+    solve = CompositeBodies().prepare(chain, structure, loops, qr)
     return jax.vmap(lambda x: solve(none, -x), 1, 1)(x)
 
 
-def _drop_unsolvable(structure: Structure, selection: PivotedQR) -> PivotedQR:
-    """Steps below the rank's tolerance dropped, for a gap along them is of second order and
-    dividing by them would only amplify round-off; and rows that are let go just now."""
+def _drop_unsolvable(structure: Structure, qr: PivotedQR) -> PivotedQR:
+    """Return the QR without rows below `rank_tolerance` and below `release_threshold`.
+
+    A gap along a row below the tolerance is of second order, and its quotient by R_kk round-off.
+    """
     return drop_below(
-        selection,
+        qr,
         jnp.maximum(
-            rank_tolerance(selection.diag_R.dtype),
-            release_threshold(selection.diag_R.dtype) * structure.margin,
+            rank_tolerance(qr.diag_R.dtype),
+            release_threshold(qr.diag_R.dtype) * structure.margin,
         ),
     )
 
@@ -128,7 +131,7 @@ def project(
 def _pivots_to_keep(
     structure: Structure, J, full: PivotedQR, pivots, hold: float, last: Bool[Array, ""]
 ) -> Float[Array, "steps dofs"]:
-    """Return the pivots or, where they are poor in the last turn, those of the new selection
+    """Return the pivots or, where they are poor in the last turn, those of the new qr
     `full`."""
     poor = lambda: (
         (pivot_ratio(refactor(J, pivots)) < hold * pivot_ratio(full))
@@ -142,11 +145,11 @@ def _step_by_pivots(
 ) -> tuple[Float[Array, "dofs 2"], Float[Array, " rows"]]:
     """Return the changes of q, that close the loops, and of v, that keep them; and the gaps."""
     moving = jnp.where(active_dofs(chain, structure), v / jacobian_scales(chain)[1], 0)
-    gap, J, selection = loops.gap, loops.J, _drop_unsolvable(structure, full)
+    gap, J, qr = loops.gap, loops.J, _drop_unsolvable(structure, full)
     open_ = jnp.stack([gap, J @ moving], 1)
     if dependent:
-        return -dependent_change(chain, selection, J, open_), gap
-    return -inertia_metric_change(chain, structure, loops, selection, open_), gap
+        return -dependent_change(chain, qr, J, open_), gap
+    return -inertia_metric_change(chain, structure, loops, qr, open_), gap
 
 
 @functools.partial(jax.jit, static_argnames=("iterations", "differentiated"))

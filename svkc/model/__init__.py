@@ -1,2 +1,1 @@
-"""The nouns (chain, structure, state, virtual link), the topology, names and the validation of
-arguments."""
+"""Data types (`Chain`, `Structure`, `State`, `VirtualLink`), topology, names and validation."""

@@ -1,5 +1,5 @@
-"""The nouns: chain (what the bodies are), structure (how they are joined now), state (how they move
-now)."""
+"""The data types of a model, by lifetime: `Chain` (bodies, for the life of a scene), `Structure`
+(how the bodies are joined, for one phase), `State` (how they move, at one instant)."""
 
 from typing import Any
 
@@ -13,13 +13,22 @@ from svkc.model.validation import real_array
 
 
 class Structure(eqx.Module):
-    """How the bodies are joined for the length of a phase. Placements are the joint's frame in its
-    two bodies (m, wxyz), its axis along z.
+    """How the bodies are joined during one phase: one entry for each virtual link.
 
-    `connected` [links]; `parent`, `real`: rows of the two bodies; `freedoms`: of each virtual
-    joint; `locked`: joint coordinates held still, None where nothing can be locked; `independent`:
-    coordinates asked to be independent where they can be; `rank`: m, decided once for the phase,
-    with `margin`: |R_mm| / |R_11| where that was, in a generic configuration.
+    Every field may have leading batch axes.
+
+    connected: whether the virtual link is connected.
+    parent: row of `Topology` of the parent body.
+    real: row of `Topology` of the real link.
+    pos: origin of the joint's frame in the parent's frame (m).
+    quat: orientation of the joint's frame in the parent's frame (wxyz); the joint's axis is z.
+    real_pos: origin of the joint's frame in the real link's frame (m).
+    real_quat: orientation of the joint's frame in the real link's frame (wxyz).
+    freedoms: freedoms of the virtual joint: rotations about x, y, z, then translations along them.
+    rank: the rank m of the loop constraints, computed once for the phase.
+    margin: |R_mm| / |R_11| of the pivoted QR factorisation that gave the rank.
+    locked: joint coordinates that are locked; None if no joint can be locked.
+    independent: joint coordinates preferred as independent ones; None: no preference.
     """
 
     connected: Bool[Array, "... links"]
@@ -37,8 +46,14 @@ class Structure(eqx.Module):
 
 
 class State(eqx.Module):
-    """How the bodies move: `q` (m, rad, wxyz; MuJoCo's qpos, then the virtual joints'), `v` (m/s,
-    rad/s), and the structure they move under."""
+    """Positions and velocities at one instant, and the structure that holds there.
+
+    Every field may have leading batch axes.
+
+    q: coordinates (m, rad, wxyz): MuJoCo's qpos for the tree, then the virtual joints' coordinates.
+    v: joint velocities (m/s, rad/s): MuJoCo's qvel for the tree, then the virtual joints'.
+    structure: how the bodies are joined.
+    """
 
     q: Float[Array, "... q"]
     v: Float[Array, "... dofs"]
@@ -46,12 +61,35 @@ class State(eqx.Module):
 
 
 class Chain(eqx.Module):
-    """The bodies of a scene and the joints between them; its floats are leaves to differentiate.
-    Made by `svkc.load`.
+    """The bodies of a scene and the joints between them, made by `svkc.load`.
 
-    Rows are those of `Topology`. `pos`, `quat`: joint frame in the parent's; `anchor`, `axis`: of
-    the joint in the row's own frame; `inertia`: about the centre of mass, row axes. What a scene
-    does not have (anchors, armature, damping, springs, limits) is None and is not compiled.
+    Floats are differentiable leaves. There is one row for each joint or fixed body of the tree
+    (`Topology`); row 0 is the world. Anchors, armature, damping, springs and limits are None if the
+    scene has none, so that no code is compiled for them.
+
+    topology: everything static: names, parents, joint kinds, index tables.
+    pos: origin of the row's frame in the parent's frame, before the joint moves it (m).
+    quat: orientation of the row's frame in the parent's frame, before the joint moves it (wxyz).
+    axis: joint axis in the row's frame, of unit length.
+    mass: mass (kg); zero for rows that are not the last of a body.
+    com: centre of mass in the row's frame (m).
+    inertia: rotational inertia about the centre of mass, in the axes of the row's frame (kg m^2).
+    gravity: gravitational acceleration in the world frame (m/s^2).
+    q_load: coordinates of the load pose.
+    length: characteristic length (m) by which translations and rotations are compared.
+    gear: joint torques (N m, N) for a unit control of each actuator.
+    control_range: lower and upper bound of each control; infinite if there is none.
+    force_range: lower and upper bound of each control by the actuator's force range.
+    structure: the structure of the load pose.
+    anchor: the joint's anchor in the row's frame (m); None: at the origin of every row.
+    armature: rotor inertia, added to the diagonal of the mass matrix (kg m^2, kg).
+    damping: joint damping (N m s, N s/m).
+    stiffness: stiffness of joint springs (N m, N/m).
+    q_spring: coordinates at which the joint springs are at rest.
+    limit: lower and upper end of the joint range (rad, m); infinite if there is none.
+    limit_spring: stiffness and damping outside of the joint range.
+    model: the `svkc.mjcf.load.Source` that the chain was loaded from.
+    left_out: one line for each kind of element of the model that is not simulated.
     """
 
     topology: Topology = eqx.field(static=True)
@@ -80,70 +118,73 @@ class Chain(eqx.Module):
 
     @property
     def body_names(self) -> tuple[str, ...]:
-        """Bodies in the model's order; the first is the world."""
+        """Names of the bodies in the model's order; the first is the world."""
         return self.topology.body_names
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Joints of the tree in the model's order."""
+        """Names of the tree's joints in the model's order."""
         return self.topology.joint_names
 
     @property
     def link_names(self) -> tuple[str, ...]:
-        """The virtual links."""
+        """Names of the virtual links, in the order of `Structure`'s entries."""
         return self.topology.link_names
 
     @property
     def dof_names(self) -> tuple[str, ...]:
-        """Of every joint coordinate: the joint's name, with .x .y .z for slides and .rx .ry .rz for
-        turns where it has several."""
+        """Names of the joint coordinates, in the order of `State.v`.
+
+        A joint with several coordinates appends .x, .y, .z (translations) and .rx, .ry, .rz.
+        """
         return self.topology.dof_names
 
     @property
     def nq(self) -> int:
-        """Coordinates q of the tree (m, rad; wxyz of a ball), MuJoCo's."""
+        """Number of the tree's coordinates q, MuJoCo's nq (four for a ball joint)."""
         return self.topology.nq
 
     @property
     def nv(self) -> int:
-        """Freedoms v of the tree (m/s, rad/s), MuJoCo's."""
+        """Number of the tree's velocities v, MuJoCo's nv."""
         return self.topology.nv
 
     @property
     def dofs(self) -> int:
-        """All joint coordinates: the tree's, then the virtual links'."""
+        """Number of all joint coordinates: the tree's, then the virtual links'; the length of v."""
         return self.topology.dofs
 
     @property
     def rotational(self) -> Float[Array, "rows 3 3"]:
-        """`inertia` made symmetric, so that its entries may be moved one by one."""
+        """Symmetric part of `inertia`, so that each entry of `inertia` can be perturbed alone."""
         return (self.inertia + jnp.swapaxes(self.inertia, -1, -2)) / 2
 
     @property
     def parent(self) -> np.ndarray:
-        """Pointer of the paper's section IV, for each body, then each virtual link, as an index
-        into both; -1: none."""
+        """Parent of each body, then of each virtual link, as an index into both; -1: none."""
         return _pointers(self)[0]
 
     @property
     def child(self) -> np.ndarray:
-        """The first child of each body and virtual link; -1: none."""
+        """First child of each body and virtual link, indexed as `parent`; -1: none."""
         return _pointers(self)[1]
 
     @property
     def brother(self) -> np.ndarray:
-        """The next child of the same parent; -1: none."""
+        """Next child of the parent of each body and virtual link, indexed as `parent`; -1: none."""
         return _pointers(self)[2]
 
     @property
     def real(self) -> np.ndarray:
-        """The real link of each virtual link; -1 for bodies, and for spare slots not bound yet."""
+        """Real link of each virtual link, indexed as `parent`; -1 for bodies and spare slots."""
         return _pointers(self)[3]
 
     @property
     def actuated(self) -> Bool[Array, " dofs"]:
-        """What the model's actuators drive (without actuators every joint that is not free), and
-        virtual joints declared as actuated."""
+        """Mask of joint coordinates that an actuator drives, or a virtual joint declared actuated.
+
+        In a model without actuators these are the coordinates of every joint that is not free.
+        """
         top = self.topology
         if self.gear.shape[0]:
             driven = jnp.any(self.gear != 0, 0)
@@ -157,14 +198,18 @@ class Chain(eqx.Module):
         return driven | self._link_dof_mask(np.array(top.link_actuated, bool))
 
     def _link_dof_mask(self, links: np.ndarray) -> np.ndarray:
-        """[dofs] the own coordinates of some virtual links."""
+        """Return the mask [dofs] of the joint coordinates of virtual links, given by a mask."""
         table, mask = self.topology.links.dof[links], np.zeros(self.dofs, bool)
         mask[table[table < self.dofs]] = True
         return mask
 
     def motors(self, u: Any) -> Float[Array, " dofs"]:
-        """Joint torques (N m, N) of the model's actuators for the controls u: gear times u, each
-        clipped to its range."""
+        """Return the joint torques (N m, N) of the model's actuators: gear times clipped controls.
+
+        u: one control for each actuator, clipped to its control range and force range.
+
+        Raises ValueError if u has another length.
+        """
         u = real_array("u", u, self.gear.dtype)
         if u.shape != self.gear.shape[:1]:
             raise ValueError(
@@ -175,40 +220,46 @@ class Chain(eqx.Module):
         return force @ self.gear
 
     def state(self, q: Any = None, v: Any = None, connected: Any = None) -> State:
-        """A consistent state: loops closed by Newton's method, velocities made to agree with them.
+        """Return a state that satisfies the loop constraints.
 
-        q, v: arrays over the tree (or over every coordinate), or dicts by joint name, whose entries
-        are kept where the loops allow it.
-        connected: names of the virtual links, or a mask; None: as the model says. ValueError:
-        unknown names, wrong sizes, quaternions that are not unit, loops that cannot be closed (says
-        which, and by how much).
+        Newton's method closes the loops; the velocity is projected onto the closed loops.
+
+        q: coordinates (m, rad, wxyz): an array over the tree or over every coordinate, or a dict by
+            joint name whose entries are kept where the loops allow it. None: the load pose.
+        v: velocities (m/s, rad/s), in the same forms. None: at rest.
+        connected: names of the connected virtual links, or a mask [links]. None: as in the model.
+
+        Raises ValueError if a name is unknown, a size is wrong, a number is not finite, a
+        quaternion is not of unit length, or the loops cannot be closed. The message then names the
+        open loops and their gaps. Under jit, open loops raise RuntimeError at run time.
         """
-        # the one import that goes up the house: a state needs the loops closed, and the contract
-        # puts the verb on the noun
+        # an import against the order of packages: a state needs the loop solver
         from svkc.transitions.initial_state import assemble
 
         return assemble(self, q, v, connected)
 
     def to_mjcf(self) -> str:
-        """MJCF text of the scene: the model as it was loaded, every number to its last digit, with
-        the virtual links as <equality>.
+        """Return MJCF text of the loaded model, with the virtual links as <equality> elements.
 
-        ball and weld are connect and weld, a hinge two connects (the second, NAME_axis, at
-        `chain.length` along its axis), each between two new sites, active where the link is
-        connected; MuJoCo holds them softly. What has no such form (other joints, motors on virtual
-        joints, spare slots, which joints may be cut) is said in a comment at the top. Files of
-        meshes are named by absolute paths, except those in memory (`MjSpec.assets`) and of attached
-        specs. Changes to the chain's own arrays are not written, but for the links' placements.
-        ValueError: loaded from a MjModel.
+        Numbers are written to the last digit. A ball becomes a connect, a weld a weld, and a hinge
+        two connects, the second named NAME_axis at a distance of `chain.length` along the axis.
+        Each is between two new sites, and active if the link is connected. MuJoCo enforces them as
+        soft constraints. A comment at the top lists everything without a form in MJCF: other
+        virtual joints, motors on virtual joints, spare slots, cuttable joints. Mesh files have
+        absolute paths, except files in memory (`MjSpec.assets`) and those of attached specs. Of the
+        chain's arrays only the placements of virtual links are written.
+
+        Raises ValueError if the chain was loaded from a MjModel, or if MuJoCo cannot read the
+        text of the MjSpec.
         """
-        # as above: the text needs what stands higher up
+        # an import against the order of packages: writing the text needs mujoco
         from svkc.mjcf.convert import to_mjcf
 
         return to_mjcf(self)
 
 
 def _pointers(chain: Chain) -> np.ndarray:
-    """[4, bodies + links] parent, child, brother, real."""
+    """Return the table [4, bodies + links] of parent, child, brother and real link."""
     top = chain.topology
     bodies, count = len(top.body_names), len(top.body_names) + len(top.link_names)
     body_of_row = np.full(len(top.parent), -1)
@@ -233,15 +284,17 @@ def _pointers(chain: Chain) -> np.ndarray:
 
 
 def active_dofs(chain: Chain, structure: Structure) -> Bool[Array, " dofs"]:
-    """Joint coordinates that can move: the tree's and the connected virtual links', less the locked
-    ones."""
+    """Return the mask of joint coordinates that can move.
+
+    These are the coordinates of the tree and of the connected virtual links that are not locked.
+    """
     top = chain.topology
-    used = jnp.concatenate(
+    enabled = jnp.concatenate(
         [(structure.connected[:, None] & structure.freedoms).ravel(), jnp.zeros(1, bool)]
     )
-    slot = np.full(top.dofs - top.nv, used.shape[0] - 1)
+    slot = np.full(top.dofs - top.nv, enabled.shape[0] - 1)
     for i, d in enumerate(top.links.dof.ravel()):
         if d < top.dofs:
             slot[d - top.nv] = i
-    active = jnp.concatenate([jnp.ones(top.nv, bool), used[slot]])
+    active = jnp.concatenate([jnp.ones(top.nv, bool), enabled[slot]])
     return active if structure.locked is None else active & ~structure.locked

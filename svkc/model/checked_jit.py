@@ -1,5 +1,5 @@
-"""Verbs on a chain and a state: compiled, and what they are given looked at while jax traces, so
-that a call pays nothing for it."""
+"""`jax.jit` for functions of a chain and a state, with validation of the arguments while JAX
+traces, so that a compiled call pays nothing for the validation."""
 
 import functools
 import inspect
@@ -15,22 +15,22 @@ from svkc.model.validation import real_array
 
 
 def check_chain(chain) -> None:
-    """ValueError for what is no chain."""
+    """Raise ValueError if `chain` is not a `Chain`."""
     if not isinstance(chain, Chain):
         raise ValueError(f"chain: expected what svkc.load(...) gives, got {type(chain).__name__}")
 
 
 def check_state(chain, state) -> None:
-    """ValueError for what is no state of this chain, by its sizes and types."""
+    """Raise ValueError if `state` is not a state of this chain, by its shapes and dtypes."""
     check_chain(chain)
     if not isinstance(state, State) or not isinstance(state.structure, Structure):
         raise ValueError(f"state: expected what chain.state(...) gives, got {type(state).__name__}")
-    sizes = (
+    expected = (
         ("q", state.q, chain.topology.nq_all),
         ("v", state.v, chain.dofs),
         ("connected", state.structure.connected, len(chain.link_names)),
     )
-    for name, value, size in sizes:
+    for name, value, size in expected:
         shape = getattr(value, "shape", None)
         if shape != (size,):
             raise ValueError(
@@ -46,22 +46,27 @@ def check_state(chain, state) -> None:
             )
 
 
-def _validated(given: dict) -> dict:
-    """The arguments by name, arrays made of what is one; ValueError for what cannot be right."""
-    chain = given["chain"]
+def _validated(arguments: dict) -> dict:
+    """Return the arguments by name, converted to arrays; raise ValueError for invalid ones."""
+    chain = arguments["chain"]
     check_chain(chain)
-    if "state" in given:
-        check_state(chain, given["state"])
-    sizes = dict.fromkeys(("q", "q1", "q2"), chain.topology.nq_all) | {"dv": chain.dofs}
-    return given | {
-        name: float_vector(chain, name, given[name], sizes.get(name))
-        for name in given.keys() - {"chain", "state"}
+    if "state" in arguments:
+        check_state(chain, arguments["state"])
+    lengths = dict.fromkeys(("q", "q1", "q2"), chain.topology.nq_all) | {"dv": chain.dofs}
+    return arguments | {
+        name: float_vector(chain, name, arguments[name], lengths.get(name))
+        for name in arguments.keys() - {"chain", "state"}
     }
 
 
 def float_vector(chain: Chain, name: str, value, size: int | None = None):
-    """An array of real numbers, of this size (None: of any), in the chain's float type where it is
-    in none; ValueError for another."""
+    """Return a value as a floating-point array; integers take the chain's float type.
+
+    name: the argument's name, for messages.
+    size: the expected length; None: any shape.
+
+    Raises ValueError if the value is not real or has another length.
+    """
     array = real_array(name, value)
     if size is not None and array.shape != (size,):
         raise ValueError(f"{name}: got shape {array.shape}, expected ({size},); for many use vmap")
@@ -73,27 +78,28 @@ def float_vector(chain: Chain, name: str, value, size: int | None = None):
 
 
 def checked_jit(fn: Callable | None = None, *, eager: bool = False) -> Callable:
-    """`jax.jit` for a function of a chain, a state and arrays; ValueError where one of them cannot
-    be right.
+    """Wrap a function of a chain, a state and arrays in `jax.jit`, and validate its arguments.
 
-    eager: called outside of every transformation it is compiled for compile time (`eager_jit`).
+    eager: outside of all transformations, compile for short compile time (`eager_jit`).
+
+    The wrapped function raises ValueError for an invalid argument.
     """
     if fn is None:
         return functools.partial(checked_jit, eager=eager)
     signature = inspect.signature(fn)
 
     @functools.wraps(fn)
-    def looked_at(*args, **options):
+    def with_validation(*args, **options):
         return fn(**_validated(signature.bind(*args, **options).arguments))
 
-    compiled = eager_jit(looked_at) if eager else jax.jit(looked_at)
+    compiled = eager_jit(with_validation) if eager else jax.jit(with_validation)
 
     @functools.wraps(fn)
     def call(*args, **options):
         try:
             return compiled(*args, **options)
         except (TypeError, OverflowError):
-            # jax could not take an argument in: say which
+            # JAX rejected an argument: validation says which
             _validated(signature.bind(*args, **options).arguments)
             raise
 
@@ -101,8 +107,10 @@ def checked_jit(fn: Callable | None = None, *, eager: bool = False) -> Callable:
 
 
 def joint_torques(chain: Chain, tau) -> Float[Array, " dofs"]:
-    """Torques over every coordinate; those of virtual joints are zero where only the tree's are
-    given. ValueError: another size."""
+    """Return torques [dofs] over every coordinate, with zeros for virtual joints if tau is [nv].
+
+    Raises ValueError if tau has another length.
+    """
     if tau.shape == (chain.dofs,):
         return tau
     if tau.shape == (chain.nv,):

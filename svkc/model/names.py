@@ -1,4 +1,7 @@
-"""Rows of bodies, joints and virtual links by their names."""
+"""Indices of bodies, joints and virtual links by their names.
+
+Raises ValueError, with the names that exist, for an unknown one.
+"""
 
 import jax
 import numpy as np
@@ -9,7 +12,10 @@ from svkc.model.validation import as_array
 
 
 def connection_mask(chain: Chain, connected) -> np.ndarray | jax.Array:
-    """[links] Boolean from names, a mask, or None (as the model says)."""
+    """Return the mask [links] of connected virtual links from names, a mask, or None (the model's).
+
+    Raises ValueError if `connected` is neither names nor a Boolean mask of this length.
+    """
     if connected is None:
         return chain.structure.connected
     names = (connected,) if isinstance(connected, str) else connected
@@ -25,7 +31,7 @@ def connection_mask(chain: Chain, connected) -> np.ndarray | jax.Array:
 
 
 def link_index(chain: Chain, name: str) -> int:
-    """The slot of a virtual link; ValueError naming those there are."""
+    """Return the index of a virtual link in `Structure`'s entries."""
     if not isinstance(name, str) or name not in chain.link_names:
         raise ValueError(
             f"no virtual link {name!r}; virtual links: {', '.join(chain.link_names) or 'none'}"
@@ -34,8 +40,11 @@ def link_index(chain: Chain, name: str) -> int:
 
 
 def joint_slice(chain: Chain, name: str, widths, starts) -> slice:
-    """Where a joint of the tree, or one that may be cut, stands in q (sizes=Q_SIZE) or v;
-    ValueError naming those there are."""
+    """Return the slice of a joint in q or v, for a joint of the tree or a cuttable one.
+
+    widths: number of coordinates by joint kind: `Q_SIZE` for q, `V_SIZE` for v.
+    starts: first index of each row: `Topology.q_start` or `Topology.v_start`.
+    """
     top = chain.topology
     for joint, link, freedom in top.cut_joints:
         if joint == name:
@@ -56,7 +65,7 @@ def joint_slice(chain: Chain, name: str, widths, starts) -> slice:
 
 
 def body_rows(chain: Chain, *bodies: str) -> list[int]:
-    """Rows of bodies by name; ValueError naming those there are."""
+    """Return the rows of bodies."""
     for body in bodies:
         if not isinstance(body, str) or body not in chain.body_names:
             raise ValueError(f"bind: no body {body!r}; bodies: {', '.join(chain.body_names)}")
@@ -64,7 +73,7 @@ def body_rows(chain: Chain, *bodies: str) -> list[int]:
 
 
 def spare_slot(chain: Chain, name: str) -> int:
-    """The slot of a spare link; ValueError for any other link."""
+    """Return the index of a spare slot; raise ValueError for any other virtual link."""
     slot = link_index(chain, name)
     if not chain.topology.link_spare[slot]:
         spare = [n for n, s in zip(chain.link_names, chain.topology.link_spare, strict=True) if s]

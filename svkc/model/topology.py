@@ -1,10 +1,11 @@
-"""What never changes about a chain: rows, levels, joint kinds, places of coordinates."""
+"""The static part of a chain: rows, levels, joint kinds, indices of coordinates."""
 
 import dataclasses
 import functools
 
 import numpy as np
 
+# joint kinds; numbers of coordinates q and velocities v of each
 FIXED, HINGE, SLIDE, BALL, FREE = range(5)
 Q_SIZE = (0, 1, 1, 4, 7)
 V_SIZE = (0, 1, 1, 3, 6)
@@ -12,11 +13,29 @@ V_SIZE = (0, 1, 1, 3, 6)
 
 @dataclasses.dataclass(frozen=True)
 class Topology:
-    """Everything about a chain that never changes and that the compiler may specialise on. Rows are
-    links, sorted by level, row 0 the world.
+    """Everything about a chain that is static, so that the compiler specialises on it.
 
-    A body with several joints takes one row a joint, the last of them the body itself; the others
-    have no mass.
+    Rows are sorted by level; row 0 is the world. A body with several joints has one row for each
+    joint. The last of these rows is the body; the others have no mass.
+
+    body_names: names of the bodies, the world first.
+    joint_names: names of the tree's joints.
+    link_names: names of the virtual links.
+    parent: parent row of each row; -1 for the world.
+    kind: joint kind of each row.
+    q_start: index in q of the first coordinate of each row.
+    v_start: index in v of the first velocity of each row.
+    nq: number of the tree's coordinates.
+    nv: number of the tree's velocities.
+    body_row: row of each body.
+    joint_row: row of each joint of the tree.
+    link_freedoms: six Booleans for each virtual link: rotations, then translations.
+    link_spare: whether each virtual link is a spare slot.
+    link_child: row of the child that each virtual link holds if it is a cuttable joint, else -1.
+    cut_joints: (name, virtual link, first freedom) of each cuttable joint.
+    model_q: index in q of each entry of the model's qpos.
+    model_v: index in v of each entry of the model's qvel.
+    link_actuated: whether a motor drives the coordinates of each virtual link.
     """
 
     body_names: tuple[str, ...]
@@ -32,11 +51,8 @@ class Topology:
     joint_row: tuple[int, ...]
     link_freedoms: tuple[tuple[bool, ...], ...]
     link_spare: tuple[bool, ...]
-    # what follows tells of joints of the tree that may be cut: the child's row of such a link, else
-    # -1; (joint, link, freedom) of each joint
     link_child: tuple[int, ...] = ()
     cut_joints: tuple[tuple[str, int, int], ...] = ()
-    # where the model's own qpos and qvel stand in q and v
     model_q: tuple[int, ...] = ()
     model_v: tuple[int, ...] = ()
     link_actuated: tuple[bool, ...] = ()
@@ -50,7 +66,7 @@ class Topology:
 
     @functools.cached_property
     def levels(self) -> tuple[tuple[int, int], ...]:
-        """(first row, last row + 1) of each level of the tree, the world's first."""
+        """(first row, last row + 1) of each level of the tree; the first level is the world."""
         depth = np.zeros(len(self.parent), int)
         for i in range(1, len(depth)):
             depth[i] = depth[self.parent[i]] + 1
@@ -59,7 +75,7 @@ class Topology:
 
     @functools.cached_property
     def root(self) -> np.ndarray:
-        """The child of the world that each row hangs on; 0 for the world."""
+        """The ancestor of each row whose parent is the world; 0 for the world."""
         root = np.arange(len(self.parent))
         for i in range(1, len(root)):
             root[i] = i if self.parent[i] == 0 else root[self.parent[i]]
@@ -67,7 +83,7 @@ class Topology:
 
     @functools.cached_property
     def dof_row(self) -> np.ndarray:
-        """The row whose joint each coordinate of the tree belongs to."""
+        """The row of each of the tree's velocities."""
         row = np.zeros(self.nv, int)
         for i, (kind, start) in enumerate(zip(self.kind, self.v_start, strict=True)):
             row[start : start + V_SIZE[kind]] = i
@@ -75,35 +91,34 @@ class Topology:
 
     @functools.cached_property
     def ancestor_mask(self) -> np.ndarray:
-        """[rows, rows] Boolean: the column is the row itself or one of its ancestors."""
+        """Mask [rows, rows]: whether the column is the row or one of its ancestors."""
         table = np.eye(len(self.parent), dtype=bool)
         for i in range(1, len(table)):
             table[i] |= table[self.parent[i]]
         return table
 
     def rows_of_kind(self, *kinds: int) -> np.ndarray:
-        """The rows whose joint is one of these kinds."""
+        """Return the rows whose joint is of one of these kinds."""
         return np.flatnonzero(np.isin(self.kind, kinds))
 
     @functools.cached_property
     def links(self) -> "LinkTables":
-        """Where the virtual links' coordinates stand in q and v."""
+        """Indices of the virtual links' coordinates in q and v."""
         return LinkTables.of(self)
 
     @property
     def nq_all(self) -> int:
-        """Length of State.q: the tree's coordinates, then the virtual links'."""
+        """Length of `State.q`: the tree's coordinates, then the virtual links'."""
         return self.links.nq_all
 
     @property
     def dofs(self) -> int:
-        """Length of State.v: N_J with every virtual link connected."""
+        """Length of `State.v`: the paper's N_J with every virtual link connected."""
         return self.links.dofs
 
     @functools.cached_property
     def quaternion_starts(self) -> tuple[np.ndarray, np.ndarray]:
-        """(first index in q, first index in v) of every rotation kept as a quaternion, virtual
-        links' included."""
+        """(first index in q, first index in v) of every quaternion, virtual links' included."""
         offset_q, offset_v = (0, 0, 0, 0, 3), (0, 0, 0, 0, 3)
         rows = self.rows_of_kind(BALL, FREE)
         q = [self.q_start[i] + offset_q[self.kind[i]] for i in rows] + [
@@ -119,20 +134,21 @@ class Topology:
 
     @functools.cached_property
     def dof_names(self) -> tuple[str, ...]:
-        """A name for each joint coordinate: the joint's, with .x .y .z for slides and .rx .ry .rz
-        for turns where it has several."""
+        """Names of the joint coordinates; see `Chain.dof_names`."""
         names = [""] * self.dofs
-        turns, slides = (".rx", ".ry", ".rz"), (".x", ".y", ".z")
-        endings = {HINGE: ("",), SLIDE: ("",), BALL: turns, FREE: slides + turns}
+        rotations, translations = (".rx", ".ry", ".rz"), (".x", ".y", ".z")
+        suffixes = {HINGE: ("",), SLIDE: ("",), BALL: rotations, FREE: translations + rotations}
         for name, row in zip(self.joint_names, self.joint_row, strict=True):
-            for k, ending in enumerate(endings[self.kind[row]]):
-                names[self.v_start[row] + k] = name + ending
+            for k, suffix in enumerate(suffixes[self.kind[row]]):
+                names[self.v_start[row] + k] = name + suffix
         for name, dofs in zip(self.link_names, self.links.dof, strict=True):
             own = [
-                (d, ending) for d, ending in zip(dofs, turns + slides, strict=True) if d < self.dofs
+                (d, suffix)
+                for d, suffix in zip(dofs, rotations + translations, strict=True)
+                if d < self.dofs
             ]
-            for d, ending in own:
-                names[d] = name + (ending if len(own) > 1 else "")
+            for d, suffix in own:
+                names[d] = name + (suffix if len(own) > 1 else "")
         for name, link, freedom in self.cut_joints:
             if sum(self.link_freedoms[link]) < 3:
                 names[self.links.dof[link, freedom]] = name
@@ -140,7 +156,10 @@ class Topology:
 
     @functools.cached_property
     def scalar_coordinates(self) -> tuple[np.ndarray, np.ndarray]:
-        """(index in q, index in v) of every coordinate whose rate is its velocity."""
+        """(index in q, index in v) of every coordinate that is not part of a quaternion.
+
+        The derivative of such a coordinate by time is its velocity.
+        """
         quat_q, quat_v = self.quaternion_starts
         q = np.setdiff1d(np.arange(self.nq_all), (quat_q[:, None] + np.arange(4)).ravel())
         v = np.setdiff1d(np.arange(self.dofs), (quat_v[:, None] + np.arange(3)).ravel())
@@ -149,22 +168,30 @@ class Topology:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class LinkTables:
-    """Index tables of the virtual joints: x, y, z turns, then x, y, z slides; an index past the end
-    reads a constant.
+    """Indices of the virtual joints' coordinates in q and v.
 
-    Three rotations are one quaternion. A spare slot has room for all six freedoms; its mask in the
-    Structure says which it uses.
+    A joint with three rotations has a quaternion, otherwise one angle for each rotation. A freedom
+    that the joint lacks has an index past the end of q or v, where constants are appended. A spare
+    slot has all six freedoms; `Structure.freedoms` says which are in use.
+
+    nq_all: length of q.
+    dofs: length of v.
+    angle: [links 3] rotations about x, y, z, into (q, 0, 1).
+    slide: [links 3] translations along x, y, z, into (q, 0, 1).
+    quat: [links 4] quaternions, into (q, 0, 1).
+    dof: [links 6] rotations, then translations, into (v, 0).
     """
 
     nq_all: int
     dofs: int
-    angle: np.ndarray  # [L 3] into (q, 0, 1)
-    slide: np.ndarray  # [L 3] into (q, 0, 1)
-    quat: np.ndarray  # [L 4] into (q, 0, 1)
-    dof: np.ndarray  # [L 6] into (v, 0)
+    angle: np.ndarray
+    slide: np.ndarray
+    quat: np.ndarray
+    dof: np.ndarray
 
     @classmethod
     def of(cls, topology: Topology) -> "LinkTables":
+        """Return the tables for a topology with its virtual links."""
         count = len(topology.link_names)
         q, v = topology.nq, topology.nv
         angle, slide, quat, dof = (np.full((count, k), -1) for k in (3, 3, 4, 6))

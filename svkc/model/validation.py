@@ -1,5 +1,8 @@
-"""Plain arguments as callers give them: numbers that must be whole, positive, or real; what cannot
-be right is said by name."""
+"""Validation of user arguments: each function returns the converted value, or raises ValueError
+that names the argument, what was given and what was expected.
+
+Values of tracers cannot be checked; their shapes and dtypes are.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +12,7 @@ from svkc._jax.pytrees import is_concrete
 
 
 def as_array(value):
-    """As an array; of objects, where it is none."""
+    """Return a value as an array, of dtype object if NumPy cannot convert the value."""
     try:
         return (
             value
@@ -23,8 +26,10 @@ def as_array(value):
 
 
 def real_array(name: str, value, dtype=None):
-    """As an array of real numbers, of type dtype where it is given. ValueError: strings, objects,
-    complex numbers, ragged lists."""
+    """Return a value as an array of real numbers, converted to `dtype` if one is given.
+
+    Raises ValueError for strings, objects, Booleans, complex numbers and ragged lists.
+    """
     array = as_array(value)
     if not any(jnp.issubdtype(array.dtype, kind) for kind in (np.integer, np.floating)):
         raise ValueError(
@@ -35,7 +40,7 @@ def real_array(name: str, value, dtype=None):
 
 
 def finite_array(name: str, value, dtype=None):
-    """The same, finite where that can be seen."""
+    """Return a value as `real_array` does; raise ValueError if a concrete one is not finite."""
     array = real_array(name, value, dtype)
     if is_concrete(array) and not np.isfinite(np.asarray(array)).all():
         raise ValueError(f"{name}: expected finite numbers, got {np.asarray(array)}")
@@ -43,7 +48,7 @@ def finite_array(name: str, value, dtype=None):
 
 
 def scalar(name: str, value):
-    """One real number."""
+    """Return a real scalar unchanged; raise ValueError for another shape."""
     array = real_array(name, value)
     if array.shape != ():
         raise ValueError(
@@ -54,7 +59,7 @@ def scalar(name: str, value):
 
 
 def vector(name: str, value, count: int):
-    """So many finite numbers."""
+    """Return a value as an array of `count` finite numbers."""
     array = finite_array(name, value)
     if array.shape != (count,):
         raise ValueError(f"{name}: got shape {array.shape}, expected {count} numbers")
@@ -62,7 +67,7 @@ def vector(name: str, value, count: int):
 
 
 def positive_scalar(name: str, value):
-    """One number above zero, where that can be seen."""
+    """Return a real scalar unchanged; raise ValueError if a concrete one is not above zero."""
     scalar(name, value)
     if is_concrete(value) and not np.asarray(value) > 0:
         raise ValueError(f"{name}: got {value}, expected a positive number")
@@ -70,7 +75,7 @@ def positive_scalar(name: str, value):
 
 
 def integer(name: str, value, minimum: int, maximum: int = 2**31 - 1) -> int:
-    """A whole number from `least` to `most`."""
+    """Return a concrete whole number from `minimum` to `maximum` as an int."""
     number = np.asarray(as_array(value) if is_concrete(value) else None)
     if (
         number.shape != ()
@@ -86,21 +91,21 @@ def integer(name: str, value, minimum: int, maximum: int = 2**31 - 1) -> int:
 
 
 def check_function(name: str, value, optional: bool = True) -> None:
-    """A function, or, where it is optional, None."""
+    """Raise ValueError if a value is not callable, nor None where `optional`."""
     if not callable(value) and not (optional and value is None):
         raise ValueError(f"{name}: expected a function, got {value!r}")
 
 
 def boolean(name: str, value) -> bool:
-    """A Boolean."""
+    """Return a Boolean of Python or NumPy as a bool."""
     if not isinstance(value, bool | np.bool_):
         raise ValueError(f"{name}: got {value!r}, expected True or False")
     return bool(value)
 
 
 def names(name: str, value) -> tuple[str, ...]:
-    """A name, or several."""
-    several = (value,) if isinstance(value, str) or not np.iterable(value) else tuple(value)
-    if not all(isinstance(x, str) for x in several):
+    """Return one name or an iterable of names as a tuple."""
+    values = (value,) if isinstance(value, str) or not np.iterable(value) else tuple(value)
+    if not all(isinstance(x, str) for x in values):
         raise ValueError(f"{name}: expected names, got {value!r}")
-    return several
+    return values

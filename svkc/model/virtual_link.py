@@ -1,4 +1,4 @@
-"""Virtual links: the joints that may be made and broken, and their freedoms."""
+"""Virtual links, which connect and disconnect at run time, and the freedoms of their joints."""
 
 import dataclasses
 from typing import Any
@@ -7,8 +7,8 @@ import numpy as np
 
 from svkc.model.validation import boolean, real_array
 
-# the freedoms of the named joints: rotations about x, y, z, then translations along x, y, z; the
-# axis of the joint is z
+# joint -> its freedoms: rotations about x, y, z, then translations along x, y, z; the joint's axis
+# is z
 JOINTS = {
     "weld": (False, False, False, False, False, False),
     "hinge": (False, False, True, False, False, False),
@@ -22,16 +22,19 @@ JOINTS = {
 
 
 def joint_freedoms(joint) -> tuple[bool, ...]:
-    """The six Booleans of a joint given by name or as six Booleans; ValueError otherwise."""
+    """Return the six freedoms of a joint given by name or as six Booleans.
+
+    Raises ValueError for anything else.
+    """
     if isinstance(joint, str):
         if joint in JOINTS:
             return JOINTS[joint]
     elif (
         np.iterable(joint)
-        and len(six := list(joint)) == 6
-        and all(isinstance(x, bool | np.bool_ | int) and x in (0, 1) for x in six)
+        and len(freedoms := list(joint)) == 6
+        and all(isinstance(x, bool | np.bool_ | int) and x in (0, 1) for x in freedoms)
     ):
-        return tuple(bool(x) for x in six)
+        return tuple(bool(x) for x in freedoms)
     raise ValueError(
         f"joint: got {joint!r}, expected one of {', '.join(JOINTS)} or six Booleans (three"
         " rotations, three translations)"
@@ -40,16 +43,27 @@ def joint_freedoms(joint) -> tuple[bool, ...]:
 
 @dataclasses.dataclass(frozen=True)
 class VirtualLink:
-    """A massless extra link, child of `parent`, that coincides with its `real` link while connected
-    (paper, section IV).
+    """A massless link, child of `parent`, that coincides with its `real` link while connected.
 
-    `parent`, `real`: names of bodies ("world" is the ground) or of sites. `pos` (m), `quat`: the
-    joint's frame in the parent; `real_pos`, `real_quat`: the same frame in the real link, None:
-    from the load pose. Of a site: in the site's frame; `real_pos` None: at the site. `axis`: of the
-    joint, in the frame `pos`, `quat` makes in the parent.
-    `joint`: weld, hinge, slide, cylinder, universal, planar, ball, free, or six Booleans (three
-    rotations, three translations).
-    `actuated`: a motor drives the joint's own coordinates (paper, Fig. 6).
+    Connected virtual links close kinematic loops (paper, section IV).
+
+    name: name of the virtual link.
+    parent: name of a body ("world" is the ground) or of a site.
+    real: name of a body or of a site.
+    joint: the joint between `parent` and the virtual link: weld, hinge, slide, cylinder, universal,
+        planar, ball, free, or six Booleans (three rotations, three translations).
+    pos: [3] origin of the joint's frame in the parent's frame, or in the site's frame (m).
+    quat: [4] orientation of the joint's frame in the parent's frame (wxyz).
+    real_pos: [3] origin of the joint's frame in the real link's frame, or in the site's frame (m).
+        None: from the load pose, or at the site.
+    real_quat: [4] orientation of the joint's frame in the real link's frame (wxyz). None: from the
+        load pose.
+    axis: [3] direction of the joint's axis in the frame that `pos` and `quat` make in the parent.
+    connected: whether the link is connected in the load pose.
+    actuated: whether a motor drives the joint's coordinates (paper, Fig. 6).
+
+    Raises ValueError if a field has another type or shape, a quaternion is not of unit length, or
+    the axis is zero.
     """
 
     name: str

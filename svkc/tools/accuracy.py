@@ -66,13 +66,13 @@ class Tuning:
 
     def __str__(self) -> str:
         lines = [
-            f"target {self.target:.1e}       seconds of computing    error  loop gap  energy drift "
+            f"target {self.target:.1e}               seconds of computing    error  loop gap  energy drift "
             " steps"
         ]
         for c in self.table:
             mark = "*" if c.options is self.best else ("+" if c.error <= self.target else " ")
             lines.append(
-                f"{mark} {c.name:<32}{c.seconds:10.4f}{c.error:11.1e}{c.gap:10.1e}"
+                f"{mark} {c.name:<40}{c.seconds:10.4f}{c.error:11.1e}{c.gap:10.1e}"
                 f"{c.energy_drift:14.1e}{c.steps:7d}  {c.result}".rstrip()
             )
         return "\n".join(
@@ -112,10 +112,10 @@ def default_candidates(dtype, span: float) -> list[Candidate]:
             )
             candidates.append(Candidate(name, options | {"stabilization": Projection()}))
             candidates.append(
-                Candidate(f"{name}, drift", options | {"stabilization": NoStabilization()})
+                Candidate(f"{name}, no stabilization", options | {"stabilization": NoStabilization()})
             )
             candidates.append(
-                Candidate(f"{name}, by bodies", options | {"dynamics": ArticulatedBodies()})
+                Candidate(f"{name}, articulated bodies", options | {"dynamics": ArticulatedBodies()})
             )
         if rtol >= 1e-8:
             candidates.append(
