@@ -10,7 +10,6 @@ from typing import Any, ClassVar
 import diffrax
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
 
 from svkc.integration.event_location import EventInfo
 from svkc.integration.ode import ODEState
@@ -34,8 +33,8 @@ class _ProjectedInterpolation(diffrax.AbstractLocalInterpolation):
     shift: the change of the step's end by the projection.
     """
 
-    t0: Float[Array, ""]
-    t1: Float[Array, ""]
+    t0: Any
+    t1: Any
     inner: Any
     shift: ODEState
 

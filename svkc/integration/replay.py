@@ -1,11 +1,10 @@
-"""The motion of one phase as a function that is differentiated both ways, whatever solver and step
-control found it.
+"""Integrate one phase with derivatives in both modes, for any solver and step-size control.
 
-The run itself is never differentiated. Its steps are gone through again, their times held fixed,
-for what a change of start and parameters does to
-each: forwards for a tangent, backwards for a cotangent. Kept of a run are the times of its steps
-and one state in `every`. What a change of the start's time or of a save time does is the rate of
-the motion there.
+The stepping loop is never differentiated. Its steps are replayed at fixed times, to find what a
+change of the start and of the parameters does to each step: forwards for a tangent, backwards for a
+cotangent. The stepping loop stores the times of the steps and a checkpoint of the state after every
+`checkpoint_interval` steps. Where the time of the start or a save time changes, the vector field
+there gives the derivative.
 """
 
 import diffrax
@@ -17,7 +16,7 @@ from jaxtyping import Array, Float
 
 from svkc._jax.control_flow import unvmap_any
 from svkc._jax.primitive import custom_primitive
-from svkc._jax.pytrees import materialise_zeros, stop_gradient_tree
+from svkc._jax.pytrees import materialise_zeros, stop_gradient_tree, tree_where
 from svkc.integration.event_adjoint import end_of_phase_tangent, transport_tangent
 from svkc.integration.integrate import integrate_phase
 from svkc.integration.ode import FieldArgs, ODEState
@@ -25,17 +24,24 @@ from svkc.integration.solution import SUCCESSFUL, PhaseProblem, PhaseSolution, S
 from svkc.integration.vector_field import VectorField, project_state
 from svkc.model.validation import integer
 
-# blocks are passed over in groups where the run has no more steps
+# Blocks of steps are skipped in groups of this size past the end of a run.
 BLOCKS_PER_GROUP = 64
 
 
 class Replay(eqx.Module):
-    """The default `adjoint` of `svkc.simulate`: both modes, in any mixture with vmap and jit.
+    """The default `adjoint` of `svkc.simulate`: replay the steps of a run to differentiate it.
 
-    every: one state in so many steps is kept, and the steps between are taken once more on the way
-    back. Memory for a phase, in numbers:
-    max_steps (1 + size / every), with size that of q and v together, and what one block of `every`
-    steps needs.
+    Forward and reverse mode work in any combination with `vmap` and `jit`. The times of the steps
+    are fixed in derivatives; the times of events, of the start, of the end and of saved states are
+    not.
+
+    The memory for a phase is max_steps (1 + n / every) numbers, where n counts the entries of q and
+    v, plus the residuals of one block of `every` steps.
+
+    every: number of steps between checkpoints. Reverse mode repeats the steps between two
+        checkpoints.
+
+    Raises ValueError if `every` is not an integer of at least 1.
     """
 
     every: int = eqx.field(static=True, default=16)
@@ -44,258 +50,285 @@ class Replay(eqx.Module):
         integer("every", self.every, 1)
 
 
-def _step_grid(t0, at, path: PhaseSolution):
-    """[steps + 1] times of the start and of every step, after the last its end again; and for each
-    save time the place of its state among them."""
-    times = jnp.concatenate([t0[None], path.step_ts])
-    place = jnp.searchsorted(times, at).astype(jnp.int32)
-    # past the last step time stands still
-    return (
-        jnp.where(
-            jnp.arange(times.shape[0], dtype=jnp.int32) > path.accepted, times[path.accepted], times
-        ),
-        place,
-    )
+def _step_grid(t0, save_ts, solution: PhaseSolution):
+    """Return the times of the step ends, and for each save time the index of its step end.
+
+    The times, [steps + 1], start with t0 and repeat the end of the phase in unused rows.
+    """
+    times = jnp.concatenate([t0[None], solution.step_ts])
+    save_index = jnp.searchsorted(times, save_ts).astype(jnp.int32)
+    unused = jnp.arange(times.shape[0], dtype=jnp.int32) > solution.accepted
+    return jnp.where(unused, times[solution.accepted], times), save_index
 
 
-def _replay_block(y: ODEState, times, world: PhaseProblem, solver) -> tuple[ODEState, ODEState]:
-    """The steps of one block, from times[0] to times[1]: the state after it, and after each
-    step."""
+def _replay_block(y: ODEState, times, problem: PhaseProblem, solver) -> tuple[ODEState, ODEState]:
+    """Return the state after one block of steps, and the states after each of its steps.
 
-    def step(y, ends):
-        y = replay_step(solver, world.field, ends[0], ends[1], y, world.field_args)
+    times: starts and ends of the steps.
+    """
+
+    def step(y, interval):
+        y = replay_step(solver, problem.field, *interval, y, problem.field_args)
         return y, y
 
     return jax.lax.scan(step, y, times)
 
 
-def _stop_shift(path: PhaseSolution, stop) -> Float[Array, ""]:
-    """Return zero, with the tangent of the scheduled end where that was reached."""
-    return jnp.where(path.result == SUCCESSFUL, stop - path.t, 0)
+def _integrate(start: ODEState, times, problem: PhaseProblem, options: StepperOptions, guards):
+    """Integrate one phase. Return its `PhaseSolution`, and the time and the state at its end.
 
+    In derivatives the time of `PhaseSolution.y` is fixed. The second and third result have the
+    derivative of the end's time as well (`event_adjoint`).
 
-def _integrate(start: ODEState, times, world: PhaseProblem, how: StepperOptions, guards):
-    path = integrate_phase(start, times, world, how)
-    return path, path.t, path.y
+    times: start, scheduled end and save times.
+    guards: the `GuardValues`, or the `VectorField` if there are no guards.
+    """
+    solution = integrate_phase(start, times, problem, options)
+    return solution, solution.t, solution.y
 
 
 def _integrate_with_replay_jvp(primals, tangents):
-    """Tangents at the times that the run has found, which stay, and what the changes of the times
-    of its start, its end and of the save times add."""
-    start, times, world, how, guards = primals
-    d_start, d_times, d_world, _, d_guards = tangents
-    path, t, end = integrate_with_replay(*primals)
-    (t0, stop, at), (d_t0, d_stop, d_at) = times, d_times
-    # of both ends by one program
+    """Return the tangents at the fixed times of the steps, plus those of changing times."""
+    start, times, problem, options, guards = primals
+    d_start, d_times, d_problem, _, d_guards = tangents
+    solution, t, y = integrate_with_replay(*primals)
+    (t0, stop, save_ts), (d_t0, d_stop, d_save_ts) = times, d_times
+    # One program evaluates the field at both ends.
     rates = jax.lax.map(
-        lambda x: world.field(*x, world.field_args),
-        (jnp.stack([t0, t]), jax.tree.map(lambda *x: jnp.stack(x), start, end)),
+        lambda x: problem.field(*x, problem.field_args),
+        (jnp.stack([t0, t]), jax.tree.map(lambda *x: jnp.stack(x), start, y)),
     )
-    at_start, at_end = (jax.tree.map(lambda x, i=i: x[i], rates) for i in range(2))
-    grid, place = _step_grid(*stop_gradient_tree((t0, at, path)))
+    rate_start, rate_end = (jax.tree.map(lambda x, i=i: x[i], rates) for i in range(2))
+    grid = _step_grid(*stop_gradient_tree((t0, save_ts, solution)))
     d_start = materialise_zeros(start, d_start)
     if d_t0 is not None:
-        start, d_start = _at_fixed_start(start, d_start, at_start, (t0, d_t0), (world, d_world))
-    d_end, d_saved, d_kept = _replay_tangents(
-        (start, d_start), (world, d_world), grid, place, path=path, how=how
-    )
-    if d_at is not None:
-        d_saved = jax.vmap(lambda y, dy, *times: _at_shifted_time(y, dy, times, (world, d_world)))(
-            path.ys, d_saved, at, d_at
+        start, d_start = _at_fixed_start(
+            start, d_start, rate_start, (t0, d_t0), (problem, d_problem)
         )
-    none = jax.tree.map(lambda x: None, path)
-    moving = lambda p: (p.y, p.ys, p.checkpoints)
-    d_path = eqx.tree_at(
-        moving,
-        none,
-        (d_end, d_saved, d_kept),
+    d_y, d_ys, d_checkpoints = _replay_tangents(
+        (start, d_start), (problem, d_problem), *grid, solution=solution, options=options
+    )
+    if d_save_ts is not None:
+        d_ys = jax.vmap(lambda y, dy, *t: _at_shifted_time(y, dy, t, (problem, d_problem)))(
+            solution.ys, d_ys, save_ts, d_save_ts
+        )
+    d_solution = eqx.tree_at(
+        lambda s: (s.y, s.ys, s.checkpoints),
+        jax.tree.map(lambda x: None, solution),
+        (d_y, d_ys, d_checkpoints),
         is_leaf=lambda x: x is None or isinstance(x, ODEState),
     )
-    late = _stop_shift(path, stop)
-    d_late = None if d_stop is None else jnp.where(path.result == SUCCESSFUL, d_stop, 0)
-    arriving = (path.t, path.y, late, world.field_args, guards, stop_gradient_tree(path.event))
-    return (path, t, end), (
-        d_path,
-        *end_of_phase_tangent(
-            arriving, (None, d_end, d_late, d_world.field_args, d_guards, None), t, end, at_end
-        ),
+    at_scheduled_end = solution.result == SUCCESSFUL
+    stop_shift = jnp.where(at_scheduled_end, stop - solution.t, 0)
+    d_stop_shift = None if d_stop is None else jnp.where(at_scheduled_end, d_stop, 0)
+    event = stop_gradient_tree(solution.event)
+    d_end = end_of_phase_tangent(
+        (solution.t, solution.y, stop_shift, problem.field_args, guards, event),
+        (None, d_y, d_stop_shift, d_problem.field_args, d_guards, None),
+        (t, y),
+        rate_end,
     )
+    return (solution, t, y), (d_solution, *d_end)
 
 
 def _at_fixed_start(
-    y: ODEState, dy: ODEState, rate: ODEState, time, world
+    y: ODEState, dy: ODEState, rate: ODEState, time, problem
 ) -> tuple[ODEState, ODEState]:
-    """Return the start of a run and its tangent, as of a start at a time that stays: one that comes
-    later has less time to move. rate: of the motion there; time, world: with their tangents."""
+    """Return the start state and its tangent as if the time of the start were fixed.
+
+    A later start leaves less time to move: the tangent loses rate dt0.
+
+    rate: derivative of the state by time at the start.
+    time, problem: pairs of primal and tangent.
+    """
     t0, d_t0 = time
-    delay = jax.lax.stop_gradient(t0) - t0
+    duration = jax.lax.stop_gradient(t0) - t0
     dy = jax.tree.map(lambda d, r: d - r * d_t0, dy, rate)
-    dy = _transport(y, dy, rate, (t0, delay), world)
-    return jax.tree.map(lambda y, r: y + delay * r, y, rate), dy
+    dy = _transport(y, dy, rate, (t0, duration), problem)
+    return jax.tree.map(lambda y, r: y + duration * r, y, rate), dy
 
 
-def _at_shifted_time(y: ODEState, dy: ODEState, time, world) -> ODEState:
-    """Return the tangent of a state saved at a time that changes, from that at a time that stays.
-    time, world: with their tangents."""
+def _at_shifted_time(y: ODEState, dy: ODEState, time, problem) -> ODEState:
+    """Return the tangent of a state saved at a changing time, given the tangent at a fixed time.
+
+    time, problem: pairs of primal and tangent.
+    """
     t, dt = time
-    rate = world[0].field(t, y, world[0].field_args)
-    dy = _transport(y, dy, rate, (t, t - jax.lax.stop_gradient(t)), world)
+    rate = problem[0].field(t, y, problem[0].field_args)
+    dy = _transport(y, dy, rate, (t, t - jax.lax.stop_gradient(t)), problem)
     return jax.tree.map(lambda d, r: d + r * dt, dy, rate)
 
 
-def _transport(y: ODEState, dy: ODEState, rate: ODEState, time, world) -> ODEState:
-    """Return dy carried along for a time that is zero but may itself change. time: t and that
-    delay; world: with its tangent."""
-    (t, delay), (world, d_world) = time, world
-    changes = dy, d_world.field_args, d_world.field
+def _transport(y: ODEState, dy: ODEState, rate: ODEState, time, problem) -> ODEState:
+    """Return `transport_tangent` of dy.
+
+    time: t and the duration of the transport.
+    problem: pair of primal and tangent.
+    """
+    (t, duration), (problem, d_problem) = time, problem
     return transport_tangent(
-        changes, rate, delay=delay, t=t, at=y, scene=world.field_args, field=world.field
+        (dy, d_problem.field_args, d_problem.field),
+        rate,
+        duration=duration,
+        t=t,
+        y=y,
+        field_args=problem.field_args,
+        field=problem.field,
     )
 
 
-def _blocks(start: ODEState, grid, path: PhaseSolution, every: int):
-    """For every block of steps, in whole groups: its place, whether it was begun, the state it
-    begins from, the times of its steps' begins and ends."""
-    groups = -(-(path.checkpoints.q.shape[0] + 1) // BLOCKS_PER_GROUP)
-    pad = groups * BLOCKS_PER_GROUP - path.checkpoints.q.shape[0] - 1
-    index = jnp.arange(groups * BLOCKS_PER_GROUP, dtype=jnp.int32)
-    going = index * every < path.accepted
-    kept = jax.tree.map(
-        lambda s, k: jnp.concatenate([s[None], k, jnp.broadcast_to(s[None], (pad, *s.shape))]),
+def _blocks(start: ODEState, step_grid, solution: PhaseSolution, interval: int):
+    """Return the blocks of `interval` steps, padded to whole groups.
+
+    For each block: its index, whether any of its steps was taken, the state at its start, and the
+    starts and ends of its steps.
+    """
+    groups = -(-(solution.checkpoints.q.shape[0] + 1) // BLOCKS_PER_GROUP)
+    count = groups * BLOCKS_PER_GROUP
+    padding = count - solution.checkpoints.q.shape[0] - 1
+    index = jnp.arange(count, dtype=jnp.int32)
+    used = index * interval < solution.accepted
+    states = jax.tree.map(
+        lambda s, c: jnp.concatenate([s[None], c, jnp.broadcast_to(s[None], (padding, *s.shape))]),
         start,
-        path.checkpoints,
+        solution.checkpoints,
     )
-    # blocks that were not begun get numbers that are finite
-    kept = jax.tree.map(
-        lambda s, k: jnp.where(going.reshape(-1, *(1,) * s.ndim), k, s[None]), start, kept
+    # Unused blocks get a finite state.
+    states = jax.tree.map(
+        lambda s, c: jnp.where(used.reshape(-1, *(1,) * s.ndim), c, s[None]), start, states
     )
-    times = jnp.concatenate(
-        [
-            grid,
-            jnp.broadcast_to(grid[-1:], (groups * BLOCKS_PER_GROUP * every + 1 - grid.shape[0],)),
-        ]
-    )
-    return index, going, kept, (times[:-1].reshape(-1, every), times[1:].reshape(-1, every))
+    rest = count * interval + 1 - step_grid.shape[0]
+    times = jnp.concatenate([step_grid, jnp.broadcast_to(step_grid[-1:], (rest,))])
+    return index, used, states, (times[:-1].reshape(-1, interval), times[1:].reshape(-1, interval))
 
 
 @eqx.filter_jit
-def _replay_tangents(start, world, grid, place, *, path: PhaseSolution, how: StepperOptions):
-    """Return the tangents at the end, at the save times and at the kept states: block after block
-    of steps, each from its kept state. start, world: with their tangents."""
-    (start, d_start), every, blocks = start, how.checkpoint_interval, path.checkpoints.q.shape[0]
-    index, *rest = _blocks(start, grid, path, every)
+def _replay_tangents(
+    start, problem, step_grid, save_index, *, solution: PhaseSolution, options: StepperOptions
+):
+    """Return the tangents at the end, at the save times and at the checkpoints.
 
-    def one(carry, x):
-        d_y, d_saved = carry
-        i, going, y, times = x
+    The blocks of steps are replayed in order, each from its checkpoint.
 
-        def taken():
-            after, d_every = _block_tangent(d_y, y, times, world, how.solver)
-            here = (place > i * every) & (place <= jnp.minimum((i + 1) * every, path.accepted))
-            local = jnp.clip(place - i * every - 1, 0, every - 1)
-            spread = lambda old, new: jnp.where(_broadcast_mask(here, old) & going, new[local], old)
-            return _where(going, after, d_y), jax.tree.map(spread, d_saved, d_every)
+    start, problem: pairs of primal and tangent.
+    step_grid, save_index: as from `_step_grid`.
+    """
+    (start, d_start), interval = start, options.checkpoint_interval
+    count = solution.checkpoints.q.shape[0]
+    index, *rest = _blocks(start, step_grid, solution, interval)
 
-        carry = jax.lax.cond(unvmap_any(going), taken, lambda: (d_y, d_saved))
+    def block(carry, x):
+        d_y, d_ys = carry
+        i, used, y, times = x
+
+        def replay():
+            d_after, d_steps = _block_tangent(d_y, y, times, problem, options.solver)
+            last = jnp.minimum((i + 1) * interval, solution.accepted)
+            in_block = (save_index > i * interval) & (save_index <= last)
+            step_index = jnp.clip(save_index - i * interval - 1, 0, interval - 1)
+            save = lambda old, new: jnp.where(
+                _broadcast_mask(in_block, old) & used, new[step_index], old
+            )
+            return tree_where(used, d_after, d_y), jax.tree.map(save, d_ys, d_steps)
+
+        carry = jax.lax.cond(unvmap_any(used), replay, lambda: (d_y, d_ys))
         return carry, carry[0]
 
     @jax.checkpoint
     def group(carry, x):
-        def some(carry):
-            return jax.lax.scan(one, carry, x)
+        def replay(carry):
+            return jax.lax.scan(block, carry, x)
 
-        def none(carry):
-            return carry, jax.tree.map(
-                lambda d: jnp.zeros((BLOCKS_PER_GROUP, *d.shape), d.dtype), carry[0]
-            )
+        def skip(carry):
+            zeros = lambda d: jnp.zeros((BLOCKS_PER_GROUP, *d.shape), d.dtype)
+            return carry, jax.tree.map(zeros, carry[0])
 
-        return jax.lax.cond(unvmap_any(jnp.any(x[1])), some, none, carry)
+        return jax.lax.cond(unvmap_any(jnp.any(x[1])), replay, skip, carry)
 
-    d_saved = jax.tree.map(
-        lambda d: jnp.where(_broadcast_mask(place == 0, d[None]), d[None], 0), d_start
-    )
-    xs = jax.tree.map(lambda x: x.reshape(-1, BLOCKS_PER_GROUP, *x.shape[1:]), (index, *rest))
-    (d_end, d_saved), after = jax.lax.scan(group, (d_start, d_saved), xs)
-    written = (index[:blocks] + 1) * every <= path.accepted
-    flat = jax.tree.map(lambda d: d.reshape(-1, *d.shape[2:])[:blocks], after)
-    return (
-        d_end,
-        d_saved,
-        jax.tree.map(lambda d: jnp.where(_broadcast_mask(written, d), d, 0), flat),
-    )
+    at_start = lambda d: jnp.where(_broadcast_mask(save_index == 0, d[None]), d[None], 0)
+    groups = jax.tree.map(lambda x: x.reshape(-1, BLOCKS_PER_GROUP, *x.shape[1:]), (index, *rest))
+    carry = d_start, jax.tree.map(at_start, d_start)
+    (d_end, d_ys), d_after = jax.lax.scan(group, carry, groups)
+    written = (index[:count] + 1) * interval <= solution.accepted
+    d_checkpoints = jax.tree.map(lambda d: d.reshape(-1, *d.shape[2:])[:count], d_after)
+    mask = lambda d: jnp.where(_broadcast_mask(written, d), d, 0)
+    return d_end, d_ys, jax.tree.map(mask, d_checkpoints)
 
 
 @eqx.filter_checkpoint
-def _block_tangent(d_y: ODEState, y: ODEState, times, world, solver):
+def _block_tangent(d_y: ODEState, y: ODEState, times, problem, solver):
     """Return the tangents after a block of steps and after each of its steps."""
-    world, d_world = world
-    step = lambda y, world: _replay_block(y, times, world, solver)
-    return eqx.filter_jvp(step, (y, world), (d_y, d_world))[1]
+    problem, d_problem = problem
+    replay = lambda y, problem: _replay_block(y, times, problem, solver)
+    return eqx.filter_jvp(replay, (y, problem), (d_y, d_problem))[1]
 
 
 def _broadcast_mask(mask, like):
-    """Return a mask of rows with the axes of an array of such rows."""
+    """Return a mask of rows with as many axes as `like`, an array of such rows."""
     return mask.reshape(-1, *(1,) * (like.ndim - 1))
 
 
-def _where(pred, new, old):
-    return jax.tree.map(lambda new, old: jnp.where(pred, new, old), new, old)
-
-
-# integrated(start, times, world, how, guards or field) -> Path, t, Motion: where the run went, with
-# the time of its end fixed in derivatives; and its end, whose time is a guard's zero or the
-# scheduled one
-integrate_with_replay = custom_primitive("integrated", _integrate, _integrate_with_replay_jvp)
+integrate_with_replay = custom_primitive(
+    "integrate_with_replay", _integrate, _integrate_with_replay_jvp
+)
 
 
 def with_scan_kind(solver: diffrax.AbstractSolver, kind: str | None) -> diffrax.AbstractSolver:
-    """The solver with its loop over stages made for what is to be differentiated: "lax" forwards,
-    "bounded" both ways, None diffrax's own choice."""
+    """Return a Runge-Kutta solver whose loop over stages is of this kind; others as they are.
+
+    kind: "lax" for forward mode, "bounded" for both modes, None for diffrax's own choice.
+    """
     if not isinstance(solver, diffrax.AbstractRungeKutta):
         return solver
     return eqx.tree_at(lambda s: s.scan_kind, solver, kind, is_leaf=lambda x: x is None)
 
 
 def replay_step(
-    solver: diffrax.AbstractSolver, field: VectorField, t0, t1, y: ODEState, scene: FieldArgs
+    solver: diffrax.AbstractSolver, field: VectorField, t0, t1, y: ODEState, field_args: FieldArgs
 ) -> ODEState:
-    """One settled step of a solver that remembers nothing of the step before, to be differentiated:
-    of each evaluation of the field, and of each turn of the loop that settles the step, only the
-    arguments are kept on the way back."""
+    """Take one projected step that depends on no earlier step, to be differentiated.
+
+    Reverse mode stores the arguments of each evaluation of the field and of each iteration of the
+    projection, and recomputes everything else.
+    """
     rate = eqx.filter_checkpoint(field)
     if isinstance(solver, diffrax.AbstractERK) and isinstance(
         solver.tableau, diffrax.ButcherTableau
     ):
-        raw = _explicit_step(solver.tableau, rate, t0, t1, y, scene)
+        y1 = _explicit_step(solver.tableau, rate, t0, t1, y, field_args)
     else:
         solver = with_scan_kind(solver, "bounded")
         term = diffrax.ODETerm(rate)
-        begun = solver.init(term, t0, t1, y, scene)
-        raw = solver.step(term, t0, t1, y, scene, begun, made_jump=False)[0]
-    return project_state(field, scene, raw)[0]
+        solver_state = solver.init(term, t0, t1, y, field_args)
+        y1 = solver.step(term, t0, t1, y, field_args, solver_state, made_jump=False)[0]
+    return project_state(field, field_args, y1)[0]
 
 
 def _explicit_step(
-    tableau: diffrax.ButcherTableau, rate, t0, t1, y: ODEState, scene: FieldArgs
+    tableau: diffrax.ButcherTableau, rate, t0, t1, y: ODEState, field_args: FieldArgs
 ) -> ODEState:
-    """An explicit Runge-Kutta step as a loop over its stages, without those that only estimate the
-    error."""
-    used = int(np.max(np.flatnonzero(tableau.b_sol))) + 1
-    A = np.zeros((used, used))
-    for i, row in enumerate(tableau.a_lower[: used - 1]):
+    """Take an explicit Runge-Kutta step as a scan over its stages.
+
+    Stages that serve the error estimate alone are skipped.
+
+    rate: vector field.
+    """
+    count = int(np.max(np.flatnonzero(tableau.b_sol))) + 1
+    A = np.zeros((count, count))
+    for i, row in enumerate(tableau.a_lower[: count - 1]):
         A[i + 1, : i + 1] = row
-    c, dtype = np.append(0.0, tableau.c)[:used], t1.dtype
+    c, dtype = np.append(0.0, tableau.c)[:count], t1.dtype
     add = lambda weights, rates: jax.tree.map(
         lambda y, k: y + (t1 - t0) * jnp.tensordot(weights, k, 1), y, rates
     )
 
     def stage(rates, x):
-        weights, part, here = x
-        k = rate(t0 + part * (t1 - t0), add(weights, rates), scene)
-        put = lambda ks, k: jnp.where(here.reshape(-1, *(1,) * k.ndim), k[None], ks)
-        return jax.tree.map(put, rates, k), None
+        weights, fraction, is_row = x
+        k = rate(t0 + fraction * (t1 - t0), add(weights, rates), field_args)
+        write = lambda ks, k: jnp.where(is_row.reshape(-1, *(1,) * k.ndim), k[None], ks)
+        return jax.tree.map(write, rates, k), None
 
-    none = jax.tree.map(lambda y: jnp.zeros((used, *y.shape), y.dtype), y)
-    stages = (jnp.asarray(A, dtype), jnp.asarray(c, dtype), np.eye(used, dtype=bool))
-    rates, _ = jax.lax.scan(stage, none, stages)
-    return add(jnp.asarray(tableau.b_sol[:used], dtype), rates)
+    zeros = jax.tree.map(lambda y: jnp.zeros((count, *y.shape), y.dtype), y)
+    stages = (jnp.asarray(A, dtype), jnp.asarray(c, dtype), np.eye(count, dtype=bool))
+    rates, _ = jax.lax.scan(stage, zeros, stages)
+    return add(jnp.asarray(tableau.b_sol[:count], dtype), rates)

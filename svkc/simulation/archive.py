@@ -124,7 +124,8 @@ def _check_complete(path, arrays: dict[str, Any], names: set[str]) -> None:
     missing = names - set(arrays)
     if missing:
         raise ValueError(
-            f"{path} lacks {', '.join(sorted(missing))}; it is not a trajectory file written by svkc"
+            f"{path} lacks {', '.join(sorted(missing))}; it is not a trajectory file written by"
+            " svkc"
         )
 
 

@@ -1,4 +1,5 @@
-"""The certificate of a run, computed after the run from its records."""
+"""The certificate of a run: loop gaps, energy, momentum and rank margins, computed from the records
+after the run."""
 
 import diffrax
 import equinox as eqx
@@ -24,11 +25,18 @@ from svkc.tree.kinematics import kinematics
 
 
 class StateCheck(eqx.Module):
-    """Quantities of the certificate at one state: the largest gaps of the loops (rad, m) and their
-    rates, and at the ends of phases energy (J), linear momentum (N s), angular momentum about the
-    centre of mass (N m s) and rank margin."""
+    """Quantities of the certificate at one state.
 
-    frame_gaps: Float[Array, "*states 2"]
+    gap, gap_rate: largest gaps of the loops (rad, m) and their rates (rad/s, m/s).
+    energy: mechanical energy (J).
+    linear, angular: linear momentum (N s), and angular momentum about the centre of mass (N m s).
+    margin: rank margin |R_mm| / |R_11|.
+
+    Energy, momenta and margin are computed at the two ends of phases only; elsewhere they are zero,
+    and the margin is one.
+    """
+
+    gap: Float[Array, "*states 2"]
     gap_rate: Float[Array, "*states 2"]
     energy: Float[Array, "*states"]
     linear: Float[Array, "*states 3"]
@@ -40,9 +48,10 @@ def certificate(
     chain: Chain, records: PhaseRecords, count: Int[Array, ""], saved: State, stages: int
 ) -> tuple[Phases, StateCheck, Int[Array, ""]]:
     """Return the phases of a run, the checks of its saved states, and the index of the first phase
-    whose loops lose rank at an end (past the last: none).
+    whose loops lose rank at one of its two ends (the number of rows if none does).
 
-    stages: evaluations of the vector field in one try of a step.
+    count: number of phases.
+    stages: evaluations of the vector field in one attempted step.
     """
     rows = records.start.shape[0]
     first, last, saved_checks = _check_states(chain, records, saved)
@@ -58,16 +67,16 @@ def _check_states(
     chain: Chain, records: PhaseRecords, saved: State
 ) -> tuple[StateCheck, StateCheck, StateCheck]:
     """Return the checks of the states at the starts of phases, at their ends, and of the saved
-    ones. One loop checks them all, so that kinematics and energy are compiled once."""
+    states. One loop checks all states, so that kinematics and energy are compiled once."""
     r, rows, join = records, records.start.shape[0], lambda *x: jnp.concatenate(x)
     states = State(
         join(r.q[:, 0], r.q[:, 1], saved.q),
         join(r.v[:, 0], r.v[:, 1], saved.v),
         jax.tree.map(join, r.structure, r.structure, saved.structure),
     )
-    at_end = np.arange(states.q.shape[0]) < 2 * rows
+    is_phase_end = np.arange(states.q.shape[0]) < 2 * rows
     checks = jax.lax.map(
-        jax.checkpoint(lambda x: _check_state(chain, *x)), (states, jnp.asarray(at_end))
+        jax.checkpoint(lambda x: _check_state(chain, *x)), (states, jnp.asarray(is_phase_end))
     )
     parts = slice(rows), slice(rows, 2 * rows), slice(2 * rows, None)
     return tuple(jax.tree.map(lambda x, part=part: x[part], checks) for part in parts)
@@ -77,19 +86,22 @@ def _phases(
     chain: Chain,
     records: PhaseRecords,
     count: Int[Array, ""],
-    both: tuple[StateCheck, StateCheck],
+    checks: tuple[StateCheck, StateCheck],
     stages: int,
 ) -> Phases:
-    """Return the phases of a run. both: the checks at their starts and at their ends."""
-    r, (first, last) = records, both
+    """Return the phases of a run.
+
+    checks: of the states at the starts and at the ends of the phases.
+    """
+    r, (first, last) = records, checks
     written = jnp.arange(r.start.shape[0], dtype=jnp.int32) < count
     fill = lambda value, none: jnp.where(
         written.reshape(-1, *(1,) * (jnp.ndim(value) - 1)), value, none
     )
     free, joint_freedoms = jax.vmap(
-        lambda s: (_free(chain, s), jnp.sum(active_dofs(chain, s), dtype=jnp.int32))
+        lambda s: (_is_free(chain, s), jnp.sum(active_dofs(chain, s), dtype=jnp.int32))
     )(r.structure)
-    # no derivative is promised of the certificate's worst values
+    # the certificate's largest values are not differentiable
     margin, gap, gap_rate, drift = stop_gradient_tree(
         (
             jnp.minimum(first.margin, last.margin),
@@ -121,13 +133,15 @@ def _phases(
     )
 
 
-def _check_state(chain: Chain, state: State, at_end: Bool[Array, ""]) -> StateCheck:
-    """Check one state. at_end: whether it is at an end of a phase; elsewhere energy, momenta and
-    margin are left out."""
-    kin, dtype, looped = kinematics(chain, state.q), state.q.dtype, bool(chain.link_names)
+def _check_state(chain: Chain, state: State, is_phase_end: Bool[Array, ""]) -> StateCheck:
+    """Return the check of one state.
+
+    is_phase_end: whether to compute energy, momenta and margin.
+    """
+    kin, dtype, has_links = kinematics(chain, state.q), state.q.dtype, bool(chain.link_names)
     gaps = rates = jnp.zeros(2, dtype)
     J = jnp.zeros((0, chain.dofs), dtype)
-    if looped:
+    if has_links:
         end = loop_frames(chain, state.structure, kin, state.q)
         J = assemble_loop_jacobian(chain, state.structure, kin, end)
         gaps, rates = (
@@ -135,7 +149,7 @@ def _check_state(chain: Chain, state: State, at_end: Bool[Array, ""]) -> StateCh
             largest_norms((J @ state.v).reshape(-1, 6)),
         )
 
-    def whole():
+    def at_phase_end():
         energy, *momenta = energy_and_momentum(chain, state, kin)
         row, column = jacobian_scales(chain)
         margin = (
@@ -144,21 +158,21 @@ def _check_state(chain: Chain, state: State, at_end: Bool[Array, ""]) -> StateCh
                     stop_gradient_tree(row[:, None] * J * column[None]), state.structure.rank
                 )
             )
-            if looped
+            if has_links
             else jnp.ones((), dtype)
         )
         return energy, *stop_gradient_tree(tuple(momenta)), margin
 
     none = jnp.zeros((), dtype), jnp.zeros(3, dtype), jnp.zeros(3, dtype), jnp.ones((), dtype)
-    energy, linear, angular, margin = jax.lax.cond(at_end, whole, lambda: none)
+    energy, linear, angular, margin = jax.lax.cond(is_phase_end, at_phase_end, lambda: none)
     return StateCheck(
         gap=gaps, gap_rate=rates, energy=energy, linear=linear, angular=angular, margin=margin
     )
 
 
-def _free(chain: Chain, s: Structure) -> Bool[Array, ""]:
-    """Whether nothing holds the bodies to the ground: every tree hangs on it by a free joint, and
-    no loop does."""
+def _is_free(chain: Chain, s: Structure) -> Bool[Array, ""]:
+    """Return whether the bodies are free of the ground: every tree has a free joint at its root, and
+    no connected virtual link joins the ground."""
     top = chain.topology
     roots = [i for i in range(1, len(top.parent)) if top.parent[i] == 0]
     if not roots or any(top.kind[i] != FREE for i in roots):
@@ -169,17 +183,19 @@ def _free(chain: Chain, s: Structure) -> Bool[Array, ""]:
 def _momentum_drift(
     chain: Chain, first: StateCheck, last: StateCheck, span: Float[Array, " phases"]
 ) -> Float[Array, "phases 2"]:
-    """Change of linear momentum (N s) that gravity does not explain, and of the angular momentum
-    about the centre of mass (N m s)."""
-    fallen = jnp.sum(chain.mass) * chain.gravity[None] * span[:, None]
-    size = lambda x: jnp.linalg.norm(x, axis=-1)
-    return jnp.stack(
-        [size(last.linear - first.linear - fallen), size(last.angular - first.angular)], 1
-    )
+    """Return the norms of the change of linear momentum less the impulse of gravity (N s) and of
+    the change of angular momentum about the centre of mass (N m s).
+
+    span: durations of the phases (s).
+    """
+    gravity_impulse = jnp.sum(chain.mass) * chain.gravity[None] * span[:, None]
+    norm = lambda x: jnp.linalg.norm(x, axis=-1)
+    linear = norm(last.linear - first.linear - gravity_impulse)
+    return jnp.stack([linear, norm(last.angular - first.angular)], 1)
 
 
 def evaluations_per_step(solver: diffrax.AbstractSolver) -> int:
-    """Evaluations of the vector field in one try of a step; Newton iterations of implicit stages
-    are not counted."""
+    """Return the number of evaluations of the vector field in one attempted step. Newton iterations
+    of implicit stages are not counted."""
     tableau = getattr(solver, "tableau", None)
     return len(np.asarray(tableau.b_sol)) if isinstance(tableau, diffrax.ButcherTableau) else 1

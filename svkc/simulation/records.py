@@ -1,4 +1,5 @@
-"""Outcomes of a run, and the records that it writes: one row for each phase and for each event."""
+"""The outcomes of a run, and the records that a run writes: one row for each phase and one for each
+event."""
 
 import equinox as eqx
 import jax
@@ -10,10 +11,14 @@ from svkc.model.chain import State, Structure
 
 
 class PhaseRecords(eqx.Module):
-    """One row for each phase: its times, the motion at its two ends, its structure, and the counts
-    of its steps.
+    """Records of the phases of a run, one row for each phase.
 
-    Unwritten rows hold the initial state, so that what is computed from them is finite.
+    start, stop: times of the phase (s).
+    q, v: at the start and at the end of the phase.
+    work: done by control, joint limits and dampers (J).
+    accepted, rejected: numbers of steps.
+
+    Unwritten rows hold the initial state, so that values computed from them are finite.
     """
 
     start: Float[Array, "*phases"]
@@ -28,11 +33,15 @@ class PhaseRecords(eqx.Module):
 
 
 class Events(eqx.Module):
-    """What happened, in the order of time; rows past `count` are unused (time inf, which -1).
+    """The events of a run in the order of time, one row for each event.
 
-    `which`: the event's place in the list given; `impulse` (N s), `angular_impulse` (N m s): on
-    each real link from its parent, at the joint, in world axes, for the links this event connected;
-    `energy_lost` (J): of events at one instant, in the first one's row.
+    time: of the event (s).
+    which: index of the event in the list that `simulate` was given.
+    impulse, angular_impulse: of each virtual link that the event connected on its real link from
+        the parent, at the joint, in world axes (N s, N m s).
+    energy_lost: kinetic energy lost in the impact (J). Events at one instant make one impact, whose
+        loss is in the row of the first of them.
+    count: number of events. Rows past `count` are empty: their time is inf, their index -1.
     """
 
     time: Float[Array, " events"]
@@ -44,7 +53,7 @@ class Events(eqx.Module):
 
 
 def empty_events(rows: int, links: int, dtype) -> Events:
-    """Return empty rows for events. Their times are inf, their indices -1."""
+    """Return records of events with empty rows: times inf, indices -1."""
     impulse = jnp.zeros((rows, links, 3), dtype)
     return Events(
         time=jnp.full(rows, jnp.inf, dtype),
@@ -57,7 +66,7 @@ def empty_events(rows: int, links: int, dtype) -> Events:
 
 
 def empty_phase_records(rows: int, state: State) -> PhaseRecords:
-    """Return the records before the first phase."""
+    """Return records of phases with empty rows: times inf, the initial state."""
     dtype = state.q.dtype
     repeat = lambda tree, *axes: jax.tree.map(
         lambda x: jnp.broadcast_to(x, (*axes, *jnp.shape(x))), tree
@@ -83,12 +92,15 @@ def write_phase_row(
     work,
     path: PhaseSolution,
 ) -> PhaseRecords:
-    """Return the records with the row of one phase written. row: one-hot, or all False for no
-    phase; began, ended: time and state."""
-    (start, first), (stop, last) = began, ended
+    """Return the records with the row of one phase written.
+
+    row: one-hot mask of the row; all False writes nothing.
+    start, end: time and state at the two ends of the phase.
+    """
+    (t_start, first), (t_stop, last) = start, end
     new = PhaseRecords(
-        start=start,
-        stop=stop,
+        start=t_start,
+        stop=t_stop,
         q=jnp.stack([first.q, last.q]),
         v=jnp.stack([first.v, last.v]),
         structure=first.structure,
@@ -104,12 +116,12 @@ def write_phase_row(
 
 
 class RESULTS(eqx.Enumeration):
-    """How a run ended, lane by lane."""
+    """How a run ended, for each element of a batch, and why a run has no derivative."""
 
     successful = ""
     stopped = "An event asked the run to stop."
     max_events = (
-        "More events than max_events: the state is that of the last event handled. Raise"
+        "More events than max_events: the final state is that after the last recorded event. Raise"
         " max_events, or look for chattering."
     )
     max_steps = "More steps than max_steps in one phase. Raise max_steps, or loosen rtol and atol."
@@ -118,47 +130,57 @@ class RESULTS(eqx.Enumeration):
         " solver and tolerance."
     )
     not_in_place = (
-        "A link was to be connected at its declared placement, but its bodies were elsewhere. Use"
-        " here, or a guard that waits."
+        "An event connects a link at its declared placement, but the bodies were elsewhere. Use"
+        " here=True, or a guard that waits until they are there."
     )
     loop_open = (
-        "A loop is open by more than the tolerance. Use smaller steps, or projection; look at"
+        "A loop is open by more than the tolerance. Use smaller steps, or projection; check the"
         " mobility and its margin there."
     )
-    non_finite = "A number that is not finite appeared."
+    non_finite = "A non-finite number appeared."
     grazing = (
-        "A guard touched zero rather than crossed it: the time of its event has no derivative, and"
-        " those given are not numbers."
+        "A guard touched zero without crossing it: the time of its event has no derivative;"
+        " derivatives are NaN."
     )
-    jump = "A guard jumped over zero: the time of its event counts as fixed in derivatives."
+    jump = "A guard jumped over zero: derivatives treat the time of its event as constant."
     together = (
-        "Events happened at one instant: derivatives are those of this order, and none where their"
-        " times can change apart."
+        "Events happened at one instant: derivatives hold for this order of events, and do not"
+        " exist if their times can separate."
     )
     rank_lost = (
-        "The loops lose rank at an end of a phase: derivatives across it are not to be relied on."
+        "The loops lose rank at an end of a phase: derivatives across that end are unreliable."
     )
     no_slot = (
-        "A grip was to be made and every spare slot was taken: it was not made, everything else"
-        " was. Load with more spare slots, or unbind."
+        "An event makes a grip, but every spare slot was bound: the grip was skipped, all other"
+        " changes were made. Load with more spare slots, or unbind."
     )
 
 
 class Phases(eqx.Module):
-    """The stretches between changes of structure; rows past `count` are unused.
+    """The phases of a run: the intervals of time between changes of structure, one row each.
 
-    `energy`: mechanical energy (J) at start and end; `work`: done in between by control, limits and
-    dampers (J); `margin`: the least |R_mm| / |R_11| of the phase (of its two ends where steps are
-    not projected), how far the weakest row that counts is from being redundant; `swaps`: how often
-    the choice of dependent coordinates changed from step to step (-1: not looked at); `loop`: the
-    one that could not be closed (-1: none);
-    `evaluations`: of the vector field, in steps alone; `error`: the estimated errors of the steps
-    added up (root mean square over q and v; inf: the solver estimates none); `gap`: the largest of
-    the loops' gaps (rad, m) at the ends of steps (of the phase, with a diffrax adjoint);
-    `gap_rate`: of their rates (rad/s, m/s) at the phase's two ends, before the event that ends it;
-    `free`: nothing holds the bodies to the ground; `momentum_drift`:
-    then, the change of linear momentum (N s) that gravity does not explain and that of the angular
-    momentum about the centre of mass (N m s).
+    start, stop: times of the phase (s).
+    connected: which virtual links are connected.
+    rank: rank m of the loop Jacobian.
+    joint_freedoms: number N_J of joint freedoms, those of connected virtual links included.
+    energy: mechanical energy at the start and at the end (J).
+    work: done by control, joint limits and dampers (J).
+    margin: least |R_mm| / |R_11|, which measures how far the loops are from losing rank. With
+        projected steps over all steps, otherwise over the two ends of the phase.
+    accepted, rejected: numbers of steps.
+    evaluations: of the vector field in steps, event location not included.
+    swaps: how often the choice of dependent coordinates changed between steps (-1: not recorded).
+    loop: index of the loop that could not be closed (-1: none).
+    error: sum of the estimated errors of the steps, root mean square over q and v (inf: the solver
+        has no error estimate).
+    gap: largest loop gaps at the ends of steps (rad, m); with a diffrax adjoint at the two ends of
+        the phase.
+    gap_rate: largest rates of the loop gaps at the two ends of the phase, before the event (rad/s,
+        m/s).
+    free: whether the bodies are free of the ground.
+    momentum_drift: of a free phase, change of linear momentum that gravity does not explain (N s),
+        and change of angular momentum about the centre of mass (N m s).
+    count: number of phases. Rows past `count` are empty.
     """
 
     start: Float[Array, " phases"]
@@ -183,10 +205,10 @@ class Phases(eqx.Module):
 
     @property
     def freedoms(self) -> Int[Array, "... phases"]:
-        """Mobility N_F = N_J - m (13)."""
+        """Mobility N_F = N_J - m (paper, (13))."""
         return self.joint_freedoms - self.rank
 
     @property
     def energy_drift(self) -> Float[Array, "... phases"]:
-        """Energy gained that no work explains (J)."""
+        """Change of energy that the work does not explain (J)."""
         return self.energy[..., 1] - self.energy[..., 0] - self.work

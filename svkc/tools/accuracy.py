@@ -66,8 +66,8 @@ class Tuning:
 
     def __str__(self) -> str:
         lines = [
-            f"target {self.target:.1e}               seconds of computing    error  loop gap  energy drift "
-            " steps"
+            f"target {self.target:.1e}               seconds of computing    error  loop gap"
+            "  energy drift  steps"
         ]
         for c in self.table:
             mark = "*" if c.options is self.best else ("+" if c.error <= self.target else " ")
