@@ -228,7 +228,7 @@ CASES = {
     ),
     "devices: expected": lambda s: s.rollout(devices=[]),
     "dt: got": lambda s: s.simulate(dt=1e-12),
-    "dt asks": lambda s: s.simulate(dt=0.1, rtol=1e-3),
+    "dt sets": lambda s: s.simulate(dt=0.1, rtol=1e-3),
     "dynamics.hold": lambda s: s.simulate(dynamics=svkc.dynamics.CompositeBodies(hold=2.0)),
     "dynamics.inertia": lambda s: s.simulate(dynamics=Dynamics(inertia=lambda *_: None)),
     "dynamics: expected": lambda s: s.simulate(dynamics=3),
@@ -267,7 +267,7 @@ CASES = {
     ),
     "source: the model has no joints": lambda s: svkc.load("<mujoco/>"),
     "source: the model has numbers": lambda s: svkc.load(endless()),
-    "...: expected a diffrax one": lambda s: s.simulate(stepsize_controller=3),
+    "...: expected a diffrax object": lambda s: s.simulate(stepsize_controller=3),
     "source: the model cannot": lambda s: s.load("<mujoco><nonsense/></mujoco>"),
     "stabilization": lambda s: s.simulate(stabilization=3),
     "state....: got": lambda s: s.simulate(

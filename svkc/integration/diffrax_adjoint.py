@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from svkc.integration.event_location import EventInfo
 from svkc.integration.ode import ODEState
-from svkc.integration.replay import with_scan_kind
+from svkc.integration.runge_kutta import with_scan_kind
 from svkc.integration.solution import (
     EVENT,
     NON_FINITE,

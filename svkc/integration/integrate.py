@@ -10,7 +10,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from svkc._jax.control_flow import buffer_at_set, while_loop
 from svkc._jax.pytrees import tree_where
@@ -32,8 +32,8 @@ from svkc.integration.solution import (
     update_stats,
 )
 from svkc.integration.stabilization import needs_projection
-from svkc.integration.step_size import MAX_STRETCH
-from svkc.integration.vector_field import ProjectionInfo, project_state
+from svkc.integration.step_size import clip_to_save_time, unclipped_step_size
+from svkc.integration.vector_field import initial_projection_info, project_state
 
 
 def integrate_phase(
@@ -102,7 +102,7 @@ def _init_stepper(
         error_order=options.solver.error_order(term),
     )
     rows = lambda n: jax.tree.map(lambda x: jnp.broadcast_to(x[None], (n, *x.shape)), start)
-    info = ProjectionInfo.initial(field, field_args, start.q)
+    info = initial_projection_info(field, field_args, start.q)
     guard_values, search = None, None
     if options.armed_guards is not None:
         guard_values = options.armed_guards.initial_values
@@ -110,7 +110,7 @@ def _init_stepper(
     return StepperState(
         t=t0,
         y=start,
-        tnext=_clip_to_save_time(t0, t1, times),
+        tnext=clip_to_save_time(t0, t1, times),
         step_size=t1 - t0,
         made_jump=jnp.zeros((), bool),
         solver_state=options.solver.init(term, t0, t1, start, field_args),
@@ -127,14 +127,6 @@ def _init_stepper(
         stats=Stats.zeros(t0.dtype, info is not None and info.pivots is not None),
         projection_info=info,
     )
-
-
-def _clip_to_save_time(t, proposed, times) -> Float[Array, ""]:
-    """Return the end of a step from t: the proposed one, clipped to the next save time or stop."""
-    _, stop, save_ts = times
-    next_save_t = jnp.min(jnp.where(save_ts > t, save_ts, jnp.inf), initial=jnp.inf)
-    limit = jnp.minimum(stop, next_save_t)
-    return jnp.where(t + (proposed - t) * (1 + MAX_STRETCH) >= limit, limit, proposed)
 
 
 def _attempt_step(
@@ -182,7 +174,9 @@ def _attempt_step(
         t=t,
         y=y,
         keep_step=keep_step & ok,
-        step_size=_unclipped_step_size(s, controller, keep_step, t1 - s.t, proposed - t),
+        step_size=unclipped_step_size(
+            controller, keep_step, t1 - s.t, proposed=proposed - t, before=s.step_size
+        ),
         made_jump=jnp.asarray(made_jump),
         solver_state=solver_state,
         controller_state=controller_state,
@@ -190,18 +184,6 @@ def _attempt_step(
         error_norm=jnp.asarray(jnp.inf, t.dtype) if error is None else rms_norm(error),
         projection_info=info,
     )
-
-
-def _unclipped_step_size(s: StepperState, controller, keep_step, taken, proposed):
-    """Return the size of the next step, as if the last one had not been clipped to a save time.
-
-    A PID controller bounds the growth from the step `taken`. Where `proposed` reaches that bound,
-    the size proposed before the clipping is restored.
-    """
-    if not isinstance(controller, diffrax.PIDController):
-        return proposed
-    at_bound = keep_step & (proposed >= 0.99 * controller.factormax * taken)
-    return jnp.where(at_bound, jnp.maximum(proposed, s.step_size), proposed)
 
 
 def _locate_event(
@@ -266,24 +248,24 @@ def _body_fun(
         t1 = jnp.where(s.search.active, s.search.next_time(), s.tnext)
         attempt = _attempt_step(s, t1, problem, options)
         attempt, guard_values, search, locating = _locate_event(s, attempt, t1, problem, options)
-    moves = lambda new, old: tree_where(attempt.keep_step, new, old)
-    stands_still = lambda new, old: tree_where(locating, old, new)
-    t, accepted = moves(attempt.t, s.t), s.accepted + attempt.keep_step.astype(jnp.int32)
+    if_advancing = lambda new, old: tree_where(attempt.keep_step, new, old)
+    unless_locating = lambda new, old: tree_where(locating, old, new)
+    t, accepted = if_advancing(attempt.t, s.t), s.accepted + attempt.keep_step.astype(jnp.int32)
     ys, checkpoints = _write_states(s, attempt, t, save_ts, accepted, options.checkpoint_interval)
-    result = stands_still(attempt.result, s.result)
+    result = unless_locating(attempt.result, s.result)
     progress = (t - t0) / jnp.where(stop > t0, stop - t0, 1)
     return StepperState(
         # These move when the loop advances.
         t=t,
-        y=moves(attempt.y, s.y),
-        made_jump=moves(attempt.made_jump, s.made_jump),
-        solver_state=moves(attempt.solver_state, s.solver_state),
-        guard_values=None if guard_values is None else moves(guard_values, s.guard_values),
-        projection_info=moves(attempt.projection_info, info),
+        y=if_advancing(attempt.y, s.y),
+        made_jump=if_advancing(attempt.made_jump, s.made_jump),
+        solver_state=if_advancing(attempt.solver_state, s.solver_state),
+        guard_values=None if guard_values is None else if_advancing(guard_values, s.guard_values),
+        projection_info=if_advancing(attempt.projection_info, info),
         # These stand still while a root is located.
-        tnext=stands_still(_clip_to_save_time(t, t + attempt.step_size, times), s.tnext),
-        step_size=stands_still(attempt.step_size, s.step_size),
-        controller_state=stands_still(attempt.controller_state, s.controller_state),
+        tnext=unless_locating(clip_to_save_time(t, t + attempt.step_size, times), s.tnext),
+        step_size=unless_locating(attempt.step_size, s.step_size),
+        controller_state=unless_locating(attempt.controller_state, s.controller_state),
         result=result,
         # These are updated by every attempt.
         progress_meter_state=options.progress_meter.step(s.progress_meter_state, progress),

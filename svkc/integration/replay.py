@@ -7,21 +7,18 @@ cotangent. The stepping loop stores the times of the steps and a checkpoint of t
 there gives the derivative.
 """
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float
 
 from svkc._jax.control_flow import unvmap_any
 from svkc._jax.primitive import custom_primitive
 from svkc._jax.pytrees import materialise_zeros, stop_gradient_tree, tree_where
 from svkc.integration.event_adjoint import end_of_phase_tangent, transport_tangent
 from svkc.integration.integrate import integrate_phase
-from svkc.integration.ode import FieldArgs, ODEState
+from svkc.integration.ode import ODEState
+from svkc.integration.runge_kutta import replay_step
 from svkc.integration.solution import SUCCESSFUL, PhaseProblem, PhaseSolution, StepperOptions
-from svkc.integration.vector_field import VectorField, project_state
 from svkc.model.validation import integer
 
 # Blocks of steps are skipped in groups of this size past the end of a run.
@@ -271,64 +268,3 @@ def _broadcast_mask(mask, like):
 integrate_with_replay = custom_primitive(
     "integrate_with_replay", _integrate, _integrate_with_replay_jvp
 )
-
-
-def with_scan_kind(solver: diffrax.AbstractSolver, kind: str | None) -> diffrax.AbstractSolver:
-    """Return a Runge-Kutta solver whose loop over stages is of this kind; others as they are.
-
-    kind: "lax" for forward mode, "bounded" for both modes, None for diffrax's own choice.
-    """
-    if not isinstance(solver, diffrax.AbstractRungeKutta):
-        return solver
-    return eqx.tree_at(lambda s: s.scan_kind, solver, kind, is_leaf=lambda x: x is None)
-
-
-def replay_step(
-    solver: diffrax.AbstractSolver, field: VectorField, t0, t1, y: ODEState, field_args: FieldArgs
-) -> ODEState:
-    """Take one projected step that depends on no earlier step, to be differentiated.
-
-    Reverse mode stores the arguments of each evaluation of the field and of each iteration of the
-    projection, and recomputes everything else.
-    """
-    rate = eqx.filter_checkpoint(field)
-    if isinstance(solver, diffrax.AbstractERK) and isinstance(
-        solver.tableau, diffrax.ButcherTableau
-    ):
-        y1 = _explicit_step(solver.tableau, rate, t0, t1, y, field_args)
-    else:
-        solver = with_scan_kind(solver, "bounded")
-        term = diffrax.ODETerm(rate)
-        solver_state = solver.init(term, t0, t1, y, field_args)
-        y1 = solver.step(term, t0, t1, y, field_args, solver_state, made_jump=False)[0]
-    return project_state(field, field_args, y1)[0]
-
-
-def _explicit_step(
-    tableau: diffrax.ButcherTableau, rate, t0, t1, y: ODEState, field_args: FieldArgs
-) -> ODEState:
-    """Take an explicit Runge-Kutta step as a scan over its stages.
-
-    Stages that serve the error estimate alone are skipped.
-
-    rate: vector field.
-    """
-    count = int(np.max(np.flatnonzero(tableau.b_sol))) + 1
-    A = np.zeros((count, count))
-    for i, row in enumerate(tableau.a_lower[: count - 1]):
-        A[i + 1, : i + 1] = row
-    c, dtype = np.append(0.0, tableau.c)[:count], t1.dtype
-    add = lambda weights, rates: jax.tree.map(
-        lambda y, k: y + (t1 - t0) * jnp.tensordot(weights, k, 1), y, rates
-    )
-
-    def stage(rates, x):
-        weights, fraction, is_row = x
-        k = rate(t0 + fraction * (t1 - t0), add(weights, rates), field_args)
-        write = lambda ks, k: jnp.where(is_row.reshape(-1, *(1,) * k.ndim), k[None], ks)
-        return jax.tree.map(write, rates, k), None
-
-    zeros = jax.tree.map(lambda y: jnp.zeros((count, *y.shape), y.dtype), y)
-    stages = (jnp.asarray(A, dtype), jnp.asarray(c, dtype), np.eye(count, dtype=bool))
-    rates, _ = jax.lax.scan(stage, zeros, stages)
-    return add(jnp.asarray(tableau.b_sol[:count], dtype), rates)

@@ -9,8 +9,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from svkc.integration.event_location import ArmedGuards, EventInfo, EventSearch
 from svkc.integration.ode import FieldArgs, ODEState
-from svkc.integration.vector_field import ProjectionInfo, VectorField
+from svkc.integration.vector_field import VectorField
 from svkc.loops.constraint import largest_gaps
+from svkc.loops.projection import ProjectionInfo
 from svkc.model.chain import State
 
 # result codes of a phase: these of svkc, and diffrax's own

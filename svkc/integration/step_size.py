@@ -1,4 +1,4 @@
-"""Fixed steps that end at every save time, as a step-size controller of diffrax."""
+"""Step sizes: fixed steps as a controller of diffrax, and steps clipped at save times."""
 
 import diffrax
 import jax.numpy as jnp
@@ -41,3 +41,27 @@ class FixedSteps(diffrax.AbstractStepSizeController):
         )
         next_t0 = jnp.where(keep_step, t1, t0)
         return keep_step, next_t0, self._tnext(t1), False, controller_state, result
+
+
+def clip_to_save_time(t, proposed, times) -> Float[Array, ""]:
+    """Return the end of a step from t: the proposed one, clipped to the next save time or stop."""
+    _, stop, save_ts = times
+    next_save_t = jnp.min(jnp.where(save_ts > t, save_ts, jnp.inf), initial=jnp.inf)
+    limit = jnp.minimum(stop, next_save_t)
+    return jnp.where(t + (proposed - t) * (1 + MAX_STRETCH) >= limit, limit, proposed)
+
+
+def unclipped_step_size(controller, keep_step, taken, *, proposed, before):
+    """Return the size of the next step, as if the last one had not been clipped at a save time.
+
+    A PID controller bounds the growth from the step taken. Where the proposed size reaches that
+    bound, the size from before the clipping is restored.
+
+    keep_step: whether the controller keeps the step.
+    taken, proposed, before: sizes of the clipped step, of the next step by the controller, and of
+        the step before it was clipped.
+    """
+    if not isinstance(controller, diffrax.PIDController):
+        return proposed
+    at_bound = keep_step & (proposed >= 0.99 * controller.factormax * taken)
+    return jnp.where(at_bound, jnp.maximum(proposed, before), proposed)

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from svkc.integration.ode import FieldArgs, ODEState
 from svkc.integration.stabilization import (
@@ -19,7 +19,7 @@ from svkc.loops.forward_dynamics import (
     velocity_and_acceleration,
     velocity_and_acceleration_lanes_last,
 )
-from svkc.loops.projection import project, project_by_loop_forces
+from svkc.loops.projection import ProjectionInfo, project, project_by_loop_forces
 from svkc.model.chain import Chain, State, active_dofs
 from svkc.model.checked_jit import joint_torques
 from svkc.model.validation import real_array
@@ -117,34 +117,12 @@ class VectorField(eqx.Module):
         return tau, tau @ v if chain.damping is None else tau @ v - jnp.sum(chain.damping * v * v)
 
 
-class ProjectionInfo(eqx.Module):
-    """What a projection onto the loops has measured.
-
-    gap: what each loop is still open by after the last Newton step (rad, units of `chain.length`).
-    margin: |R_mm| / |R_11| of the pivoted loop Jacobian. None: no pivots were selected.
-    pivots: the pivots to reuse in the next step. None: no pivots were selected.
-    """
-
-    gap: Float[Array, "links 2"]
-    margin: Float[Array, ""] | None = None
-    pivots: Float[Array, "steps dofs"] | None = None
-
-    @classmethod
-    def initial(cls, field: VectorField, field_args: FieldArgs, q) -> "ProjectionInfo | None":
-        """Return the value before the first step. None: steps are not projected."""
-        if not needs_projection(field.stabilization, field_args):
-            return None
-        links, dofs = len(field_args.chain.link_names), field_args.chain.dofs
-        gap = jnp.zeros((links, 2), q.dtype)
-        if field.projects_by_loop_forces:
-            return cls(gap)
-        # Zero pivots lack every row, so the first evaluation of the field selects pivots.
-        return cls(gap, jnp.ones((), q.dtype), jnp.zeros((min(6 * links, dofs), dofs), q.dtype))
-
-    @property
-    def dependent(self) -> Bool[Array, " dofs"]:
-        """Mask of the dependent coordinates, those with a pivot."""
-        return jnp.any(self.pivots > 0, 0)
+def initial_projection_info(field: VectorField, field_args: FieldArgs, q) -> ProjectionInfo | None:
+    """Return the projection's result before the first step. None: steps are not projected."""
+    if not needs_projection(field.stabilization, field_args):
+        return None
+    with_pivots = not field.projects_by_loop_forces
+    return ProjectionInfo.initial(field_args.chain, q.dtype, with_pivots=with_pivots)
 
 
 def project_state(
@@ -159,7 +137,7 @@ def project_state(
     if not needs_projection(stabilization, field_args):
         return eqx.tree_at(lambda y: y.q, y, normalize(chain, y.q)), None
     if field.projects_by_loop_forces:
-        q, v, *info = project_by_loop_forces(
+        q, v, info = project_by_loop_forces(
             chain,
             structure,
             y.q,
@@ -168,7 +146,7 @@ def project_state(
             differentiated=field.differentiated,
         )
     else:
-        q, v, *info = project(
+        q, v, info = project(
             chain,
             structure,
             y.q,
@@ -178,4 +156,4 @@ def project_state(
             pivots=field_args.pivots,
             hold=field.dynamics.hold or 0.0,
         )
-    return eqx.tree_at(lambda y: (y.q, y.v), y, (q, v)), ProjectionInfo(*info)
+    return eqx.tree_at(lambda y: (y.q, y.v), y, (q, v)), info

@@ -33,13 +33,14 @@ def reduced_mass_matrix(
 class AbstractDynamics(eqx.Module):
     """A method to compute accelerations. All methods give the same ones, at different cost.
 
-    uses_pivots: whether dependent coordinates are qr. Where they are not, `svkc.stabilization.Projection()`
-    puts steps back onto the loops without pivots too.
-    hold: dependent coordinates are qr at every evaluation (None), or held until, at the end of
-    a step, the least |R_kk| / |R_11| of their columns is below this part of what a new choice has
-    (default 0.3); 0 holds them until the structure changes. Held only where steps are projected by
-    pivots; near a singular configuration, and in what is differentiated, they are qr at every
-    evaluation, as the motion does not depend on the choice.
+    uses_pivots: whether the method chooses dependent coordinates. If not,
+    `svkc.stabilization.Projection` works without pivots too.
+    hold: how long pivots are kept. None: choose new ones at every evaluation. A number from 0 to 1
+    (default 0.3): keep them until, at the end of a step, their |R_mm| / |R_11| is below this
+    fraction of that of new pivots; 0 keeps them until the structure changes. Near a singular
+    configuration, under differentiation, and with stabilizations that do not project by pivots,
+    new ones are chosen at every evaluation. The motion does not depend on the choice.
+    Raises ValueError if hold is neither None nor a number from 0 to 1.
     """
 
     uses_pivots: eqx.AbstractClassVar[bool]
@@ -151,7 +152,7 @@ def default_dynamics(chain: Chain) -> AbstractDynamics:
 
 
 def articulated_bodies(chain: Chain, kin: Kinematics):
-    """Names articulated bodies in the older spelling, `svkc.dynamics.ArticulatedBodies()`."""
+    """Stand for `ArticulatedBodies` in `svkc.Dynamics(inertia=svkc.by_bodies)`."""
     return articulated_inertias(chain, kin)
 
 
@@ -228,8 +229,7 @@ def _implicit_solve(
         return jnp.where(active, force, x), J @ x + jnp.where(active_rows, 0, mu)
 
     def solve(force: Float[Array, " dofs"], bias: Float[Array, " rows"]) -> Float[Array, " dofs"]:
-        force, bias = _link_tangents(force, bias)
-        right_sides = jnp.where(active, force, 0), -select_rows(bias)
+        right_sides = _link_tangents(jnp.where(active, force, 0), -select_rows(bias))
         return jax.lax.custom_linear_solve(
             equations, right_sides, solve=lambda _, sides: factor_solve(*sides), symmetric=True
         )[0]

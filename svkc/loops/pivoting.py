@@ -237,8 +237,8 @@ def pivot_blocks(
     return Jm, Jm @ qr.P.T + jnp.diag(jnp.where(qr.active, 0, 1).astype(J.dtype))
 
 
-# Fraction of the phase's margin below which a configuration counts as near a singular one. Elsewhere
-# the motion does not depend on the choice of pivots.
+# Fraction of the phase's margin below which a configuration counts as near a singular one.
+# Elsewhere the motion does not depend on the choice of pivots.
 NEAR_SINGULAR = 0.1
 
 

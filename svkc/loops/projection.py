@@ -2,6 +2,7 @@
 
 import functools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -76,6 +77,35 @@ def _drop_unsolvable(structure: Structure, qr: PivotedQR) -> PivotedQR:
     )
 
 
+class ProjectionInfo(eqx.Module):
+    """What a projection onto the loops has measured.
+
+    gap: what each loop is still open by after the last Newton step (rad, units of `chain.length`).
+    margin: |R_mm| / |R_11| of the pivoted QR of J_C. None: no pivots were chosen.
+    pivots: the pivots to use in the next step. None: no pivots were chosen.
+    """
+
+    gap: Float[Array, "links 2"]
+    margin: Float[Array, ""] | None = None
+    pivots: Float[Array, "steps dofs"] | None = None
+
+    @classmethod
+    def initial(cls, chain: Chain, dtype, *, with_pivots: bool) -> "ProjectionInfo":
+        """Return the value before the first projection."""
+        links, dofs = len(chain.link_names), chain.dofs
+        gap = jnp.zeros((links, 2), dtype)
+        if not with_pivots:
+            return cls(gap)
+        # zero pivots are fewer than the rank, so that new ones are chosen
+        pivots = jnp.zeros((min(6 * links, dofs), dofs), dtype)
+        return cls(gap=gap, margin=jnp.ones((), dtype), pivots=pivots)
+
+    @property
+    def dependent(self) -> Bool[Array, " dofs"]:
+        """Mask of the dependent coordinates, those with a pivot."""
+        return jnp.any(self.pivots > 0, 0)
+
+
 @functools.partial(jax.jit, static_argnames=("iterations", "dependent_only", "hold"))
 def project(
     chain: Chain,
@@ -87,107 +117,100 @@ def project(
     dependent_only: bool = False,
     pivots=None,
     hold: float = 0.0,
-) -> tuple[
-    Float[Array, " q"],
-    Float[Array, " dofs"],
-    Float[Array, "links 2"],
-    Float[Array, ""],
-    Float[Array, "steps dofs"],
-]:
-    """Close the loops by Newton's method, then project the velocity. The last turn of one loop is
-    the velocity's, so that the body is compiled once. dependent: only dependent coordinates move;
-    otherwise the change is the least in the metric of the inertia.
+) -> tuple[Float[Array, " q"], Float[Array, " dofs"], ProjectionInfo]:
+    """Take `iterations` Newton steps on q to close the loops, then project v once.
 
-    And what the loops show: the gaps (rad, `chain.length`s) that each loop is left with, |R_mm| /
-    |R_11|, and the pivots to go on with. pivots: those held so far (None: none are), which go on
-    until their |R_mm| / |R_11| is below `hold` times that of new ones.
+    Both are turns of one loop, so that its body is compiled once.
+
+    dependent_only: whether only dependent coordinates change; otherwise the change is the least in
+    the metric of the mass matrix.
+    pivots: pivots in use so far (None: none). They are replaced if their |R_mm| / |R_11| is below
+    `hold` times that of new ones.
     """
 
     @functools.partial(jax.checkpoint, prevent_cse=False)
-    def turn(i, both):
-        q, v = both[:2]
-        last = i == iterations
+    def newton_step(i, carry):
+        q, v, _ = carry
+        velocity_turn = i == iterations
         loops = loop_kinematics(chain, structure, q)
-        full = pivoted_qr(loops.J, structure.rank, structure.independent)
-        held = (
-            full.P
+        new = pivoted_qr(loops.J, structure.rank, structure.independent)
+        kept = (
+            new.P
             if pivots is None
-            else _pivots_to_keep(structure, loops.J, full, pivots, hold, last)
+            else _pivots_to_keep(structure, loops.J, new, pivots, hold, velocity_turn)
         )
-        step, open_ = _step_by_pivots(chain, structure, loops, v, full, dependent_only)
-        seen = jax.lax.stop_gradient((gap_norms(open_), pivot_ratio(full), held))
-        q = integrate(chain, q, jnp.where(last, 0, step[:, 0]))
-        return q, jnp.where(last, v + step[:, 1], v), *seen
+        step, gap = _step_by_pivots(chain, structure, loops, v, new, dependent_only)
+        info = ProjectionInfo(gap=gap_norms(gap), margin=pivot_ratio(new), pivots=kept)
+        q = integrate(chain, q, jnp.where(velocity_turn, 0, step[:, 0]))
+        v = jnp.where(velocity_turn, v + step[:, 1], v)
+        return q, v, jax.lax.stop_gradient(info)
 
-    links = len(chain.link_names)
-    none = (
-        jnp.zeros((links, 2), q.dtype),
-        jnp.ones((), q.dtype),
-        jnp.zeros((min(6 * links, chain.dofs), chain.dofs), q.dtype),
-    )
-    return jax.lax.fori_loop(0, iterations + 1, turn, (normalize(chain, q), v, *none))
+    start = normalize(chain, q), v, ProjectionInfo.initial(chain, q.dtype, with_pivots=True)
+    return jax.lax.fori_loop(0, iterations + 1, newton_step, start)
 
 
 def _pivots_to_keep(
-    structure: Structure, J, full: PivotedQR, pivots, hold: float, last: Bool[Array, ""]
+    structure: Structure, J, new: PivotedQR, pivots, hold: float, velocity_turn: Bool[Array, ""]
 ) -> Float[Array, "steps dofs"]:
-    """Return the pivots or, where they are poor in the last turn, those of the new qr
-    `full`."""
+    """Return `pivots` or, if they are poor in the last turn, those of the new QR."""
     poor = lambda: (
-        (pivot_ratio(refactor(J, pivots)) < hold * pivot_ratio(full))
+        (pivot_ratio(refactor(J, pivots)) < hold * pivot_ratio(new))
         | lacks_pivots(pivots, structure.rank)
     )
-    return jax.lax.cond(last, lambda: jnp.where(poor(), full.P, pivots), lambda: pivots)
+    return jax.lax.cond(velocity_turn, lambda: jnp.where(poor(), new.P, pivots), lambda: pivots)
 
 
 def _step_by_pivots(
-    chain: Chain, structure: Structure, loops: LoopKinematics, v, full: PivotedQR, dependent: bool
+    chain: Chain,
+    structure: Structure,
+    loops: LoopKinematics,
+    v,
+    qr: PivotedQR,
+    dependent_only: bool,
 ) -> tuple[Float[Array, "dofs 2"], Float[Array, " rows"]]:
-    """Return the changes of q, that close the loops, and of v, that keep them; and the gaps."""
-    moving = jnp.where(active_dofs(chain, structure), v / jacobian_scales(chain)[1], 0)
-    gap, J, qr = loops.gap, loops.J, _drop_unsolvable(structure, full)
-    open_ = jnp.stack([gap, J @ moving], 1)
-    if dependent:
-        return -dependent_change(chain, qr, J, open_), gap
-    return -inertia_metric_change(chain, structure, loops, qr, open_), gap
+    """Return the changes of q and of v that close the loops, as two columns, and the scaled gap."""
+    scaled_v = jnp.where(active_dofs(chain, structure), v / jacobian_scales(chain)[1], 0)
+    gap, J, qr = loops.gap, loops.J, _drop_unsolvable(structure, qr)
+    residual = jnp.stack([gap, J @ scaled_v], 1)
+    if dependent_only:
+        return -dependent_change(chain, qr, J, residual), gap
+    return -inertia_metric_change(chain, structure, loops, qr, residual), gap
 
 
 @functools.partial(jax.jit, static_argnames=("iterations", "differentiated"))
 def project_by_loop_forces(
     chain: Chain, structure: Structure, q, v, *, iterations: int, differentiated: bool = True
-) -> tuple[Float[Array, " q"], Float[Array, " dofs"], Float[Array, "links 2"]]:
-    """`settle_loops` in the metric of the inertia, by articulated bodies and the forces of the
-    loops: no pivots are chosen. And the gaps (rad, `chain.length`s) that each loop is left with.
-    differentiated: as `Field`'s."""
-    one_turn = _step_by_loop_forces if differentiated else with_lanes_last(_step_by_loop_forces)
+) -> tuple[Float[Array, " q"], Float[Array, " dofs"], ProjectionInfo]:
+    """Return `project` in the metric of the mass matrix, by `ArticulatedBodies` without pivots.
+
+    differentiated: whether derivatives are taken through the projection. If not, a `vmap` keeps
+    lanes last.
+    """
+    compute_step = _step_by_loop_forces if differentiated else with_lanes_last(_step_by_loop_forces)
 
     @functools.partial(jax.checkpoint, prevent_cse=False)
-    def turn(i, both):
-        q, v, _ = both
-        step, left = one_turn(chain, structure, q, v, i == iterations)
-        return (
-            integrate(chain, q, jnp.where(i == iterations, 0, step)),
-            jnp.where(i == iterations, v + step, v),
-            left,
-        )
+    def newton_step(i, carry):
+        q, v, _ = carry
+        velocity_turn = i == iterations
+        step, gap = compute_step(chain, structure, q, v, velocity_turn)
+        q = integrate(chain, q, jnp.where(velocity_turn, 0, step))
+        return q, jnp.where(velocity_turn, v + step, v), ProjectionInfo(gap)
 
-    return jax.lax.fori_loop(
-        0,
-        iterations + 1,
-        turn,
-        (normalize(chain, q), v, jnp.zeros((len(chain.link_names), 2), q.dtype)),
-    )
+    start = normalize(chain, q), v, ProjectionInfo.initial(chain, q.dtype, with_pivots=False)
+    return jax.lax.fori_loop(0, iterations + 1, newton_step, start)
 
 
 def _step_by_loop_forces(
-    chain: Chain, structure: Structure, q, v, last: Bool[Array, ""]
+    chain: Chain, structure: Structure, q, v, velocity_turn: Bool[Array, ""]
 ) -> tuple[Float[Array, " dofs"], Float[Array, "links 2"]]:
-    """The least change, in the metric of the inertia, of q that closes the loops or, in the last
-    turn, of v that keeps them; and the gaps at q."""
+    """Return the change of q that closes the loops or, in the velocity's turn, of v; and the gaps.
+
+    The change is the least in the metric of the mass matrix. Gaps are those at q.
+    """
     column = jacobian_scales(chain)[1]
     loops = loop_kinematics(chain, structure, q)
-    J, open_, active = loops.J, loops.gap, active_dofs(chain, structure)
-    apart = jnp.where(last, J @ jnp.where(active, v / column, 0), open_)
+    J, gap, active = loops.J, loops.gap, active_dofs(chain, structure)
+    residual = jnp.where(velocity_turn, J @ jnp.where(active, v / column, 0), gap)
     solve = ArticulatedBodies().prepare(chain, structure, loops)
-    step = solve(jnp.zeros(chain.dofs, q.dtype), apart)
-    return step, jax.lax.stop_gradient(gap_norms(open_))
+    step = solve(jnp.zeros(chain.dofs, q.dtype), residual)
+    return step, jax.lax.stop_gradient(gap_norms(gap))

@@ -171,8 +171,8 @@ def _check_state(chain: Chain, state: State, is_phase_end: Bool[Array, ""]) -> S
 
 
 def _is_free(chain: Chain, s: Structure) -> Bool[Array, ""]:
-    """Return whether the bodies are free of the ground: every tree has a free joint at its root, and
-    no connected virtual link joins the ground."""
+    """Return whether the bodies are free of the ground: every tree has a free joint at its root,
+    and no connected virtual link joins the ground."""
     top = chain.topology
     roots = [i for i in range(1, len(top.parent)) if top.parent[i] == 0]
     if not roots or any(top.kind[i] != FREE for i in roots):

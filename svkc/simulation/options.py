@@ -1,4 +1,5 @@
-"""What a call of `simulate` asks for, checked at once, with defaults filled in."""
+"""The options of a call of `simulate`: arguments are validated and defaults are resolved here, before
+anything is compiled."""
 
 from collections.abc import Callable
 from typing import Any
@@ -28,7 +29,13 @@ from svkc.transitions.plan import Plan, make_plan
 
 
 class Options(eqx.Module):
-    """How to integrate."""
+    """The options of a run, validated and with defaults resolved.
+
+    dt: fixed step size (s); None: `controller` sets the step size.
+    first_step: size of the first step with a controller (s).
+    has_work: whether to integrate the work of control, joint limits and dampers.
+    gap_tolerance: largest gap of a loop that counts as closed (rad, m).
+    """
 
     control: Callable | None
     solver: diffrax.AbstractSolver
@@ -42,16 +49,20 @@ class Options(eqx.Module):
     max_events: int = eqx.field(static=True)
     max_steps: int = eqx.field(static=True)
     has_work: bool = eqx.field(static=True)
-    gap: float = eqx.field(static=True)
+    gap_tolerance: float = eqx.field(static=True)
 
     @property
     def field(self) -> VectorField:
-        """The vector field of a phase."""
+        """The vector field of each phase."""
         return VectorField(self.control, self.stabilization, self.dynamics)
 
     def step_size_control(self, ts=None):
-        """The step-size controller and the first step; for a loop that does not look to the save
-        times itself, made to stop at each of `ts`."""
+        """Return the step-size controller and the size of the first step (None: the controller
+        chooses it).
+
+        ts: times at which an adaptive or fixed-step controller ends a step, for loops that do not
+            clip steps at save times themselves; None: no such times.
+        """
         if self.dt is not None:
             return FixedSteps(self.dt, jnp.zeros(0, self.dt.dtype) if ts is None else ts), None
         if ts is not None and isinstance(
@@ -64,8 +75,8 @@ class Options(eqx.Module):
 
 
 def resolve_tolerances(dtype, rtol=None, atol=None) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Those left open are 1e-7 (float32: 1e-4), and a hundredth of rtol, or what round-off
-    leaves."""
+    """Return rtol and atol as arrays. The defaults are 1e-7 (float32: 1e-4) for rtol, and a
+    hundredth of rtol, but at least eight times round-off, for atol."""
     eps = np.finfo(dtype).eps
     rtol = (1e-7 if eps < 1e-10 else 1e-4) if rtol is None else rtol
     if atol is None:
@@ -81,75 +92,75 @@ def prepare_options(
     chain: Chain, state: State, t0, t1, *, ts, events, control, dt, rtol, atol, solver,
     stepsize_controller, stabilization, dynamics, adjoint, max_events, max_steps, progress_meter,
 ) -> tuple[Options, Float[Array, " times"], Plan]:  # fmt: skip
-    """The call's options, save times and plan of events; ValueError for what cannot be right."""
+    """Return the options, the save times and the plan of events of a call of `simulate`. Raises
+    ValueError for invalid arguments."""
     _check_state(chain, state)
     dtype, events = state.q.dtype, as_events(events)
     _check_times(t0, t1, ts, events)
-    _check_steps(dt, rtol, atol, stepsize_controller)
+    _check_step_options(dt, rtol, atol, stepsize_controller)
     check_function("control", control)
-    _check_kind("stepsize_controller", stepsize_controller, diffrax.AbstractStepSizeController)
-    _check_kind("progress_meter", progress_meter, diffrax.AbstractProgressMeter)
-    made = make_plan(chain, events, dtype)
-    # on the host where nothing is traced: each operation that jax is given eagerly is a program of
-    # its own
-    of = lambda x: np.asarray(x, dtype) if is_concrete(x) else jnp.asarray(x, dtype)
+    _check_instance("stepsize_controller", stepsize_controller, diffrax.AbstractStepSizeController)
+    _check_instance("progress_meter", progress_meter, diffrax.AbstractProgressMeter)
+    plan = make_plan(chain, events, dtype)
+    # concrete numbers stay in numpy: JAX compiles a program for every eager operation
+    cast = lambda x: np.asarray(x, dtype) if is_concrete(x) else jnp.asarray(x, dtype)
     host = np if is_concrete(t0, t1) else jnp
-    span = of(t1) - of(t0)
+    span = cast(t1) - cast(t0)
     controller = stepsize_controller
     if controller is None:
-        smallest = np.finfo(dtype).eps * host.maximum(host.abs(span), host.abs(of(t1)))
-        controller = _controller(rtol, atol, smallest, dtype)
+        smallest = np.finfo(dtype).eps * host.maximum(host.abs(span), host.abs(cast(t1)))
+        controller = _default_controller(rtol, atol, smallest, dtype)
     options = Options(
         control=control,
         solver=_resolve_solver(solver, None if dt is not None else controller, dtype),
-        stabilization=_stabilization(stabilization),
-        dynamics=_dynamics(chain, dynamics),
+        stabilization=_resolve_stabilization(stabilization),
+        dynamics=_resolve_dynamics(chain, dynamics),
         controller=controller,
-        adjoint=_adjoint(adjoint, controller if dt is None else None),
+        adjoint=_resolve_adjoint(adjoint, controller if dt is None else None),
         progress_meter=diffrax.NoProgressMeter() if progress_meter is None else progress_meter,
         dt=None if dt is None else jnp.asarray(dt, dtype),
         first_step=jnp.asarray(host.maximum(span, np.finfo(dtype).tiny) * 1e-3, dtype),
-        max_events=_capacity(max_events, made),
-        max_steps=_step_bound(max_steps, span, dt),
+        max_events=_resolve_max_events(max_events, plan),
+        max_steps=_resolve_max_steps(max_steps, span, dt),
         has_work=control is not None or chain.limit is not None or chain.damping is not None,
-        gap=1e3 * gap_tolerance(dtype),
+        gap_tolerance=1e3 * gap_tolerance(dtype),
     )
-    save_at = host.stack([of(t0), of(t1)]) if ts is None else ts
-    return options, jnp.asarray(save_at, dtype), made
+    save_at = host.stack([cast(t0), cast(t1)]) if ts is None else ts
+    return options, jnp.asarray(save_at, dtype), plan
 
 
-def _controller(rtol, atol, smallest, dtype) -> diffrax.PIDController:
-    """Return the default control of adaptive steps. smallest: step (s)."""
-    # as arrays: another tolerance is the same program
+def _default_controller(rtol, atol, smallest, dtype) -> diffrax.PIDController:
+    """Return the default step-size controller. smallest: lower bound of the step size (s)."""
+    # arrays, so that a run with other tolerances uses the same program
     rtol, atol = resolve_tolerances(dtype, rtol, atol)
     return diffrax.PIDController(
         rtol, atol, norm=rms_norm, dtmin=jnp.asarray(smallest, dtype), force_dtmin=False
     )
 
 
-def _check_steps(dt, rtol, atol, stepsize_controller) -> None:
-    """Check that steps are asked for in one way."""
+def _check_step_options(dt, rtol, atol, stepsize_controller) -> None:
+    """Raise ValueError unless dt, the tolerances or a controller alone sets the step size."""
     for name, value in (("dt", dt), ("rtol", rtol), ("atol", atol)):
         if value is not None:
             positive_scalar(name, value)
     tolerance = rtol is not None or atol is not None
     if dt is not None and (tolerance or stepsize_controller is not None):
         raise ValueError(
-            "dt asks for fixed steps, rtol, atol and stepsize_controller for others; give one of"
-            " them"
+            "dt sets fixed steps; rtol, atol and stepsize_controller set adaptive steps; give one"
+            " or the other"
         )
     if stepsize_controller is not None and tolerance:
-        raise ValueError("rtol and atol belong inside the stepsize_controller that is given")
+        raise ValueError("rtol and atol: give them to the stepsize_controller instead")
 
 
-def _check_kind(name: str, value, kind: type) -> None:
-    """Check that an option is of a class of diffrax's."""
+def _check_instance(name: str, value, kind: type) -> None:
+    """Raise ValueError if an option is neither None nor an instance of a class of diffrax."""
     if value is not None and not isinstance(value, kind):
-        raise ValueError(f"{name}: expected a diffrax one, got {value!r}")
+        raise ValueError(f"{name}: expected a diffrax object for it, got {value!r}")
 
 
-def _stabilization(stabilization) -> AbstractStabilization:
-    """Return what is done about the drift of the loops, or the default."""
+def _resolve_stabilization(stabilization) -> AbstractStabilization:
+    """Return the stabilization, `Projection()` by default. Raises ValueError for another type."""
     if stabilization is None:
         return Projection()
     if not isinstance(stabilization, AbstractStabilization):
@@ -160,8 +171,8 @@ def _stabilization(stabilization) -> AbstractStabilization:
     return stabilization
 
 
-def _dynamics(chain: Chain, dynamics) -> AbstractDynamics:
-    """Return the way to compute accelerations, or the default one of the chain."""
+def _resolve_dynamics(chain: Chain, dynamics) -> AbstractDynamics:
+    """Return the dynamics, by default those of the chain. Raises ValueError for another type."""
     if dynamics is None:
         return default_dynamics(chain)
     if isinstance(dynamics, Dynamics):
@@ -175,8 +186,14 @@ def _dynamics(chain: Chain, dynamics) -> AbstractDynamics:
 
 
 def _resolve_solver(solver, controller, dtype) -> diffrax.AbstractSolver:
-    """The solver, or the default; one with implicit stages solves them as closely as steps are
-    controlled, or, where they are not, to sqrt(eps)."""
+    """Return the solver, by default Dopri8, or Tsit5 with fixed steps or in float32.
+
+    An implicit solver whose root finder has no tolerances of its own takes those of the
+    controller; without a controller with tolerances its stages are solved to sqrt(eps).
+
+    Raises ValueError if the solver is not one of diffrax, or has no error estimate for adaptive
+    steps.
+    """
     if solver is None:
         return (
             diffrax.Dopri8()
@@ -189,81 +206,95 @@ def _resolve_solver(solver, controller, dtype) -> diffrax.AbstractSolver:
         solver, diffrax.AbstractAdaptiveSolver
     ):
         raise ValueError(
-            f"solver: {type(solver).__name__} does not estimate the errors of its steps; give dt,"
-            " or another solver"
+            f"solver: {type(solver).__name__} has no error estimate for adaptive steps; give dt, or"
+            " another solver"
         )
     if not isinstance(solver, diffrax.AbstractImplicitSolver):
         return solver
     finder = solver.root_finder
-    given = {name: getattr(controller, name, None) for name in ("rtol", "atol", "norm")}
-    # diffrax marks what is to be the step-size controller's with a thing that is neither a number
-    # nor a function
-    left_open = [
-        name
-        for name in given
-        if not (callable(x := getattr(finder, name, 0.0)) or eqx.is_inexact_array_like(x))
-    ]
-    if None in given.values() and left_open:
-        # a step that cannot be made shorter has to be solved: by Newton's method
+    of_controller = {name: getattr(controller, name, None) for name in ("rtol", "atol", "norm")}
+    inherited = [name for name in of_controller if _inherits_tolerance(getattr(finder, name, 0.0))]
+    if None in of_controller.values() and inherited:
+        # fixed steps cannot be shortened if the stages do not converge, so use full Newton steps
         close = float(np.finfo(dtype).eps ** 0.5)
         return eqx.tree_at(
             lambda s: s.root_finder, solver, optimistix.Newton(close, close, norm=rms_norm)
         )
-    if left_open and isinstance(finder, diffrax.VeryChord):
+    if inherited and isinstance(finder, diffrax.VeryChord):
         solver = eqx.tree_at(lambda s: s.root_finder, solver, SimplifiedNewton(0.0, 0.0))
     return eqx.tree_at(
-        lambda s: [getattr(s.root_finder, name) for name in left_open],
+        lambda s: [getattr(s.root_finder, name) for name in inherited],
         solver,
-        [given[name] for name in left_open],
+        [of_controller[name] for name in inherited],
     )
 
 
-def _adjoint(adjoint, controller) -> diffrax.AbstractAdjoint | Replay:
-    """Steps that do not meet the save times are not gone through again: what is saved is
-    interpolated between them."""
-    meets = controller is None or isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
+def _inherits_tolerance(value) -> bool:
+    """Return whether a root finder leaves this tolerance or norm to the step-size controller.
+
+    diffrax marks such values with a private sentinel, which is neither a number nor callable.
+    """
+    return not (callable(value) or eqx.is_inexact_array_like(value))
+
+
+def _resolve_adjoint(adjoint, controller) -> diffrax.AbstractAdjoint | Replay:
+    """Return the adjoint, by default `Replay()`.
+
+    Replay needs steps that end at save times, as fixed and adaptive steps do. With other
+    controllers, for which saved states are interpolated, the default is diffrax's.
+
+    Raises ValueError for another type, or for Replay with such a controller.
+    """
+    can_replay = controller is None or isinstance(
+        controller, diffrax.AbstractAdaptiveStepSizeController
+    )
     if adjoint is None:
-        return Replay() if meets else diffrax.RecursiveCheckpointAdjoint()
+        return Replay() if can_replay else diffrax.RecursiveCheckpointAdjoint()
     if not isinstance(adjoint, Replay | diffrax.AbstractAdjoint):
         raise ValueError(
             f"adjoint: expected svkc.integrators.Replay or a diffrax adjoint, got {adjoint!r}"
         )
-    if isinstance(adjoint, Replay) and not meets:
+    if isinstance(adjoint, Replay) and not can_replay:
         raise ValueError(
-            "adjoint: svkc.integrators.Replay needs dt or an adaptive stepsize_controller; give a diffrax"
-            " adjoint with this one"
+            "adjoint: svkc.integrators.Replay needs dt or an adaptive stepsize_controller; give a"
+            " diffrax adjoint with this controller"
         )
     return adjoint
 
 
-def _capacity(max_events, made: Plan) -> int:
+def _resolve_max_events(max_events, plan: Plan) -> int:
+    """Return the capacity for events, by default one for each timed event and four for each
+    guard."""
     if max_events is None:
-        return len(made.timed) + 4 * len(made.guarded)
-    most = integer("max_events", max_events, 0)
-    return most if made.actions else 0
+        return len(plan.timed) + 4 * len(plan.guarded)
+    capacity = integer("max_events", max_events, 0)
+    return capacity if plan.actions else 0
 
 
-def _step_bound(max_steps, span, dt) -> int:
+def _resolve_max_steps(max_steps, span, dt) -> int:
+    """Return the bound on the number of steps of a phase, large enough for all fixed steps by
+    default. Raises ValueError if these are more than 1e9."""
     if max_steps is not None:
         return integer("max_steps", max_steps, 1)
-    # room for every fixed step, and for those that save times and events make shorter
     if dt is None or not is_concrete(span, dt):
         return 65536
+    # save times and events shorten some fixed steps, so there are more than span / dt
     steps = float(np.max(np.asarray(span / dt)))
     if not steps < 1e9:
         raise ValueError(
             f"dt: got {dt}, with which a run of {float(span):g} s has more than 1e9 steps; give a"
-            " larger one, or max_steps"
+            " larger dt, or max_steps"
         )
     return max(65536, int(1.1 * steps) + 1024)
 
 
 def _check_state(chain: Chain, state: State):
+    """Raise ValueError if the state does not belong to the chain or is not finite."""
     check_state(chain, state)
     if state.q.dtype == np.float64 and not jax.config.read("jax_enable_x64"):
         raise ValueError(
-            "state and chain are float64, but jax_enable_x64 is off now; make them in the precision"
-            " that simulate is to compute in"
+            "state and chain are float64, but jax_enable_x64 is off now; enable it, or load the"
+            " chain and make the state in float32"
         )
     if is_concrete(state) and not (
         np.isfinite(np.asarray(state.q)).all() and np.isfinite(np.asarray(state.v)).all()
@@ -272,6 +303,7 @@ def _check_state(chain: Chain, state: State):
 
 
 def _check_times(t0, t1, ts, events):
+    """Raise ValueError for invalid start, end, save and event times, if they are concrete."""
     for name, value in (("t0", t0), ("t1", t1)):
         scalar(name, value)
     times = None if ts is None else finite_array("ts", ts)
@@ -288,7 +320,7 @@ def _check_times(t0, t1, ts, events):
             or np.any((times < t0) | (times > t1))
         ):
             raise ValueError(
-                f"ts: expected times in order from t0 = {t0} to t1 = {t1}, got {times}"
+                f"ts: expected non-decreasing times from t0 = {t0} to t1 = {t1}, got {times}"
             )
     for event in events:
         if (

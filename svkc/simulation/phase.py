@@ -14,7 +14,8 @@ from svkc.integration.event_adjoint import end_of_phase
 from svkc.integration.event_location import ArmedGuards, GuardValues
 from svkc.integration.integrate import integrate_phase
 from svkc.integration.ode import FieldArgs, ODEState, is_finite
-from svkc.integration.replay import Replay, integrate_with_replay, with_scan_kind
+from svkc.integration.replay import Replay, integrate_with_replay
+from svkc.integration.runge_kutta import with_scan_kind
 from svkc.integration.solution import (
     EVENT,
     LOOP_OPEN,

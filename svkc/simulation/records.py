@@ -87,10 +87,10 @@ def empty_phase_records(rows: int, state: State) -> PhaseRecords:
 def write_phase_row(
     records: PhaseRecords,
     row: Bool[Array, " phases"],
-    began: tuple,
-    ended: tuple,
+    start: tuple,
+    end: tuple,
     work,
-    path: PhaseSolution,
+    solution: PhaseSolution,
 ) -> PhaseRecords:
     """Return the records with the row of one phase written.
 
@@ -105,9 +105,9 @@ def write_phase_row(
         v=jnp.stack([first.v, last.v]),
         structure=first.structure,
         work=work,
-        accepted=path.accepted,
-        rejected=path.rejected,
-        stats=path.stats,
+        accepted=solution.accepted,
+        rejected=solution.rejected,
+        stats=solution.stats,
     )
     write = lambda old, new: jnp.where(
         row.reshape(-1, *(1,) * jnp.ndim(new)), jnp.asarray(new)[None], old
@@ -119,7 +119,7 @@ class RESULTS(eqx.Enumeration):
     """How a run ended, for each element of a batch, and why a run has no derivative."""
 
     successful = ""
-    stopped = "An event asked the run to stop."
+    stopped = "An event stopped the run."
     max_events = (
         "More events than max_events: the final state is that after the last recorded event. Raise"
         " max_events, or look for chattering."

@@ -340,5 +340,5 @@ def test_no_slot_left(gripped):
     assert traj.result == svkc.RESULTS.no_slot
     assert float(traj.t_final) == 0.2
     assert traj.final.structure.connected.tolist() == [True]
-    with pytest.raises(RuntimeError, match="every spare slot was taken"):
+    with pytest.raises(RuntimeError, match="every spare slot was bound"):
         run(times)
