@@ -1,11 +1,13 @@
-"""The trade of speed for accuracy: error against time of computing, each integrator and each way
-against drift, float64 and float32, MuJoCo beside them.
+"""Error against computing time, for each integrator and stabilization, with MuJoCo for comparison.
 
-`python benchmarks/accuracy.py [problem ...] [--only TEXT]` prints results/accuracy.csv and draws
-results/accuracy_PROBLEM.png. Errors are those at the end, root mean square over coordinates (rad,
-m), against closed forms, published digits, or, where the reference says so, Dopri8 at
-rtol 1e-12. Seconds are per simulated second, the median of five runs of a compiled program, one run
-at a time."""
+`python benchmarks/accuracy.py [problem ...] [--only TEXT]` prints and writes results/accuracy.csv
+and draws results/accuracy_PROBLEM.png.
+
+The error is that at the end of the run: the root mean square over coordinates (rad, m). The
+reference is a closed form, published digits, or a run of Dopri8 at rtol 1e-12, as each problem
+says. Seconds are per simulated second: the median of five runs of a compiled program, one run at a
+time.
+"""
 
 import argparse
 import csv
@@ -71,11 +73,13 @@ METHODS = STABILIZATIONS | {
 
 
 class Problem:
-    """A chain and its start; `exact`: coordinates at `end` (None: of a fine run); what else
-    `simulate` is to be given.
+    """A chain, its initial state, and reference coordinates at the end time.
 
-    `released`: times and names of links let go in the fine run; `torques`: constant ones that
-    `control` has, by joint."""
+    exact: the tree's coordinates at `end`. None: those of a reference run of Dopri8 at rtol 1e-12.
+    torques: constant joint torques that `control` contains, by joint.
+    call: further arguments of `simulate`.
+    released: times and names of the links that the reference run cut.
+    """
 
     def __init__(self, chain, state, end, exact=None, torques=(), **call):
         self.chain, self.state, self.end, self.call = chain, state, end, call
@@ -98,7 +102,7 @@ class Problem:
             ]
 
     def error(self, q) -> float:
-        """Root mean square over the tree's coordinates."""
+        """Return the root mean square error of the tree's coordinates (rad, m)."""
         full = lambda tree: jnp.concatenate(
             [jnp.asarray(tree, self.state.q.dtype), self.state.q[self.chain.nq :]]
         )
@@ -115,6 +119,7 @@ class Problem:
 
 
 def _top(model, case):
+    """Return the problem of a top from its model and its closed form."""
     chain = svkc.load(model)
     return Problem(
         chain,
@@ -125,7 +130,7 @@ def _top(model, case):
 
 
 def heavy_top():
-    """Lagrange's top at 20 rad/s for 3 s: closed form."""
+    """Return Lagrange's top at 20 rad/s for 3 s, with its closed form."""
     data, n = reference.given("heavy_top"), reference.numbers
     model, case = data["model"], data["cases"][-1]
     return _top(
@@ -137,7 +142,7 @@ def heavy_top():
 
 
 def free_top():
-    """An asymmetric top without gravity for 10 s: closed form."""
+    """Return an asymmetric top without gravity for 10 s, with its closed form."""
     case = reference.given("free_top")["cases"][-1]
     return _top(
         reference.ROTATION.format("0 0 0", "0 0 0", 1, reference.numbers(case["inertia"])), case
@@ -145,7 +150,9 @@ def free_top():
 
 
 def n_four_bar(windows: int = 2):
-    """Two windows for 10 s, twenty times through configurations where rank drops."""
+    """Return the N four-bar with two windows for 10 s: twenty passes through singular
+    configurations.
+    """
     case = next(case for case in reference.given("n_four_bar")["cases"] if case["N"] == windows)
     chain, state = maximal.load(reference.n_four_bar(windows))
     angle = -case["theta"][-1]
@@ -160,13 +167,15 @@ def n_four_bar(windows: int = 2):
 
 
 def forty_windows():
-    """Forty windows for 20 s: 81 bars, 40 loops."""
+    """Return the N four-bar with forty windows: 81 bars, 40 loops."""
     return n_four_bar(40)
 
 
 def andrews():
-    """Andrews' squeezing mechanism up to 0.03 s; reference: Dopri8 at rtol 1e-12, which has the
-    published digits to 1e-10."""
+    """Return Andrews' squeezing mechanism up to 0.03 s.
+
+    The reference is Dopri8 at rtol 1e-12, which agrees with the published digits to 1e-10.
+    """
     data = reference.given("andrews")
     chain, state = maximal.load(data["problem"])
     torques = {
@@ -180,14 +189,14 @@ def andrews():
 
 
 def high_bar():
-    """Two hands, one, none."""
+    """Return the high bar for 1 s: two hands on the bar, then one, then none."""
     chain, state = svkc.scenes.high_bar(ignore="limit")
     events = [svkc.at(0.5, cut="right_hand_grip"), svkc.at(0.7, cut="left_hand_grip")]
     return Problem(chain, state, 1.0, events=events)
 
 
 def swing():
-    """The seat leaves as the thighs slide over its edge, from a swing pushed back."""
+    """Return the swing, pushed back, until the seat is lost as the thighs slide over its edge."""
     from svkc.scenes.swing import seat_events, swing
 
     chain, seated = swing(ignore="limit")
@@ -207,8 +216,10 @@ PROBLEMS = {
 
 
 def time_runs(run, *args):
-    """What a run gives, and the median of its seconds; no more runs once they have taken long
-    enough."""
+    """Return the result of run(*args) and the median of its seconds.
+
+    The first call compiles. Calls stop after `RUNS` calls or `MAX_SECONDS`.
+    """
     out, seconds = jax.block_until_ready(run(*args)), []
     for _ in range(RUNS):
         start = time.perf_counter()
@@ -220,7 +231,7 @@ def time_runs(run, *args):
 
 
 def measure_curve(problem: Problem, label: str, solver, settings, method=None):
-    """Rows of one curve."""
+    """Yield the rows of one curve: one row for each step or tolerance in `settings`."""
     dtype, scale = problem.state.q.dtype, min(1.0, problem.end)
 
     def run(state, setting):
@@ -268,7 +279,9 @@ def measure_curve(problem: Problem, label: str, solver, settings, method=None):
 
 
 def measure_mujoco(problem: Problem, name: str):
-    """MuJoCo's integrators on the same model; links are let go when they were in the reference."""
+    """Yield rows of MuJoCo's integrators on this problem. Links are cut at the times of the
+    reference.
+    """
     for integrator in soft_loops.INTEGRATORS:
         for dt in FIXED:
             run = soft_loops.Run(
@@ -289,8 +302,11 @@ def measure_mujoco(problem: Problem, name: str):
 
 
 def list_curves(name: str, loops: bool):
-    """(dtype, label, solver, settings, way) of each: every integrator, and each with every way
-    against drift at some settings; Dopri8 with all ways."""
+    """Yield (dtype, label, solver, settings, method) of each curve of a problem.
+
+    With loops: every integrator with every stabilization at some settings, and Dopri8 with all
+    methods.
+    """
     if name == "forty_windows":
         yield "float64", "Dopri8", INTEGRATORS["Dopri8"][0], (1e-8,), {}
         yield (
@@ -323,7 +339,7 @@ def list_curves(name: str, loops: bool):
 
 
 def problem_rows(name: str, only: str):
-    """All rows of one problem, or those of curves whose dtype and label have `only` in them."""
+    """Yield the rows of one problem, limited to curves whose dtype and label contain `only`."""
     problem = PROBLEMS[name]()
     for dtype, label, solver, settings, method in list_curves(name, bool(problem.chain.link_names)):
         if only not in f"{dtype} {label}":
@@ -348,8 +364,10 @@ def problem_rows(name: str, only: str):
 
 
 def draw(name: str):
-    """Error against time of computing, from the file of all rows: a curve for each integrator, each
-    way against drift with Dopri8, float32 with Tsit5."""
+    """Draw error against computing time, from results/accuracy.csv.
+
+    There is a curve for each integrator, each stabilization with Dopri8, and float32 with Tsit5.
+    """
     import matplotlib.pyplot as plt
 
     with (RESULTS / "accuracy.csv").open() as file:
@@ -396,8 +414,10 @@ def draw(name: str):
 
 
 def save(name: str, only: str, head, table):
-    """Rows of a problem in the file of all, in place of its old ones; the file is read only now, as
-    another problem may have been run beside."""
+    """Replace the rows of a problem in results/accuracy.csv.
+
+    The file is read only now, because another process may have written rows of another problem.
+    """
     path, other_rows = RESULTS / "accuracy.csv", []
     if path.exists():
         with path.open() as file:

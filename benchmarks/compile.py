@@ -1,13 +1,13 @@
-"""What the first call costs: tracing, lowering and XLA's compilation of whole programs, each in a
-process of its own.
+"""Cost of the first call: tracing, lowering and XLA's compilation, each program in its own process.
 
 `python benchmarks/compile.py [PROGRAM ...] [--beside FOLDER] [--rounds N] [--no-run]` prints a row
-for each program and writes results/compile.csv. FOLDER is another checkout; the two take turns.
+for each program and writes results/compile.csv. FOLDER is another checkout; the two alternate.
+
 Columns: `instructions`, of the HLO module before XLA's passes, with every call inlined; `kernels`,
-the fusions that are left after them; CPU seconds of tracing, lowering and XLA; `first`, CPU and
-wall seconds of the first call as a user makes it, from after the imports and the models' loading to
-its result; `again`, the wall milliseconds of a second call. Medians where there are several rounds.
-Options of XLA are the default ones.
+    the fusions that are left after them; CPU seconds of tracing, lowering and XLA; `first`, CPU and
+    wall seconds of a user's first call, from imports and loading done to the result; `again`, the
+    wall milliseconds of a second call. With several rounds, medians. XLA's options are the default
+    ones.
 """
 
 import argparse
@@ -62,13 +62,12 @@ def count_instructions(text: str) -> int:
 
 
 def count_kernels(text: str) -> int:
-    """Count the fusions of a compiled module: XLA's CPU backend compiles each by itself, in some 20
-    ms."""
+    """Count the fusions of a compiled module: XLA's CPU backend compiles each in some 20 ms."""
     return len(re.findall(r" = [^=]*? fusion\(", text))
 
 
 def clocks() -> tuple[float, float]:
-    """Read CPU and wall seconds."""
+    """Return CPU seconds and wall seconds."""
     return time.process_time(), time.perf_counter()
 
 
@@ -126,7 +125,7 @@ def measure_eager(model: str) -> dict:
 
 
 def child(name: str, run: bool) -> None:
-    """Print what one process measures."""
+    """Measure one program or model in this process and print the result as JSON."""
     import jax
 
     jax.config.update("jax_enable_x64", True)
@@ -135,13 +134,13 @@ def child(name: str, run: bool) -> None:
 
     import svkc  # noqa: F401
 
-    # the first operation of a process starts the backend
+    # the first operation of a process initializes the backend, which is not measured
     jax.block_until_ready(jax.numpy.zeros(3) + 1)
     print(json.dumps(measure_eager(name) if name in MODELS else measure_program(name, run)))
 
 
 def in_process(name: str, folder: pathlib.Path, run: bool) -> dict:
-    """Measure one program of the checkout in `folder` in a cold process."""
+    """Measure one program of the checkout in `folder` in a new process without a cache."""
     environment = {**os.environ, "PYTHONPATH": str(folder), "JAX_PLATFORMS": "cpu"}
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)
     command = [
@@ -158,14 +157,14 @@ def in_process(name: str, folder: pathlib.Path, run: bool) -> dict:
 
 
 def version(folder: pathlib.Path) -> str:
-    """Return the short name of the commit that is checked out."""
+    """Return the abbreviated commit of a checkout."""
     return subprocess.run(
         ["git", "-C", str(folder), "rev-parse", "--short", "HEAD"], capture_output=True, text=True
     ).stdout.strip()
 
 
 def update_results(rows: dict) -> None:
-    """Replace the rows of the programs that were measured, keep the others."""
+    """Replace the rows of the measured programs in results/compile.csv."""
     import jax
 
     rows_of_file = list(csv.DictReader(RESULTS.open())) if RESULTS.exists() else []

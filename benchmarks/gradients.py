@@ -1,13 +1,14 @@
-"""What derivatives cost: time and memory of a whole run, its gradient and its directional
-derivative, and the compilation of each.
+"""Cost of derivatives: time and memory of a run, its gradient and its directional derivative.
 
-High bar: 1.8 s with both releases, 198 parameters (masses, centres of mass, velocity, release
-times, torques). Open chain: the same figure in free fall, alone and 64 by `vmap`, 200 steps of the
-classical Runge-Kutta method of 2 ms, 198 parameters (velocity, torques), beside MJX's gradient of
-the same steps and central differences with MuJoCo, both of which hold the torque of a step's
-middle; all three gradients are compared. `python benchmarks/gradients.py` prints and writes
-results/gradients.csv; needs the extra `bench`. float64. Medians; runs that are compared take
-turns."""
+High bar: 1.8 s with both releases, 198 parameters (masses, centers of mass, velocity, release
+times, torques). Open chain: the same figure in free fall, alone and 64 by `vmap`, 200 steps of 2 ms
+of the classical Runge-Kutta method, 198 parameters (velocity, torques). The open chain is compared
+with MJX's gradient of the same steps, and with central differences of MuJoCo runs. Both hold the
+torque constant during a step, at its value in the middle. All three gradients are compared.
+
+`python benchmarks/gradients.py` (extra `bench`) prints and writes results/gradients.csv. float64.
+Times are medians; programs that are compared alternate.
+"""
 
 import csv
 import os
@@ -40,7 +41,7 @@ RUNGE_KUTTA_4 = diffrax.ButcherTableau(
 
 
 class ClassicalRungeKutta(diffrax.AbstractERK):
-    """MuJoCo's RK4."""
+    """The classical Runge-Kutta method, MuJoCo's RK4."""
 
     tableau = RUNGE_KUTTA_4
     interpolation_cls = diffrax.ThirdOrderHermitePolynomialInterpolation.from_k
@@ -50,7 +51,10 @@ class ClassicalRungeKutta(diffrax.AbstractERK):
 
 
 def high_bar_loss(**options):
-    """The high bar, both hands let go. how: options of `simulate`."""
+    """Return (loss, parameters) of the high bar with both hands released.
+
+    options: keyword arguments of `simulate`.
+    """
     chain, state = high_bar()
     ts = jnp.linspace(0, 1.8, 73)
 
@@ -95,7 +99,7 @@ def high_bar_loss(**options):
 
 
 def joint_torques(coefficients, t, pad):
-    """Of the joints, at a time: sines of eleven frequencies."""
+    """Return joint torques at time t: sums of eleven sines."""
     return pad(
         (
             coefficients @ np.sin(np.arange(1, 12) * t)
@@ -107,7 +111,7 @@ def joint_torques(coefficients, t, pad):
 
 
 def falling_spec():
-    """The figure for MuJoCo, without contacts and limits."""
+    """Return MuJoCo's model of the figure without contacts and joint ranges."""
     spec = mujoco.MjSpec.from_file(str(FOLDER / "figure16.xml"))
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
     spec.option.timestep = DT
@@ -118,7 +122,7 @@ def falling_spec():
 
 
 def falling_loss():
-    """Open chain, by svkc."""
+    """Return (loss, parameters) of the open chain in svkc."""
     chain = svkc.load(falling_spec(), ignore=("limit", "contact"))
     state = chain.state()
 
@@ -142,7 +146,7 @@ def falling_loss():
 
 
 def falling_loss_mjx():
-    """The same steps, by MJX."""
+    """Return the loss of the open chain in MJX, with equal steps."""
     from mujoco import mjx
 
     model = mjx.put_model(falling_spec().compile())
@@ -164,7 +168,7 @@ def falling_loss_mjx():
 
 
 def falling_loss_mujoco():
-    """The loss, and its gradient by central differences."""
+    """Return the loss of the open chain in MuJoCo, and its gradient by central differences."""
     model = falling_spec().compile()
     data = mujoco.MjData(model)
 
@@ -185,8 +189,9 @@ def falling_loss_mujoco():
 
 
 def compile_program(function, p):
-    """The program, and seconds of tracing with lowering and of compilation, and its temporary
-    memory (MB)."""
+    """Return the program, seconds of tracing and lowering, seconds of compilation, temporary memory
+    (MB).
+    """
     start = time.perf_counter()
     lowered = jax.jit(function).lower(p)
     lowered_at = time.perf_counter()
@@ -200,7 +205,7 @@ def compile_program(function, p):
 
 
 def time_in_turns(programs, p, runs=RUNS):
-    """Median seconds of each; they take turns."""
+    """Return the median seconds of each program. Programs alternate."""
     times = {name: [] for name in programs}
     for _ in range(runs + 1):
         for name, program in programs.items():
@@ -211,7 +216,10 @@ def time_in_turns(programs, p, runs=RUNS):
 
 
 def measure_case(case, loss, p, peers=()):
-    """Rows of one case: forward, reverse, forward mode; then those of its peers."""
+    """Return rows of one case, for svkc and the other libraries, and the gradients by library.
+
+    The rows are the run, its gradient, and (svkc alone) its directional derivative.
+    """
     tangent = jax.tree.map(jnp.ones_like, p)
     kinds = {
         "run": loss,
@@ -246,12 +254,12 @@ def measure_case(case, loss, p, peers=()):
 
 
 def as_vector(gradient):
-    """As one vector."""
+    """Return a gradient as one vector."""
     return np.concatenate([np.ravel(gradient["v"]), np.ravel(gradient["torque"])])
 
 
 def main():
-    """Measures, prints, writes."""
+    """Measure, print and write all cases."""
     loss, p = high_bar_loss()
     count = sum(x.size for x in jax.tree.leaves(p))
     rows, _ = measure_case(f"high bar, {count} parameters", loss, p)

@@ -1,9 +1,9 @@
-"""Section VI of the paper, joints of several freedoms mean fewer links and less computation,
-measured on the 40-freedom figure of its Fig. 16.
+"""Joints of several freedoms need fewer links and less computation (the paper's section VI).
 
-As 12 balls and 4 hinges, and as 40 hinges. `python benchmarks/joints.py` prints and writes
-results/joints.csv. The figures take turns, so that a busy machine slows both. Times of a batch are
-those of all its lanes together."""
+The 40-freedom figure of the paper's Fig. 16 is measured with 12 balls and 4 hinges, and with 40
+hinges. `python benchmarks/joints.py` prints and writes results/joints.csv. The two figures
+alternate, so that other load slows both. The time of a batch is that of all its lanes together.
+"""
 
 import csv
 import functools
@@ -27,8 +27,7 @@ DT, STEPS, BATCH, COMPILES, RUNS = 1e-3, 300, 64, 7, 5
 
 
 def hinges_for_balls() -> tuple[mujoco.MjSpec, list[str]]:
-    """The figure with three hinges about x, y, z where it has a ball, and the names of the
-    balls."""
+    """Return the figure with three hinges about x, y, z for each ball, and the balls' names."""
     spec = mujoco.MjSpec.from_file(str(FIGURE))
     balls = [joint.name for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_BALL]
     for name in balls:
@@ -40,7 +39,7 @@ def hinges_for_balls() -> tuple[mujoco.MjSpec, list[str]]:
 
 
 def ball_state(angles, rates):
-    """Quaternion and angular velocity (body axes) of hinges about x, y, z."""
+    """Return quaternion and angular velocity (body axes) of three hinges about x, y, z."""
     quat, rate = jax.jvp(
         lambda turns: functools.reduce(quat_multiply, quat_from_axis_angle(jnp.eye(3), turns)),
         (angles,),
@@ -50,8 +49,10 @@ def ball_state(angles, rates):
 
 
 def matching_states(chains, balls, rng):
-    """One state in the coordinates of both figures: turns of at most 0.5 rad about each axis, far
-    from where three hinges lock."""
+    """Return one random configuration and velocity as states of both figures.
+
+    Rotations are at most 0.5 rad about each axis, far from gimbal lock.
+    """
     angles, rates = rng.uniform(-0.5, 0.5, (len(balls), 3)), rng.uniform(-1, 1, (len(balls), 3))
     quats, angular_velocities = jax.vmap(ball_state)(angles, rates)
     hinges, names = (
@@ -71,7 +72,9 @@ def matching_states(chains, balls, rng):
 
 
 def motion_difference(chains, states) -> str:
-    """The largest distance and angle between the bodies of the two figures in half a second."""
+    """Return a sentence with the largest distance and angle between the two figures' bodies in 0.5
+    s.
+    """
     tolerances = {"rtol": 1e-10, "atol": 1e-12} if jax.config.jax_enable_x64 else {}
     runs = [
         svkc.simulate(chain, s, 0.5, ts=jnp.linspace(0, 0.5, 11), **tolerances).states
@@ -88,21 +91,23 @@ def motion_difference(chains, states) -> str:
 
 
 def forward(chain, s):
-    """A step of semi-implicit Euler."""
+    """Return the state after one step of symplectic Euler."""
     v = s.v + DT * svkc.forward_dynamics(chain, s, jnp.zeros_like(s.v))
     return svkc.State(svkc.integrate(chain, s.q, DT * v), v, s.structure), None
 
 
 def inverse(chain, s):
-    """A step at constant velocity, and the torques at some acceleration."""
+    """Return the state after one step at constant velocity, and the torques for an acceleration."""
     return svkc.State(
         svkc.integrate(chain, s.q, DT * s.v), s.v, s.structure
     ), svkc.inverse_dynamics(chain, s, s.v)
 
 
 def measure(task, chains, states) -> dict[str, dict[str, list]]:
-    """Seconds to trace and compile and microseconds a step: {unit: {figure: [repetitions]}}. A
-    program's first run is a warm-up."""
+    """Return seconds of compilation and microseconds of a step: {unit: {figure: [repetitions]}}.
+
+    The first run of a program is not counted.
+    """
     times = {unit: {name: [] for name in chains} for unit in ("s to compile", "us a step")}
     for _, (name, chain) in itertools.product(range(COMPILES), chains.items()):
         jax.clear_caches()
@@ -119,8 +124,7 @@ def measure(task, chains, states) -> dict[str, dict[str, list]]:
 
 
 def compare(dtype: str):
-    """Rows of the table: what is measured; median, least and most of each figure; the ratio of the
-    medians."""
+    """Yield rows: task, median, least and most of each figure, and the ratio of the medians."""
     spec, balls = hinges_for_balls()
     chains, rng = (
         {"balls": svkc.load(str(FIGURE)), "hinges": svkc.load(spec)},

@@ -1,7 +1,7 @@
-"""A Runge-Kutta-Munthe-Kaas method, to compare with: any solver of diffrax, in a rotation vector
-from the start of each step.
+"""A Runge-Kutta-Munthe-Kaas method around any diffrax solver, for comparison.
 
-What svkc does instead: quaternions as four numbers, put back to unit length after every step.
+The inner solver integrates a rotation vector from the start of each step. svkc itself integrates
+the four numbers of a quaternion and normalizes them after every step.
 """
 
 from typing import ClassVar
@@ -15,8 +15,10 @@ from svkc.tree.configuration import configuration_derivative, integrate
 
 
 def rotation_vector_rate(chain, u, v):
-    """The rate of u where q = q0 exp(u) moves with v: the inverse of the exponential's derivative,
-    on every ball and free joint."""
+    """Return du/dt for q = q0 exp(u) moving with velocity v, on every ball and free joint.
+
+    This is the inverse of the exponential map's derivative, applied to v.
+    """
     columns = chain.topology.quaternion_starts[1][:, None] + np.arange(3)
     x, w = u[columns], v[columns]
     squared_angle = jnp.sum(x * x, -1, keepdims=True)
@@ -33,7 +35,7 @@ def rotation_vector_rate(chain, u, v):
 
 
 class MuntheKaas(diffrax.AbstractAdaptiveSolver):
-    """The inner solver's steps in coordinates about where each begins."""
+    """A solver whose inner solver steps in exponential coordinates about each step's start."""
 
     solver: diffrax.AbstractSolver
     term_structure: ClassVar = diffrax.AbstractTerm

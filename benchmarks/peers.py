@@ -1,8 +1,9 @@
-"""Those that benchmarks/speed.py compares svkc with: MuJoCo and Pinocchio, called from here; MJX
-and JaxSim, each in a process and on a core of its own.
+"""The libraries that speed.py compares svkc with: MuJoCo, Pinocchio, MJX and JaxSim.
 
-Run as a program it is such a process: it compiles, says what that took, and runs once for every
-line it reads."""
+MuJoCo and Pinocchio are called in this process. MJX and JaxSim each run in a process of their own,
+on one core. Run as a program, this file is such a process: it compiles, writes the compile times,
+and runs once for every line that it reads.
+"""
 
 import json
 import os
@@ -29,8 +30,10 @@ USER_XLA_FLAGS, TIMEOUT = os.environ.get("XLA_FLAGS", ""), 60
 
 
 def mujoco_runs(model, q, v, batch: int, steps: int):
-    """`mj_step` on one core; `rollout` on all. Both leave their end where the next call begins
-    anew."""
+    """Yield MuJoCo's `mj_step` on one core, or its `rollout` on all cores, as (label, function).
+
+    Each call starts from the initial states.
+    """
     data = mujoco.MjData(model)
     if batch == 1:
 
@@ -58,9 +61,11 @@ def mujoco_runs(model, q, v, batch: int, steps: int):
 
 
 def pinocchio_runs(name: str, chain, state, batch: int, steps: int):
-    """Accelerations alone, called from Python one after another on one core: articulated bodies of
-    an open chain; with grips `constraintDynamics`, a ball as one point held to another, a hinge as
-    two. Its accelerations are svkc's: asserted."""
+    """Yield Pinocchio's accelerations alone, called from Python on one core, as (label, function).
+
+    An open chain uses `aba`. Grips use `constraintDynamics`: a ball is one point constraint, a
+    hinge two. The accelerations are asserted to equal svkc's.
+    """
     import pinocchio
 
     model = pinocchio.buildModelFromMJCF(speed_cases.model_path(name))
@@ -86,7 +91,7 @@ def pinocchio_runs(name: str, chain, state, batch: int, steps: int):
         grips = {"contact_models": models, "contact_datas": datas, "prox_settings": proximal}
         run = lambda: pinocchio.constraintDynamics(model, data, q, v, force, **grips)
     ours = np.asarray(svkc.forward_dynamics(chain, at_rest, jnp.zeros(chain.nv)))[6 : chain.nv]
-    # (the base's own are in other axes)
+    # Pinocchio's base accelerations are in other axes
     assert np.max(np.abs(ours - run()[6:])) < (1e-8 if ours.dtype == np.float64 else 0.1), (
         "Pinocchio's accelerations are not svkc's"
     )
@@ -94,8 +99,7 @@ def pinocchio_runs(name: str, chain, state, batch: int, steps: int):
 
 
 def _point_constraints(pinocchio, model, chain, structure, two: bool):
-    """What holds the figure: for each link that is connected a point of the body at one of the
-    ground, or two, along the joint's axis."""
+    """Yield Pinocchio's point constraints of each link: one, or two along the axis."""
     frame = lambda quat, pos: pinocchio.SE3(
         pinocchio.Quaternion(*map(float, quat)).matrix(), np.asarray(pos, float)
     )
@@ -122,7 +126,7 @@ def _point_constraints(pinocchio, model, chain, structure, two: bool):
 
 
 class Process:
-    """A peer that is compiled as XLA does by itself, on a core of its own."""
+    """A library in its own process, compiled with XLA's default options, on one core."""
 
     def __init__(self, kind: str, name: str, dtype: str, batch: int, steps: int):
         env, case = (
@@ -144,7 +148,7 @@ class Process:
         self.compile_stats = answer["compile_stats"]
 
     def __call__(self):
-        """All its steps. TimeoutError: it does not answer."""
+        """Run all steps. Raise TimeoutError if the process does not answer."""
         self.process.stdin.write("\n")
         self.process.stdin.flush()
         if not select.select([self.process.stdout], [], [], TIMEOUT)[0]:
@@ -153,13 +157,13 @@ class Process:
         self.process.stdout.readline()
 
     def close(self):
-        """Ends the process."""
+        """End the process."""
         self.process.stdin.close()
         self.process.wait()
 
 
 def mjx_program(name: str, batch: int, steps: int):
-    """The figure, or the high bar's."""
+    """Return MJX's steps of a case."""
     from mujoco import mjx
 
     chain, state = speed_cases.load_case(name)
@@ -175,8 +179,10 @@ def mjx_program(name: str, batch: int, steps: int):
 
 
 def jaxsim_program(name: str, batch: int, steps: int):
-    """The open figure, three hinges for each ball: JaxSim has no balls, and no joints that close
-    loops but welds."""
+    """Return JaxSim's steps of the open figure, with three hinges for each ball.
+
+    JaxSim has no ball joints, and closes loops by welds only.
+    """
     import jaxsim.api as js
     import joints
 
@@ -184,7 +190,7 @@ def jaxsim_program(name: str, batch: int, steps: int):
         hinge_model_as_sdf(joints.hinges_for_balls()[0].compile()), time_step=DT, is_urdf=False
     )
     v = jax.random.normal(jax.random.key(0), (batch, model.dofs())) * 0.5
-    # (far above its ground, which nothing of the figure could touch)
+    # JaxSim has a ground: start far above it
     states = jax.vmap(
         lambda v: js.data.JaxSimModelData.build(
             model, base_position=jnp.array([0, 0, 1e3]), joint_velocities=v
@@ -194,8 +200,11 @@ def jaxsim_program(name: str, batch: int, steps: int):
 
 
 def hinge_model_as_sdf(model: mujoco.MjModel) -> str:
-    """Links on hinges as SDF; of several hinges on a body all but the last carry a tenth of a
-    gramme."""
+    """Return a model whose joints are all hinges as SDF.
+
+    SDF allows one hinge for each link: of several hinges on a body, all but the last get a link of
+    0.1 gram.
+    """
     numbers = lambda *x: " ".join(repr(float(y)) for y in x)
     elements, names = [], {0: None} | {b: model.body(b).name for b in range(1, model.nbody)}
 
@@ -256,9 +265,8 @@ def hinge_model_as_sdf(model: mujoco.MjModel) -> str:
 
 
 def main(kind: str, name: str, dtype: str, batch: int, steps: int):
-    """The other end of a `Process`."""
-    # on two cores, and now and then on one, MJX's batches wait for one another for ever (mujoco-mjx
-    # 3.17.0, jax 0.10.1)
+    """Compile one library's steps and run them once for every line of the standard input."""
+    # on two cores, and sometimes on one, MJX's batches deadlock (mujoco-mjx 3.17.0, jax 0.10.1)
     os.sched_setaffinity(0, {0})
     stdout = os.dup(1)
     os.dup2(2, 1)

@@ -1,22 +1,22 @@
-"""Whole runs of the high bar, events and certificate and all: one run of 10 s, and thousands whose
-hands let go at times of their own.
+"""Complete runs of the high bar, with events and report: one of 10 s, and thousands in a batch.
 
-`python benchmarks/runs.py [--lanes 4096]` (two hands until 8 s, one until 9 s, then flight; in
-lanes 1.8 s, the right hand until 0.3 to 0.9 s, the left
-0.2 s longer; `unequal`: their ends from 0.1 to 1.8 s) prints its rows and puts them into
-results/runs.csv. Medians of rounds in which all that are compared take turns; XLA is told to make
-one kernel of a loop (README). MuJoCo: steps of 5 ms of the same figure by symplectic Euler, its
-grips soft and never let go. Error: root mean square over the tree's coordinates, at the end,
-against Dopri8 at rtol 1e-11; in lanes the median of some of them. Ten seconds of
-limbs that nothing damps are chaotic: there the error says no more than that, and the energy is what
-to look at. Joint ranges are left out but where they are named; without them limbs come to spin at
-100 rad/s, and of 4096 lanes one in ten is not finite with symplectic Euler of 5 ms.
+`python benchmarks/runs.py [--lanes 4096]` prints and writes results/runs.csv.
+
+One run: two hands until 8 s, one until 9 s, then flight. Batch: 1.8 s; the right hand releases at
+0.3 to 0.9 s, the left one 0.2 s later. `unequal`: the lanes end at 0.1 to 1.8 s. Times are medians
+of rounds in which all compared programs alternate, with the XLA option that speed.py sets. MuJoCo:
+symplectic Euler steps of 5 ms of the same figure, with soft grips that are never released.
+
+Error: root mean square over the tree's coordinates at the end, relative to Dopri8 at rtol 1e-11; in
+    a batch, the median of some lanes. Ten seconds of undamped limbs are chaotic: there the energy
+    drift is the meaningful number. Joint ranges are left out unless the label says so. Without them
+    limbs reach 100 rad/s, and one in ten of 4096 lanes is not finite with symplectic Euler of 5 ms.
 """
 
 import argparse
 import csv
 
-import speed  # first: it tells XLA what to do
+import speed  # first: sets XLA_FLAGS
 
 # isort: split
 import diffrax
@@ -58,18 +58,18 @@ speed.ROUNDS = ROUNDS
 
 
 def events(right, left):
-    """The hands let go."""
+    """Return the release of each hand, at the given times (s)."""
     return [svkc.at(right, cut="right_hand_grip"), svkc.at(left, cut="left_hand_grip")]
 
 
 def final_error(chain, traj, reference) -> float:
-    """Root mean square at the end, over the tree."""
+    """Return the root mean square error at the end, over the tree's coordinates."""
     difference = svkc.difference(chain, reference.final.q, traj.final.q)[: chain.nv]
     return float(jnp.sqrt(jnp.mean(difference**2)))
 
 
 def result_row(label, who, seconds, simulated, error, phases):
-    """What a run, or the runs of a batch, took and gave."""
+    """Return the row of a run or a batch."""
     drift, steps, rejected = (
         np.asarray(x)
         for x in (
@@ -92,14 +92,14 @@ def result_row(label, who, seconds, simulated, error, phases):
 
 
 def mujoco_steps(chain, state, lanes: int, steps: int):
-    """MuJoCo's steps, alone or on all cores."""
+    """Return (label, function) of MuJoCo's steps, on one core or, for a batch, on all."""
     model, q, v = speed_cases.mujoco_case("high bar", chain, state)
     model.opt.timestep = 5e-3
     return next(speed.mujoco_runs(model, q, np.broadcast_to(v, (lanes, len(v))), lanes, steps))
 
 
 def single_runs(chain, state):
-    """10 s at rtol 1e-8."""
+    """Yield rows of one run of 10 s at rtol 1e-8."""
     make_run = lambda **options: jax.jit(
         lambda s: svkc.simulate(chain, s, 10.0, events=events(8.0, 9.0), **options)
     )
@@ -125,7 +125,7 @@ def single_runs(chain, state):
 
 
 def batch_runs(chain, state, lanes: int, methods: dict, peers=()):
-    """Lanes by `svkc.rollout`, whose first call compiles."""
+    """Yield rows of batches by `svkc.rollout`. The first call compiles."""
     states = jax.tree.map(lambda x: jnp.broadcast_to(x, (lanes, *x.shape)), state)
     times = 0.3 + 0.6 * jax.random.uniform(jax.random.key(1), (lanes,))
     lane = lambda chain, time: {"events": events(time, time + 0.2)}
@@ -163,7 +163,7 @@ def batch_runs(chain, state, lanes: int, methods: dict, peers=()):
 
 
 def unequal_runs(chain, state, lanes: int):
-    """Lanes that end at 0.1 to 1.8 s, as they come and with those alike together."""
+    """Yield rows of lanes that end at 0.1 to 1.8 s, unsorted and sorted by duration."""
     states = jax.tree.map(lambda x: jnp.broadcast_to(x, (lanes, *x.shape)), state)
     ends = 0.1 + 1.7 * jax.random.uniform(jax.random.key(2), (lanes,))
     lane = lambda chain, end: {"events": events(end / 2, 0.8 * end), "t1": end}
@@ -185,7 +185,7 @@ def unequal_runs(chain, state, lanes: int):
 
 
 def main(lanes: int):
-    """Measures, prints, writes."""
+    """Measure, print and write all rows."""
     chain, state = speed_cases.load_case("high bar")
     table, machine = [], speed.machine()
     print("| " + " | ".join(HEAD) + " |")

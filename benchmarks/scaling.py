@@ -1,15 +1,16 @@
-"""How cost and memory grow: with links, with loops, with lanes, with the time that is simulated and
-with events; exponents fitted.
+"""Growth of cost and memory with links, loops, lanes, simulated time and events; fitted exponents.
 
 `python benchmarks/scaling.py [links loops lanes time events]` (extra `bench`) prints and writes
-results/scaling.csv and draws results/scaling.png. Microseconds per `svkc.step` (links, loops,
-lanes) or milliseconds per run of `svkc.simulate` (time, events), medians; seconds to trace, lower
-and compile; megabytes of temporary memory. `mj_step` of MuJoCo beside the links."""
+results/scaling.csv and draws results/scaling.png. Rows hold microseconds per `svkc.step` (links,
+loops, lanes) or milliseconds per run of `svkc.simulate` (time, events), medians; seconds of
+tracing, lowering and compilation; megabytes of temporary memory. MuJoCo's `mj_step` is measured for
+links.
+"""
 
 import csv
 import sys
 
-import speed  # first: it tells XLA what to do, and where the tests' models are
+import speed  # first: sets XLA_FLAGS, and the path to the tests
 
 # isort: split
 import jax
@@ -42,7 +43,7 @@ LINK = (
 
 
 def chain_of(count: int, balls: bool = False) -> str:
-    """MJCF of bars in a row, on hinges whose axes take turns, or on balls."""
+    """Return MJCF of bars in a row, on hinges with alternating axes or on balls."""
     text = ""
     for i in reversed(range(count)):
         kind, axis = (
@@ -56,14 +57,14 @@ def chain_of(count: int, balls: bool = False) -> str:
 
 
 def step_program(chain, state, batch: int = 1):
-    """Steps in one call, and the program of them."""
+    """Return the number of steps in one call, and their program."""
     steps, tau = speed.steps_for(batch), jnp.zeros(chain.nv)
     step = lambda s: svkc.step(chain, s, tau, speed_cases.DT)
     return steps * batch, Program(scan_steps(step if batch == 1 else jax.vmap(step), steps), state)
 
 
 def links():
-    """An open chain of bars, 5 to 200."""
+    """Yield open chains of 5 to 200 bars."""
     for count in (5, 10, 20, 50, 100, 200):
         chain = svkc.load(chain_of(count))
         state = chain.state(np.full(count, 0.1))
@@ -79,7 +80,7 @@ def links():
 
 
 def loops():
-    """Forty bars on balls, 1 to 20 of them held to the ground by a ball each."""
+    """Yield forty bars on balls, with 1 to 20 of them connected to the ground by balls."""
     for count in (1, 2, 5, 10, 20):
         pins = [
             svkc.VirtualLink(
@@ -94,7 +95,7 @@ def loops():
 
 
 def lanes():
-    """The open figure of 46 freedoms, 256 to 16384 lanes."""
+    """Yield batches of 256 to 16384 open figures of 46 freedoms."""
     chain, state = speed_cases.load_case("open")
     for batch in (256, 1024, 4096, 16384):
         steps, program = step_program(chain, speed_cases.random_states(chain, state, batch), batch)
@@ -102,7 +103,7 @@ def lanes():
 
 
 def time():
-    """The high bar without releases, 0.5 to 8 s."""
+    """Yield the high bar without releases, for 0.5 to 8 s."""
     chain, state = speed_cases.load_case("high bar")
     for end in (0.5, 1.0, 2.0, 4.0, 8.0):
         yield (
@@ -118,7 +119,7 @@ def time():
 
 
 def events():
-    """A pendulum for 2 s, its pin cut and made again 1 to 64 times."""
+    """Yield a pendulum for 2 s whose pin is cut and connected 1 to 64 times."""
     chain = svkc.load(chain_of(1), cuttable="j0")
     state = chain.state({"j0": 1.0})
     for count in (1, 4, 16, 64):
@@ -139,7 +140,7 @@ GROWTH = {f.__name__: f for f in (links, loops, lanes, time, events)}
 
 
 def draw(table):
-    """A panel for each of what grows."""
+    """Draw a panel for each growing quantity."""
     import matplotlib.pyplot as plt
     from matplotlib.ticker import NullFormatter
 
@@ -168,7 +169,7 @@ def draw(table):
 
 
 def main(names):
-    """Measures, prints, fits, writes."""
+    """Measure, fit, print and write the named quantities."""
     table = []
     print("| " + " | ".join(HEAD) + " |")
     for name in names:

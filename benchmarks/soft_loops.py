@@ -1,5 +1,7 @@
-"""MuJoCo's models of the accuracy problems, and its runs of them: loops are soft equality
-constraints as stiff as twice the time step lets them be."""
+"""MuJoCo's models and runs of the accuracy problems.
+
+Loops are soft equality constraints, as stiff as a time constant of two time steps allows.
+"""
 
 import pathlib
 import sys
@@ -7,7 +9,7 @@ import sys
 import mujoco
 import numpy as np
 
-# the tests' reference problems
+# the reference problems of the tests
 sys.path.insert(0, str(pathlib.Path(__file__).parents[1] / "tests" / "references"))
 
 import maximal
@@ -20,8 +22,10 @@ INTEGRATORS = ("Euler", "implicitfast", "RK4")
 
 
 def mechanism_model(problem, problem_data: dict, dt: float):
-    """A problem given body by body: its joints left over as `connect`s, its springs as tendons.
-    MjModel."""
+    """Return the MjModel of a mechanism described body by body.
+
+    Joints that close loops are `connect` constraints, springs are tendons.
+    """
     xml, bodies, _, loops = maximal.mjcf(problem_data)
     numbers, equalities, sites, tendons = maximal._numbers, "", {}, ""
     for joint in loops:
@@ -63,8 +67,11 @@ def mechanism_model(problem, problem_data: dict, dt: float):
 
 
 def figure_model(problem, spec: mujoco.MjSpec, dt: float):
-    """A model and the virtual links of the problem's start: two `connect`s for a hinge, one for a
-    ball; a slide is a `weld` to a sled of a gram. MjModel."""
+    """Return the MjModel of a model and the virtual links that are connected at the problem's
+    start.
+
+    A hinge is two `connect` constraints, a ball is one, a slide is a `weld` to a sled of one gram.
+    """
     chain, s = problem.chain, problem.state.structure
     rows = dict(zip(chain.topology.body_row, chain.body_names))
     body = lambda row: spec.worldbody if rows[int(row)] == "world" else spec.body(rows[int(row)])
@@ -120,11 +127,13 @@ MODELS = {
 
 
 class Run:
-    """MuJoCo from the problem's start to its end; links are let go when they were in the reference.
-    Called: qpos in the order of the chain's q.
+    """MuJoCo's run of a problem. A call returns the final qpos in the order of the chain's q.
 
-    gap: the largest of the loops at releases and the end. drift: change of energy less the work of
-    the torques, J."""
+    Links are released at the times of the reference run.
+
+    gap: largest loop gap at releases and at the end.
+    drift: change of energy minus the work of the torques (J).
+    """
 
     def __init__(self, problem, name: str, integrator: str, dt: float):
         chain, state = problem.chain, problem.state
@@ -134,7 +143,7 @@ class Run:
             self.released.setdefault(time, []).extend(
                 i for i in range(model.neq) if model.equality(i).name.startswith(links)
             )
-        # whole steps to each release, and to the end
+        # an integer number of steps to each release, and to the end
         self.stops = [*sorted(self.released), problem.end]
         self.steps = sum(round((b - a) / dt) for a, b in zip([0.0, *self.stops], self.stops))
         model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
@@ -163,7 +172,7 @@ class Run:
             self.torque[model.joint(dof).dofadr] = torque
 
     def _places(self, chain):
-        """Where the chain's q and v lie in qpos and qvel, sleds left out."""
+        """Return the indices of the chain's q and v in qpos and qvel. Sleds are left out."""
         own = [
             i for i in range(self.model.njnt) if self.model.joint(i).name not in chain.link_names
         ]

@@ -1,14 +1,16 @@
-"""Steps of the 40-freedom figure on a free base (46 freedoms), open and with two grips, and of the
-high bar's, beside MuJoCo, MJX, Pinocchio and JaxSim.
+"""Time of one step of svkc, MuJoCo, MJX, Pinocchio and JaxSim.
 
-`python benchmarks/speed.py [case ...] [--dtype ..] [--batch ..]` prints its rows, puts them into
-results/speed.csv and draws results/speed.png (extra `viz`). Peers that are not installed (extra
-`bench`) are left out. One step is symplectic Euler of 2 ms with all that it needs; microseconds per
-step and lane, the median of rounds in which all that are compared take turns, and the least and
-most; `times svkc`: of svkc on as many cores.
-XLA is told to make one kernel of a loop (README). svkc on one core is `vmap` of `svkc.step` in one
-program, on all cores each device has its own lanes. Grips are hard in svkc, soft in MuJoCo and MJX.
-Compile seconds: trace, lower, XLA."""
+The cases are the 40-freedom figure on a free base (46 freedoms), open and with two grips, and the
+high bar's figure. `python benchmarks/speed.py [case ...] [--dtype ..] [--batch ..]` prints and
+writes results/speed.csv and draws results/speed.png (extra `viz`). Libraries that are not installed
+(extra `bench`) are skipped.
+
+One step is symplectic Euler of 2 ms. Rows hold microseconds per step and lane: median, least and
+most of rounds in which all compared libraries alternate. `times svkc` is relative to svkc on as
+many cores. XLA compiles each loop to one kernel (see README). svkc on one core is `vmap` of
+`svkc.step` in one program; on all cores each device has its own lanes. Grips are hard in svkc, soft
+in MuJoCo and MJX. Compile seconds: tracing, lowering, XLA.
+"""
 
 import argparse
 import csv
@@ -17,9 +19,9 @@ import pathlib
 import platform
 import time
 
-import peers  # first: its own processes go without the next line
+import peers  # first: saves XLA_FLAGS for its processes
 
-# before jax makes its first program
+# before XLA compiles anything
 os.environ["XLA_FLAGS"] = (
     peers.USER_XLA_FLAGS
     + " --xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000000"
@@ -60,12 +62,12 @@ HEAD = [
 
 
 def steps_for(batch: int) -> int:
-    """Steps in one timed call: enough to be measured, not so many that it takes long."""
+    """Return the number of steps in one timed call."""
     return max(5, min(250, 40000 // batch))
 
 
 def svkc_runs(chain, state, batch: int, steps: int):
-    """One core, and all of them."""
+    """Yield svkc's steps on one core and on all cores, as (label, program)."""
     tau = jnp.zeros(chain.nv, state.q.dtype)
     run = scan_steps(lambda s: svkc.step(chain, s, tau, DT), steps)
     if batch == 1:
@@ -96,7 +98,9 @@ def svkc_runs(chain, state, batch: int, steps: int):
 
 
 def time_in_turns(runs: dict) -> dict[str, np.ndarray]:
-    """Seconds of each, in turns; a first one is left out."""
+    """Return the seconds of each run of each function. Functions alternate; the first round is
+    dropped.
+    """
     seconds = {name: [] for name in runs}
     for _ in range(ROUNDS + 1):
         for name, run in list(runs.items()):
@@ -112,7 +116,7 @@ def time_in_turns(runs: dict) -> dict[str, np.ndarray]:
 
 
 def compare_case(name: str, dtype: str, batch: int, messages: set):
-    """Rows of one case."""
+    """Yield the rows of one case."""
     chain, state = speed_cases.load_case(name)
     model, q, _ = speed_cases.mujoco_case(name, chain, state)
     v, steps, runs = (
@@ -168,7 +172,7 @@ def compare_case(name: str, dtype: str, batch: int, messages: set):
 
 
 def draw(table):
-    """Microseconds per step and lane by lanes: a panel for each case, float32 dashed."""
+    """Draw microseconds per step and lane against lanes: a panel for each case, float32 dashed."""
     import matplotlib.pyplot as plt
 
     cases = list(dict.fromkeys(row[0] for row in table))
@@ -205,7 +209,7 @@ def draw(table):
 
 
 def machine() -> dict:
-    """What it was measured with."""
+    """Return versions, processor and number of cores."""
     cpu = [
         line.split(":")[1].strip()
         for line in open("/proc/cpuinfo")
@@ -225,8 +229,7 @@ def machine() -> dict:
 
 
 def main(cases, dtypes, batches):
-    """Measures, prints, writes: rows of a case, a dtype and a number of lanes in place of their old
-    ones."""
+    """Measure, print and write the rows of all cases, dtypes and batch sizes."""
     messages = set()
     print("| " + " | ".join(HEAD) + " |")
     for name in cases:
@@ -243,7 +246,10 @@ def main(cases, dtypes, batches):
 
 
 def save(key: tuple, rows):
-    """In the file of all, and in its picture."""
+    """Replace rows in results/speed.csv and redraw the picture.
+
+    key: case, dtype and batch size of the rows.
+    """
     path = RESULTS / "speed.csv"
     with path.open() as file:
         rows_of_file = [row for row in list(csv.reader(file))[1:] if tuple(row[:3]) != key]

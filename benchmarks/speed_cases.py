@@ -1,5 +1,8 @@
-"""What the benchmarks of speed move: the 40-freedom figure on a free base, open and held, the
-16-joint figure on its bar, and MuJoCo's models of them."""
+"""Chains and states of the speed benchmarks, and MuJoCo's models of them.
+
+The cases are the 40-freedom figure on a free base, open and with grips, and the 16-joint figure on
+the high bar.
+"""
 
 from types import SimpleNamespace
 
@@ -19,8 +22,11 @@ CASES = ("open", "two ball grips", "two hinge grips", "high bar")
 
 
 def figure_with_grips(joint: str):
-    """The 40-freedom figure, each hand held to the ground by a joint where it is when both arms are
-    raised forward."""
+    """Return the 40-freedom figure with both arms raised forward, each hand connected to the
+    ground.
+
+    joint: joint of the two virtual links.
+    """
     links = [
         svkc.VirtualLink(
             f"{side}_grip", "world", f"{side}_hand", joint, axis=(0, 1, 0), real_pos=PALM
@@ -40,7 +46,7 @@ def figure_with_grips(joint: str):
 
 
 def load_case(name: str):
-    """Chain and state."""
+    """Return chain and state of a case."""
     if name == "open":
         chain = svkc.load(FIGURE, ignore=("limit",))
         return chain, chain.state(
@@ -52,12 +58,12 @@ def load_case(name: str):
 
 
 def model_path(name: str) -> str:
-    """Of the model."""
+    """Return the path of the case's MJCF file."""
     return str(svkc.scenes.FOLDER / "figure16.xml") if name == "high bar" else FIGURE
 
 
 def mujoco_case(name: str, chain, state) -> tuple[mujoco.MjModel, np.ndarray, np.ndarray]:
-    """MuJoCo's model with the step DT and no ranges, grips as `connect`s; qpos, qvel."""
+    """Return MuJoCo's model (step DT, no joint ranges, grips as `connect`), qpos and qvel."""
     spec = mujoco.MjSpec.from_file(model_path(name))
     model = soft_loops.figure(SimpleNamespace(chain=chain, state=state), spec, DT)
     model.opt.timestep, model.opt.jacobian = DT, mujoco.mjtJacobian.mjJAC_DENSE
@@ -68,7 +74,7 @@ def mujoco_case(name: str, chain, state) -> tuple[mujoco.MjModel, np.ndarray, np
 
 
 def random_states(chain, state, batch: int):
-    """States with velocities of their own that the loops allow."""
+    """Return a batch of states with random velocities that satisfy the loop constraints."""
     v = jax.random.normal(jax.random.key(0), (batch, chain.dofs), state.v.dtype) * 0.5
     if chain.link_names:
         v = v @ svkc.coordinates(chain, state).W.T

@@ -1,11 +1,11 @@
-"""How many files a reader enters who follows one thing through the code.
+"""Number of files that a reader enters to follow one object through the code.
 
 Four walks: a `State` through `simulate`, a `VirtualLink` from `load` to the loop Jacobian, a guard
 from `when` to the derivative of its time, a torque through forward dynamics. A walk is the list of
-functions of svkc in the order in which the interpreter first calls them. Printed for each: files
-entered, moves between files, moves back to a file already left, packages.
+svkc's functions in the order in which the interpreter first calls them. The table holds files
+entered, moves between files, moves back to a file left before, and packages.
 
-`python benchmarks/walks.py`; with PYTHONPATH set to another checkout, the walks there.
+`python benchmarks/walks.py`; with PYTHONPATH set to another checkout, its walks.
 """
 
 import pathlib
@@ -52,7 +52,7 @@ def count_moves(files: list[str]) -> tuple[int, int, int, int]:
 
 
 def load():
-    """Return a two-link arm whose hand a pin holds."""
+    """Return a two-link arm whose hand is connected to the ground by a pin."""
     pin = svkc.VirtualLink(
         "pin", "world", "hand", "hinge", pos=(0.5, 0, -1), axis=(0, 1, 0), connected=True
     )

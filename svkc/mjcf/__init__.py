@@ -1,1 +1,1 @@
-"""Models in and out: MJCF and URDF by MuJoCo, virtual links from equalities, a chain as MJCF."""
+"""Loading of MJCF and URDF through MuJoCo, and conversion of chains and states to MuJoCo."""

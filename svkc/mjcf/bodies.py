@@ -1,4 +1,4 @@
-"""What a MuJoCo model says of bodies, joints and motors, as numpy arrays by row."""
+"""Bodies, joints and actuators of a MuJoCo model as NumPy arrays, by row of `Topology`."""
 
 import dataclasses
 
@@ -7,14 +7,15 @@ import numpy as np
 from svkc.mjcf.unsupported import is_torque_motor
 from svkc.model.topology import BALL, FIXED, FREE, HINGE, Q_SIZE, SLIDE, V_SIZE, Topology
 
-# rad/s: a joint outside its range is an oscillator of this frequency, critically damped, at its
-# load-pose inertia
+# rad/s: outside of its range, a joint with its inertia in the load pose is a critically damped
+# oscillator of this angular frequency
 _LIMIT_RATE = 50.0
 JOINT_KINDS = {0: FREE, 1: BALL, 2: SLIDE, 3: HINGE}  # mjtJoint
 
 
 def name_of(model, kind: str, index: int) -> str:
-    """The name of a body, joint, site or equality, or kind_index where it has none."""
+    """Return the name of an element ("body", "joint", "site", "equality"), or KIND_INDEX if it has
+    none."""
     import mujoco
 
     name = mujoco.mj_id2name(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), index)
@@ -22,7 +23,7 @@ def name_of(model, kind: str, index: int) -> str:
 
 
 def rotation_matrix(quat) -> np.ndarray:
-    """The rotation matrix [3 3] of a quaternion, in numpy."""
+    """Return the rotation matrix [3 3] of a quaternion (wxyz)."""
     import mujoco
 
     R = np.zeros(9)
@@ -32,8 +33,15 @@ def rotation_matrix(quat) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True)
 class TreeJoint:
-    """A joint of the tree and where its coordinates stand; `joint` is -1 for the free joint that a
-    body gets whose own joints may be cut."""
+    """A joint of the tree.
+
+    name: name of the joint.
+    kind: joint kind of `Topology`.
+    body: index of the body in the model.
+    joint: index of the joint in the model; -1 for the free joint of a body with cuttable joints.
+    q: index in q of its first coordinate.
+    v: index in v of its first velocity.
+    """
 
     name: str
     kind: int
@@ -44,16 +52,19 @@ class TreeJoint:
 
 
 def tree_joints(model, cut_bodies) -> list[TreeJoint]:
-    """The joints of the tree in the model's order; a body in `cut_bodies` (body -> name) hangs on
-    the base by a free joint (paper, Fig. 15)."""
-    out, q, v, seen = [], 0, 0, set()
+    """Return the joints of the tree in the model's order.
+
+    cut_bodies: body -> name of the virtual link that holds the body. A free joint joins such a body
+    to the world (paper, Fig. 15).
+    """
+    out, q, v, with_free_joint = [], 0, 0, set()
     for j in range(model.njnt):
         body = int(model.jnt_bodyid[j])
-        if body in seen:
+        if body in with_free_joint:
             continue
         kind, name, joint = JOINT_KINDS[int(model.jnt_type[j])], name_of(model, "joint", j), j
         if body in cut_bodies:
-            seen.add(body)
+            with_free_joint.add(body)
             kind, name, joint = FREE, f"{cut_bodies[body]}_free", -1
         out.append(TreeJoint(name=name, kind=kind, body=body, joint=joint, q=q, v=v))
         q, v = q + Q_SIZE[kind], v + V_SIZE[kind]
@@ -61,8 +72,10 @@ def tree_joints(model, cut_bodies) -> list[TreeJoint]:
 
 
 def tree_rows(model, cut_bodies) -> tuple[list[tuple[int, int]], Topology]:
-    """One row a joint, sorted by level: [(body, joint or -1)] and the topology without virtual
-    links."""
+    """Return (body, joint or -1) of each row, and the topology without virtual links.
+
+    There is one row for each joint, and one for each body without joints, sorted by level.
+    """
     joints = tree_joints(model, cut_bodies)
     order, depth, last, own = [(0, -1, -1)], [0], {0: 0}, {0: None}
     for body in range(1, model.nbody):
@@ -95,7 +108,7 @@ def tree_rows(model, cut_bodies) -> tuple[list[tuple[int, int]], Topology]:
 
 
 def body_arrays(model, topology, rows) -> dict[str, np.ndarray]:
-    """Of each row: frame in the parent, joint axis and anchor, mass, centre of mass, inertia."""
+    """Return pos, quat, axis, anchor, mass, com and inertia of each row; see `Chain`."""
     n = len(rows)
     out = {
         "pos": np.zeros((n, 3)),
@@ -121,22 +134,21 @@ def body_arrays(model, topology, rows) -> dict[str, np.ndarray]:
 
 
 def _inertia(model, body):
-    """About the centre of mass, in body axes."""
+    """Return the inertia about the centre of mass in the body's axes."""
     R = rotation_matrix(model.body_iquat[body])
     return R @ np.diag(model.body_inertia[body]) @ R.T
 
 
 def springs_and_limits(model, ignored, topology) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Stiffness [dofs], range [2 dofs] (infinite where there is none) and its spring and damper [2
-    dofs]."""
-    n, place = topology.dofs, np.array(topology.model_v, int)
+    """Return stiffness [dofs], limit [2 dofs] and limit_spring [2 dofs]; see `Chain`."""
+    n, model_v = topology.dofs, np.array(topology.model_v, int)
     stiffness, limit, spring = np.zeros(n), np.tile([[-np.inf], [np.inf]], (1, n)), np.zeros((2, n))
     for j in range(model.njnt):
         own = slice(
             int(model.jnt_dofadr[j]),
             int(model.jnt_dofadr[j]) + V_SIZE[JOINT_KINDS[int(model.jnt_type[j])]],
         )
-        dofs = place[own]
+        dofs = model_v[own]
         if "spring" not in ignored:
             stiffness[dofs] = np.ravel(model.jnt_stiffness[j])[0]
         if model.jnt_limited[j] and model.jnt_type[j] in (2, 3) and "limit" not in ignored:
@@ -151,7 +163,10 @@ def springs_and_limits(model, ignored, topology) -> tuple[np.ndarray, np.ndarray
 
 
 def joint_armature(model, ignored, without: tuple[str, ...]) -> np.ndarray:
-    """The model's armature [nv], zero for joints in `without`; ValueError: no such joint."""
+    """Return the model's armature [nv], zero for the joints in `without`.
+
+    Raises ValueError if there is no such joint.
+    """
     names = [name_of(model, "joint", j) for j in range(model.njnt)]
     armature = np.zeros(model.nv) if "armature" in ignored else np.array(model.dof_armature)
     for name in without:
@@ -163,16 +178,16 @@ def joint_armature(model, ignored, without: tuple[str, ...]) -> np.ndarray:
 
 
 def scatter_to_dofs(topology, values) -> np.ndarray:
-    """[dofs] from the model's own [nv]: zero for virtual joints that are none of its."""
+    """Return values of the model's velocities [nv] as [dofs], zero for other virtual joints."""
     out = np.zeros(topology.dofs)
     out[np.array(topology.model_v, int)] = np.ravel(values)
     return out
 
 
 def actuator_arrays(model, ignored, topology):
-    """Gear matrix and ranges of the actuators that are plain torques on joints."""
+    """Return gear [motors dofs], control_range and force_range [motors 2]; see `Chain`."""
     count = 0 if {"actuator", "all"} & ignored and not is_torque_motor(model).all() else model.nu
-    place = np.array(topology.model_v, int)
+    model_v = np.array(topology.model_v, int)
     gear, control, force = (
         np.zeros((count, topology.dofs)),
         np.tile([-np.inf, np.inf], (count, 1)),
@@ -181,7 +196,7 @@ def actuator_arrays(model, ignored, topology):
     for i in range(count):
         joint = int(model.actuator_trnid[i, 0])
         size, start = V_SIZE[JOINT_KINDS[int(model.jnt_type[joint])]], int(model.jnt_dofadr[joint])
-        gear[i, place[start : start + size]] = (
+        gear[i, model_v[start : start + size]] = (
             model.actuator_gear[i, :size] * model.actuator_gainprm[i, 0]
         )
         if model.actuator_ctrllimited[i]:

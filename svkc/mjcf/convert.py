@@ -1,4 +1,4 @@
-"""States and scenes to MuJoCo and back."""
+"""Conversion of states to and from `mujoco.MjData`, and of chains to MJCF text."""
 
 import os
 
@@ -11,15 +11,14 @@ from svkc.model.virtual_link import JOINTS
 
 
 def _links_with_equality(chain: Chain) -> list[tuple[int, int]]:
-    """(virtual link, MuJoCo's <equality>) of each link that was one."""
+    """Return (virtual link, index of the <equality>) of each link that is one in the model."""
     model, names = chain.model.model, {name: i for i, name in enumerate(chain.link_names)}
-    found = [(name_of(model, "equality", i), i) for i in range(model.neq)]
-    return [(names[name], i) for name, i in found if name in names]
+    equalities = [(name_of(model, "equality", i), i) for i in range(model.neq)]
+    return [(names[name], i) for name, i in equalities if name in names]
 
 
 def mjcf_text(spec) -> str:
-    """MJCF of a mujoco.MjSpec as it was written, to the last digit; makes the directories of its
-    files absolute."""
+    """Return the MJCF of a mujoco.MjSpec with all digits, and the folders of its files absolute."""
     spec.compiler.savecompiled = spec.compiler.savecanonical = False
     here = os.path.abspath(spec.modelfiledir or ".")
     if not spec.assets:
@@ -31,7 +30,7 @@ def mjcf_text(spec) -> str:
 
 
 def to_mjcf(chain: Chain) -> str:
-    """See `Chain.to_mjcf`."""
+    """Return MJCF text of the chain; see `Chain.to_mjcf`."""
     import mujoco
 
     if chain.model.text is None:
@@ -71,34 +70,37 @@ def to_mjcf(chain: Chain) -> str:
 
 
 def _add_equality(chain: Chain, spec, link: int, name: str) -> list[str]:
-    """Adds a virtual link between two new sites; returns what has to be said of it."""
+    """Add a virtual link to the spec as <equality> elements between new sites.
+
+    Return notes on everything about the link that MJCF cannot express.
+    """
     import mujoco
 
     s, top = chain.structure, chain.topology
-    free, active = top.link_freedoms[link], bool(s.connected[link])
+    freedoms, active = top.link_freedoms[link], bool(s.connected[link])
     bodies = [top.body_row.index(int(row)) for row in (s.parent[link], s.real[link])]
     frames = [
         tuple(float(x) for x in frame[link]) for frame in (s.pos, s.quat, s.real_pos, s.real_quat)
     ]
-    given = ", ".join(
+    placement = ", ".join(
         f"{key}={frame}"
         for key, frame in zip(("pos", "quat", "real_pos", "real_quat"), frames, strict=True)
     )
     ends = ", ".join(repr(top.body_names[body]) for body in bodies)
     call = (
-        f"svkc.VirtualLink({name!r}, {ends}, {_joint_argument(free)!r}, {given}, connected={active},"
-        f" actuated={top.link_actuated[link]})"
+        f"svkc.VirtualLink({name!r}, {ends}, {_joint_argument(freedoms)!r}, {placement},"
+        f" connected={active}, actuated={top.link_actuated[link]})"
     )
-    turns = sum(free[:3])
-    if turns == 2 or any(free[3:]):
+    rotations = sum(freedoms[:3])
+    if rotations == 2 or any(freedoms[3:]):
         return [f"no <equality> is like {call}"]
-    kind = mujoco.mjtEq.mjEQ_CONNECT if turns else mujoco.mjtEq.mjEQ_WELD
-    places = {name: np.zeros(3)}
-    if turns == 1:
-        places[_unique_name(f"{name}_axis", chain.link_names)] = float(chain.length) * np.array(
-            free[:3], float
+    kind = mujoco.mjtEq.mjEQ_CONNECT if rotations else mujoco.mjtEq.mjEQ_WELD
+    points = {name: np.zeros(3)}
+    if rotations == 1:
+        points[_unique_name(f"{name}_axis", chain.link_names)] = float(chain.length) * np.array(
+            freedoms[:3], float
         )
-    for label, place in places.items():
+    for label, point in points.items():
         sites = []
         for body, side, pos, quat in zip(
             bodies, ("parent", "real"), frames[::2], frames[1::2], strict=True
@@ -125,23 +127,24 @@ def _add_equality(chain: Chain, spec, link: int, name: str) -> list[str]:
     )
 
 
-def _unique_name(name: str, taken) -> str:
-    """The name, longer where another has it."""
-    while name in taken:
+def _unique_name(name: str, existing) -> str:
+    """Return the name, with underscores appended until it is not in `existing`."""
+    while name in existing:
         name += "_"
     return name
 
 
 def _joint_argument(freedoms: tuple[bool, ...]):
-    """The joint as it is declared."""
-    return next((joint for joint, those in JOINTS.items() if those == freedoms), freedoms)
+    """Return the `joint` argument of a `VirtualLink` with these freedoms."""
+    return next((joint for joint, others in JOINTS.items() if others == freedoms), freedoms)
 
 
-def _check_sizes(chain: Chain, data) -> None:
+def _check_data(chain: Chain, data) -> None:
+    """Raise ValueError if the data's qpos and qvel are not of the chain's model."""
     nq, nv = len(chain.topology.model_q), len(chain.topology.model_v)
-    sizes = [np.asarray(getattr(data, name, None)).shape for name in ("qpos", "qvel")]
-    if sizes != [(nq,), (nv,)]:
-        got = [size[0] if size else "no" for size in sizes]
+    shapes = [np.asarray(getattr(data, name, None)).shape for name in ("qpos", "qvel")]
+    if shapes != [(nq,), (nv,)]:
+        got = [shape[0] if shape else "no" for shape in shapes]
         raise ValueError(
             f"data: got {got[0]} qpos and {got[1]} qvel, the chain's model has {nq} and {nv}; make"
             " it of the same model"
@@ -149,14 +152,17 @@ def _check_sizes(chain: Chain, data) -> None:
 
 
 def to_mujoco(chain: Chain, state: State, data) -> None:
-    """Copies q (m, rad, wxyz) and v (m/s, rad/s) into a `mujoco.MjData` of the chain's model, and
-    which of its <equality> hold; call `mj_forward` next.
+    """Copy a state into a `mujoco.MjData` of the chain's model; call `mj_forward` next.
 
-    Of a joint that was cut, the coordinates that it would have. ValueError: the data is another
-    model's.
+    Writes qpos, qvel, and which <equality> elements are active. A joint that is cut has the
+    coordinates of its virtual joint.
+
+    data: a `mujoco.MjData` of `chain.model.model`, changed in place.
+
+    Raises ValueError if the data is of another model.
     """
     check_state(chain, state)
-    _check_sizes(chain, data)
+    _check_data(chain, data)
     data.qpos[:] = np.asarray(state.q)[np.array(chain.topology.model_q, int)]
     data.qvel[:] = np.asarray(state.v)[np.array(chain.topology.model_v, int)]
     for link, equality in _links_with_equality(chain):
@@ -164,11 +170,17 @@ def to_mujoco(chain: Chain, state: State, data) -> None:
 
 
 def from_mujoco(chain: Chain, data) -> State:
-    """The state in a `mujoco.MjData` of the chain's model, by copy: its loops are closed and
-    velocities made consistent, as by `chain.state`; links that were <equality> hold where it says
-    so, others as in the chain. ValueError: the data is another model's, a loop cannot be closed."""
+    """Return the state in a `mujoco.MjData` of the chain's model, by copy.
+
+    `chain.state` closes the loops and projects the velocity. Virtual links from an <equality> are
+    connected if the equality is active in the data, others as in the chain.
+
+    data: a `mujoco.MjData` of `chain.model.model`.
+
+    Raises ValueError if the data is of another model, or if a loop cannot be closed.
+    """
     check_chain(chain)
-    _check_sizes(chain, data)
+    _check_data(chain, data)
     connected = np.array(chain.structure.connected)
     for link, equality in _links_with_equality(chain):
         connected[link] = bool(data.eq_active[equality])

@@ -1,5 +1,5 @@
-"""Joints of the tree that may be cut (paper, Fig. 15): the child hangs on the base by a free joint,
-a virtual link with the joint holds it."""
+"""Cuttable joints of the tree: a free joint joins the child to the world, and a virtual link with
+the original joint holds the child (paper, Fig. 15)."""
 
 import dataclasses
 
@@ -9,14 +9,18 @@ from svkc.mjcf.bodies import JOINT_KINDS, name_of, rotation_matrix
 from svkc.model.topology import BALL, FREE, HINGE, SLIDE, V_SIZE, Topology
 from svkc.model.virtual_link import VirtualLink
 
-# place of the coordinates of each kind among the six freedoms of a virtual joint
+# indices of a joint's coordinates among the six freedoms of a virtual joint
 _FREEDOM_INDICES = {"hinge": (2,), "slide": (5,), "ball": (0, 1, 2), "universal": (0, 1)}
 
 
 @dataclasses.dataclass(frozen=True)
 class CuttableJoint:
-    """One cuttable joint: the virtual link that takes its place, the body it carries, and the
-    model's joints in it."""
+    """A cuttable joint.
+
+    link: the virtual link that replaces the joint.
+    body: index in the model of the body that the joint holds.
+    joints: indices in the model of the joints that the virtual link replaces.
+    """
 
     link: VirtualLink
     body: int
@@ -28,8 +32,10 @@ class CuttableJoint:
 
 
 def cuttable_joints(model, cuttable) -> list[CuttableJoint]:
-    """The cuts asked for by joint names; ValueError: unknown names, joints that no virtual joint is
-    like."""
+    """Return the cuttable joints with these names, one for each body.
+
+    Raises ValueError if a name is unknown, or if no virtual joint has the joint's freedoms.
+    """
     names = [name_of(model, "joint", j) for j in range(model.njnt)]
     cuts: dict[int, CuttableJoint] = {}
     for name in cuttable:
@@ -41,6 +47,7 @@ def cuttable_joints(model, cuttable) -> list[CuttableJoint]:
 
 
 def _cuttable_joint(model, name: str, body: int) -> CuttableJoint:
+    """Return the cuttable joint that holds a body; `name` is one of the body's joints."""
     joints = tuple(
         range(
             int(model.body_jntadr[body]),
@@ -50,7 +57,7 @@ def _cuttable_joint(model, name: str, body: int) -> CuttableJoint:
     kinds = [JOINT_KINDS[int(model.jnt_type[j])] for j in joints]
     frame, axis = np.eye(3), model.jnt_axis[joints[0]]
     ref = [float(model.qpos0[model.jnt_qposadr[j]]) for j in joints]
-    pos, turned = np.array(model.body_pos[body]), rotation_matrix(model.body_quat[body])
+    pos, R = np.array(model.body_pos[body]), rotation_matrix(model.body_quat[body])
     anchor = np.array(model.jnt_pos[joints[0]])
     if (
         kinds == [HINGE, HINGE]
@@ -70,11 +77,11 @@ def _cuttable_joint(model, name: str, body: int) -> CuttableJoint:
         )
     if joint in ("slide", "universal"):
         anchor = anchor * (joint == "universal")
-    base = turned @ frame
-    # the coordinate reads the joint's own: `ref` in the load pose
+    frame_in_parent = R @ frame
+    # the virtual joint's coordinate equals the joint's, which is `ref` in the load pose
     if joint == "hinge":
-        base = base @ _rotation_about(axis, -ref[0])
-    place = pos + turned @ anchor - (turned @ axis * ref[0] if joint == "slide" else 0)
+        frame_in_parent = frame_in_parent @ _rotation_about(axis, -ref[0])
+    joint_pos = pos + R @ anchor - (R @ axis * ref[0] if joint == "slide" else 0)
     link = VirtualLink(
         name, name_of(model, "body", int(model.body_parentid[body])), name_of(model, "body", body),
         joint, pos=tuple(place), quat=tuple(_quaternion(base)), real_pos=tuple(anchor),
@@ -85,10 +92,9 @@ def _cuttable_joint(model, name: str, body: int) -> CuttableJoint:
 
 
 def check_armature(model, cuts: list[CuttableJoint], armature: np.ndarray) -> None:
-    """ValueError where a joint that may be cut has armature [nv], as virtual joints have no
-    inertia."""
-    turning = set(np.asarray(model.dof_jntid)[armature != 0])
-    names = [name_of(model, "joint", j) for cut in cuts for j in cut.joints if j in turning]
+    """Raise ValueError if a cuttable joint has armature [nv], as virtual joints have no inertia."""
+    with_armature = set(np.asarray(model.dof_jntid)[armature != 0])
+    names = [name_of(model, "joint", j) for cut in cuts for j in cut.joints if j in with_armature]
     if names:
         raise ValueError(
             f"cuttable: got armature on {', '.join(names)}; a rotor has no place in the tree once"
@@ -99,8 +105,10 @@ def check_armature(model, cuts: list[CuttableJoint], armature: np.ndarray) -> No
 def with_cuttable_joints(
     model, topology: Topology, cuts: list[CuttableJoint], first: int
 ) -> Topology:
-    """The topology with the cuts' tables: their links start at slot `first`; where the model's own
-    qpos and qvel are to be found."""
+    """Return the topology with link_child, cut_joints, model_q and model_v filled.
+
+    first: index of the first virtual link that replaces a cuttable joint.
+    """
     slots = {cut.body: (first + i, cut) for i, cut in enumerate(cuts)}
     link_child = [-1] * len(topology.link_names)
     for body, (slot, _) in slots.items():
@@ -111,14 +119,14 @@ def with_cuttable_joints(
         [],
         iter(zip(topology.joint_names, topology.joint_row, strict=True)),
     )
-    table, seen = topology.links, set()
+    table, with_free_joint = topology.links, set()
     for j in range(model.njnt):
         body, kind = int(model.jnt_bodyid[j]), JOINT_KINDS[int(model.jnt_type[j])]
         if body in slots:
             slot, cut = slots[body]
-            if body not in seen:
+            if body not in with_free_joint:
                 next(tree)
-                seen.add(body)
+                with_free_joint.add(body)
             own = cut.freedoms if kind == BALL else (cut.freedoms[cut.joints.index(j)],)
             cut_joints.append((name_of(model, "joint", j), slot, own[0]))
             model_q += (
@@ -143,6 +151,7 @@ def with_cuttable_joints(
 
 
 def _quaternion(R) -> np.ndarray:
+    """Return the unit quaternion (wxyz) of a rotation matrix."""
     import mujoco
 
     quat = np.zeros(4)
@@ -151,6 +160,7 @@ def _quaternion(R) -> np.ndarray:
 
 
 def _rotation_about(axis, angle) -> np.ndarray:
+    """Return the rotation matrix of an axis and an angle (rad)."""
     import mujoco
 
     quat = np.zeros(4)

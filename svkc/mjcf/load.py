@@ -1,4 +1,4 @@
-"""A MuJoCo model -> Chain, on the host in numpy. mujoco is imported here and nowhere below."""
+"""Loading of a `Chain` from MJCF, URDF or MuJoCo objects, on the host with NumPy."""
 
 import dataclasses
 import hashlib
@@ -36,10 +36,15 @@ from svkc.model.virtual_link import VirtualLink, joint_freedoms
 
 @dataclasses.dataclass(frozen=True)
 class Source:
-    """The MuJoCo model a chain was made of, its MJCF (None where only the compiled model was
-    given) and the other arguments of `load`: for pictures, `chain.to_mjcf` and files.
+    """The source of a chain, for rendering, `Chain.to_mjcf` and saved files.
 
-    It is static data of the chain, so that jax compares it. Two are equal where their digests are.
+    A source is static data of the chain, so that JAX compares sources: two are equal if their
+    digests are.
+
+    model: the mujoco.MjModel.
+    text: its MJCF text; None if the chain was loaded from a MjModel.
+    arguments: the other arguments of `load`.
+    digest: SHA-256 of the model, the text and the arguments.
     """
 
     model: Any = dataclasses.field(compare=False, repr=False)
@@ -49,21 +54,25 @@ class Source:
 
 
 def load(source, *, virtual_links=(), cuttable=(), spare=0, ignore=(), ignore_armature=()) -> Chain:
-    """A Chain from MJCF or URDF (path or text), a mujoco.MjSpec or a mujoco.MjModel.
+    """Load a `Chain` from a model.
 
-    `virtual_links`: more of them, beside the <equality> connect (ball) and weld of the model;
-    `spare`: slots for links bound at run time;
-    `cuttable`: names of joints of the tree that may be cut, each a virtual link of its name,
-    connected at first (paper, Fig. 15);
-    `ignore`: kinds of elements to leave out, by the names the error message uses, or "all";
-    "equality" means those that are neither connect nor weld. "limit" leaves out joint ranges.
-    Collisions between geoms are never modelled.
-    `ignore_armature`: names of joints whose armature (rotor inertia) is left out, others keep
-    theirs; a joint that may be cut cannot have any.
-    Functions are compiled once for all loads of one model with the same arguments, and again for
-    another model, even where only numbers differ. For other numbers and one program replace floats
-    of one chain (`eqx.tree_at`).
-    ValueError: the source does not parse, elements not supported, unknown names.
+    Functions are compiled once for all loads of one model with equal arguments. They are compiled
+    again for another model, even if only numbers differ: to change numbers without compiling,
+    replace floats of one chain (`eqx.tree_at`). Collisions between geoms are not simulated.
+
+    source: MJCF or URDF as a path or text, a mujoco.MjSpec, or a mujoco.MjModel.
+    virtual_links: `VirtualLink`s in addition to those from the model's <equality> elements: a
+        connect becomes a ball, a weld a weld, under the element's name.
+    cuttable: names of joints of the tree that can be cut. Each becomes a virtual link of that name,
+        connected in the load pose (paper, Fig. 15).
+    spare: number of spare slots, virtual links that `bind` makes at run time.
+    ignore: kinds of elements to leave out, by the names in the error message, or "all". "equality"
+        means those that are neither connect nor weld, "limit" means joint ranges.
+    ignore_armature: names of joints whose armature (rotor inertia) is left out. A cuttable joint
+        cannot have armature.
+
+    Raises ValueError if the source cannot be read, has elements that are neither simulated nor
+    ignored, has numbers that are not finite, or if a name is unknown or not unique.
     """
     declared = tuple(virtual_links) if np.iterable(virtual_links) else (virtual_links,)
     model, text = _compile(source)
@@ -86,10 +95,10 @@ def load(source, *, virtual_links=(), cuttable=(), spare=0, ignore=(), ignore_ar
         "ignore": ignore,
         "ignore_armature": ignore_armature,
     }
-    # here and not where it is compared: a MjModel may be changed after the chain is made
+    # computed now, as the user can modify a MjModel after loading
     digest = _digest(model, text, arguments)
-    kept = Source(model=model, text=text, arguments=arguments, digest=digest)
-    return _check_finite(_build_chain(kept, topology, rows, structure, armature, left_out))
+    loaded = Source(model=model, text=text, arguments=arguments, digest=digest)
+    return _check_finite(_build_chain(loaded, topology, rows, structure, armature, left_out))
 
 
 def _tree_without(model, cuts: list[CuttableJoint]) -> tuple[list[tuple[int, int]], Topology]:
@@ -105,7 +114,7 @@ def _tree_without(model, cuts: list[CuttableJoint]) -> tuple[list[tuple[int, int
 
 
 def _with_virtual_links(topology: Topology, links: list[VirtualLink], spare: int) -> Topology:
-    """Return the topology with these virtual links, the last of them spare."""
+    """Return the topology with these virtual links, of which the last `spare` are spare slots."""
     return dataclasses.replace(
         topology,
         link_names=tuple(link.name for link in links),
@@ -116,10 +125,10 @@ def _with_virtual_links(topology: Topology, links: list[VirtualLink], spare: int
 
 
 def _digest(model, text: str | None, arguments: dict[str, Any]) -> str:
-    """Return SHA-256 of what a chain is made of: every byte of the compiled model, the text, and
-    the arguments of `load` in one form for all ways to write them.
+    """Return the SHA-256 of the compiled model, its text, and the arguments of `load`.
 
-    Two compilations of one text give the same bytes.
+    MuJoCo compiles one text to the same bytes each time. The arguments are hashed in a canonical
+    form.
     """
     import mujoco
 
@@ -134,24 +143,24 @@ def _digest(model, text: str | None, arguments: dict[str, Any]) -> str:
 
 
 def _canonical_link(link: VirtualLink) -> tuple:
-    """Return the fields of a virtual link as plain numbers, the joint by its freedoms."""
-    places = (link.pos, link.quat, link.real_pos, link.real_quat, link.axis)
-    numbers = (None if x is None else np.asarray(x, float).tolist() for x in places)
+    """Return the fields of a virtual link as lists of floats, with the joint by its freedoms."""
+    vectors = (link.pos, link.quat, link.real_pos, link.real_quat, link.axis)
+    numbers = (None if x is None else np.asarray(x, float).tolist() for x in vectors)
     flags = bool(link.connected), bool(link.actuated)
     return link.name, link.parent, link.real, joint_freedoms(link.joint), *numbers, *flags
 
 
-def _check_unique(what: str, names) -> None:
-    """ValueError where a name that svkc gives to what has none is one that the model uses."""
+def _check_unique(elements: str, names) -> None:
+    """Raise ValueError if names are not unique, such as `joint_1` of a joint without a name."""
     if len(set(names)) < len(names):
         raise ValueError(
-            f"source: names of {what} must differ, those given to what has none included; got"
-            f" {names}"
+            f"source: names of {elements} must be unique, with KIND_INDEX for {elements} without a"
+            f" name; got {names}"
         )
 
 
 def _check_finite(chain: Chain) -> Chain:
-    """The chain; ValueError for numbers that are not finite in the precision it is kept in."""
+    """Return the chain; raise ValueError if a number is not finite in the chain's precision."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(chain):
         name, leaf = jax.tree_util.keystr(path), np.asarray(leaf)
         if np.isnan(leaf).any() or (
@@ -165,8 +174,10 @@ def _check_finite(chain: Chain) -> Chain:
 
 
 def _compile(source) -> tuple[Any, str | None]:
-    """Return the mujoco.MjModel of any source and its text, None for a MjModel; ValueError with
-    MuJoCo's own words where it does not parse."""
+    """Return the mujoco.MjModel of a source and its MJCF text, which is None for a MjModel.
+
+    Raises ValueError, with MuJoCo's message, if the source cannot be read.
+    """
     import mujoco
 
     if isinstance(source, mujoco.MjModel):
@@ -189,8 +200,10 @@ def _compile(source) -> tuple[Any, str | None]:
 
 
 def _read_spec(text: str):
-    """MJCF or URDF, by text or path. URDF keeps the links that fixed joints hold, whose names are
-    wanted for grips; ROS's package:// is looked up."""
+    """Return the mujoco.MjSpec of MJCF or URDF, by text or path.
+
+    Links of a URDF held by fixed joints stay bodies, so that virtual links can name them.
+    """
     import mujoco
 
     inline = "<" in text
@@ -205,8 +218,11 @@ def _read_spec(text: str):
 
 
 def _resolve_package_uri(file: str, folder: pathlib.Path) -> str:
-    """A file of package://NAME/...: in a folder NAME above, or beside what stands above, or else by
-    its last name in `folder`; others as they are."""
+    """Return the path of a file given as ROS's package://NAME/PATH; return other names unchanged.
+
+    Looks for NAME/PATH, then PATH, in `folder` and its parents, then for the file's name in
+    `folder`.
+    """
     if not file.startswith("package://"):
         return file
     name = pathlib.PurePosixPath(file.removeprefix("package://"))
@@ -218,8 +234,8 @@ def _resolve_package_uri(file: str, folder: pathlib.Path) -> str:
 
 
 def _load_pose(model, topology: Topology) -> np.ndarray:
-    """[q] the model's qpos0, bodies that may be cut where that puts them, virtual joints at
-    zero."""
+    """Return the coordinates of the load pose: the model's qpos0, and zero for other virtual
+    joints."""
     import mujoco
 
     data = mujoco.MjData(model)
@@ -236,7 +252,7 @@ def _load_pose(model, topology: Topology) -> np.ndarray:
 
 
 def _gravity(model) -> np.ndarray:
-    """Return gravity (m/s^2), zero where the model turns it off."""
+    """Return gravity (m/s^2), zero if the model disables it."""
     import mujoco
 
     off = model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
@@ -244,8 +260,10 @@ def _gravity(model) -> np.ndarray:
 
 
 def _characteristic_length(bodies: dict[str, np.ndarray], topology: Topology) -> float:
-    """Return the root mean square offset (m) of joints and centres of mass, 1 where all are
-    zero."""
+    """Return the root mean square of the offsets (m) of joints and centres of mass.
+
+    Offsets of zero do not count. The length is 1 if all are zero.
+    """
     below_roots = bodies["pos"][np.array(topology.parent) > 0]
     offsets = np.linalg.norm(np.concatenate([below_roots, bodies["com"]]), axis=1)
     offsets = offsets[offsets > 1e-12]
@@ -253,8 +271,7 @@ def _characteristic_length(bodies: dict[str, np.ndarray], topology: Topology) ->
 
 
 def _passive_forces(model, ignored: set[str], topology: Topology, q_load) -> dict[str, Any]:
-    """Return the chain's fields on dampers, springs and ranges; None for those that act on no
-    joint."""
+    """Return the chain's fields on damping, springs and limits; None if the model has none."""
     stiffness, limit, spring = springs_and_limits(model, ignored, topology)
     damping = scatter_to_dofs(
         topology, 0 * model.dof_damping if "damping" in ignored else model.dof_damping
@@ -272,7 +289,7 @@ def _passive_forces(model, ignored: set[str], topology: Topology, q_load) -> dic
 
 
 def _build_chain(source: Source, topology, rows, structure, armature, left_out) -> Chain:
-    """Return the chain with the numbers of the model."""
+    """Return the chain with all arrays of the model."""
     model, ignored = source.model, set(source.arguments["ignore"])
     bodies = body_arrays(model, topology, rows)
     gear, control, force = actuator_arrays(model, ignored, topology)

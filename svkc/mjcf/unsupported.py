@@ -1,10 +1,10 @@
-"""What a MuJoCo model may hold that svkc does not simulate, said all at once."""
+"""Elements of a MuJoCo model that svkc does not simulate, reported all at once."""
 
 import numpy as np
 
 
 def is_torque_motor(model) -> np.ndarray:
-    """[nu] Boolean: the actuator is a torque on a joint, gear times control."""
+    """Return the mask [nu] of actuators that are a torque on a joint, gear times control."""
     import mujoco
 
     joint = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
@@ -29,12 +29,15 @@ UNSUPPORTED_KINDS = (
 
 
 def _any_nonzero(model, *names: str) -> bool:
-    """Return whether one of these arrays of the model, as far as MuJoCo has them, is not zero."""
+    """Return whether one of these arrays of the model has a nonzero entry.
+
+    Arrays that the installed MuJoCo lacks do not count.
+    """
     return any(np.any(getattr(model, name, 0)) for name in names)
 
 
 def _unsupported_in_actuators(model) -> dict[str, tuple]:
-    """Look at tendons and actuators: kind -> (what was found, how to say it)."""
+    """Return kind -> (whether the model has it, its description) for tendons and actuators."""
     import mujoco
 
     tendon = [
@@ -61,7 +64,7 @@ def _unsupported_in_actuators(model) -> dict[str, tuple]:
 
 
 def _unsupported_in_joints(model) -> dict[str, tuple]:
-    """Look at joints, as `_in_actuators` at actuators."""
+    """Return kind -> (whether the model has it, its description) for joints."""
     import mujoco
 
     ball = model.jnt_type == int(mujoco.mjtJoint.mjJNT_BALL)
@@ -86,8 +89,8 @@ def _unsupported_in_joints(model) -> dict[str, tuple]:
 
 
 def _unsupported_in_bodies(model) -> dict[str, tuple]:
-    """Look at bodies, what is between them and what is around them, as `_in_actuators` at
-    actuators."""
+    """Return kind -> (whether the model has it, its description) for bodies, constraints between
+    bodies, and the fluid around them."""
     import mujoco
 
     supported = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
@@ -123,14 +126,18 @@ def _unsupported_elements(model) -> list[tuple[str, str]]:
 
 
 def left_out_elements(model, ignore) -> tuple[str, ...]:
-    """What the chain will lack, by name; ValueError listing every element that is neither simulated
-    nor ignored."""
+    """Return one line for each kind of element that the chain leaves out.
+
+    Raises ValueError, which lists every kind that is neither simulated nor ignored.
+    """
     known = {"all", "limit", "spring", "damping", "armature", "collision", *UNSUPPORTED_KINDS}
     unknown = [name for name in ignore if name not in known]
     if unknown:
         raise ValueError(f"ignore: got {unknown}, expected some of {', '.join(sorted(known))}")
-    found = _unsupported_elements(model)
-    missing = [(kind, text) for kind, text in found if "all" not in ignore and kind not in ignore]
+    elements = _unsupported_elements(model)
+    missing = [
+        (kind, text) for kind, text in elements if "all" not in ignore and kind not in ignore
+    ]
     if missing:
         lines = "".join(f"\n  {kind}: {text}" for kind, text in missing)
         names = ", ".join(repr(kind) for kind, _ in missing)
@@ -144,4 +151,4 @@ def left_out_elements(model, ignore) -> tuple[str, ...]:
         if colliding
         else ()
     )
-    return tuple(f"{kind}: {text}" for kind, text in found) + collisions
+    return tuple(f"{kind}: {text}" for kind, text in elements) + collisions

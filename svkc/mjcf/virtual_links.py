@@ -1,5 +1,5 @@
-"""Virtual links as a model and its user declare them: <equality>, ends by bodies or sites,
-placements."""
+"""Virtual links from a model's <equality> elements and from the user, with placements from bodies,
+sites and the load pose."""
 
 import dataclasses
 
@@ -13,8 +13,10 @@ from svkc.model.virtual_link import VirtualLink, joint_freedoms
 
 
 def links_from_equalities(model) -> list[VirtualLink]:
-    """<equality> connect and weld as virtual links: ball and weld, child of the first body, under
-    their own names."""
+    """Return the model's <equality> elements as virtual links, children of the first body.
+
+    A connect becomes a ball, a weld a weld. Other elements are skipped.
+    """
     import mujoco
 
     links = []
@@ -30,7 +32,7 @@ def links_from_equalities(model) -> list[VirtualLink]:
         elif weld:
             places = [(data[3:6], data[6:10]), (data[:3], (1, 0, 0, 0))]
         else:
-            # a ball's coordinates start at the identity in the load pose
+            # without an orientation, the ball's quaternion is the identity in the load pose
             places = [(data[:3], (1, 0, 0, 0)), (data[3:6], None)]
         links.append(
             VirtualLink(
@@ -49,8 +51,10 @@ def links_from_equalities(model) -> list[VirtualLink]:
 
 
 def declared_links(model, declared, cuttable: list[VirtualLink], spare: int) -> list[VirtualLink]:
-    """Return the virtual links in the order of their slots: <equality>, declared, cuttable joints,
-    spare; ValueError for what is no link, and for names that do not differ."""
+    """Return all virtual links in order: <equality>, declared, cuttable joints, spare slots.
+
+    Raises ValueError if a declared link is no `VirtualLink`, or if names are not unique.
+    """
     links = [*links_from_equalities(model), *declared]
     for link in links:
         if not isinstance(link, VirtualLink):
@@ -64,6 +68,7 @@ def declared_links(model, declared, cuttable: list[VirtualLink], spare: int) -> 
 
 
 def _normalize(quat) -> tuple[float, ...]:
+    """Return a quaternion of unit length."""
     return tuple(np.asarray(quat, float) / np.linalg.norm(quat))
 
 
@@ -77,7 +82,7 @@ def _multiply(a, b) -> np.ndarray:
 
 
 def _rotate(quat, x) -> np.ndarray:
-    """Return the vector x turned by a quaternion."""
+    """Return the vector x rotated by a quaternion."""
     import mujoco
 
     out = np.zeros(3)
@@ -86,8 +91,13 @@ def _rotate(quat, x) -> np.ndarray:
 
 
 def _resolve_sites(model, link: VirtualLink, ids: dict[str, int]) -> VirtualLink:
-    """The link from body to body: an end that names a site is the site's body, its placement is in
-    the site's frame, at the site where none is given."""
+    """Return the link between two bodies: replace each site by its body and move the placement.
+
+    A placement at a site is in the site's frame; None is the site's origin.
+
+    ids: name -> index of the bodies.
+    Raises ValueError if a name is neither a body nor a site.
+    """
     sites = {name_of(model, "site", i): i for i in range(model.nsite)}
     for side, pos, quat in (("parent", "pos", "quat"), ("real", "real_pos", "real_quat")):
         name = getattr(link, side)
@@ -100,8 +110,8 @@ def _resolve_sites(model, link: VirtualLink, ids: dict[str, int]) -> VirtualLink
                 f" bodies: {', '.join(ids)}"
             )
         frame, body = model.site_quat[site], name_of(model, "body", int(model.site_bodyid[site]))
-        place = _rotate(frame, (0, 0, 0) if getattr(link, pos) is None else getattr(link, pos))
-        changed = {side: body, pos: tuple(model.site_pos[site] + place)}
+        offset = _rotate(frame, (0, 0, 0) if getattr(link, pos) is None else getattr(link, pos))
+        changed = {side: body, pos: tuple(model.site_pos[site] + offset)}
         if getattr(link, quat) is not None:
             changed[quat] = _normalize(_multiply(frame, getattr(link, quat)))
         link = dataclasses.replace(link, **changed)
@@ -109,23 +119,28 @@ def _resolve_sites(model, link: VirtualLink, ids: dict[str, int]) -> VirtualLink
 
 
 def _joint_frames(data, link: VirtualLink, parent: int, real: int) -> dict[str, np.ndarray]:
-    """Return the joint's frame in the two bodies, its axis turned to z; what the link does not say
-    is taken from the load pose."""
+    """Return pos, quat, real_pos and real_quat of the joint's frame, with the joint's axis on z.
+
+    Placements that the link leaves None are those of the load pose.
+
+    data: MjData in the load pose.
+    parent, real: indices of the two bodies.
+    """
     import mujoco
 
     to_z = np.zeros(4)
     mujoco.mju_quatZ2Vec(to_z, np.asarray(link.axis, float) / np.linalg.norm(link.axis))
     quat = _normalize(_multiply(_normalize(link.quat), to_z))
-    back = data.xquat[real] * np.array([1, -1, -1, -1])
-    world = data.xpos[parent] + _rotate(data.xquat[parent], link.pos)
+    real_inverse = data.xquat[real] * np.array([1, -1, -1, -1])
+    pos_w = data.xpos[parent] + _rotate(data.xquat[parent], link.pos)
     frames = {
         "pos": link.pos,
         "quat": quat,
-        "real_pos": _rotate(back, world - data.xpos[real])
+        "real_pos": _rotate(real_inverse, pos_w - data.xpos[real])
         if link.real_pos is None
         else link.real_pos,
         "real_quat": _normalize(
-            _multiply(back, _multiply(data.xquat[parent], quat))
+            _multiply(real_inverse, _multiply(data.xquat[parent], quat))
             if link.real_quat is None
             else _multiply(_normalize(link.real_quat), to_z)
         ),
@@ -134,7 +149,7 @@ def _joint_frames(data, link: VirtualLink, parent: int, real: int) -> dict[str, 
 
 
 def load_structure(model, topology: Topology, links: list[VirtualLink]) -> Structure:
-    """Return the structure of the load pose, with the links where they are declared."""
+    """Return the structure of the load pose, with the links at their declared placements."""
     import mujoco
 
     data = mujoco.MjData(model)
@@ -163,5 +178,5 @@ def load_structure(model, topology: Topology, links: list[VirtualLink]) -> Struc
 
 
 def float_array(x):
-    """The default float type's array: float64 where jax has it enabled, else float32."""
+    """Return an array of JAX's default float type: float64 if x64 is enabled, else float32."""
     return jnp.asarray(np.asarray(x, np.float64), dtype=jnp.result_type(float))

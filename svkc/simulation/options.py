@@ -1,4 +1,4 @@
-"""The options of a call of `simulate`: arguments are validated and defaults are resolved here, before
+"""The options of a call of `simulate`: arguments are validated and defaults are resolved before
 anything is compiled."""
 
 from collections.abc import Callable
@@ -6,7 +6,6 @@ from typing import Any
 
 import diffrax
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix
@@ -22,9 +21,14 @@ from svkc.integration.vector_field import VectorField
 from svkc.loops.constrained_dynamics import AbstractDynamics, Dynamics, default_dynamics
 from svkc.loops.constraint import gap_tolerance
 from svkc.model.chain import Chain, State
-from svkc.model.checked_jit import check_state
-from svkc.model.validation import check_function, finite_array, integer, positive_scalar, scalar
-from svkc.transitions.events import At, as_events
+from svkc.model.validation import check_function, integer
+from svkc.simulation.option_checks import (
+    check_initial_state,
+    check_instance,
+    check_step_options,
+    check_times,
+)
+from svkc.transitions.events import as_events
 from svkc.transitions.plan import Plan, make_plan
 
 
@@ -94,13 +98,13 @@ def prepare_options(
 ) -> tuple[Options, Float[Array, " times"], Plan]:  # fmt: skip
     """Return the options, the save times and the plan of events of a call of `simulate`. Raises
     ValueError for invalid arguments."""
-    _check_state(chain, state)
+    check_initial_state(chain, state)
     dtype, events = state.q.dtype, as_events(events)
-    _check_times(t0, t1, ts, events)
-    _check_step_options(dt, rtol, atol, stepsize_controller)
+    check_times(t0, t1, ts, events)
+    check_step_options(dt, rtol, atol, stepsize_controller)
     check_function("control", control)
-    _check_instance("stepsize_controller", stepsize_controller, diffrax.AbstractStepSizeController)
-    _check_instance("progress_meter", progress_meter, diffrax.AbstractProgressMeter)
+    check_instance("stepsize_controller", stepsize_controller, diffrax.AbstractStepSizeController)
+    check_instance("progress_meter", progress_meter, diffrax.AbstractProgressMeter)
     plan = make_plan(chain, events, dtype)
     # concrete numbers stay in numpy: JAX compiles a program for every eager operation
     cast = lambda x: np.asarray(x, dtype) if is_concrete(x) else jnp.asarray(x, dtype)
@@ -136,27 +140,6 @@ def _default_controller(rtol, atol, smallest, dtype) -> diffrax.PIDController:
     return diffrax.PIDController(
         rtol, atol, norm=rms_norm, dtmin=jnp.asarray(smallest, dtype), force_dtmin=False
     )
-
-
-def _check_step_options(dt, rtol, atol, stepsize_controller) -> None:
-    """Raise ValueError unless dt, the tolerances or a controller alone sets the step size."""
-    for name, value in (("dt", dt), ("rtol", rtol), ("atol", atol)):
-        if value is not None:
-            positive_scalar(name, value)
-    tolerance = rtol is not None or atol is not None
-    if dt is not None and (tolerance or stepsize_controller is not None):
-        raise ValueError(
-            "dt sets fixed steps; rtol, atol and stepsize_controller set adaptive steps; give one"
-            " or the other"
-        )
-    if stepsize_controller is not None and tolerance:
-        raise ValueError("rtol and atol: give them to the stepsize_controller instead")
-
-
-def _check_instance(name: str, value, kind: type) -> None:
-    """Raise ValueError if an option is neither None nor an instance of a class of diffrax."""
-    if value is not None and not isinstance(value, kind):
-        raise ValueError(f"{name}: expected a diffrax object for it, got {value!r}")
 
 
 def _resolve_stabilization(stabilization) -> AbstractStabilization:
@@ -286,46 +269,3 @@ def _resolve_max_steps(max_steps, span, dt) -> int:
             " larger dt, or max_steps"
         )
     return max(65536, int(1.1 * steps) + 1024)
-
-
-def _check_state(chain: Chain, state: State):
-    """Raise ValueError if the state does not belong to the chain or is not finite."""
-    check_state(chain, state)
-    if state.q.dtype == np.float64 and not jax.config.read("jax_enable_x64"):
-        raise ValueError(
-            "state and chain are float64, but jax_enable_x64 is off now; enable it, or load the"
-            " chain and make the state in float32"
-        )
-    if is_concrete(state) and not (
-        np.isfinite(np.asarray(state.q)).all() and np.isfinite(np.asarray(state.v)).all()
-    ):
-        raise ValueError("state: q and v must be finite")
-
-
-def _check_times(t0, t1, ts, events):
-    """Raise ValueError for invalid start, end, save and event times, if they are concrete."""
-    for name, value in (("t0", t0), ("t1", t1)):
-        scalar(name, value)
-    times = None if ts is None else finite_array("ts", ts)
-    if not is_concrete(t0, t1):
-        return
-    if not t1 >= t0 or not np.isfinite(t1) or not np.isfinite(t0):
-        raise ValueError(f"t1: got {t1}, expected a time at or after t0 = {t0}")
-    if ts is not None and is_concrete(ts):
-        times = np.asarray(times)
-        if (
-            times.ndim != 1
-            or not times.size
-            or np.any(np.diff(times) < 0)
-            or np.any((times < t0) | (times > t1))
-        ):
-            raise ValueError(
-                f"ts: expected non-decreasing times from t0 = {t0} to t1 = {t1}, got {times}"
-            )
-    for event in events:
-        if (
-            isinstance(event, At)
-            and is_concrete(event.time)
-            and not np.all((np.asarray(event.time) >= t0) & np.isfinite(np.asarray(event.time)))
-        ):
-            raise ValueError(f"at: got time {event.time}, before the start of the run at {t0}")

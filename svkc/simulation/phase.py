@@ -129,7 +129,7 @@ def _path(
         controller=controller,
         first_step=first_step,
         progress_meter=options.progress_meter if replayed else diffrax.NoProgressMeter(),
-        gap_tolerance=options.gap,
+        gap_tolerance=options.gap_tolerance,
         max_steps=options.max_steps,
         checkpoint_interval=min(adjoint.every, options.max_steps)
         if replayed

@@ -71,7 +71,7 @@ def simulate(
     run = call_with_comparable(run, control=options.control, events=made.guards)
     certified = _certified_once if len(save_at) <= MAX_EAGER_STATES else _certified
     traj = certified(
-        chain, run, save_at, given[3], options.gap, evaluations_per_step(options.solver)
+        chain, run, save_at, given[3], options.gap_tolerance, evaluations_per_step(options.solver)
     )
     return _raised(chain, traj) if throw else traj
 

@@ -1,0 +1,74 @@
+"""Validation of the arguments of `simulate` that need no defaults: state, times, step sizes."""
+
+import jax
+import numpy as np
+
+from svkc._jax.pytrees import is_concrete
+from svkc.model.chain import Chain, State
+from svkc.model.checked_jit import check_state
+from svkc.model.validation import finite_array, positive_scalar, scalar
+from svkc.transitions.events import At
+
+
+def check_step_options(dt, rtol, atol, stepsize_controller) -> None:
+    """Raise ValueError unless dt, the tolerances or a controller alone sets the step size."""
+    for name, value in (("dt", dt), ("rtol", rtol), ("atol", atol)):
+        if value is not None:
+            positive_scalar(name, value)
+    tolerance = rtol is not None or atol is not None
+    if dt is not None and (tolerance or stepsize_controller is not None):
+        raise ValueError(
+            "dt sets fixed steps; rtol, atol and stepsize_controller set adaptive steps; give one"
+            " or the other"
+        )
+    if stepsize_controller is not None and tolerance:
+        raise ValueError("rtol and atol: give them to the stepsize_controller instead")
+
+
+def check_instance(name: str, value, kind: type) -> None:
+    """Raise ValueError if an option is neither None nor an instance of a class of diffrax."""
+    if value is not None and not isinstance(value, kind):
+        raise ValueError(f"{name}: expected a diffrax object for it, got {value!r}")
+
+
+def check_initial_state(chain: Chain, state: State):
+    """Raise ValueError if the state does not belong to the chain or is not finite."""
+    check_state(chain, state)
+    if state.q.dtype == np.float64 and not jax.config.read("jax_enable_x64"):
+        raise ValueError(
+            "state and chain are float64, but jax_enable_x64 is off now; enable it, or load the"
+            " chain and make the state in float32"
+        )
+    if is_concrete(state) and not (
+        np.isfinite(np.asarray(state.q)).all() and np.isfinite(np.asarray(state.v)).all()
+    ):
+        raise ValueError("state: q and v must be finite")
+
+
+def check_times(t0, t1, ts, events):
+    """Raise ValueError for invalid start, end, save and event times, if they are concrete."""
+    for name, value in (("t0", t0), ("t1", t1)):
+        scalar(name, value)
+    times = None if ts is None else finite_array("ts", ts)
+    if not is_concrete(t0, t1):
+        return
+    if not t1 >= t0 or not np.isfinite(t1) or not np.isfinite(t0):
+        raise ValueError(f"t1: got {t1}, expected a time at or after t0 = {t0}")
+    if ts is not None and is_concrete(ts):
+        times = np.asarray(times)
+        if (
+            times.ndim != 1
+            or not times.size
+            or np.any(np.diff(times) < 0)
+            or np.any((times < t0) | (times > t1))
+        ):
+            raise ValueError(
+                f"ts: expected non-decreasing times from t0 = {t0} to t1 = {t1}, got {times}"
+            )
+    for event in events:
+        if (
+            isinstance(event, At)
+            and is_concrete(event.time)
+            and not np.all((np.asarray(event.time) >= t0) & np.isfinite(np.asarray(event.time)))
+        ):
+            raise ValueError(f"at: got time {event.time}, before the start of the run at {t0}")
