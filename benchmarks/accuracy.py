@@ -131,7 +131,7 @@ def _top(model, case):
 
 def heavy_top():
     """Return Lagrange's top at 20 rad/s for 3 s, with its closed form."""
-    data, n = reference.given("heavy_top"), reference.numbers
+    data, n = reference.load_reference("heavy_top"), reference.numbers
     model, case = data["model"], data["cases"][-1]
     return _top(
         reference.ROTATION.format(
@@ -143,7 +143,7 @@ def heavy_top():
 
 def free_top():
     """Return an asymmetric top without gravity for 10 s, with its closed form."""
-    case = reference.given("free_top")["cases"][-1]
+    case = reference.load_reference("free_top")["cases"][-1]
     return _top(
         reference.ROTATION.format("0 0 0", "0 0 0", 1, reference.numbers(case["inertia"])), case
     )
@@ -153,7 +153,9 @@ def n_four_bar(windows: int = 2):
     """Return the N four-bar with two windows for 10 s: twenty passes through singular
     configurations.
     """
-    case = next(case for case in reference.given("n_four_bar")["cases"] if case["N"] == windows)
+    case = next(
+        case for case in reference.load_reference("n_four_bar")["cases"] if case["N"] == windows
+    )
     chain, state = maximal.load(reference.n_four_bar(windows))
     angle = -case["theta"][-1]
     return Problem(
@@ -176,7 +178,7 @@ def andrews():
 
     The reference is Dopri8 at rtol 1e-12, which agrees with the published digits to 1e-10.
     """
-    data = reference.given("andrews")
+    data = reference.load_reference("andrews")
     chain, state = maximal.load(data["problem"])
     torques = {
         force["body"]: force["world"][2]

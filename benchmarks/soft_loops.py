@@ -117,7 +117,7 @@ def figure_model(problem, spec: mujoco.MjSpec, dt: float):
 MODELS = {
     "n_four_bar": lambda problem, dt: mechanism_model(problem, reference.n_four_bar(2), dt),
     "andrews": lambda problem, dt: mechanism_model(
-        problem, reference.given("andrews")["problem"], dt
+        problem, reference.load_reference("andrews")["problem"], dt
     ),
     "high_bar": lambda problem, dt: figure_model(
         problem, mujoco.MjSpec.from_file(str(svkc.scenes.FOLDER / "figure16.xml")), dt

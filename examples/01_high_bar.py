@@ -1,5 +1,7 @@
-"""The high bar: a figure hangs on by two hands, lets one go, then the other, and flies. Writes a
-picture to the folder given (default: here)."""
+"""The high bar: a figure hangs by two hands, releases one, then the other, and flies.
+
+Writes a picture to the folder named on the command line (default: the current one).
+"""
 
 import pathlib
 import sys

@@ -1,5 +1,8 @@
-"""A swing whose seat gives way: thighs slide along the plate until each has passed its edge, hands
-hold on. Writes a picture to the folder given."""
+"""A swing whose seat is lost: each thigh slides along the plate until it passes the edge.
+
+The hands stay connected. Writes a picture to the folder named on the command line (default: the
+current one).
+"""
 
 import pathlib
 import sys
@@ -18,7 +21,7 @@ thighs = ["right_thigh_plate", "left_thigh_plate"]
 
 
 def distance_beyond_edge(link):
-    """A guard: how far beyond the plate's edge a thigh is on its slide."""
+    """Return a guard: the distance (m) of a thigh on its slide beyond the plate's edge."""
     along = svkc.touch(chain, link, 0.0, axes="z")
     return lambda t, state, args: jnp.abs(along(t, state)) - PLATE_EDGE
 

@@ -1,5 +1,8 @@
-"""Brachiation: a figure travels hand over hand along three bars, catching and letting go by guards.
-Writes a picture to the folder given (default: here)."""
+"""Brachiation: a figure travels hand over hand along three bars.
+
+Guards decide when a hand catches or releases a bar. Writes a picture to the folder named on the
+command line (default: the current one).
+"""
 
 import pathlib
 import sys
@@ -21,7 +24,10 @@ to_bar2, to_bar3 = (
 
 
 def per_joint(side="", **numbers):
-    """A number for each joint, by the end of its name; zero for the others."""
+    """Return a number for each joint, selected by the end of its name; zero for other joints.
+
+    side: prefix of the joint names that are selected.
+    """
     return jnp.array(
         [
             sum(
@@ -47,8 +53,11 @@ limb_inertia = jnp.diag(svkc.mass_matrix(chain, state))[6:]
 
 @jax.jit
 def control(t, state, args):
-    """Arms that hold stay bent, legs rise as the hips swing forwards (m/s: v[0]), a spring draws
-    the free hand to the next bar."""
+    """Return joint torques.
+
+    Arms that hold a bar stay bent. Legs rise while the hips swing forwards (v[0], m/s). A spring
+    pulls the free hand to the next bar.
+    """
     bar1, bar2, bar3 = state.structure.connected
     q, v = state.q[7:23], state.v[6:22]
     holds = (right_arm & (bar1 | bar3)) | (left_arm & bar2)
@@ -68,8 +77,10 @@ def control(t, state, args):
 
 
 def swings_forward(bar):
-    """A guard: with one hand on this bar and one on bar 2, the hips turn from swinging back to
-    swinging forwards."""
+    """Return a guard: with hands on this bar and on bar 2, the velocity of the hips along x (m/s).
+
+    The guard is positive while other hands hold.
+    """
     return lambda t, state, args: jnp.where(
         jnp.all(state.structure.connected[jnp.array([bar - 1, 1])]), state.v[0], 1.0
     )

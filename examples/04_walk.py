@@ -1,5 +1,7 @@
-"""Walking: a foot is held where it touches the ground, and let go when the ground would have to
-pull. Writes a picture to the folder given."""
+"""Walking: a foot is connected on touching the ground, and cut when the ground would have to pull.
+
+Writes a picture to the folder named on the command line (default: the current one).
+"""
 
 import pathlib
 import sys
@@ -22,7 +24,7 @@ feet = {side: chain.link_names.index(f"{side}_foot_ground") for side in ("left",
 
 
 def steps_done(t):
-    """How many steps are done: the right foot comes down at 1, the left one at 2."""
+    """Return the number of steps done: the right foot touches down at 1, the left one at 2."""
     starting, stopping = jnp.minimum(t, RAMP), jnp.minimum(END - t, RAMP)
     return (starting**2 - stopping**2 + RAMP**2) / (2 * RAMP * PERIOD) + (
         jnp.clip(t, RAMP, END - RAMP) - RAMP
@@ -30,8 +32,11 @@ def steps_done(t):
 
 
 def planned_angles(t, structure):
-    """Angles of the 16 joints: hips at one height, a little slower over the foot that stands; feet
-    that hold stay where they are."""
+    """Return the planned angles of the 16 joints.
+
+    The hips stay at one height and move slightly slower over the supporting foot. Supporting feet
+    stay where they are.
+    """
     steps, middle = steps_done(t), steps_done(t) - (1 + DOUBLE_SUPPORT) / 2
     hips = STRIDE * middle - 0.007 * jnp.sin(2 * jnp.pi * middle) - SOLE_OFFSET
     swing, joints = 0.3 * jnp.cos(jnp.pi * (steps - DOUBLE_SUPPORT / 2)), {}
@@ -62,7 +67,7 @@ def planned_angles(t, structure):
 
 
 def torques_on_foot(foot, state, vdot):
-    """Torques for an acceleration of all joints that leave the whole load to this foot."""
+    """Return torques that produce these accelerations and put all load on one foot."""
     single_support = eqx.tree_at(
         lambda s: (s.connected, s.rank),
         state.structure,
@@ -72,8 +77,11 @@ def torques_on_foot(foot, state, vdot):
 
 
 def control(t, state, args):
-    """Computed torque: the plan's accelerations as nearly as the feet allow, the load led from the
-    rear leg to the front one."""
+    """Return joint torques by computed torque control.
+
+    Accelerations follow the plan as closely as the supporting feet allow. While both feet stand,
+    the load moves from the rear leg to the front one.
+    """
     position_and_velocity = lambda t: jax.jvp(
         lambda t: planned_angles(t, state.structure), (t,), (jnp.ones_like(t),)
     )

@@ -1,5 +1,8 @@
-"""Gradients through releases: joint torques and both release times on the high bar, chosen to fly
-farthest. Writes a picture to the folder given."""
+"""Gradients through releases: joint torques and release times on the high bar, for the longest
+flight.
+
+Writes a picture to the folder named on the command line (default: the current one).
+"""
 
 import dataclasses
 import pathlib
@@ -43,15 +46,18 @@ OPTIONS = {
 
 
 def control(t, state, torques):
-    """Weak springs towards the first pose, and for each driven joint a sum of bumps in time
-    (parameters in units of 100 N m)."""
+    """Return joint torques: weak springs to the first pose, and bumps in time for each driven
+    joint.
+
+    torques: amplitudes of the bumps, in units of 100 N m.
+    """
     tau = limb * (25.0 * (rest - state.q[7:23]) - 10.0 * state.v[6:22])
     tau = tau.at[driven_joints].add(100.0 * torques @ jnp.exp(-(((t - bumps) / 0.15) ** 2)))
     return jnp.pad(tau, (6, chain.dofs - 22))  # none at the base, none at the bar
 
 
 def center_of_mass(state):
-    """The centre of mass: gravity's potential is linear in gravity."""
+    """Return the center of mass (m): the potential energy is linear in gravity."""
     return (
         -jax.grad(lambda g: svkc.potential_energy(dataclasses.replace(chain, gravity=g), state))(
             chain.gravity
@@ -61,8 +67,10 @@ def center_of_mass(state):
 
 
 def swing(x, ts=None):
-    """The run, and the times of the releases: the right hand's before 1.4 s, the left hand's up to
-    0.4 s after it."""
+    """Return the run and the release times (s).
+
+    The right hand releases before 1.4 s, the left hand at most 0.4 s later.
+    """
     right, delay = jax.nn.sigmoid(x["times"]) * jnp.array([1.4, 0.4])
     events = [svkc.at(right, cut="right_hand_grip"), svkc.at(right + delay, cut="left_hand_grip")]
     return (
@@ -83,8 +91,11 @@ def swing(x, ts=None):
 
 
 def loss(x):
-    """A price on torque, less the distance (m) at which the freely falling centre of mass passes
-    the mat's height, before or after the run's end."""
+    """Return the cost of torque minus the distance (m) of the flight, and the distance.
+
+    The distance is where the freely falling center of mass passes the height of the mat, before or
+    after the run's end.
+    """
     traj, *_ = swing(x)
     (px, _, pz), (vx, _, vz) = (
         center_of_mass(traj.final),

@@ -1,5 +1,7 @@
-"""A soft catch: the torques in flight, and the moment, that cost a figure least energy as it takes
-hold of the bar. Writes a picture to the folder given."""
+"""A soft catch: torques in flight and a catch time that lose the least energy on catching the bar.
+
+Writes a picture to the folder named on the command line (default: the current one).
+"""
 
 import pathlib
 import sys
@@ -36,16 +38,21 @@ limb_inertia = jnp.diag(svkc.mass_matrix(chain, start))[6:22]
 
 
 def control(t, state, bend):
-    """Torques that change evenly in flight, none after it; alike on both sides. Inner ones: the
-    flight's momentum stays as it was."""
+    """Return joint torques, equal on both sides: linear in time during flight, then zero.
+
+    Torques inside the figure leave the momentum of the flight unchanged.
+    """
     arm, leg = jnp.split(bend[0] + (bend[1] - bend[0]) * t / CATCH_TIME, 2)
     tau = limb_inertia * jnp.concatenate([arm, arm, leg, leg])
     return jnp.pad(jnp.where(state.structure.connected[0], 0.0, tau), (6, 2))
 
 
 def fly(p, t1, ts=None):
-    """Both hands take hold at a time, wherever they are then: it is for the loss to have them at
-    the bar."""
+    """Return a run in which both hands connect to the ground at one time, at their current
+    positions.
+
+    The loss makes these positions coincide with the bar.
+    """
     events = [svkc.at(CATCH_TIME + p["late"] / 100, connect=HANDS, here=True)]
     options = {"solver": diffrax.Dopri8(), "rtol": 1e-9, "atol": 1e-11}
     return svkc.simulate(
@@ -54,7 +61,11 @@ def fly(p, t1, ts=None):
 
 
 def loss(p):
-    """Energy lost in the catch, 1 J for a hand 1 cm off the bar, a little for torques."""
+    """Return the loss and its parts.
+
+    The loss is the energy lost in the catch (J), 1 J for a hand 1 cm off the bar, and a small cost
+    of torques. The parts are energy lost (J), impulse on a hand (N s), distance from the bar (cm).
+    """
     traj = fly(p, 0.5)
     hand_offset = traj.final.structure.pos[:, ::2] - jnp.array([0.0, BAR_HEIGHT])
     metrics = (

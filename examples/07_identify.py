@@ -1,5 +1,8 @@
-"""Identification: what the links of an arm weigh, and what its wrist can carry, from one run in
-which it breaks. Writes a picture to the folder given."""
+"""Identification: masses of an arm's links and the strength of its wrist, from one run that breaks
+it.
+
+Writes a picture to the folder named on the command line (default: the current one).
+"""
 
 import pathlib
 import sys
@@ -41,15 +44,19 @@ OPTIONS = {"solver": diffrax.Dopri8(), "rtol": 1e-9, "atol": 1e-11}
 
 
 def control(t, state, args):
-    """A known torque (N m) at the shoulder: without one only ratios could be found, as masses and
-    limit could all be twice as large."""
+    """Return a known torque at the shoulder (N m).
+
+    Without a known torque, only ratios of masses and strength could be identified.
+    """
     return jnp.zeros(chain.dofs).at[chain.dof_names.index("shoulder")].set(6 * jnp.sin(4 * t))
 
 
 @jax.jit
 def run(p):
-    """With masses and limit times these factors: where the ends of the links are (m; times, links,
-    x and z), and when the overloaded wrist breaks (s)."""
+    """Return marker positions (m) [times markers 2] and the time at which the wrist breaks (s).
+
+    p: factors on the masses and on the wrist's strength. Positions are x and z.
+    """
     scale = jnp.ones_like(chain.mass).at[rows].set(p["mass"])
     arm = eqx.tree_at(
         lambda c: (c.mass, c.inertia),

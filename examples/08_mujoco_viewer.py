@@ -1,5 +1,7 @@
-"""MuJoCo's viewer: a run of svkc, played in its window at its own speed. Without a display says so.
-(On macOS, mujoco's viewer wants `mjpython`.)"""
+"""A run of svkc played in MuJoCo's viewer in real time. Without a display, prints a message.
+
+On macOS, mujoco's viewer needs `mjpython`.
+"""
 
 import sys
 import threading

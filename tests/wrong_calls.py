@@ -172,7 +172,7 @@ CASES = {
     "...: expected names": lambda s: svkc.at(0.5, connect=3),
     "...: got ..., expected True": lambda s: link(connected="no"),
     "...: got ..., expected a whole": lambda s: s.load(spare=1e300),
-    "...: got shape ..., expected (...,); for many use": lambda s: svkc.interop.quaternions_xyzw(
+    "...: got shape ..., expected (...,); use vmap for": lambda s: svkc.interop.quaternions_xyzw(
         s.four, jnp.zeros(9)
     ),
     "...: got ..., expected a positive": lambda s: s.simulate(dt=-1.0),

@@ -1,5 +1,7 @@
-"""Which actuator torques give an acceleration, in any structure (paper, section III-A): S^T tau_A =
-W^T tau_O, square, redundant or missing."""
+"""Inverse dynamics of any structure (paper, section III-A): S^T tau_A = W^T tau_O.
+
+The system may be square, redundant or deficient, and the torques may be bounded.
+"""
 
 import equinox as eqx
 import jax
@@ -8,11 +10,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.eager import eager_jit
-from svkc._jax.pytrees import is_concrete, stop_gradient_tree
+from svkc._jax.pytrees import is_concrete
 from svkc.loops.constraint import jacobian_scales, loop_kinematics
 from svkc.loops.coordinates import closed_coordinates, open_coordinates
 from svkc.loops.forward_dynamics import constraint_forces
-from svkc.loops.pivoting import PivotedQR, pivoted_qr, pivoted_qr_with_rank, solve_positive
+from svkc.loops.least_squares import least_cost_solution, solve_bounded
+from svkc.loops.pivoting import PivotedQR, pivoted_qr, pivoted_qr_with_rank
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import check_state
 from svkc.model.validation import as_array, real_array
@@ -21,19 +24,21 @@ from svkc.tree.kinematics import kinematics, twists
 
 
 class Actuation(eqx.Module):
-    """Torques of the actuators for an acceleration, and what is left open or out of reach. Columns
-    of the bases that do not count are zero.
+    """Torques of the actuators for an acceleration, and bases of what they leave undetermined.
 
-    `tau` [dofs]: the particular solution (N m, N), of least weighted norm; `residual` [dofs]:
-    generalized force on theta_G that no torque gives (zero:
-    the acceleration is reached); `rank`: of S; `redundancy`: actuators more than that,
-    `deficiency`: freedoms that nobody drives.
-    `null_space` [dofs, dofs]: torques that change no motion (they only load the loops), one for
-    each actuator that the others can stand in for; `null_force`, `null_torque`: what each of them
-    does to the links' wrenches, on `real` from `parent`, world axes;
-    `stress_force`, `stress_torque`: self-stresses, wrenches of redundant loops together that need
-    no torque, one for each redundant row;
-    `undriven` [dofs, dofs]: joint velocities on which no actuator does work.
+    Bases are padded with zero columns.
+
+    tau: torques (N m, N) of least weighted norm.
+    residual: generalized force on theta_G that no torques produce; zero if the acceleration is
+    reached.
+    null_space: columns are torques that do not change the motion, one for each redundant actuator.
+    null_force, null_torque: change of the links' wrenches by each column of `null_space`, on `real`
+    from `parent`, in world axes.
+    stress_force, stress_torque: self-stresses, wrenches of redundant loops that need no torques,
+    one for each redundant row.
+    undriven: columns are joint velocities on which no actuator does work.
+    rank: rank of S. redundancy: number of actuators beyond the rank.
+    deficiency: number of freedoms beyond the rank.
     """
 
     tau: Float[Array, " dofs"]
@@ -52,16 +57,17 @@ class Actuation(eqx.Module):
 def actuation(
     chain: Chain, state: State, vdot_G, weight=None, *, actuated=None, bounds=None
 ) -> Actuation:
-    """Inverse dynamics of any structure (paper, section III-A): the torques at `actuated` for the
-    accelerations vdot_G of theta_G.
+    """Return the torques for the accelerations vdot_G of the independent coordinates theta_G.
 
-    vdot_G: over every coordinate [dofs], of which those of theta_G (`coordinates(chain,
-    state).independent`) are read, or theta_G's alone, in order.
-    weight [dofs]: positive; what is least is sum(weight tau^2), by default the plain sum. actuated:
-    mask, by default `chain.actuated`.
-    bounds: (lower, upper) torques, scalars or [dofs]: the least within them; where they leave no
-    exact solution, the one of least residual. Crossed bounds that are traced give NaN. Springs and
-    dampers are counted. ValueError: wrong sizes, weights that are not positive, crossed bounds.
+    The forces of the joints' springs and dampers are subtracted. (Paper, section III-A.)
+
+    vdot_G: accelerations (rad/s^2, m/s^2) over every coordinate, of which those of theta_G
+    (`coordinates(chain, state).independent`) are used, or those of theta_G alone, in order.
+    weight: positive weights, a scalar or [dofs]; sum(weight tau^2) is minimised (None: ones).
+    actuated: mask of the actuated coordinates (None: `chain.actuated`).
+    bounds: (lower, upper) torques, each a scalar or [dofs] (None: unbounded). If no torques within
+    them reach the acceleration, the residual is minimised first. Traced bounds that cross give NaN.
+    Raises ValueError if a size is wrong, if a weight is not positive, or if bounds cross.
     """
     check_state(chain, state)
     independent, vdot_G = None, real_array("vdot_G", vdot_G, state.v.dtype)
@@ -92,14 +98,18 @@ def actuation(
             f" {actuated.shape}"
         )
     actuated = jnp.asarray(actuated)
-    done, problem = _solve_unbounded(chain, state, vdot_G, weight, actuated)
+    result, problem = _solve_unbounded(chain, state, vdot_G, weight, actuated)
     if bounds is None:
-        return done
-    tau, residual = _solve_bounded(problem, weight, *_limits(chain, bounds, state))
-    return eqx.tree_at(lambda d: (d.tau, d.residual), done, (tau, residual))
+        return result
+    tau, residual = solve_bounded(problem, weight, *_limits(chain, bounds, state))
+    return eqx.tree_at(lambda r: (r.tau, r.residual), result, (tau, residual))
 
 
 def _per_dof(chain: Chain, name: str, value, default, state: State) -> Float[Array, " dofs"]:
+    """Return the argument `name` over every coordinate.
+
+    Raises ValueError for another shape than () or [dofs].
+    """
     value = real_array(name, default if value is None else value, state.v.dtype)
     if value.shape not in ((), (chain.dofs,)):
         raise ValueError(f"{name}: got shape {value.shape}, expected a number or ({chain.dofs},)")
@@ -107,7 +117,10 @@ def _per_dof(chain: Chain, name: str, value, default, state: State) -> Float[Arr
 
 
 def _limits(chain: Chain, bounds, state: State) -> list[Float[Array, " dofs"]]:
-    """Return the lower and the upper bounds; ValueError where they are not two, or cross."""
+    """Return the lower and the upper bounds.
+
+    Raises ValueError if they are not a pair, or if they cross.
+    """
     if not isinstance(bounds, tuple | list | np.ndarray | jax.Array) or len(bounds) != 2:
         raise ValueError(f"bounds: expected (lower, upper), got {bounds!r}")
     limits = [_per_dof(chain, "bounds", b, 0.0, state) for b in bounds]
@@ -119,6 +132,7 @@ def _limits(chain: Chain, bounds, state: State) -> list[Float[Array, " dofs"]]:
 
 @eager_jit
 def _coordinates_and_twists(chain: Chain, state: State):
+    """Return the coordinate partitioning, the kinematics and the twists of a state."""
     if not chain.link_names:
         kin = kinematics(chain, state.q)
         return open_coordinates(chain, state.structure), kin, twists(chain, kin, state.v)
@@ -130,30 +144,23 @@ def _coordinates_and_twists(chain: Chain, state: State):
 def _null_space_basis(
     B: Float[Array, "rows dofs"], rank=None
 ) -> tuple[PivotedQR, Int[Array, ""], Float[Array, "dofs dofs"]]:
-    """Pivots of B, its rank (None: to be found), and a basis of its null space: for each column
-    that is no pivot a one there, balanced by the pivots."""
-    chosen, rank = pivoted_qr_with_rank(B) if rank is None else (pivoted_qr(B, rank), rank)
-    P = chosen.P
-    Bm = chosen.Q @ B
-    R = Bm @ P.T + jnp.diag(jnp.where(chosen.active, 0, 1).astype(B.dtype))
-    others = jnp.eye(B.shape[1], dtype=B.dtype) - P.T @ jnp.linalg.solve(R, Bm)
-    return chosen, rank, jnp.where(jnp.any(P > 0, 0)[None], 0, others)
+    """Return the pivoted QR of B, its rank, and a basis of its null space.
 
+    Each basis vector has a one at a column that is no pivot; the pivots balance it.
 
-def _least_cost_solution(chosen: PivotedQR, B, wanted, cost):
-    """The y of least sum(cost y^2) that makes |B y - wanted| least, by an orthonormal basis Z of
-    B's range."""
-    Z = chosen.Q.T
-    ZB = Z.T @ B
-    over_cost = ZB.T / cost[:, None]
-    G = ZB @ over_cost + jnp.diag(jnp.where(chosen.active, 0, 1).astype(B.dtype))
-    y = over_cost @ jnp.linalg.solve(G, Z.T @ wanted)
-    # once more for what round-off left
-    return y + over_cost @ jnp.linalg.solve(G, Z.T @ (wanted - B @ y))
+    rank: rank of B (None: determine it).
+    """
+    qr, rank = pivoted_qr_with_rank(B) if rank is None else (pivoted_qr(B, rank), rank)
+    P = qr.P
+    Bm = qr.Q @ B
+    R = Bm @ P.T + jnp.diag(jnp.where(qr.active, 0, 1).astype(B.dtype))
+    null_space = jnp.eye(B.shape[1], dtype=B.dtype) - P.T @ jnp.linalg.solve(R, Bm)
+    return qr, rank, jnp.where(jnp.any(P > 0, 0)[None], 0, null_space)
 
 
 @eager_jit
 def _solve_unbounded(chain: Chain, state: State, vdot_G, weight, actuated: Bool[Array, " dofs"]):
+    """Return the `Actuation` without bounds, and (B, force, column) for `solve_bounded`."""
     nv = chain.nv
     co, kin, V = _coordinates_and_twists(chain, state)
     _, column = jacobian_scales(chain)
@@ -161,36 +168,38 @@ def _solve_unbounded(chain: Chain, state: State, vdot_G, weight, actuated: Bool[
     forces = append_virtual_joints(chain, rnea(chain, kin, V, state.v, vdot[:nv])) - passive_forces(
         chain, state.q, state.v
     )
-    wanted = co.W.T @ forces
-    # without units: torques over metres, as the columns of J_C
+    target_force = co.W.T @ forces
+    # dimensionless, scaled as the columns of J_C
     S = jnp.where(actuated[:, None], co.W, 0)
     B = column[:, None] * S.T / column[None]
-    # the null spaces of S^T and S, which are of one size, by one program
+    # the null spaces of S^T and of S, which have the same size, by one compiled function
     both, ranks, bases = jax.lax.map(_null_space_basis, jnp.stack([B, B.T]))
-    chosen, rank, null = jax.tree.map(lambda x: x[0], (both, ranks, bases))
-    y = _least_cost_solution(chosen, B, column * wanted, weight / column**2)
+    qr, rank, null = jax.tree.map(lambda x: x[0], (both, ranks, bases))
+    y = least_cost_solution(qr, B, column * target_force, weight / column**2)
     null = column[:, None] ** -1 * jnp.where(actuated[None], null, 0)
     reachable = actuated & jnp.any(co.W != 0, 1)
     undriven = co.W @ (column[:, None] * jnp.where(co.independent[None], bases[1], 0))
     if len(chain.link_names):
-        carried = jax.vmap(
+        wrenches = jax.vmap(
             lambda tau: constraint_forces(chain, co.selection, co.J, tau), in_axes=1, out_axes=-1
         )(null)
         _, _, stress = _null_space_basis(co.J.T, state.structure.rank)
         row, _ = jacobian_scales(chain)
-        holds = jnp.repeat(state.structure.connected, 6)
-        stress = jnp.where(holds[None], row[:, None] * stress, 0).reshape(-1, 6, row.shape[0])
+        connected_rows = jnp.repeat(state.structure.connected, 6)
+        stress = jnp.where(connected_rows[None], row[:, None] * stress, 0).reshape(
+            -1, 6, row.shape[0]
+        )
     else:
-        carried, stress = jnp.zeros((0, 6, chain.dofs), y.dtype), jnp.zeros((0, 6, 0), y.dtype)
+        wrenches, stress = jnp.zeros((0, 6, chain.dofs), y.dtype), jnp.zeros((0, 6, 0), y.dtype)
     count = lambda mask: jnp.sum(mask, dtype=jnp.int32)
     tau = y / column
-    residual = wanted - S.T @ tau
-    done = Actuation(
+    residual = target_force - S.T @ tau
+    result = Actuation(
         tau=tau,
         residual=residual,
         null_space=null,
-        null_force=carried[:, 3:],
-        null_torque=carried[:, :3],
+        null_force=wrenches[:, 3:],
+        null_torque=wrenches[:, :3],
         stress_force=stress[:, 3:],
         stress_torque=stress[:, :3],
         undriven=undriven,
@@ -198,94 +207,4 @@ def _solve_unbounded(chain: Chain, state: State, vdot_G, weight, actuated: Bool[
         redundancy=count(reachable) - rank,
         deficiency=count(co.independent) - rank,
     )
-    return done, (B, column * wanted, column)
-
-
-@eager_jit
-def _solve_bounded(
-    problem, weight, lower, upper
-) -> tuple[Float[Array, " dofs"], Float[Array, " dofs"]]:
-    """Return the least weighted torques of least residual within the bounds, and that residual.
-
-    The active bounds are found on frozen numbers. The free torques then follow from one linear
-    solve, so derivatives are exact wherever the active set is locally constant.
-    """
-    B, wanted, column = problem
-    root, small = jnp.sqrt(weight), jnp.finfo(B.dtype).eps ** 0.25
-    scaled = stop_gradient_tree((B * (column / root)[None], wanted, root * lower, root * upper))
-    target = _bounded_target(*scaled) / jax.lax.stop_gradient(root)
-    nearest, drives = jnp.clip(target, lower, upper), jnp.any(B != 0, 0)
-    free = drives & (lower < target) & (target < upper)
-    held = jnp.where(drives & ~free, jnp.where(target <= lower, lower, upper), 0)
-    part = jnp.where(free[None], B, 0)
-    y = _least_cost_solution(
-        pivoted_qr_with_rank(part)[0], part, wanted - B @ (column * held), weight / column**2
-    )
-    solved = jnp.where(free, y / column, nearest)
-    tau = jnp.clip(solved, lower, upper)
-    # the iterate, should a free torque leave its bounds by more than round-off
-    inside = jnp.max(jnp.abs(solved - tau)) <= small * jnp.max(jnp.abs(nearest))
-    tau = jnp.where(free, jnp.where(inside, tau, nearest), held)
-    valid = jnp.all(lower <= upper) & jnp.isfinite(jnp.sum(B) + jnp.sum(wanted))
-    tau = jnp.where(valid, tau, jnp.nan)
-    return tau, (wanted - B @ (column * tau)) / column
-
-
-def _bounded_target(A, b, lower, upper):
-    """Return the z for which clip(z, lower, upper) is the x of least norm in the box among those
-    that make |A x - b| least.
-
-    In two stages: in the second the coordinates that the residual presses against a bound stay
-    there. Without them the residual no longer drives the multiplier, which keeps its precision.
-    """
-    small = jnp.finfo(A.dtype).eps ** 0.25
-
-    def stage(_, carry):
-        held, target = carry
-        rest = b - A @ jnp.where(held, jnp.clip(target, lower, upper), 0)
-        part = jnp.where(held[None], 0, A)
-        Z = pivoted_qr_with_rank(part)[0].Q
-        part, rest = Z @ part, Z @ rest
-        target = jnp.where(held, target, _multiplier(part, rest, lower, upper) @ part)
-        press = (rest - part @ jnp.clip(target, lower, upper)) @ part
-        far = jnp.abs(press) > small * jnp.sqrt(jnp.sum(part**2, 0) * jnp.sum(rest**2))
-        return held | (far & ((target <= lower) | (target >= upper))), target
-
-    start = jnp.zeros(b.shape, bool), jnp.zeros_like(b)
-    return jax.lax.fori_loop(0, 2, stage, start)[1]
-
-
-def _multiplier(A, b, lower, upper):
-    """Return the mu for which x = clip(A^T mu, lower, upper) is of least norm in the box among
-    those that make |A x - b| least.
-
-    Augmented Lagrangian, ten updates of `center`; where no x of the box solves A x = b it converges
-    to the closest problem that has a solution (Chiche and Gilbert, 2016). Each inner problem is
-    solved in its dual, by semismooth Newton with exact line search.
-    """
-    eps, size = jnp.finfo(A.dtype).eps, jnp.sum(A * A)
-    damping = eps**0.8 * jnp.where(size > 0, size, 1)
-
-    def step(carry):
-        mu, center, updates, k = carry
-        target = mu @ A
-        x, free = jnp.clip(target, lower, upper), (lower < target) & (target < upper)
-        gradient = A @ x - b + damping * (mu - center)
-        hessian = jnp.where(free[None], A, 0) @ A.T + damping * jnp.eye(b.size, dtype=A.dtype)
-        d = -solve_positive(hessian, gradient)
-        along = d @ A
-        # the slope along d is linear in t between the t at which a coordinate meets a bound
-        speed = jnp.where(along == 0, 1, along)
-        meets = jnp.append((lower - target) / speed, (upper - target) / speed)
-        t = jnp.sort(jnp.append(jnp.clip(meets, 0, 1), jnp.array([0, 1], A.dtype)))
-        clipped = jax.vmap(lambda t: jnp.clip(target + t * along, lower, upper))(t)
-        slope = clipped @ along - b @ d + damping * ((mu - center) @ d + t * (d @ d))
-        mu = mu + jnp.interp(jnp.zeros((), A.dtype), slope, t) * d
-        after = jnp.clip(mu @ A, lower, upper)
-        error = jnp.max(jnp.abs(after - x - jnp.where(free, along, 0)))
-        # true for NaN
-        solved = ~(error > eps**0.5 * jnp.max(jnp.abs(after)))
-        return mu, jnp.where(solved, mu, center), jnp.where(solved, updates + 1, updates), k + 1
-
-    more = lambda carry: (carry[2] < 10) & (carry[3] < 10 * b.size + 10)
-    return jax.lax.while_loop(more, step, (jnp.zeros_like(b), jnp.zeros_like(b), 0, 0))[0]
+    return result, (B, column * target_force, column)

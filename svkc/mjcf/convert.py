@@ -35,14 +35,14 @@ def to_mjcf(chain: Chain) -> str:
 
     if chain.model.text is None:
         raise ValueError(
-            "to_mjcf: the chain was loaded from a MjModel, which does not say what it was compiled"
-            " from; load a path, text or MjSpec"
+            "to_mjcf: the chain was loaded from a MjModel, which does not hold its MJCF; load a path,"
+            " text or MjSpec"
         )
     try:
         spec = mujoco.MjSpec.from_string(chain.model.text)
     except ValueError as error:
         raise ValueError(
-            f"to_mjcf: MuJoCo cannot read what it writes of this MjSpec: {error}"
+            f"to_mjcf: MuJoCo cannot read the MJCF that it writes for this MjSpec: {error}"
         ) from error
     own, top, notes = dict(_links_with_equality(chain)), chain.topology, []
     for link, name in enumerate(chain.link_names):
@@ -108,7 +108,7 @@ def _add_equality(chain: Chain, spec, link: int, name: str) -> list[str]:
             sites.append(_unique_name(f"{label}_{side}", [site.name for site in spec.sites]))
             spec.bodies[body].add_site(
                 name=sites[-1],
-                pos=np.array(pos) + rotation_matrix(quat) @ place,
+                pos=np.array(pos) + rotation_matrix(quat) @ point,
                 quat=quat,
                 group=3,
             )
@@ -146,8 +146,8 @@ def _check_data(chain: Chain, data) -> None:
     if shapes != [(nq,), (nv,)]:
         got = [shape[0] if shape else "no" for shape in shapes]
         raise ValueError(
-            f"data: got {got[0]} qpos and {got[1]} qvel, the chain's model has {nq} and {nv}; make"
-            " it of the same model"
+            f"data: got {got[0]} qpos and {got[1]} qvel, the chain's model has {nq} and {nv};"
+            " give a MjData of that model"
         )
 
 

@@ -28,6 +28,7 @@ class CuttableJoint:
 
     @property
     def freedoms(self) -> tuple[int, ...]:
+        """Indices of the joint's coordinates among the six freedoms of the virtual joint."""
         return _FREEDOM_INDICES[self.link.joint]
 
 
@@ -72,7 +73,7 @@ def _cuttable_joint(model, name: str, body: int) -> CuttableJoint:
     else:
         raise ValueError(
             f"cuttable: {name!r} belongs to body {name_of(model, 'body', body)!r} with {len(kinds)}"
-            " joints; what can be cut is one hinge, slide or ball, or two hinges through one point"
+            " joints; a cuttable body has one hinge, slide or ball, or two hinges through one point"
             " at right angles to each other and with ref=0"
         )
     if joint in ("slide", "universal"):
@@ -84,8 +85,8 @@ def _cuttable_joint(model, name: str, body: int) -> CuttableJoint:
     joint_pos = pos + R @ anchor - (R @ axis * ref[0] if joint == "slide" else 0)
     link = VirtualLink(
         name, name_of(model, "body", int(model.body_parentid[body])), name_of(model, "body", body),
-        joint, pos=tuple(place), quat=tuple(_quaternion(base)), real_pos=tuple(anchor),
-        real_quat=tuple(_quaternion(frame)),
+        joint, pos=tuple(joint_pos), quat=tuple(_quaternion(frame_in_parent)),
+        real_pos=tuple(anchor), real_quat=tuple(_quaternion(frame)),
         axis=tuple((0.0, 0.0, 1.0) if joint in ("ball", "universal") else axis), connected=True,
     )  # fmt: skip
     return CuttableJoint(link, body, joints)
@@ -97,8 +98,8 @@ def check_armature(model, cuts: list[CuttableJoint], armature: np.ndarray) -> No
     names = [name_of(model, "joint", j) for cut in cuts for j in cut.joints if j in with_armature]
     if names:
         raise ValueError(
-            f"cuttable: got armature on {', '.join(names)}; a rotor has no place in the tree once"
-            f" its joint is cut. To load without: svkc.load(..., ignore_armature={names})"
+            f"cuttable: got armature on {', '.join(names)}; a cuttable joint cannot have any."
+            f" To load without: svkc.load(..., ignore_armature={names})"
         )
 
 

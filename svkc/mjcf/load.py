@@ -38,8 +38,7 @@ from svkc.model.virtual_link import VirtualLink, joint_freedoms
 class Source:
     """The source of a chain, for rendering, `Chain.to_mjcf` and saved files.
 
-    A source is static data of the chain, so that JAX compares sources: two are equal if their
-    digests are.
+    A source is static data of the chain: JAX compares two sources by their digests.
 
     model: the mujoco.MjModel.
     text: its MJCF text; None if the chain was loaded from a MjModel.
@@ -102,11 +101,11 @@ def load(source, *, virtual_links=(), cuttable=(), spare=0, ignore=(), ignore_ar
 
 
 def _tree_without(model, cuts: list[CuttableJoint]) -> tuple[list[tuple[int, int]], Topology]:
-    """Return `rows_of` the tree that is left when the cuts are made; ValueError where nothing can
-    move, or names of bodies or joints do not differ."""
+    """Return `tree_rows` without the cuttable joints; raise ValueError if no joint is left, or if
+    names of bodies or joints are not unique."""
     rows, topology = tree_rows(model, {cut.body: cut.link.name for cut in cuts})
     if not topology.joint_names:
-        raise ValueError("source: the model has no joints, so that nothing in it can move")
+        raise ValueError("source: the model has no joints")
     _check_unique("bodies", topology.body_names)
     cut_joints = [name_of(model, "joint", j) for cut in cuts for j in cut.joints]
     _check_unique("joints", [*topology.joint_names, *cut_joints])
@@ -125,11 +124,7 @@ def _with_virtual_links(topology: Topology, links: list[VirtualLink], spare: int
 
 
 def _digest(model, text: str | None, arguments: dict[str, Any]) -> str:
-    """Return the SHA-256 of the compiled model, its text, and the arguments of `load`.
-
-    MuJoCo compiles one text to the same bytes each time. The arguments are hashed in a canonical
-    form.
-    """
+    """Return the SHA-256 of the compiled model, its text, and the canonical arguments of `load`."""
     import mujoco
 
     image = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
@@ -174,10 +169,7 @@ def _check_finite(chain: Chain) -> Chain:
 
 
 def _compile(source) -> tuple[Any, str | None]:
-    """Return the mujoco.MjModel of a source and its MJCF text, which is None for a MjModel.
-
-    Raises ValueError, with MuJoCo's message, if the source cannot be read.
-    """
+    """Return the mujoco.MjModel of a source and its MJCF text, which is None for a MjModel."""
     import mujoco
 
     if isinstance(source, mujoco.MjModel):
@@ -200,15 +192,13 @@ def _compile(source) -> tuple[Any, str | None]:
 
 
 def _read_spec(text: str):
-    """Return the mujoco.MjSpec of MJCF or URDF, by text or path.
-
-    Links of a URDF held by fixed joints stay bodies, so that virtual links can name them.
-    """
+    """Return the mujoco.MjSpec of MJCF or URDF, by text or path."""
     import mujoco
 
     inline = "<" in text
     spec = mujoco.MjSpec.from_string(text) if inline else mujoco.MjSpec.from_file(text)
     if "<robot" in (text if inline else pathlib.Path(text).read_text(errors="replace")):
+        # keep links behind fixed joints as bodies, so that virtual links can name them
         spec.compiler.fusestatic = False
         for mesh in spec.meshes:
             mesh.file = _resolve_package_uri(
@@ -220,8 +210,7 @@ def _read_spec(text: str):
 def _resolve_package_uri(file: str, folder: pathlib.Path) -> str:
     """Return the path of a file given as ROS's package://NAME/PATH; return other names unchanged.
 
-    Looks for NAME/PATH, then PATH, in `folder` and its parents, then for the file's name in
-    `folder`.
+    Search for NAME/PATH, then PATH, in `folder` and its parents; then for the file in `folder`.
     """
     if not file.startswith("package://"):
         return file
@@ -234,8 +223,7 @@ def _resolve_package_uri(file: str, folder: pathlib.Path) -> str:
 
 
 def _load_pose(model, topology: Topology) -> np.ndarray:
-    """Return the coordinates of the load pose: the model's qpos0, and zero for other virtual
-    joints."""
+    """Return the coordinates of the load pose: the model's qpos0, other virtual joints at zero."""
     import mujoco
 
     data = mujoco.MjData(model)
@@ -260,10 +248,7 @@ def _gravity(model) -> np.ndarray:
 
 
 def _characteristic_length(bodies: dict[str, np.ndarray], topology: Topology) -> float:
-    """Return the root mean square of the offsets (m) of joints and centres of mass.
-
-    Offsets of zero do not count. The length is 1 if all are zero.
-    """
+    """Return the root mean square of nonzero offsets (m) of joints and centres of mass, or 1."""
     below_roots = bodies["pos"][np.array(topology.parent) > 0]
     offsets = np.linalg.norm(np.concatenate([below_roots, bodies["com"]]), axis=1)
     offsets = offsets[offsets > 1e-12]

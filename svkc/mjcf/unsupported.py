@@ -116,13 +116,13 @@ def _unsupported_in_bodies(model) -> dict[str, tuple]:
 
 
 def _unsupported_elements(model) -> list[tuple[str, str]]:
-    """(kind, what was found) for everything that would change the motion and is not simulated."""
-    seen = (
+    """Return (kind, description) of every element that changes the motion and is not simulated."""
+    found = (
         _unsupported_in_actuators(model)
         | _unsupported_in_joints(model)
         | _unsupported_in_bodies(model)
     )
-    return [(kind, seen[kind][1]) for kind in UNSUPPORTED_KINDS if seen[kind][0]]
+    return [(kind, found[kind][1]) for kind in UNSUPPORTED_KINDS if found[kind][0]]
 
 
 def left_out_elements(model, ignore) -> tuple[str, ...]:

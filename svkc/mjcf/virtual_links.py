@@ -63,7 +63,7 @@ def declared_links(model, declared, cuttable: list[VirtualLink], spare: int) -> 
     links += [VirtualLink(f"spare_{i}", "world", "world", "free") for i in range(spare)]
     names = [link.name for link in links]
     if len(set(names)) < len(names):
-        raise ValueError(f"virtual_links: names must differ, got {names}")
+        raise ValueError(f"virtual_links: names must be unique, got {names}")
     return links
 
 

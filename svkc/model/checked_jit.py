@@ -17,14 +17,18 @@ from svkc.model.validation import real_array
 def check_chain(chain) -> None:
     """Raise ValueError if `chain` is not a `Chain`."""
     if not isinstance(chain, Chain):
-        raise ValueError(f"chain: expected what svkc.load(...) gives, got {type(chain).__name__}")
+        raise ValueError(
+            f"chain: expected a Chain, as svkc.load(...) returns, got {type(chain).__name__}"
+        )
 
 
 def check_state(chain, state) -> None:
     """Raise ValueError if `state` is not a state of this chain, by its shapes and dtypes."""
     check_chain(chain)
     if not isinstance(state, State) or not isinstance(state.structure, Structure):
-        raise ValueError(f"state: expected what chain.state(...) gives, got {type(state).__name__}")
+        raise ValueError(
+            f"state: expected a State, as chain.state(...) returns, got {type(state).__name__}"
+        )
     expected = (
         ("q", state.q, chain.topology.nq_all),
         ("v", state.v, chain.dofs),
@@ -34,8 +38,8 @@ def check_state(chain, state) -> None:
         shape = getattr(value, "shape", None)
         if shape != (size,):
             raise ValueError(
-                f"state.{name}: got shape {shape}, expected ({size},); for many states use vmap or"
-                " svkc.rollout"
+                f"state.{name}: got shape {shape}, expected ({size},); use vmap or svkc.rollout"
+                    " for a batch"
             )
     for value in (state.q, state.v):
         dtype = real_array("state", value).dtype
@@ -69,7 +73,9 @@ def float_vector(chain: Chain, name: str, value, size: int | None = None):
     """
     array = real_array(name, value)
     if size is not None and array.shape != (size,):
-        raise ValueError(f"{name}: got shape {array.shape}, expected ({size},); for many use vmap")
+        raise ValueError(
+            f"{name}: got shape {array.shape}, expected ({size},); use vmap for a batch"
+        )
     return (
         array
         if isinstance(array, jax.Array) and jnp.issubdtype(array.dtype, jnp.floating)

@@ -52,8 +52,7 @@ def scalar(name: str, value):
     array = real_array(name, value)
     if array.shape != ():
         raise ValueError(
-            f"{name}: got shape {array.shape}, expected one number; for another in each lane use"
-            " vmap"
+            f"{name}: got shape {array.shape}, expected one number; use vmap for a batch"
         )
     return value
 

@@ -9,13 +9,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.pytrees import stop_gradient_tree
-from svkc.loops.constraint import (
-    assemble_loop_jacobian,
-    frame_gaps,
-    jacobian_scales,
-    largest_norms,
-    loop_frames,
-)
+from svkc.loops.constraint import assemble_loop_jacobian, jacobian_scales, largest_norms
+from svkc.loops.frames import frame_gaps, loop_frames
 from svkc.loops.pivoting import pivot_ratio, pivoted_qr, rank_tolerance
 from svkc.model.chain import Chain, State, Structure, active_dofs
 from svkc.model.topology import FREE

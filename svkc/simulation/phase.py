@@ -1,5 +1,5 @@
 """One phase: the integration of one smooth vector field up to the next scheduled time, or to the
-first guard that crosses zero."""
+first guard that crosses zero. Changes of structure happen between phases."""
 
 import dataclasses
 
@@ -34,14 +34,22 @@ from svkc.transitions.plan import Plan
 
 
 class RunState(eqx.Module):
-    """The state that a phase hands to the next. `count`: phases so far; `stale`: guards whose
-    values belong to another structure; `derivative`, `invalid_from`: why the run has no derivative,
-    and the index of the first such phase."""
+    """The state of a run between two phases.
+
+    work: done so far by control, joint limits and dampers (J).
+    guard_values: at the end of the last phase.
+    stale: which guard values belong to the structure before the last change.
+    pending: which timed events have not happened yet.
+    count: number of phases so far.
+    saved: states at the save times.
+    derivative, invalid_from: why the run has no derivative, and the index of the first phase for
+        which this is so.
+    """
 
     t: Float[Array, ""]
     state: State
     work: Float[Array, ""] | None
-    guards: Float[Array, " guards"] | None
+    guard_values: Float[Array, " guards"] | None
     stale: Bool[Array, " guards"] | None
     pending: Bool[Array, " timed"]
     events: Events
@@ -54,117 +62,131 @@ class RunState(eqx.Module):
 
 
 class PhaseOutcome(eqx.Module):
-    """Where a phase ended: time, motion, the guards that fired there, which guard values go on, the
-    solver's words, and whether it can be differentiated."""
+    """The end of a phase.
+
+    y: the ODE state at the end.
+    fired: which guards ended the phase.
+    guard_values: at the end.
+    ys: ODE states at the save times.
+    solution: of the solver, without derivatives.
+    derivative: why the phase has no derivative.
+    """
 
     t: Float[Array, ""]
-    motion: ODEState
+    y: ODEState
     fired: Bool[Array, " guards"]
-    guards: Float[Array, " guards"] | None
-    saved: ODEState
-    path: PhaseSolution
+    guard_values: Float[Array, " guards"] | None
+    ys: ODEState
+    solution: PhaseSolution
     result: RESULTS
     derivative: RESULTS
 
 
 def solve_phase(
-    run: RunState, stop, ts, made: Plan, options: Options, scene: FieldArgs
+    run: RunState, stop, ts, plan: Plan, options: Options, field_args: FieldArgs
 ) -> PhaseOutcome:
-    """From run.t to `stop`, or to the first guard that crosses zero."""
-    guards = GuardValues(made, options.field) if made.guards else None
-    watched = (
-        None
-        if guards is None
-        else stop_gradient_tree(
-            ArmedGuards(guards, run.guards, made.armed(scene.chain, scene.structure))
-        )
+    """Integrate one phase from run.t to `stop`, or to the first guard that crosses zero.
+
+    ts: save times of the run; states are saved at those within the phase.
+    """
+    guards = GuardValues(plan, options.field) if plan.guards else None
+    armed = None
+    if guards is not None:
+        mask = plan.armed(field_args.chain, field_args.structure)
+        armed = stop_gradient_tree(ArmedGuards(guards, run.guard_values, mask))
+    y0 = ODEState(run.state.q, run.state.v, run.work)
+    # Save times outside the phase are clipped to its ends. Only save times within the phase, ends
+    # included, have derivatives here; the states saved at the others are those of other phases.
+    t_start, t_stop = stop_gradient_tree((run.t, jnp.maximum(stop, run.t)))
+    clipped_ts = jnp.where(ts < t_start, t_start, jnp.where(ts > t_stop, t_stop, ts))
+    solution, event, t, y = _integrate(
+        y0,
+        (run.t, stop, clipped_ts),
+        PhaseProblem(field_args, options.field),
+        armed,
+        options,
+        options.field if guards is None else guards,
     )
-    start = ODEState(run.state.q, run.state.v, run.work)
-    # a save time within the phase, its ends included, moves by itself; what is saved of the others
-    # counts in another phase
-    begun, ended = stop_gradient_tree((run.t, jnp.maximum(stop, run.t)))
-    at = jnp.where(ts < begun, begun, jnp.where(ts > ended, ended, ts))
-    reading = options.field if guards is None else guards
-    path, found, t, motion = _path(
-        start, (run.t, stop, at), PhaseProblem(scene, options.field), watched, options, reading
-    )
-    result = _translate(path.result, path.y)
-    solved = PhaseOutcome(
+    outcome = PhaseOutcome(
         t=t,
-        motion=motion,
+        y=y,
         fired=jnp.zeros(0, bool),
-        guards=None,
-        saved=path.ys,
-        path=stop_gradient_tree(path),
-        result=result,
+        guard_values=None,
+        ys=solution.ys,
+        solution=stop_gradient_tree(solution),
+        result=_as_result(solution.result, solution.y),
         derivative=RESULTS.successful,
     )
-    if found is None:
-        return solved
-    code = RESULTS.where(found.jumps, RESULTS.jump, RESULTS.successful)
-    code = RESULTS.where(jnp.sum(found.fired) > 1, RESULTS.together, code)
-    code = RESULTS.where(found.grazing, RESULTS.grazing, code)
-    return dataclasses.replace(solved, fired=found.fired, guards=found.values, derivative=code)
-
-
-def _path(
-    start: ODEState,
-    times,
-    world: PhaseProblem,
-    watched: ArmedGuards | None,
-    options: Options,
-    reading: GuardValues | VectorField,
-):
-    """Return the path up to its end, the guard that ends it, and the time and motion there.
-
-    The derivative is that of the replayed steps, or that of the diffrax adjoint asked for.
-    """
-    adjoint, replayed = options.adjoint, isinstance(options.adjoint, Replay)
-    solver, looked_for, (controller, first_step) = stop_gradient_tree(
-        (with_scan_kind(options.solver, "lax"), watched, options.step_size_control())
+    if event is None:
+        return outcome
+    code = RESULTS.where(event.jumps, RESULTS.jump, RESULTS.successful)
+    code = RESULTS.where(jnp.sum(event.fired) > 1, RESULTS.together, code)
+    code = RESULTS.where(event.grazing, RESULTS.grazing, code)
+    return dataclasses.replace(
+        outcome, fired=event.fired, guard_values=event.values, derivative=code
     )
-    how = StepperOptions(
+
+
+def _integrate(
+    y0: ODEState,
+    times,
+    problem: PhaseProblem,
+    armed: ArmedGuards | None,
+    options: Options,
+    guards: GuardValues | VectorField,
+):
+    """Return the solution of a phase, the event that ended it, and the time and ODE state at its
+    end.
+
+    Derivatives are those of the replayed steps, or those of the diffrax adjoint of the options.
+
+    times: start and latest end of the phase, and the save times.
+    guards: the guards, or the vector field where there are no guards.
+    """
+    adjoint, replays = options.adjoint, isinstance(options.adjoint, Replay)
+    solver, armed_guards, (controller, first_step) = stop_gradient_tree(
+        (with_scan_kind(options.solver, "lax"), armed, options.step_size_control())
+    )
+    stepper_options = StepperOptions(
         solver=solver,
-        armed_guards=looked_for,
+        armed_guards=armed_guards,
         controller=controller,
         first_step=first_step,
-        progress_meter=options.progress_meter if replayed else diffrax.NoProgressMeter(),
+        progress_meter=options.progress_meter if replays else diffrax.NoProgressMeter(),
         gap_tolerance=options.gap_tolerance,
         max_steps=options.max_steps,
-        checkpoint_interval=min(adjoint.every, options.max_steps)
-        if replayed
-        else options.max_steps,
+        checkpoint_interval=min(adjoint.every, options.max_steps) if replays else options.max_steps,
     )
-    if replayed:
-        path, t, motion = integrate_with_replay(start, times, world, how, reading)
-        return path, stop_gradient_tree(path.event), t, motion
-    t0, stop, at = times
-    found = None
-    if watched is not None:
-        # an event is located once, before the differentiated solve, which then ends at its time
-        begin, fixed_times, still = stop_gradient_tree((start, times, world))
-        first = integrate_phase(begin, fixed_times, still, how)
-        stop = jnp.where(first.event.occurred, first.t, stop)
-        at, found = jnp.where(at > stop, stop, at), first.event
-    controller, first_step = options.step_size_control(at)
-    how = dataclasses.replace(
-        how,
+    if replays:
+        solution, t, y = integrate_with_replay(y0, times, problem, stepper_options, guards)
+        return solution, stop_gradient_tree(solution.event), t, y
+    t0, stop, ts = times
+    event = None
+    if armed is not None:
+        # the event is located first, without derivatives; the differentiated solve ends at its time
+        located = integrate_phase(*stop_gradient_tree((y0, times, problem)), stepper_options)
+        stop = jnp.where(located.event.occurred, located.t, stop)
+        ts, event = jnp.where(ts > stop, stop, ts), located.event
+    controller, first_step = options.step_size_control(ts)
+    stepper_options = dataclasses.replace(
+        stepper_options,
         solver=options.solver,
         controller=controller,
         first_step=first_step,
         progress_meter=options.progress_meter,
     )
-    path = integrate_with_diffrax(start, (t0, stop, at), world, how, adjoint, found)
-    # the adjoint has seen to a scheduled end that moves
-    late = jnp.zeros_like(path.t)
-    return path, found, *end_of_phase(path.t, path.y, late, world.field_args, reading, found)
+    solution = integrate_with_diffrax(y0, (t0, stop, ts), problem, stepper_options, adjoint, event)
+    # the adjoint differentiates by a scheduled end, so the end is not shifted again here
+    stop_shift = jnp.zeros_like(solution.t)
+    t, y = end_of_phase(solution.t, solution.y, stop_shift, problem.field_args, guards, event)
+    return solution, event, t, y
 
 
-def _translate(result: Int[Array, ""], motion: ODEState) -> RESULTS:
-    """Diffrax's word for how a solve ended, as ours."""
+def _as_result(result: Int[Array, ""], y: ODEState) -> RESULTS:
+    """Return the result code of a solve as one of `RESULTS`."""
     out = RESULTS.where(
         (result == SUCCESSFUL) | (result == EVENT), RESULTS.successful, RESULTS.step_too_small
     )
     out = RESULTS.where(result == MAX_STEPS, RESULTS.max_steps, out)
     out = RESULTS.where(result == LOOP_OPEN, RESULTS.loop_open, out)
-    return RESULTS.where(is_finite(motion) & (result != NON_FINITE), out, RESULTS.non_finite)
+    return RESULTS.where(is_finite(y) & (result != NON_FINITE), out, RESULTS.non_finite)

@@ -57,26 +57,26 @@ def simulate(
     ValueError: a call that cannot be right. A run that goes wrong ends with a code in `result`,
     raised when throw=True.
     """
-    options, save_at, made = prepare_options(
+    options, save_at, plan = prepare_options(
         chain, state, t0, t1, ts=ts, events=events, control=control, dt=dt, rtol=rtol, atol=atol,
         solver=solver, stepsize_controller=stepsize_controller, stabilization=stabilization,
         dynamics=dynamics, adjoint=adjoint, max_events=max_events, max_steps=max_steps,
         progress_meter=progress_meter,
     )  # fmt: skip
     dtype = state.q.dtype
-    given = chain, state, jnp.asarray(t0, dtype), jnp.asarray(t1, dtype), save_at
+    inputs = chain, state, jnp.asarray(t0, dtype), jnp.asarray(t1, dtype), save_at
     run = lambda control, events: _run(
-        *given, _with(made, guards=events), _with(options, control=control), args
+        *inputs, replace(plan, guards=events), replace(options, control=control), args
     )
-    run = call_with_comparable(run, control=options.control, events=made.guards)
-    certified = _certified_once if len(save_at) <= MAX_EAGER_STATES else _certified
+    run = call_with_comparable(run, control=options.control, events=plan.guards)
+    certified = _certify_eagerly if len(save_at) <= MAX_EAGER_STATES else _certify
     traj = certified(
-        chain, run, save_at, given[3], options.gap_tolerance, evaluations_per_step(options.solver)
+        chain, run, save_at, inputs[3], options.gap_tolerance, evaluations_per_step(options.solver)
     )
-    return _raised(chain, traj) if throw else traj
+    return _raise_on_failure(chain, traj) if throw else traj
 
 
-def _raised(chain: Chain, traj: Trajectory) -> Trajectory:
+def _raise_on_failure(chain: Chain, traj: Trajectory) -> Trajectory:
     """Return the trajectory. Raise RuntimeError, or an error at run time under jit, where the run
     went wrong."""
     good = RESULTS.successful, RESULTS.stopped
@@ -92,12 +92,12 @@ def _raised(chain: Chain, traj: Trajectory) -> Trajectory:
 
 
 @eqx.filter_jit
-def _run(chain: Chain, state: State, t0, t1, ts, made: Plan, options: Options, args) -> RunState:
-    made, options = _closure_convert(chain, state, t0, made, options, args)
-    run = _start(chain, state, t0, ts, made, options)
+def _run(chain: Chain, state: State, t0, t1, ts, plan: Plan, options: Options, args) -> RunState:
+    plan, options = _closure_convert(chain, state, t0, plan, options, args)
+    run = _initial_run_state(chain, state, t0, ts, plan, options)
 
     def phase(run: RunState, index):
-        return _phase(chain, run, index, (t1, ts), made=made, options=options, args=args), None
+        return _run_phase(chain, run, index, (t1, ts), plan=plan, options=options, args=args), None
 
     if options.max_events == 0:
         run, _ = phase(run, jnp.asarray(0))
@@ -107,16 +107,16 @@ def _run(chain: Chain, state: State, t0, t1, ts, made: Plan, options: Options, a
 
 
 def _with_certificate(
-    chain: Chain, run: RunState, ts, t1, most: float, evaluations: int
+    chain: Chain, run: RunState, ts, t1, gap_tolerance: float, stages: int
 ) -> Trajectory:
-    """Return the run with its certificate. most: the largest gap of a closed loop; evaluations: of
+    """Return the run with its certificate. gap_tolerance: the largest gap of a closed loop; stages: of
     the field in one try of a step."""
     short = (run.t < t1) & (run.result == RESULTS.successful)
     result = RESULTS.where(short, RESULTS.max_events, run.result)
-    phases, saved, lost = certificate(chain, run.records, run.count, run.saved, evaluations)
+    phases, saved, lost = certificate(chain, run.records, run.count, run.saved, stages)
     worst = jnp.maximum(jnp.max(saved.gap), jnp.max(phases.gap))
     result = RESULTS.where(
-        (result == RESULTS.successful) & (worst > most), RESULTS.loop_open, result
+        (result == RESULTS.successful) & (worst > gap_tolerance), RESULTS.loop_open, result
     )
     derivative = RESULTS.where(
         (lost < phases.start.shape[0]) & (lost <= run.invalid_from),
@@ -139,30 +139,30 @@ def _with_certificate(
 
 # a program of its own, which an eager call compiles for compile time: it checks each state once
 MAX_EAGER_STATES = 1000
-_certified, _certified_once = (
+_certify, _certify_eagerly = (
     eqx.filter_jit(_with_certificate),
     eager_jit(_with_certificate, eqx.filter_jit),
 )
 
 
 def _closure_convert(
-    chain: Chain, state: State, t0, made: Plan, options: Options, args
+    chain: Chain, state: State, t0, plan: Plan, options: Options, args
 ) -> tuple[Plan, Options]:
     """Control and guards with all that they close over as their leaves, so that it can be
     differentiated."""
-    state = _lockable(chain, state, made)
-    guards = tuple(g.closure_convert(t0, state, args) for g in made.guards)
+    state = _with_lock_mask(chain, state, plan)
+    guards = tuple(g.closure_convert(t0, state, args) for g in plan.guards)
     control = options.control
     control = None if control is None else ClosureConverted.from_function(control, t0, state, args)
-    return _with(made, guards=guards), _with(options, control=control)
+    return replace(plan, guards=guards), replace(options, control=control)
 
 
-def _with(node, **changed):
-    return dataclasses.replace(node, **changed)
+def replace(node, **changed):
+    return replace(node, **changed)
 
 
-def _lockable(chain: Chain, state: State, made: Plan) -> State:
-    if not made.has_locks or state.structure.locked is not None:
+def _with_lock_mask(chain: Chain, state: State, plan: Plan) -> State:
+    if not plan.has_locks or state.structure.locked is not None:
         return state
     return eqx.tree_at(
         lambda s: s.structure.locked,
@@ -172,20 +172,22 @@ def _lockable(chain: Chain, state: State, made: Plan) -> State:
     )
 
 
-def _start(chain: Chain, state: State, t0, ts, made: Plan, options: Options) -> RunState:
+def _initial_run_state(
+    chain: Chain, state: State, t0, ts, plan: Plan, options: Options
+) -> RunState:
     """Empty records, sized by capacity; unwritten entries show: inf, -1."""
     links, rows, dtype = len(chain.link_names), options.max_events, state.q.dtype
-    state = _lockable(chain, state, made)
+    state = _with_lock_mask(chain, state, plan)
     # an overload from the start is a crossing; guards that need no torques are evaluated at the
     # start of the phase
-    initial = [g.initial_value for g in made.guards]
+    initial = [g.initial_value for g in plan.guards]
     return RunState(
         t=t0,
         state=state,
         work=jnp.zeros((), dtype) if options.has_work else None,
-        guards=jnp.asarray(initial, dtype) if made.guards else None,
-        stale=jnp.asarray(reevaluated_guards(made)) if made.guards else None,
-        pending=jnp.ones(len(made.timed), bool),
+        guard_values=jnp.asarray(initial, dtype) if plan.guards else None,
+        stale=jnp.asarray(reevaluated_guards(plan)) if plan.guards else None,
+        pending=jnp.ones(len(plan.timed), bool),
         events=empty_events(rows, links, dtype),
         records=empty_phase_records(rows + 1, state),
         count=jnp.asarray(0, jnp.int32),
@@ -196,59 +198,59 @@ def _start(chain: Chain, state: State, t0, ts, made: Plan, options: Options) -> 
     )  # fmt: skip
 
 
-def _next_stop(run: RunState, t1, made: Plan):
+def _next_stop(run: RunState, t1, plan: Plan):
     """Return the time at which the next phase ends at the latest: that of the next event, or t1.
 
     Of two equal times the one taken is differentiated: the event's where it is t1, and t1 where the
     run is there already.
     """
-    next_time = jnp.min(jnp.where(run.pending, made.times, jnp.inf), initial=jnp.inf)
+    next_time = jnp.min(jnp.where(run.pending, plan.times, jnp.inf), initial=jnp.inf)
     stop = jnp.where(next_time <= t1, next_time, t1)
     return jnp.where((stop < run.t) | (run.result != RESULTS.successful), run.t, stop)
 
 
-def _phase(
-    chain: Chain, run: RunState, index, times, *, made: Plan, options: Options, args
+def _run_phase(
+    chain: Chain, run: RunState, index, times, *, plan: Plan, options: Options, args
 ) -> RunState:
     """One solve, the events at its end, and the records of both. times: the end and the save
     times."""
     t1, ts = times
-    run = _with_guards(chain, run, made, options, args)
-    going = (run.t < t1) | jnp.any(run.pending & (made.times <= t1))
-    going = going & (run.result == RESULTS.successful)
-    stop = _next_stop(run, t1, made)
-    solved = solve_phase(run, stop, ts, made, options, FieldArgs(chain, run.state.structure, args))
-    reached = going & (solved.result == RESULTS.successful)
-    timed = run.pending & (made.times <= solved.t + event_tolerance(solved.t)) & reached
+    run = _rearm_guards(chain, run, plan, options, args)
+    active = (run.t < t1) | jnp.any(run.pending & (plan.times <= t1))
+    active = active & (run.result == RESULTS.successful)
+    stop = _next_stop(run, t1, plan)
+    outcome = solve_phase(run, stop, ts, plan, options, FieldArgs(chain, run.state.structure, args))
+    reached = active & (outcome.result == RESULTS.successful)
+    timed = run.pending & (plan.times <= outcome.t + event_tolerance(outcome.t)) & reached
     fired = (
-        jnp.zeros(len(made.actions), bool)
-        .at[np.array(made.timed + made.guarded, int)]
-        .set(jnp.concatenate([timed, solved.fired & reached]))
+        jnp.zeros(len(plan.actions), bool)
+        .at[np.array(plan.timed + plan.guarded, int)]
+        .set(jnp.concatenate([timed, outcome.fired & reached]))
     )
-    ended = State(solved.motion.q, solved.motion.v, run.state.structure)
-    saved = _save(run, ended, solved, ts)
-    row = (jnp.arange(run.records.start.shape[0]) == index) & going
-    work = jnp.zeros_like(run.t) if run.work is None else solved.motion.work - run.work
+    end_state = State(outcome.y.q, outcome.y.v, run.state.structure)
+    saved = _write_saved_states(run, end_state, outcome, ts)
+    row = (jnp.arange(run.records.start.shape[0]) == index) & active
+    work = jnp.zeros_like(run.t) if run.work is None else outcome.y.work - run.work
     records = write_phase_row(
-        run.records, row, (run.t, run.state), (solved.t, ended), work, solved.path
+        run.records, row, (run.t, run.state), (outcome.t, end_state), work, outcome.solution
     )
-    count = run.count + going.astype(jnp.int32)
-    derivative, invalid_from = _derivative(run, solved, going, timed, index)
-    after, events, result = ended, run.events, solved.result
-    if made.actions:
-        after, events, result = apply_events(chain, run, ended, solved, fired, made)
+    count = run.count + active.astype(jnp.int32)
+    derivative, invalid_from = _check_derivative(run, outcome, active, timed, index)
+    after, events, result = end_state, run.events, outcome.result
+    if plan.actions:
+        after, events, result = apply_events(chain, run, end_state, outcome, fired, plan)
     result = RESULTS.where(run.result == RESULTS.successful, result, run.result)
     # a guard that rests at zero after it fired keeps its value
     stale = (
-        jnp.asarray(reevaluated_guards(made)) & jnp.any(fired) & (solved.guards != 0)
-        if made.guards
+        jnp.asarray(reevaluated_guards(plan)) & jnp.any(fired) & (outcome.guard_values != 0)
+        if plan.guards
         else None
     )
     return RunState(
-        t=solved.t,
+        t=outcome.t,
         state=after,
-        work=solved.motion.work,
-        guards=solved.guards,
+        work=outcome.y.work,
+        guard_values=outcome.guard_values,
         stale=stale,
         pending=run.pending & ~timed,
         events=events,
@@ -261,39 +263,39 @@ def _phase(
     )
 
 
-def _derivative(
-    run: RunState, solved: PhaseOutcome, going, timed: Bool[Array, " timed"], index
+def _check_derivative(
+    run: RunState, outcome: PhaseOutcome, active, timed: Bool[Array, " timed"], index
 ) -> tuple[RESULTS, Int[Array, ""]]:
     """Return the first reason why the run has no derivative, and the index of its phase. Ranks are
     checked after the run."""
     code = RESULTS.where(
-        jnp.sum(solved.fired) + jnp.sum(timed) > 1, RESULTS.together, solved.derivative
+        jnp.sum(outcome.fired) + jnp.sum(timed) > 1, RESULTS.together, outcome.derivative
     )
-    first = (run.derivative == RESULTS.successful) & going & (code != RESULTS.successful)
+    first = (run.derivative == RESULTS.successful) & active & (code != RESULTS.successful)
     return RESULTS.where(first, code, run.derivative), jnp.where(
         first, index.astype(jnp.int32), run.invalid_from
     )
 
 
-def _with_guards(chain: Chain, run: RunState, made: Plan, options: Options, args) -> RunState:
+def _rearm_guards(chain: Chain, run: RunState, plan: Plan, options: Options, args) -> RunState:
     """Return the run with its stale guards re-evaluated at the start of a phase."""
-    if not made.guards or not reevaluated_guards(made).any():
+    if not plan.guards or not reevaluated_guards(plan).any():
         return run
     scene = FieldArgs(chain, run.state.structure, args)
-    now = stop_gradient_tree(GuardValues(made, options.field))(
+    now = stop_gradient_tree(GuardValues(plan, options.field))(
         *stop_gradient_tree((run.t, ODEState(run.state.q, run.state.v), scene))
     )
-    return dataclasses.replace(run, guards=jnp.where(run.stale, now, run.guards))
+    return replace(run, guard_values=jnp.where(run.stale, now, run.guard_values))
 
 
-def _save(run: RunState, ended: State, solved: PhaseOutcome, ts) -> State:
+def _write_saved_states(run: RunState, end_state: State, outcome: PhaseOutcome, ts) -> State:
     """The saved states with those of this phase written in: from its start to its end, both
     included; later ones hold its end."""
-    here, later = ((ts >= run.t) & (ts <= solved.t))[:, None], (ts > solved.t)[:, None]
-    q = jnp.where(here, solved.saved.q, jnp.where(later, ended.q[None], run.saved.q))
-    v = jnp.where(here, solved.saved.v, jnp.where(later, ended.v[None], run.saved.v))
+    here, later = ((ts >= run.t) & (ts <= outcome.t))[:, None], (ts > outcome.t)[:, None]
+    q = jnp.where(here, outcome.ys.q, jnp.where(later, end_state.q[None], run.saved.q))
+    v = jnp.where(here, outcome.ys.v, jnp.where(later, end_state.v[None], run.saved.v))
 
     def write(new, old):
         return jnp.where((ts >= run.t).reshape(-1, *(1,) * new.ndim), new[None], old)
 
-    return State(q, v, jax.tree.map(write, ended.structure, run.saved.structure))
+    return State(q, v, jax.tree.map(write, end_state.structure, run.saved.structure))

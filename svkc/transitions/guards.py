@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from svkc._jax.primitive import ClosureConverted
-from svkc.loops.constraint import loop_frames
 from svkc.loops.forward_dynamics import loop_forces
+from svkc.loops.frames import loop_frames
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import check_chain, joint_torques
 from svkc.model.names import link_index

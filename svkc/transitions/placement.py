@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from svkc.loops.constraint import loop_frames
+from svkc.loops.frames import loop_frames
 from svkc.model.chain import Chain, Structure
 from svkc.tree.kinematics import Kinematics
 from svkc.tree.spatial import (

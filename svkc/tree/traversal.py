@@ -163,10 +163,10 @@ def _pad(top: Topology, levels: list[Level]) -> Level:
         return stacked
 
     # in the children's tables the padding is the size of the next level, which is now `widest`
-    next_sizes = [*(len(level.rows) for level in levels[1:]), 0]
+    next_lengths = [*(len(level.rows) for level in levels[1:]), 0]
     children = [
         np.where(level.children == size, widest, level.children)
-        for level, size in zip(levels, next_sizes, strict=True)
+        for level, size in zip(levels, next_lengths, strict=True)
     ]
     return Level(
         rows=stack([level.rows for level in levels], len(top.parent)),

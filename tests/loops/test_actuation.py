@@ -10,7 +10,7 @@ from scipy.optimize import lsq_linear, minimize
 from tolerances import DIFFERENCE, REFERENCE, ROUND_OFF
 
 import svkc
-from svkc.loops.actuation import _solve_bounded
+from svkc.loops.least_squares import solve_bounded
 
 
 def mask(chain, *names):
@@ -254,7 +254,7 @@ def bounded_problem(seed, n=12, dtype=np.float64):
 
 @jax.jit
 def within(B, wanted, cost, lower, upper):
-    return _solve_bounded((B, wanted, jnp.ones_like(wanted)), cost, lower, upper)[0]
+    return solve_bounded((B, wanted, jnp.ones_like(wanted)), cost, lower, upper)[0]
 
 
 def by_scipy(B, wanted, cost, lower, upper):

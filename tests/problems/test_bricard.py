@@ -14,7 +14,7 @@ pytestmark = pytest.mark.slow
 
 CORNERS = np.array([(0, 0, 0), (1, 0, 0), (1, 0, 1), (1, 1, 1), (0, 1, 1), (0, 1, 0)], float)
 AXES = [np.cross(CORNERS[k] - CORNERS[k - 1], CORNERS[(k + 1) % 6] - CORNERS[k]) for k in range(6)]
-THIN, GRAVITY = 1e-13, 9.81
+ROD_INERTIA, GRAVITY = 1e-13, 9.81
 
 
 def numbers(x):
@@ -25,7 +25,7 @@ def mechanism():
     nested = ""
     for k in reversed(range(5)):
         edge = CORNERS[k + 1] - CORNERS[k]
-        inertia = (1 - edge**2) / 12 + THIN
+        inertia = (1 - edge**2) / 12 + ROD_INERTIA
         inertial = (
             f'<inertial pos="{numbers(edge / 2)}" mass="1" diaginertia="{numbers(inertia)}"/>'
         )
@@ -50,7 +50,7 @@ def mechanism():
     )
 
 
-def turned(axis, angle):
+def rotation_matrix(axis, angle):
     cross = jnp.array(np.cross(np.eye(3), axis))
     return jnp.eye(3) + jnp.sin(angle) * cross + (1 - jnp.cos(angle)) * cross @ cross
 
@@ -63,15 +63,15 @@ def angles(a):
 
 
 def corners(a):
-    at, frame, found = jnp.zeros(3), jnp.eye(3), [jnp.zeros(3)]
+    position, frame, positions = jnp.zeros(3), jnp.eye(3), [jnp.zeros(3)]
     for k, angle in enumerate(angles(a)):
-        frame = frame @ turned(AXES[k], angle)
-        at = at + frame @ jnp.array(CORNERS[k + 1] - CORNERS[k])
-        found.append(at)
-    return jnp.stack(found)
+        frame = frame @ rotation_matrix(AXES[k], angle)
+        position = position + frame @ jnp.array(CORNERS[k + 1] - CORNERS[k])
+        positions.append(position)
+    return jnp.stack(positions)
 
 
-def by_hand(ends):
+def reference_angles(times):
     """The first hinge's angle at each time: a thin rod's energy is that of its ends, (x'x' + x'y' +
     y'y') / 6."""
 
@@ -94,10 +94,10 @@ def by_hand(ends):
 
     return solve_ivp(
         lambda t, y: np.asarray(rates(y)),
-        (0, ends[-1]),
+        (0, times[-1]),
         [0.0, 0.0],
         method="DOP853",
-        t_eval=ends,
+        t_eval=times,
         rtol=1e-12,
         atol=1e-13,
     ).y[0]
@@ -112,7 +112,7 @@ def test_bricards_mechanism(dynamics):
     chain, times = mechanism(), jnp.linspace(0, 10, 101)
     traj = svkc.simulate(chain, chain.state(), 10.0, ts=times, rtol=1e-11, dynamics=dynamics)
     np.testing.assert_allclose(
-        traj.states.q[:, :5], jax.vmap(angles)(jnp.array(by_hand(times))), atol=1e-8
+        traj.states.q[:, :5], jax.vmap(angles)(jnp.array(reference_angles(times))), atol=1e-8
     )
     assert np.min(traj.states.q[:, 0]) < -3
     assert svkc.mobility(chain, traj.final).freedoms == 1

@@ -59,30 +59,40 @@ def planar_impact(model, x, theta, v):
     m = model.body_mass[1:]
     inertia = [np.max(i) for i in model.body_inertia[1:]]
     c = [b[1] for b in model.body_ipos[1:]]
-    along = lambda a: np.array([-np.sin(a), np.cos(a)])
-    turn = lambda r: np.array([-r[1], r[0]])
+    direction = lambda a: np.array([-np.sin(a), np.cos(a)])
+    perpendicular = lambda r: np.array([-r[1], r[0]])
     a1, a2 = theta[0], theta[0] + theta[1]
-    elbow, tip = along(a1), along(a2)
+    elbow, tip = direction(a1), direction(a2)
     w1, w2 = v[2], v[2] + v[3]
-    u1 = v[:2] + w1 * turn(c[0] * elbow)
-    u2 = v[:2] + w1 * turn(elbow) + w2 * turn(c[1] * tip)
+    u1 = v[:2] + w1 * perpendicular(c[0] * elbow)
+    u2 = v[:2] + w1 * perpendicular(elbow) + w2 * perpendicular(c[1] * tip)
     # unknowns: u1, w1, u2, w2 after, the impulse P from link 1 on the base, and G from the ground
     # on link 1
     A, b = np.zeros((10, 10)), np.zeros(10)
     r1, r2, r2e = (1 - c[0]) * elbow, (1 - c[1]) * tip, -c[1] * tip
     A[0:2, 0:2], A[0:2, 6:8], b[0:2] = m[0] * np.eye(2), -np.eye(2), m[0] * u1
-    A[2, 2], A[2, 6:8], b[2] = inertia[0], -turn(r1), inertia[0] * w1
+    A[2, 2], A[2, 6:8], b[2] = inertia[0], -perpendicular(r1), inertia[0] * w1
     A[3:5, 3:5], A[3:5, 6:8], A[3:5, 8:10], b[3:5] = (
         m[1] * np.eye(2),
         np.eye(2),
         -np.eye(2),
         m[1] * u2,
     )
-    A[5, 5], A[5, 6:8], A[5, 8:10], b[5] = inertia[1], turn(r2e), -turn(r2), inertia[1] * w2
-    A[6:8, 0:2], A[6:8, 2], A[6:8, 3:5], A[6:8, 5] = np.eye(2), turn(r1), -np.eye(2), -turn(r2e)
-    A[8:10, 3:5], A[8:10, 5] = np.eye(2), turn(r2)
+    A[5, 5], A[5, 6:8], A[5, 8:10], b[5] = (
+        inertia[1],
+        perpendicular(r2e),
+        -perpendicular(r2),
+        inertia[1] * w2,
+    )
+    A[6:8, 0:2], A[6:8, 2], A[6:8, 3:5], A[6:8, 5] = (
+        np.eye(2),
+        perpendicular(r1),
+        -np.eye(2),
+        -perpendicular(r2e),
+    )
+    A[8:10, 3:5], A[8:10, 5] = np.eye(2), perpendicular(r2)
     u1x, u1y, w1, _, _, w2 = np.linalg.solve(A, b)[:6]
-    return np.array([*(np.array([u1x, u1y]) - w1 * turn(c[0] * elbow)), w1, w2 - w1])
+    return np.array([*(np.array([u1x, u1y]) - w1 * perpendicular(c[0] * elbow)), w1, w2 - w1])
 
 
 SERIAL = """<mujoco><option gravity="0 -9.81 0"/><worldbody><body name="link1" pos="0 2 0"><joint
@@ -104,32 +114,32 @@ def test_attached_in_flight_it_is_the_serial_chain(links):
     q = {"base": [*foot, 0, np.cos(theta[0] / 2), 0, 0, np.sin(theta[0] / 2)], "link1": theta[1]}
     tol = {"rtol": 1e-12, "atol": 1e-13}
     # back in time from the moment of contact, then forth
-    early = svkc.simulate(
+    before = svkc.simulate(
         chain,
         chain.state(q, {"base": [-v[0], -v[1], 0, 0, 0, -v[2]], "link1": -v[3]}, connected=()),
         0.3,
         **tol,
     ).final
-    start = svkc.State(early.q, -early.v, early.structure)
+    start = svkc.State(before.q, -before.v, before.structure)
     ts = jnp.linspace(0, 5.3, 54)
     traj = svkc.simulate(chain, start, 5.3, ts=ts, events=[svkc.at(0.3, connect="link1v")], **tol)
     after = planar_impact(chain.model.model, foot, theta, v)
-    just = traj.states.v[3]
-    np.testing.assert_allclose(just[np.array([0, 1, 5, 6])], after, atol=REFERENCE)
+    at_contact = traj.states.v[3]
+    np.testing.assert_allclose(at_contact[np.array([0, 1, 5, 6])], after, atol=REFERENCE)
     assert float(traj.events.energy_lost[0]) > 0.1
     assert np.linalg.norm(traj.events.impulse[0]) > 0.1
     serial = svkc.load(SERIAL)
     # the serial chain's joints turn link 1 first, then the base
-    there = serial.state(
+    serial_start = serial.state(
         {"ground": theta[0] + theta[1], "elbow": -theta[1]},
         {"ground": after[2] + after[3], "elbow": -after[3]},
     )
-    same = svkc.simulate(serial, there, 5.0, ts=ts[3:] - 0.3, **tol)
-    ours, _ = jax.vmap(lambda s: svkc.poses(chain, s))(traj.states)
-    theirs, _ = jax.vmap(lambda s: svkc.poses(serial, s))(same.states)
+    serial_traj = svkc.simulate(serial, serial_start, 5.0, ts=ts[3:] - 0.3, **tol)
+    positions, _ = jax.vmap(lambda s: svkc.poses(chain, s))(traj.states)
+    serial_positions, _ = jax.vmap(lambda s: svkc.poses(serial, s))(serial_traj.states)
     np.testing.assert_allclose(
-        ours[3:, chain.body_names.index("link1")],
-        theirs[:, serial.body_names.index("base")],
+        positions[3:, chain.body_names.index("link1")],
+        serial_positions[:, serial.body_names.index("base")],
         atol=REFERENCE,
     )
     assert float(traj.gaps.max()) < ROUND_OFF
@@ -174,11 +184,11 @@ def test_rodrigues_euler_keeps_quaternions_at_unit_length():
     )
     assert int(traj.report().accepted) == 100000
     assert abs(float(jnp.linalg.norm(traj.final.q[3:7])) - 1) < 5e-16
-    turn = quat_exp(jnp.array([3e-3, 1e-4, 2e-3]))
-    bare = jax.lax.fori_loop(
-        0, 100000, lambda i, q: quat_multiply(q, turn), jnp.array([1.0, 0, 0, 0])
+    rotation = quat_exp(jnp.array([3e-3, 1e-4, 2e-3]))
+    product = jax.lax.fori_loop(
+        0, 100000, lambda i, q: quat_multiply(q, rotation), jnp.array([1.0, 0, 0, 0])
     )
-    assert abs(float(jnp.linalg.norm(bare)) - 1) < 100000 * 2.3e-16
+    assert abs(float(jnp.linalg.norm(product)) - 1) < 100000 * 2.3e-16
 
 
 @pytest.fixture(scope="module")

@@ -11,19 +11,27 @@ import jax.numpy as jnp
 import maximal
 import numpy as np
 import pytest
-from reference_problems import ROTATION, given, n_four_bar, numbers, places, springs, tight
+from reference_problems import (
+    ROTATION,
+    body_positions,
+    load_reference,
+    n_four_bar,
+    numbers,
+    springs,
+    tight,
+)
 from tolerances import REFERENCE, ROUND_OFF
 
 import svkc
 
 
-def turned_alike(q, expected):
+def align_quaternion_signs(q, expected):
     """Quaternions, the sign of each as expected."""
     q, expected = np.asarray(q), np.asarray(expected)
     return q * np.sign(np.sum(q * expected, 1))[:, None], expected
 
 
-@pytest.mark.parametrize("case", given("free_top")["cases"], ids=lambda case: case["name"])
+@pytest.mark.parametrize("case", load_reference("free_top")["cases"], ids=lambda case: case["name"])
 def test_free_top(case):
     """1e-9; where the motion itself amplifies round-off, three times what a plain integration in
     double precision loses."""
@@ -37,16 +45,18 @@ def test_free_top(case):
     )
     bound = max(1e-9, 3 * case["plain"])
     np.testing.assert_allclose(
-        *turned_alike(traj.states.q, case["quat_wxyz_body_to_world"]), atol=bound
+        *align_quaternion_signs(traj.states.q, case["quat_wxyz_body_to_world"]), atol=bound
     )
     np.testing.assert_allclose(
         traj.states.v, case["omega_body"], atol=3 * bound * np.max(np.abs(case["omega_body"]))
     )
 
 
-@pytest.mark.parametrize("case", given("heavy_top")["cases"], ids=lambda case: case["name"])
+@pytest.mark.parametrize(
+    "case", load_reference("heavy_top")["cases"], ids=lambda case: case["name"]
+)
 def test_heavy_top(case):
-    model = given("heavy_top")["model"]
+    model = load_reference("heavy_top")["model"]
     chain = svkc.load(
         ROTATION.format(
             numbers(model["gravity"]),
@@ -63,7 +73,7 @@ def test_heavy_top(case):
         **tight(1e-13),
     )
     np.testing.assert_allclose(
-        *turned_alike(traj.states.q, case["quat_wxyz_body_to_world"]), atol=REFERENCE
+        *align_quaternion_signs(traj.states.q, case["quat_wxyz_body_to_world"]), atol=REFERENCE
     )
 
 
@@ -84,7 +94,7 @@ ERROR_AT = {1e-9: 1e-5, 1e-12: 1e-8}
 def test_n_four_bar_through_its_singular_configurations(windows, tolerances):
     """10 s, two windows 20 s, some forty times through configurations where the rank drops: angle,
     energy, loops; coordinates are swapped."""
-    case = next(case for case in given("n_four_bar")["cases"] if case["N"] == windows)
+    case = next(case for case in load_reference("n_four_bar")["cases"] if case["N"] == windows)
     chain, state = maximal.load(n_four_bar(windows))
     ts = jnp.array([*case["t"], 20.0] if windows == 2 else case["t"])
     run = jax.jit(
@@ -92,8 +102,8 @@ def test_n_four_bar_through_its_singular_configurations(windows, tolerances):
     )
     for tolerance in tolerances:
         traj = run(state, tolerance)
-        found = 2 * places(chain, traj, "vert0")[: len(case["t"]), :2]
-        np.testing.assert_allclose(found, case["B0"], atol=ERROR_AT[tolerance])
+        positions = 2 * body_positions(chain, traj, "vert0")[: len(case["t"]), :2]
+        np.testing.assert_allclose(positions, case["B0"], atol=ERROR_AT[tolerance])
         energy = jax.vmap(lambda s: svkc.energy(chain, s))(traj.states)
         assert np.max(np.abs(energy - energy[0])) <= 1e-6 * case["energy"]
         assert np.max(traj.gaps) < ROUND_OFF
@@ -105,7 +115,7 @@ def test_n_four_bar_through_its_singular_configurations(windows, tolerances):
 
 def forty_windows():
     """20 s of them, through all their singular configurations."""
-    case = next(case for case in given("n_four_bar")["cases"] if case["N"] == 40)
+    case = next(case for case in load_reference("n_four_bar")["cases"] if case["N"] == 40)
     chain, state = maximal.load(n_four_bar(40))
     assert svkc.mobility(chain, state).freedoms == 1
     traj = svkc.simulate(
@@ -116,7 +126,9 @@ def forty_windows():
         dynamics=svkc.dynamics.CompositeBodies(hold=None),
         **tight(1e-8),
     )
-    np.testing.assert_allclose(2 * places(chain, traj, "vert0")[1, :2], case["B0"][1], atol=1e-6)
+    np.testing.assert_allclose(
+        2 * body_positions(chain, traj, "vert0")[1, :2], case["B0"][1], atol=1e-6
+    )
     assert abs(float(traj.report().energy_drift)) <= 1e-6 * case["energy"]
     assert int(traj.report().swaps) > 0
     assert np.max(traj.gaps) < ROUND_OFF
@@ -144,7 +156,7 @@ def test_n_four_bar_of_forty_windows():
 @pytest.mark.slow
 def test_andrews_mechanism():
     """Every angle and rate over 0.05 s; at 0.03 s the digits that are published, to 1e-8."""
-    reference = given("andrews")
+    reference = load_reference("andrews")
     chain, state = maximal.load(reference["problem"])
     traj = svkc.simulate(
         chain,
@@ -156,17 +168,18 @@ def test_andrews_mechanism():
     )
     # K1 turns by beta, K2 on it by Theta, K3 by gamma, K5 and K7 by delta and epsilon, K4 and K6 on
     # them by Phi and Omega
-    turned = {
+    bodies_of_angle = {
         "beta": ("K1",),
         "gamma": ("K1", "K2", "K3"),
         "delta": ("K1", "K2", "K4", "K5"),
         "epsilon": ("K1", "K2", "K6", "K7"),
         "Theta": ("K2",),
     }
-    turned |= {"Phi": ("K5",), "Omega": ("K7",)}
+    bodies_of_angle |= {"Phi": ("K5",), "Omega": ("K7",)}
     signs = {"Phi": -1, "Omega": -1}
     index = {
-        name: [chain.dof_names.index(body) for body in bodies] for name, bodies in turned.items()
+        name: [chain.dof_names.index(body) for body in bodies]
+        for name, bodies in bodies_of_angle.items()
     }
     for i, name in enumerate(reference["angles"]):
         sign = signs.get(name, 1)
@@ -176,39 +189,41 @@ def test_andrews_mechanism():
         np.testing.assert_allclose(
             rate, np.array(reference["v"])[:, i], atol=1e-8 * np.max(np.abs(reference["v"]))
         )
-        there = int(np.argmin(np.abs(np.array(reference["t"]) - 0.03)))
-        assert angle[there] == pytest.approx(float(reference["at_0p03"]["q"][i]), rel=1e-8)
-        assert rate[there] == pytest.approx(float(reference["at_0p03"]["v"][i]), rel=1e-8)
+        published = int(np.argmin(np.abs(np.array(reference["t"]) - 0.03)))
+        assert angle[published] == pytest.approx(float(reference["at_0p03"]["q"][i]), rel=1e-8)
+        assert rate[published] == pytest.approx(float(reference["at_0p03"]["v"][i]), rel=1e-8)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "variant", given("slider_crank_3d")["variants"], ids=lambda variant: variant["name"]
+    "variant", load_reference("slider_crank_3d")["variants"], ids=lambda variant: variant["name"]
 )
 def test_slider_crank_3d(variant):
     chain, state = maximal.load(variant["problem"])
     traj = svkc.simulate(chain, state, 5.0, ts=jnp.array(variant["t"]), **tight(1e-12))
-    np.testing.assert_allclose(places(chain, traj, "slider")[:, 0], variant["slider_x"], atol=1e-10)
+    np.testing.assert_allclose(
+        body_positions(chain, traj, "slider")[:, 0], variant["slider_x"], atol=1e-10
+    )
     np.testing.assert_allclose(
         traj.states.v[:, chain.dof_names.index("slider")], variant["slider_v"], atol=REFERENCE
     )
 
 
 @pytest.mark.slow
-def test_rssr_does_not_notice_its_idle_spin():
+def test_rssr_motion_is_independent_of_the_idle_spin():
     """A coupler that spins at 200 rad/s about itself: crank and rocker as with one at rest."""
-    found = []
-    for variant in given("rssr")["variants"]:
+    crank_velocities = []
+    for variant in load_reference("rssr")["variants"]:
         chain, state = maximal.load(variant["problem"])
         traj = svkc.simulate(chain, state, 4.0, ts=jnp.array(variant["t"]), **tight(1e-12))
         np.testing.assert_allclose(
-            places(chain, traj, "coupler"), variant["coupler_com"], atol=REFERENCE
+            body_positions(chain, traj, "coupler"), variant["coupler_com"], atol=REFERENCE
         )
         np.testing.assert_allclose(
             traj.states.v[:, chain.dof_names.index("crank")], variant["crank_rate"], atol=1e-8
         )
-        found.append(np.asarray(traj.states.v[:, 0]))
-    np.testing.assert_allclose(*found, atol=1e-8)
+        crank_velocities.append(np.asarray(traj.states.v[:, 0]))
+    np.testing.assert_allclose(*crank_velocities, atol=1e-8)
 
 
 CART = (
@@ -226,7 +241,7 @@ CART = (
 )
 def test_light_cartpole(number, tolerance, error):
     """A cart of 1e-6, 1e-3, 1e-9 of its pole: rates of 4e3, 1e2, 1e5 rad/s in each swing."""
-    case = given("light_cartpole")["cases"][number]
+    case = load_reference("light_cartpole")["cases"][number]
     chain = svkc.load(CART.format(case["M"]))
     traj = svkc.simulate(
         chain, chain.state({"theta": np.pi / 2}), 10.0, ts=jnp.array(case["t"]), **tight(tolerance)
@@ -239,7 +254,7 @@ def test_light_cartpole(number, tolerance, error):
 def test_slider_crank_with_gradients():
     """SUNDIALS' own example: the path, the integral of the kinetic energy, and its derivatives by
     the spring and the damper."""
-    reference = given("sundials_slider_crank")
+    reference = load_reference("sundials_slider_crank")
     crank = (
         '<body name="crank"><joint name="crank" axis="0 0 1"/><inertial pos="0 0 0" mass="1"'
         ' diaginertia="1 1 1"/></body>'
@@ -258,7 +273,7 @@ def test_slider_crank_with_gradients():
     )
     state = chain.state({"crank": np.pi / 2, "x": np.sqrt(0.75), "rod": -np.pi / 6})
 
-    def along(q):
+    def points(q):
         """The spring's two ends, and the end of the rod that is pushed."""
         crank, x, rod = q[0], q[1], q[2]
         tip, slider = 0.5 * jnp.stack([jnp.cos(crank), jnp.sin(crank)]), jnp.stack([x, 0 * x])
@@ -266,8 +281,8 @@ def test_slider_crank_with_gradients():
         return tip / 2, slider - beyond / 2, slider + beyond
 
     def control(t, state, args):
-        (one, other, _), back = jax.vjp(along, state.q)
-        rates = jax.jvp(along, (state.q,), (state.v,))[1]
+        (one, other, _), back = jax.vjp(points, state.q)
+        rates = jax.jvp(points, (state.q,), (state.v,))[1]
         apart, opening = other - one, rates[1] - rates[0]
         length = jnp.linalg.norm(apart)
         pull = (args[0] * (length - 1) + args[1] * (apart @ opening) / length) * apart / length
@@ -277,7 +292,7 @@ def test_slider_crank_with_gradients():
     node, weight = np.polynomial.legendre.leggauss(8)
     nodes = (np.arange(40)[:, None] + (node + 1) / 2).ravel() / 4
 
-    args, wanted = jnp.ones(2), reference["functional"]
+    args, expected = jnp.ones(2), reference["functional"]
     ts = np.concatenate([nodes, reference["t"]])
     order = np.argsort(ts, kind="stable")
 
@@ -294,14 +309,14 @@ def test_slider_crank_with_gradients():
     (value, path), slope = jax.jit(jax.value_and_grad(functional, has_aux=True))(args)
     for column, name in enumerate(("q", "x", "p")):
         np.testing.assert_allclose(path[:, column], reference[name], atol=1e-10)
-    assert float(value) == pytest.approx(wanted["value"], rel=1e-11)
-    np.testing.assert_allclose(slope, [wanted["dG_dk"], wanted["dG_dc"]], rtol=REFERENCE)
+    assert float(value) == pytest.approx(expected["value"], rel=1e-11)
+    np.testing.assert_allclose(slope, [expected["dG_dk"], expected["dG_dc"]], rtol=REFERENCE)
 
 
 @pytest.mark.slow
 def test_two_rods_latched():
     """Velocities after a hinge and after a weld, momenta and kinetic energy: the closed form."""
-    case = given("events")["latch_two_rods"]
+    case = load_reference("events")["latch_two_rods"]
     rod = (
         '<body name="{0}" pos="{1} 0 0"><joint name="{0}.x" type="slide" axis="1 0 0"/><joint'
         ' name="{0}.y" type="slide" axis="0 1 0"/>'
@@ -334,7 +349,7 @@ def test_two_rods_latched():
 def test_pendulum_released():
     """A rod comes off its pin at an angle and flies: the time, the rate, and the path of both
     parts."""
-    case = given("events")["pendulum_release"]
+    case = load_reference("events")["pendulum_release"]
     rod = '<body name="rod"><joint name="pin" axis="0 0 1"/><inertial pos="0 -0.5 0" mass="1" '
     rod += f'diaginertia="{1 / 12!r} 0.01 {1 / 12!r}"/></body>'
     chain = svkc.load(
@@ -361,13 +376,13 @@ def test_pendulum_released():
     com = place[:, :2] + 0.5 * np.stack([np.sin(expected[:, 0]), -np.cos(expected[:, 0])], 1)
     np.testing.assert_allclose(com, expected[:, 1:], atol=1e-11)
     half = np.stack([np.cos(expected[:, 0] / 2), np.sin(expected[:, 0] / 2)], 1)
-    np.testing.assert_allclose(*turned_alike(quat[:, [0, 3]], half), atol=1e-11)
+    np.testing.assert_allclose(*align_quaternion_signs(quat[:, [0, 3]], half), atol=1e-11)
 
 
 @pytest.mark.slow
 def test_simple_pendulum_for_a_long_time():
     """IFToMM A01: a point mass on a rod without mass, from the level, 42 periods and more."""
-    case = given("events")["a01_simple_pendulum"]
+    case = load_reference("events")["a01_simple_pendulum"]
     rod = (
         '<body name="rod"><joint name="pin" axis="0 0 1"/><inertial pos="1 0 0" mass="1"'
         ' diaginertia="1e-15 1e-15 1e-15"/></body>'
@@ -378,15 +393,15 @@ def test_simple_pendulum_for_a_long_time():
     )
     ts = [t for t in case["t"] if t <= 100]
     traj = svkc.simulate(chain, chain.state(), 100.0, ts=jnp.array(ts), **tight(1e-13))
-    found = np.stack([np.cos(traj.states.q[:, 0]), np.sin(traj.states.q[:, 0])], 1)
-    np.testing.assert_allclose(found, case["xy"][: len(ts)], atol=REFERENCE)
+    positions = np.stack([np.cos(traj.states.q[:, 0]), np.sin(traj.states.q[:, 0])], 1)
+    np.testing.assert_allclose(positions, case["xy"][: len(ts)], atol=REFERENCE)
 
 
 @pytest.mark.slow
-def test_an_elbow_that_locks():
+def test_locking_an_elbow():
     """Rate, angular momentum and kinetic energy of a double pendulum whose elbow is locked in full
     swing: the closed form."""
-    case = given("events")["joint_lock"]
+    case = load_reference("events")["joint_lock"]
     rod = (
         '<body name="{0}" pos="{1}"><joint name="{0}" axis="0 0 1"/><inertial pos="0 -0.5 0"'
         ' mass="1" diaginertia="{2} 0.01 {2}"/>{3}</body>'
@@ -409,10 +424,10 @@ def test_an_elbow_that_locks():
 
 
 @pytest.mark.slow
-def test_a_ball_that_bounces_ever_faster():
+def test_a_bouncing_ball_with_restitution():
     """Impacts are plastic here; one with restitution is a run that ends, a velocity put in by hand,
     and the next run: 25 of them, towards a last instant."""
-    case = given("events")["bouncing_ball_zeno"]
+    case = load_reference("events")["bouncing_ball_zeno"]
     ball = (
         '<body name="ball"><joint name="z" type="slide" axis="0 0 1"/><inertial pos="0 0 0"'
         ' mass="1" diaginertia="1 1 1"/></body>'
@@ -423,7 +438,7 @@ def test_a_ball_that_bounces_ever_faster():
     ground = svkc.when(lambda t, s, args: s.q[0], stop=True, direction=False)
 
     @jax.jit
-    def fall(state):
+    def simulate_flight(state):
         # a step over the whole of a short flight would see the ground at both its ends
         longest = jnp.maximum(jnp.abs(state.v[0]) / 9.81, jnp.where(state.q[0] > 0.5, 0.1, 0))
         steps = diffrax.PIDController(rtol=1e-12, atol=1e-15, dtmax=longest)
@@ -431,7 +446,7 @@ def test_a_ball_that_bounces_ever_faster():
 
     state, time = chain.state({"z": 1.0}), 0.0
     for impact in case["impacts"]:
-        end = fall(state)
+        end = simulate_flight(state)
         time = time + float(end.events.time[0])
         assert time == pytest.approx(impact, abs=ROUND_OFF)
         state = svkc.State(end.final.q, -0.5 * end.final.v, end.final.structure)

@@ -8,7 +8,7 @@ import maximal
 import models
 import numpy as np
 import pytest
-from reference_problems import given, n_four_bar
+from reference_problems import load_reference, n_four_bar
 from tolerances import REFERENCE, ROUND_OFF
 
 import svkc
@@ -16,7 +16,7 @@ import svkc
 FINE = {"rtol": 1e-9, "atol": 1e-11}
 
 
-def tilted(angle):
+def tilted_four_bar(angle):
     """The four-bar with the axis of its last pin out of the others' direction by a small angle."""
     pin = models.pin(axis=(np.sin(angle), np.cos(angle), 0))
     return svkc.load(models.MJCF.format(models.FOUR_BAR), virtual_links=[pin])
@@ -29,12 +29,12 @@ def test_nearly_redundant_loops():
     run = eqx.filter_jit(lambda chain, state: svkc.simulate(chain, state, 1.0, **FINE))
     ends = {}
     for angle in (0.0, 1e-8, 1e-6):
-        chain = tilted(angle)
+        chain = tilted_four_bar(angle)
         state = chain.state(v={"crank": 4.0})
-        found = svkc.mobility(chain, state)
+        mobility = svkc.mobility(chain, state)
         traj = run(chain, state)
-        assert int(found.rank) == (3 if angle < 1e-7 else 4)
-        assert float(found.margin) == pytest.approx(
+        assert int(mobility.rank) == (3 if angle < 1e-7 else 4)
+        assert float(mobility.margin) == pytest.approx(
             0.3032 if angle < 1e-7 else 0.255 * angle, rel=1e-2
         )
         assert float(traj.gaps.max()) <= max(0.5 * angle, 1e-12)
@@ -45,22 +45,22 @@ def test_nearly_redundant_loops():
 
 
 @pytest.mark.slow
-def test_a_wrong_rank_is_seen():
+def test_a_wrong_rank_is_reported():
     """Too low, a loop opens and the run stops there; too high, the margin is round-off."""
     chain = models.four_bar()
     state = chain.state(v={"crank": 4.0})
-    forced = lambda rank: eqx.tree_at(
+    with_rank = lambda rank: eqx.tree_at(
         lambda s: s.structure.rank, state, jnp.asarray(rank, jnp.int32)
     )
     for kw in ({"dt": 1e-3}, FINE):
-        low = svkc.simulate(chain, forced(2), 1.0, throw=False, **kw)
+        low = svkc.simulate(chain, with_rank(2), 1.0, throw=False, **kw)
         assert low.result == svkc.RESULTS.loop_open
         assert 0 < float(low.t_final) < 0.1
         assert int(low.report().loop) == 0
         assert float(low.gaps.max()) < 1e-5
         with pytest.raises(RuntimeError, match=r"in phase 1, loop 'pin': A loop is open"):
-            svkc.simulate(chain, forced(2), 1.0, **kw)
-    high = svkc.simulate(chain, forced(4), 0.1, throw=False, dt=1e-3)
+            svkc.simulate(chain, with_rank(2), 1.0, **kw)
+    high = svkc.simulate(chain, with_rank(4), 0.1, throw=False, dt=1e-3)
     assert float(high.report().margin) < ROUND_OFF
     assert high.derivative == svkc.RESULTS.rank_lost
 
@@ -81,10 +81,10 @@ def test_loops_that_allow_only_the_first_order():
 
 
 @pytest.mark.slow
-def test_a_loop_of_no_length():
+def test_a_pin_on_a_hinge_is_redundant():
     """A second pin on a hinge that is there already takes nothing away."""
     rods = models.TWO_RODS
-    again = svkc.VirtualLink(
+    pin = svkc.VirtualLink(
         "again",
         "upper",
         "lower",
@@ -95,7 +95,7 @@ def test_a_loop_of_no_length():
         connected=True,
     )
     chain, plain = (
-        svkc.load(models.MJCF.format(rods), virtual_links=[again]),
+        svkc.load(models.MJCF.format(rods), virtual_links=[pin]),
         svkc.load(models.MJCF.format(rods)),
     )
     pose = {"upper": 0.5}, {"lower": 1.0}
@@ -109,7 +109,7 @@ def test_a_loop_of_no_length():
 
 
 @pytest.mark.slow
-def test_a_loop_that_locks():
+def test_a_crank_that_turns_back_at_a_dead_centre():
     """A crank longer than its rod reaches no further than a dead centre, where the coordinate that
     drove it stands still: it turns back there, with all its energy, on other coordinates."""
     slider = (
@@ -133,10 +133,10 @@ def test_a_loop_that_locks():
     state = chain.state({"crank": 0.2, "rod": -0.5}, {"crank": 2.0})
     ts = jnp.linspace(0, 3.0, 301)
     traj = svkc.simulate(chain, state, 3.0, ts=ts, **FINE)
-    turned = np.asarray(traj.states.q[:, chain.dof_names.index("crank")])
+    crank_angle = np.asarray(traj.states.q[:, chain.dof_names.index("crank")])
     # the rod reaches the slider's line only while the crank's end is within half a metre of it
-    assert np.abs(-np.cos(turned) + 0.9).max() <= 0.5 + 1e-9
-    assert np.diff(np.sign(np.diff(turned))).any()
+    assert np.abs(-np.cos(crank_angle) + 0.9).max() <= 0.5 + 1e-9
+    assert np.diff(np.sign(np.diff(crank_angle))).any()
     assert abs(float(traj.report().energy_drift)) < 1e-6
     assert int(traj.report().swaps) > 0
 
@@ -173,18 +173,18 @@ def test_without_pivots_a_singular_configuration_may_end_the_run():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("before", [1e-2, 1e-4, 1e-6, 0.0])
-def test_started_beside_a_singular_configuration(before):
+def test_start_near_a_singular_configuration(offset):
     """The N four-bar as its bars align, or nearly: it goes on as the parallelogram that it moves
     as, the direction of its velocity kept."""
-    case = next(case for case in given("n_four_bar")["cases"] if case["N"] == 2)
+    case = next(case for case in load_reference("n_four_bar")["cases"] if case["N"] == 2)
     chain, state = maximal.load(n_four_bar(2))
     signs = np.sign(np.asarray(state.v))
-    theta = np.pi / 2 - before
+    theta = np.pi / 2 - offset
     # three bars that turn about their ends and two that are carried, a kilogram and a metre each
     rate = np.sqrt(2 * (case["energy"] - 9.81 * (3 / 2 + 2) * np.cos(theta)) / (3 / 3 + 2))
-    started = svkc.State(jnp.asarray(signs * theta), jnp.asarray(signs * rate), state.structure)
-    traj = svkc.simulate(chain, started, 1.0, ts=jnp.linspace(0, 1, 5), **FINE)
+    start = svkc.State(jnp.asarray(signs * theta), jnp.asarray(signs * rate), state.structure)
+    traj = svkc.simulate(chain, start, 1.0, ts=jnp.linspace(0, 1, 5), **FINE)
     energy = jax.vmap(lambda s: svkc.energy(chain, s))(traj.states)
     np.testing.assert_allclose(energy, case["energy"], atol=1e-5)
-    upright = np.asarray(traj.states.q)[:, [chain.dof_names.index(f"vert{i}") for i in range(3)]]
-    np.testing.assert_allclose(upright, upright[:, :1].repeat(3, 1), atol=REFERENCE)
+    angles = np.asarray(traj.states.q)[:, [chain.dof_names.index(f"vert{i}") for i in range(3)]]
+    np.testing.assert_allclose(angles, angles[:, :1].repeat(3, 1), atol=REFERENCE)

@@ -13,8 +13,8 @@ import svkc
 
 pytestmark = pytest.mark.slow
 
-STIFFNESS, DAMPING, START = 8e5, 4e4, np.pi / 6
-BALL, OWN, SLIDER, TURNING, GRAVITY = 5.0, 0.02, 1.0, 0.1, 9.81
+STIFFNESS, DAMPING, START_ANGLE = 8e5, 4e4, np.pi / 6
+BALL_MASS, ARM_INERTIA, SLIDER_MASS, SHAFT_INERTIA, GRAVITY = 5.0, 0.02, 1.0, 0.1, 9.81
 ARM = (
     '<body name="{0}" pos="0 0 1"><joint name="{0}" axis="0 {1} 0"/><inertial pos="0 0 -1" mass="5"'
     ' diaginertia="0.02 0.02 0.02"/></body>'
@@ -28,63 +28,67 @@ GOVERNOR = (
 )
 
 
-def stretch(angle, height, jnp=np):
+def spring_length(angle, height, jnp=np):
     """Length of a spring, from the middle of an arm to the slider."""
     return jnp.sqrt((jnp.sin(angle) / 2) ** 2 + (height - 1 + jnp.cos(angle) / 2) ** 2)
 
 
-LOW = 0.7 - np.cos(START) / 2
-REST = stretch(START, LOW)
+START_HEIGHT = 0.7 - np.cos(START_ANGLE) / 2
+REST_LENGTH = spring_length(START_ANGLE, START_HEIGHT)
 
 
-def by_hand(t1):
+def reference_motion(t1):
     """Angle of the shaft, of the arms, height of the slider at the end: Lagrange's equations of the
     symmetric motion, by LSODA."""
-    turned = lambda angle: 2 * TURNING + 2 * OWN + 2 * BALL * np.sin(angle) ** 2
-    spin = turned(START) * 2 * np.pi
+    inertia = lambda angle: 2 * SHAFT_INERTIA + 2 * ARM_INERTIA + 2 * BALL_MASS * np.sin(angle) ** 2
+    momentum = inertia(START_ANGLE) * 2 * np.pi
 
     def rates(t, y):
         _, angle, height, opening, rising = y
-        length = stretch(angle, height)
+        length = spring_length(angle, height)
         by_angle = (
             (np.sin(angle) * np.cos(angle) / 2 - (height - 1 + np.cos(angle) / 2) * np.sin(angle))
             / 2
             / length
         )
         by_height = (height - 1 + np.cos(angle) / 2) / length
-        pull = STIFFNESS * (length - REST) + DAMPING * (by_angle * opening + by_height * rising)
-        rate = spin / turned(angle)
+        pull = STIFFNESS * (length - REST_LENGTH) + DAMPING * (
+            by_angle * opening + by_height * rising
+        )
+        rate = momentum / inertia(angle)
         swung = (
-            BALL * np.sin(angle) * np.cos(angle) * rate**2
-            - BALL * GRAVITY * np.sin(angle)
+            BALL_MASS * np.sin(angle) * np.cos(angle) * rate**2
+            - BALL_MASS * GRAVITY * np.sin(angle)
             - pull * by_angle
         )
         return [
             rate,
             opening,
             rising,
-            swung / (BALL + OWN),
-            -GRAVITY - 2 * pull * by_height / SLIDER,
+            swung / (BALL_MASS + ARM_INERTIA),
+            -GRAVITY - 2 * pull * by_height / SLIDER_MASS,
         ]
 
     return solve_ivp(
-        rates, (0, t1), [0, START, LOW, 0, 0], method="LSODA", rtol=1e-10, atol=1e-12
+        rates, (0, t1), [0, START_ANGLE, START_HEIGHT, 0, 0], method="LSODA", rtol=1e-10, atol=1e-12
     ).y[:3, -1]
 
 
 def control(t, state, args):
     """The springs and dampers, as joint torques."""
-    lengths = lambda q: stretch(q[1:3], q[3], jnp)
-    length, back = jax.vjp(lengths, state.q)
-    return back(
-        -STIFFNESS * (length - REST) - DAMPING * jax.jvp(lengths, (state.q,), (state.v,))[1]
+    lengths = lambda q: spring_length(q[1:3], q[3], jnp)
+    length, pull_back = jax.vjp(lengths, state.q)
+    return pull_back(
+        -STIFFNESS * (length - REST_LENGTH) - DAMPING * jax.jvp(lengths, (state.q,), (state.v,))[1]
     )[0]
 
 
 @pytest.fixture(scope="module")
 def governor():
     chain = svkc.load(GOVERNOR)
-    state = chain.state({"left": START, "right": START, "slider": LOW}, {"shaft": 2 * np.pi})
+    state = chain.state(
+        {"left": START_ANGLE, "right": START_ANGLE, "slider": START_HEIGHT}, {"shaft": 2 * np.pi}
+    )
     return lambda **kw: svkc.simulate(chain, state, 0.5, control=control, **kw)
 
 
@@ -93,15 +97,17 @@ def governor():
     [(None, 1e-8, 3000), (diffrax.Kvaerno5(), 5e-6, 200)],
     ids=["explicit", "implicit"],
 )
-def test_flyball_governor(governor, solver, error, most):
+def test_flyball_governor(governor, solver, error, max_steps):
     traj = governor(solver=solver)
-    np.testing.assert_allclose(traj.final.q[jnp.array([0, 1, 3])], by_hand(0.5), atol=error)
+    np.testing.assert_allclose(
+        traj.final.q[jnp.array([0, 1, 3])], reference_motion(0.5), atol=error
+    )
     np.testing.assert_allclose(traj.final.q[1], traj.final.q[2], atol=REFERENCE)
-    assert int(traj.report().accepted) < most
+    assert int(traj.report().accepted) < max_steps
 
 
-def test_solvers_keep_the_root_finder_they_are_given(governor):
+def test_an_explicit_root_finder_is_kept(governor):
     """Stages that are solved with one Jacobian for all give steps up far sooner than by Newton's
     method, which svkc fills in where none is given."""
-    frozen = diffrax.Kvaerno5(root_finder=diffrax.VeryChord(rtol=1e-7, atol=1e-9))
-    assert int(governor(solver=frozen).report().accepted) > 500
+    solver = diffrax.Kvaerno5(root_finder=diffrax.VeryChord(rtol=1e-7, atol=1e-9))
+    assert int(governor(solver=solver).report().accepted) > 500

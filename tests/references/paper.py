@@ -10,9 +10,10 @@ from jax.scipy.linalg import cho_factor, cho_solve
 from jaxtyping import Array, Float
 
 from svkc.loops.constrained_dynamics import UnitVectors, reduced_mass_matrix
-from svkc.loops.constraint import assemble_loop_jacobian, loop_frames, loop_kinematics
+from svkc.loops.constraint import assemble_loop_jacobian, loop_kinematics
 from svkc.loops.coordinates import closed_coordinates
 from svkc.loops.forward_dynamics import acceleration
+from svkc.loops.frames import loop_frames
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import joint_torques
 from svkc.model.names import link_index

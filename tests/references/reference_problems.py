@@ -20,7 +20,7 @@ ROTATION = (
 ROTATION += '<inertial pos="{}" mass="{}" diaginertia="{}"/></body></worldbody></mujoco>'
 
 
-def given(name):
+def load_reference(name):
     return json.loads((FOLDER / f"{name}.json").read_text())
 
 
@@ -32,7 +32,7 @@ def numbers(x):
     return " ".join(repr(float(value)) for value in x)
 
 
-def places(chain, traj, body):
+def body_positions(chain, traj, body):
     """[times 3] of the body's frame."""
     return np.asarray(jax.vmap(lambda s: svkc.poses(chain, s)[0])(traj.states))[
         :, chain.body_names.index(body)
@@ -41,7 +41,7 @@ def places(chain, traj, body):
 
 def n_four_bar(windows):
     """The problem of two windows with as many as asked for."""
-    problem = given("n_four_bar")["problem"]
+    problem = load_reference("n_four_bar")["problem"]
     upright, level = problem["bodies"][0], problem["bodies"][-1]
     hinge = {"type": "revolute", "axis_world0": [0, 0, 1]}
     bodies = [upright | {"name": f"vert{i}", "com_world0": [i, 0.5, 0]} for i in range(windows + 1)]
