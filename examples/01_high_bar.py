@@ -17,7 +17,7 @@ from svkc.scenes import high_bar
 
 chain, state = high_bar()
 
-# three structures, one program: two hands, one hand, none
+# three structures in one compiled program: two hands, one hand, none
 events = [svkc.at(0.9, cut="right_hand_grip"), svkc.at(1.15, cut="left_hand_grip")]
 traj = svkc.simulate(
     chain, state, 1.8, ts=jnp.linspace(0, 1.8, 73), events=events, rtol=1e-8, atol=1e-10
@@ -30,7 +30,7 @@ for phase in range(int(traj.phases.count)):
         f" {int(p.joint_freedoms[phase])} joint freedoms, mobility {int(p.freedoms[phase])}"
     )
 
-# how far the hips fly, and how well the loops held
+# path of the hips, and the largest loop gap
 positions, _ = jax.vmap(lambda s: svkc.poses(chain, s))(traj.states)
 hips = positions[:, chain.body_names.index("torso")]
 print(

@@ -26,8 +26,7 @@ def distance_beyond_edge(link):
     return lambda t, state, args: jnp.abs(along(t, state)) - PLATE_EDGE
 
 
-# two guards; the figure sits straight, so that both fire at one instant and make one change of
-# structure
+# the figure is symmetric: both guards cross zero at one instant and make one change of structure
 events = [svkc.when(distance_beyond_edge(link), cut=link, direction=True) for link in thighs]
 traj = svkc.simulate(
     chain, state, 2.0, ts=jnp.linspace(0, 2.0, 81), events=events, rtol=1e-8, atol=1e-10

@@ -46,7 +46,7 @@ right_arm, left_arm = (
 hanging_pose = per_joint(shoulder_flexion=3.0, shoulder_abduction=-0.1, elbow=0.85, wrist=0.2)
 free_pose = per_joint(shoulder_flexion=1.2, elbow=0.6, hip_flexion=0.3, knee=0.4, ankle=-0.5)
 pump_amplitude = per_joint(hip_flexion=0.9, knee=0.6)
-# kg m^2: what an arm that holds has to turn is the whole body; a free limb turns itself
+# kg m^2: an arm that holds a bar moves the whole body, a free limb only itself
 load_inertia = per_joint(shoulder_flexion=3.0, elbow=3.0, shoulder_abduction=20.0, wrist=10.0)
 limb_inertia = jnp.diag(svkc.mass_matrix(chain, state))[6:]
 
@@ -72,7 +72,7 @@ def control(t, state, args):
 
     reach_torque = -jax.grad(spring_energy)(jnp.zeros_like(state.v))[6:22] - 8.0 * limb_inertia * v
     reaching = (left_arm & bar1 & ~bar2) | (right_arm & bar2 & ~bar1 & ~bar3)
-    # none at the base, none at the bars
+    # no torque at the base and at the bars
     return jnp.pad(jnp.where(reaching, reach_torque, tau), (6, chain.dofs - 22))
 
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import svkc
 from svkc.scenes.walking import ANKLE_HEIGHT, HIP_HEIGHT, SOLE_OFFSET, STRIDE, leg_angles, walking
 
-# steps, s a step, the part of it on both feet, s to get going and to stop
+# number of steps; duration of a step (s); part of it on both feet; time to start and to stop (s)
 STEPS, PERIOD, DOUBLE_SUPPORT, RAMP = 5, 0.65, 0.12, 0.6
 END = RAMP + (STEPS + DOUBLE_SUPPORT / 2) * PERIOD
 chain, state = walking()
@@ -51,13 +51,13 @@ def planned_angles(t, structure):
         foot_x = lift_off_x + ((step + 1) * STRIDE - lift_off_x) * phase**3 * (
             10 - 15 * phase + 6 * phase**2
         )
-        # comes down with some speed, and would go below the ground
+        # the plan continues below the ground, so that the foot touches down with some speed
         foot_height = 0.6 * u**2 * (1 - u) * (1.15 - u)
         angles = leg_angles(
             jnp.where(supports, lift_off_x, foot_x) - SOLE_OFFSET - hips,
             HIP_HEIGHT - ANKLE_HEIGHT - jnp.where(supports, 0, foot_height),
         )
-        # toes down on the way
+        # toes point down in the middle of a step
         angles["ankle"] -= jnp.where(supports, 0, 6 * phase**2 * (1 - phase) ** 2)
         angles |= {"shoulder_flexion": -swing if odd else swing, "elbow": 0.35}
         joints |= {f"{side}_{name}": angle for name, angle in angles.items()}
@@ -100,7 +100,7 @@ def control(t, state, args):
         state.structure.pos[:, 0],
     )
     phase = jnp.clip((steps_done(t) - jnp.round(steps_done(t))) / DOUBLE_SUPPORT, 0, 1)
-    # passes one: then the ground would have to pull the rear foot
+    # exceeds one at the end: the rear foot would have to be pulled, so its guard releases it
     front = 0.02 + 1.03 * phase**2 * (3 - 2 * phase)
     on_left = jnp.where(
         jnp.all(supports),

@@ -21,8 +21,7 @@ from matplotlib.figure import Figure
 import svkc
 from svkc.scenes import high_bar
 
-# the ranges of joints act like walls: differences, to which the gradient is compared, would be
-# rough
+# without joint ranges: they are nearly discontinuous, so that differences would be inaccurate
 chain, start = high_bar(ignore="limit")
 # all but the free base: q[7:23], v[6:22]
 joints, mass, rest = chain.joint_names[1:], chain.mass.sum(), start.q[7:23]
@@ -34,8 +33,8 @@ driven_joints = jnp.array(
         for name in ("shoulder_flexion", "hip_flexion", "knee")
     ]
 )
-bumps = jnp.linspace(0.1, 0.9, 5)  # s: when each bump of a joint's torque is at its top
-# m: the centre of mass on landing; m per (100 N m)^2; of the optimiser; s
+bumps = jnp.linspace(0.1, 0.9, 5)  # s: maximum of each bump of a joint's torque
+# height of the center of mass on landing (m); m per (100 N m)^2; optimizer steps; end time (s)
 MAT_HEIGHT, TORQUE_COST, STEPS, END = 1.0, 0.3, 25, 1.9
 OPTIONS = {
     "solver": diffrax.Dopri8(),
@@ -53,7 +52,7 @@ def control(t, state, torques):
     """
     tau = limb * (25.0 * (rest - state.q[7:23]) - 10.0 * state.v[6:22])
     tau = tau.at[driven_joints].add(100.0 * torques @ jnp.exp(-(((t - bumps) / 0.15) ** 2)))
-    return jnp.pad(tau, (6, chain.dofs - 22))  # none at the base, none at the bar
+    return jnp.pad(tau, (6, chain.dofs - 22))  # no torque at the base and at the bar
 
 
 def center_of_mass(state):
@@ -112,8 +111,8 @@ first = x = {
 gradient, adam = jax.jit(jax.value_and_grad(loss, has_aux=True)), optax.adam(0.07)
 optimizer_state = adam.init(x)
 for _ in range(STEPS):
-    change, optimizer_state = adam.update(gradient(x)[1], optimizer_state)
-    x = optax.apply_updates(x, change)
+    updates, optimizer_state = adam.update(gradient(x)[1], optimizer_state)
+    x = optax.apply_updates(x, updates)
 ts, run_swing, figure = (
     jnp.linspace(0, END, 77),
     jax.jit(swing),
@@ -143,7 +142,7 @@ for axes, steps, at in zip(figure.subplots(2, 1, sharex=True, sharey=True), (0, 
                 solid_capstyle="round",
             )
     axes.plot(path[: down + 1, 0], path[: down + 1, 2], "k--", linewidth=1)
-    # and the bar; blue: two hands on it, orange: one, green: none
+    # landing point and bar; blue: two hands on the bar, orange: one, green: none
     axes.plot(distance, MAT_HEIGHT, "kv", 0, 2.6, "ko")
 figure.savefig(
     pathlib.Path(sys.argv[1] if len(sys.argv) > 1 else ".") / "05_optimise_release.png", dpi=110

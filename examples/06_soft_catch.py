@@ -19,21 +19,21 @@ import optax
 import svkc
 from svkc.scenes import BAR_HEIGHT, hanging_state, high_bar
 
-# s, m/s
+# catch time without correction (s); velocity of the hands there (m/s)
 HANDS, CATCH_TIME, ARRIVAL_VELOCITY = (
     ("right_hand_grip", "left_hand_grip"),
     0.4,
     jnp.array([0.6, 0.0, -1.2]),
 )
-# joint ranges are left out: penalties keep the joints' motion small instead
+# without joint ranges: the cost of torques keeps the joints' motion small
 chain, _ = high_bar(ignore="limit")
 
-# a flight with arms stretched and limbs at rest, back along its parabola from the bar: nothing but
-# the fall moves the hands, and they come to the bar
+# a flight with stretched arms and limbs at rest, from the bar back along the parabola: without
+# torques the hands arrive at the bar
 hanging_start, fall = hanging_state(chain, angle=0.3), chain.gravity
 q = hanging_start.q[: chain.nq].at[:3].add(fall * CATCH_TIME**2 / 2 - ARRIVAL_VELOCITY * CATCH_TIME)
 start = chain.state(q, {"base": [*(ARRIVAL_VELOCITY - fall * CATCH_TIME), 0, 0, 0]}, connected=())
-# kg m^2: what each joint has to turn
+# kg m^2: inertia that each joint moves
 limb_inertia = jnp.diag(svkc.mass_matrix(chain, start))[6:22]
 
 
@@ -53,7 +53,7 @@ def fly(p, t1, ts=None):
 
     The loss makes these positions coincide with the bar.
     """
-    events = [svkc.at(CATCH_TIME + p["late"] / 100, connect=HANDS, here=True)]
+    events = [svkc.at(CATCH_TIME + p["delay"] / 100, connect=HANDS, here=True)]
     options = {"solver": diffrax.Dopri8(), "rtol": 1e-9, "atol": 1e-11}
     return svkc.simulate(
         chain, start, t1, ts=ts, events=events, control=control, args=p["bend"], **options
@@ -76,22 +76,22 @@ def loss(p):
     return metrics[0] + 1e4 * jnp.sum(hand_offset**2) + 2e-3 * jnp.sum(p["bend"] ** 2), metrics
 
 
-# rad/s^2, for four joints of an arm and four of a leg, at the start and at the time meant for the
-# catch; hundredths of a second
-p = first = {"bend": jnp.zeros((2, 8)), "late": jnp.zeros(())}
+# accelerations (rad/s^2) of four arm joints and four leg joints, at the start and at CATCH_TIME;
+# delay of the catch (0.01 s)
+p = first = {"bend": jnp.zeros((2, 8)), "delay": jnp.zeros(())}
 step, adam = jax.jit(jax.value_and_grad(loss, has_aux=True)), optax.adam(0.4)
 optimizer_state = adam.init(p)
 for i in range(41):
     (value, (lost, impulse, off)), gradient = step(p)
     if i % 10 == 0:
-        after = CATCH_TIME + float(p["late"]) / 100
+        after = CATCH_TIME + float(p["delay"]) / 100
         print(
             f"{i}: loss {value:.3f}; a catch after {after:.3f} s costs {lost:.2f} J, {impulse:.2f}"
             f" N s a hand, {off:.1f} cm off the bar"
         )
     if i < 40:
-        change, optimizer_state = adam.update(gradient, optimizer_state)
-        p = optax.apply_updates(p, change)
+        updates, optimizer_state = adam.update(gradient, optimizer_state)
+        p = optax.apply_updates(p, updates)
 run_flight = jax.jit(lambda p: fly(p, 0.8, jnp.linspace(0, 0.8, 65)))
 folder = pathlib.Path(sys.argv[1] if len(sys.argv) > 1 else ".")
 figure, panels = plt.subplots(1, 2, figsize=(11, 7.6), layout="constrained")
@@ -100,7 +100,7 @@ with tempfile.TemporaryDirectory() as scratch:
         picture = plt.imread(
             svkc.render(chain, run_flight(x), pathlib.Path(scratch) / "strobe.png", frames=6)
         )
-        panel.imshow(picture[:, 270:830])  # without the empty sides
+        panel.imshow(picture[:, 270:830])  # crop the empty sides
         panel.set_title(what, fontsize=16)
         panel.axis("off")
 figure.savefig(folder / "06_soft_catch.png", dpi=110, bbox_inches="tight")

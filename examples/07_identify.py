@@ -20,8 +20,8 @@ from jax.flatten_util import ravel_pytree
 
 import svkc
 
-# an arm of three links that swings about y; the wrist is a joint that can break; a body without a
-# joint marks the end of a link
+# an arm of three links on hinges about y; the wrist can break; bodies without a joint are markers at
+# the ends of links
 ARM = """<mujoco><worldbody>
   <body name="upper"><joint name="shoulder" axis="0 1 0"/><geom type="capsule"
     fromto="0 0 0 0 0 -0.5" size="0.04" mass="3"/>
@@ -37,7 +37,7 @@ links, markers = (
     for names in (["upper", "fore", "tool"], ["fore", "end of fore", "end of tool"])
 )
 rows = np.array(chain.topology.body_row)[links]
-masses, limit = chain.mass[rows], 50.0  # kg, N: as drawn, and the first guess
+masses, limit = chain.mass[rows], 50.0  # kg, N: the first guess
 start = chain.state({"shoulder": -1.6, "elbow": 0.3, "wrist": 0.2})
 ts, noise = jnp.linspace(0, 0.9, 31), 2e-3  # s, m
 OPTIONS = {"solver": diffrax.Dopri8(), "rtol": 1e-9, "atol": 1e-11}
@@ -80,8 +80,7 @@ def run(p):
 true = {"mass": jnp.array([2.4, 1.7, 1.3]) / masses, "limit": jnp.asarray(35.0 / limit)}
 guess = {"mass": jnp.ones(3), "limit": jnp.ones(())}
 observed = run(true)[0] + noise * np.random.default_rng(0).normal(size=(len(ts), 3, 2))
-# Levenberg and Marquardt's method: few parameters, so forward mode, and one program gives the
-# misses too
+# Levenberg-Marquardt: forward mode because parameters are few; one program returns J and residuals
 residuals = lambda p: (run(p)[0] - observed).ravel()
 x, tree = ravel_pytree(guess)
 derivatives = jax.jit(jax.jacfwd(lambda x: 2 * (residuals(tree(x)),), has_aux=True))
@@ -100,8 +99,8 @@ for what, p in (("true", true), ("guess", guess), ("found", estimate), ("expecte
     )
     if what != "expected error":
         print(
-            f"  breaks at {run(p)[1]:.4f} s; misses {1e3 * jnp.sqrt(jnp.mean(residuals(p) ** 2)):.2f}"
-            " mm rms"
+            f"  breaks at {run(p)[1]:.4f} s;"
+            f" misses {1e3 * jnp.sqrt(jnp.mean(residuals(p) ** 2)):.2f} mm rms"
         )
 folder = pathlib.Path(sys.argv[1] if len(sys.argv) > 1 else ".")
 figure, axes = plt.subplots(figsize=(9, 7), layout="constrained")

@@ -8,7 +8,7 @@ import threading
 import time
 import warnings
 
-import glfw  # mujoco brings it
+import glfw  # installed with mujoco
 import jax
 
 jax.config.update("jax_enable_x64", True)
@@ -21,7 +21,7 @@ import svkc
 from svkc.scenes import high_bar
 
 chain, initial_state = high_bar()
-model = chain.model.model  # mujoco's own, of which the chain was made
+model = chain.model.model  # the MjModel from which the chain was loaded
 data = mujoco.MjData(model)
 
 with warnings.catch_warnings(action="ignore"):  # glfw warns before it fails
@@ -48,11 +48,11 @@ with mujoco.viewer.launch_passive(model, data, show_left_ui=False, show_right_ui
     begin = time.perf_counter()
     for i, t in enumerate(ts):
         svkc.interop.to_mujoco(chain, jax.tree.map(lambda x, i=i: x[i], states), data)
-        mujoco.mj_forward(model, data)  # where the bodies are
+        mujoco.mj_forward(model, data)  # compute body poses
         viewer.sync()
         if not viewer.is_running():
             break
         time.sleep(max(0.0, begin + t - time.perf_counter()))
     print(f"played {i + 1} of {len(ts)} states")
 for thread in set(threading.enumerate()) - threads_before:
-    thread.join()  # the window is mujoco's own thread's: it is to be closed before Python ends
+    thread.join()  # the window belongs to a thread, which must end before Python does

@@ -56,7 +56,7 @@ def use_cache() -> pathlib.Path | None:
     with contextlib.suppress(OSError, RuntimeError):
         root = _root_folder()
         folder = root and root / f"jaxlib-{importlib.metadata.version('jaxlib')}-{processor_id()}"
-        if folder and _make_private(root) and _make_private(folder):
+        if root and folder and _make_private(root) and _make_private(folder):
             _prune(root)
             jax.config.update("jax_compilation_cache_dir", str(folder))
             jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)

@@ -131,6 +131,7 @@ def integrate_with_diffrax(
         throw=False,
         progress_meter=options.progress_meter,
     )
+    assert solution.ts is not None and solution.ys is not None
     (y_end, ys), result = solution.ys, solution.result._value
     result = jnp.where(result == diffrax.RESULTS.internal_error._value, NON_FINITE, result)
     if event is not None:

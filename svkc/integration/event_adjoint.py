@@ -27,7 +27,7 @@ from svkc.integration.vector_field import VectorField
 def _end_of_phase_jvp(primals, tangents):
     end = end_of_phase(*primals)
     _, _, _, field_args, guards, _ = primals
-    rate = vector_field_of(guards)(*end, field_args)
+    rate = vector_field_of(guards)(end[0], end[1], field_args)
     return end, end_of_phase_tangent(primals, tangents, end, rate)
 
 

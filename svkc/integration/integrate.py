@@ -68,6 +68,7 @@ def integrate_phase(
         ys = jax.tree.map(lambda x: x[jnp.searchsorted(save_ts, save_ts)], ys)
     event, stopped = None, jnp.where(end.t < stop, MAX_STEPS, SUCCESSFUL)
     if options.armed_guards is not None:
+        assert end.search is not None and end.guard_values is not None
         event = event_info(end.search, end.guard_values, end.t)
         stopped = jnp.where(event.occurred, EVENT, stopped)
     result = jnp.where(end.result == SUCCESSFUL, stopped, end.result)
@@ -194,6 +195,8 @@ def _locate_event(
     Return the attempt as the loop takes it, the values of the guards, the search, and whether the
     loop stands still because a root is being located.
     """
+    assert s.search is not None and s.guard_values is not None
+    assert options.armed_guards is not None
     guard_values, search = update_search(
         s.search,
         s.guard_values,

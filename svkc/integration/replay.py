@@ -65,7 +65,8 @@ def _replay_block(y: ODEState, times, problem: PhaseProblem, solver) -> tuple[OD
     """
 
     def step(y, interval):
-        y = replay_step(solver, problem.field, *interval, y, problem.field_args)
+        start, stop = interval
+        y = replay_step(solver, problem.field, start, stop, y, problem.field_args)
         return y, y
 
     return jax.lax.scan(step, y, times)

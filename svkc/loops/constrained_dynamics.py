@@ -114,6 +114,7 @@ class AbstractMassMatrix(AbstractDynamics):
         """Return the mass matrix of the tree."""
 
     def prepare(self, chain, structure, loops, selection=None):
+        assert selection is not None
         qr, rows, frozen, static = jax.lax.stop_gradient(
             (selection, loops.J, (chain, loops.kin), structure)
         )
@@ -188,7 +189,7 @@ class Dynamics(eqx.Module):
     def resolved(self, chain: Chain) -> AbstractDynamics:
         """Return the equivalent object of `svkc.dynamics`."""
         if self.inertia is None:
-            return type(default_dynamics(chain))(hold=self.hold)
+            return dataclasses.replace(default_dynamics(chain), hold=self.hold)
         return next(new for old, new in DEPRECATED_SPELLINGS if old is self.inertia)(hold=self.hold)
 
 

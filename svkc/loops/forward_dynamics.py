@@ -62,6 +62,7 @@ def velocity_and_acceleration(
             else None
         )
         if project_velocity:
+            assert qr is not None
             near = pivot_ratio(qr) < NEAR_SINGULAR * structure.margin
             v = jnp.where(
                 near,

@@ -103,6 +103,7 @@ class ProjectionInfo(eqx.Module):
     @property
     def dependent(self) -> Bool[Array, " dofs"]:
         """Mask of the dependent coordinates, those with a pivot."""
+        assert self.pivots is not None
         return jnp.any(self.pivots > 0, 0)
 
 

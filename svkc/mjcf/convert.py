@@ -35,8 +35,8 @@ def to_mjcf(chain: Chain) -> str:
 
     if chain.model.text is None:
         raise ValueError(
-            "to_mjcf: the chain was loaded from a MjModel, which does not hold its MJCF; load a path,"
-            " text or MjSpec"
+            "to_mjcf: the chain was loaded from a MjModel, which does not hold its MJCF; load a"
+            " path, text or MjSpec"
         )
     try:
         spec = mujoco.MjSpec.from_string(chain.model.text)

@@ -39,7 +39,7 @@ def check_state(chain, state) -> None:
         if shape != (size,):
             raise ValueError(
                 f"state.{name}: got shape {shape}, expected ({size},); use vmap or svkc.rollout"
-                    " for a batch"
+                " for a batch"
             )
     for value in (state.q, state.v):
         dtype = real_array("state", value).dtype

@@ -252,8 +252,15 @@ def _worst_entry(
     errors = np.where(np.isfinite(errors), errors, np.inf).ravel()
     modes = modes if np.isfinite(modes) else np.inf
     if not errors.size:
-        zeros = {"derivative": 0.0, "difference": 0.0, "uncertainty": 0.0}
-        return GradientCheck(error=0.0, output=output, input=input, **zeros, modes=modes)
+        return GradientCheck(
+            error=0.0,
+            output=output,
+            input=input,
+            derivative=0.0,
+            difference=0.0,
+            uncertainty=0.0,
+            modes=modes,
+        )
     worst = int(np.argmax(errors))
     entry = lambda x: float(np.ravel(x)[worst])
     return GradientCheck(

@@ -83,7 +83,7 @@ def rollout(
     )
 
 
-def _prepare_devices(devices, chunk: int | None, lanes: int) -> tuple[list[jax.Device], int]:
+def _prepare_devices(devices, chunk: int | None, lanes: int) -> tuple[list[Any], int]:
     """Return the devices and how many lanes each runs at once.
 
     Raises ValueError if either is invalid.

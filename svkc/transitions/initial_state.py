@@ -225,8 +225,7 @@ def check_closed(chain: Chain, state: State, residual_gaps: Float[Array, " links
             ~(jnp.max(residual_gaps) < limit),
             "the loops of the initial state cannot be closed",
         )
-    residual_gaps = np.asarray(residual_gaps)
-    if not np.all(residual_gaps < limit):
+    if not np.all(np.asarray(residual_gaps) < limit):
         gaps = np.asarray(loop_gaps(chain, state))
         open_loops = [
             f"{chain.link_names[i]} by {np.linalg.norm(gaps[i, 3:]):.3g} m and"

@@ -242,6 +242,7 @@ class _Iteration(eqx.Module):
 
         def read():
             coordinates = joint_coordinates(chain, self.structure, loops.kin, q)
+            assert self.held.read_links is not None
             return with_coordinates(chain, self.held.read_links, coordinates, q)
 
         return jax.lax.cond(kind == READ_COORDINATES, read, lambda: q_next)

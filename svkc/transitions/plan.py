@@ -105,6 +105,7 @@ class Plan(eqx.Module):
         connect, cut = (self.action_mask(chain, name)[rows] for name in ("connect", "cut"))
         changes = jnp.any(connect & ~connected, 1) | jnp.any(cut & connected, 1)
         if self.has_locks:
+            assert structure.locked is not None
             lock, unlock = (self.action_mask(chain, name)[rows] for name in ("lock", "unlock"))
             changes = (
                 changes

@@ -103,7 +103,7 @@ def limit_forces(
     of the range: a kink would cost adaptive steps of high order more than the motion itself.
     """
     tau = jnp.zeros_like(v)
-    if chain.limit is None:
+    if chain.limit is None or chain.limit_spring is None:
         return tau
     k, c = chain.limit_spring
     scalar_q, scalar_v = chain.topology.scalar_coordinates

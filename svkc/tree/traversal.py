@@ -49,6 +49,7 @@ def accumulate_to_root(top: Topology, x: Float[Array, "rows *n"]) -> Float[Array
         own = x[first:last]
         below = own if below is None else own + sum_children(level.children, below)
         sums.append(below)
+    assert below is not None  # the world has a level of its own
     return jnp.concatenate([x[:1] + jnp.sum(below, 0, keepdims=True), *sums[::-1]])
 
 
@@ -158,8 +159,8 @@ def _pad(top: Topology, levels: list[Level]) -> Level:
 
     def stack(tables, padding: int) -> np.ndarray:
         stacked = np.full((len(tables), *np.max([x.shape for x in tables], 0)), padding, np.int32)
-        for padded, table in zip(stacked, tables, strict=True):
-            padded[tuple(map(slice, table.shape))] = table
+        for i, table in enumerate(tables):
+            stacked[(i, *map(slice, table.shape))] = table
         return stacked
 
     # in the children's tables the padding is the size of the next level, which is now `widest`

@@ -1,6 +1,8 @@
-"""Bricard's rectangular mechanism, IFToMM's A04: five rods along the edges of a cube, six hinges,
-one row of the loop redundant wherever it is. Ten seconds against Lagrange's equation of its one
-freedom."""
+"""Bricard's rectangular mechanism, IFToMM's A04, against Lagrange's equation of its one freedom.
+
+Five rods along the edges of a cube and six hinges. One row of the loop is redundant in every
+configuration.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -18,10 +20,12 @@ ROD_INERTIA, GRAVITY = 1e-13, 9.81
 
 
 def numbers(x):
+    """Return numbers as MJCF writes them."""
     return " ".join(map(str, x))
 
 
 def mechanism():
+    """Return the mechanism at its start along the edges of the cube."""
     nested = ""
     for k in reversed(range(5)):
         edge = CORNERS[k + 1] - CORNERS[k]
@@ -51,18 +55,22 @@ def mechanism():
 
 
 def rotation_matrix(axis, angle):
+    """Return the rotation about a unit axis, by Rodrigues' formula."""
     cross = jnp.array(np.cross(np.eye(3), axis))
     return jnp.eye(3) + jnp.sin(angle) * cross + (1 - jnp.cos(angle)) * cross @ cross
 
 
 def angles(a):
-    """Of the hinges: sin a + sin b = sin a sin b, by Bricard's relation of angles that are counted
-    from the cube."""
+    """Return the angles of the hinges for the first one, a.
+
+    Bricard's relation, with angles counted from the cube: sin a + sin b = sin a sin b.
+    """
     b = jnp.arcsin(jnp.sin(a) / (jnp.sin(a) - 1))
     return jnp.stack([a, b, a, b, a])
 
 
 def corners(a):
+    """Return the positions of the corners (m) for the first angle."""
     position, frame, positions = jnp.zeros(3), jnp.eye(3), [jnp.zeros(3)]
     for k, angle in enumerate(angles(a)):
         frame = frame @ rotation_matrix(AXES[k], angle)
@@ -72,8 +80,10 @@ def corners(a):
 
 
 def reference_angles(times):
-    """The first hinge's angle at each time: a thin rod's energy is that of its ends, (x'x' + x'y' +
-    y'y') / 6."""
+    """Return the first hinge's angle at each time, by Lagrange's equation.
+
+    The kinetic energy of a thin rod with end velocities x', y' is (x'x' + x'y' + y'y') / 6.
+    """
 
     def inertia(a):
         rate = jax.jacfwd(corners)(a)
@@ -109,6 +119,7 @@ def reference_angles(times):
     ids=["pivots", "bodies"],
 )
 def test_bricards_mechanism(dynamics):
+    """Ten seconds agree with the reference to 1e-8 rad, and the mobility is one."""
     chain, times = mechanism(), jnp.linspace(0, 10, 101)
     traj = svkc.simulate(chain, chain.state(), 10.0, ts=times, rtol=1e-11, dynamics=dynamics)
     np.testing.assert_allclose(

@@ -1,5 +1,7 @@
-"""Extremes: sizes, masses, speeds, stiffness, counts and coincidences at the ends of what a scene
-may hold, in float64 and float32, each with the bound that it keeps; and what float32 cannot do."""
+"""Extremes of size, mass, speed, stiffness and count, in float64 and float32, each with its bound.
+
+The last section holds the limits of float32.
+"""
 
 import types
 
@@ -64,19 +66,20 @@ BOUNDS = {
 
 @pytest.fixture(params=BOUNDS)
 def bounds(request):
-    """Of one precision, which holds during the test."""
+    """The bounds of one precision, which is set during the test."""
     with jax.enable_x64(request.param == "double"):
         yield BOUNDS[request.param]
 
 
 @pytest.fixture
 def single():
+    """Set float32 during the test."""
     with jax.enable_x64(False):
         yield
 
 
 def rods(masses, lengths):
-    """A chain of slender rods on hinges about y, hanging."""
+    """Return a hanging chain of slender rods on hinges about y."""
     out = ""
     for i, (m, l) in reversed(list(enumerate(zip(masses, lengths, strict=True)))):
         inertia, above = m * l * l / 12, 0.0 if i == 0 else -lengths[i - 1]
@@ -90,11 +93,12 @@ def rods(masses, lengths):
 
 
 def zigzag(chain, angle=0.3):
+    """Return the state with angles of alternating sign."""
     return chain.state({name: angle * (-1) ** i for i, name in enumerate(chain.joint_names)})
 
 
 def relative_energy_drift(chain, traj):
-    """Energy gained, of the largest kinetic energy on the way."""
+    """Return the largest change of the energy relative to the largest kinetic energy."""
     energy = jax.vmap(lambda s: svkc.energy(chain, s))(traj.states)
     kinetic_energy = jax.vmap(lambda s: svkc.kinetic_energy(chain, s))(traj.states)
     return float(np.max(np.abs(energy - energy[0])) / np.max(kinetic_energy))
@@ -110,13 +114,14 @@ TIMES = np.linspace(0, 1, 11)
     ids=["falling", "heavy", "light"],
 )
 def test_masses_from_a_milligram_to_a_thousand_tons(masses):
+    """Chains of seven rods of unlike masses conserve energy."""
     chain = rods([float(m) for m in masses], [1.0] * 7)
     traj = svkc.simulate(chain, zigzag(chain), 1.0, ts=TIMES, **FINE)
     assert relative_energy_drift(chain, traj) < REFERENCE
 
 
 def test_masses_in_a_loop():
-    """A four-bar whose bars weigh a milligram, a kilogram and a thousand tons, in every order."""
+    """A four-bar with bars of a milligram, a kilogram and a thousand tons, in every order."""
     chain = models.four_bar()
     run = jax.jit(
         lambda chain: svkc.simulate(chain, chain.state(v={"crank": 4.0}), 1.0, ts=TIMES, **FINE)
@@ -133,7 +138,7 @@ def test_masses_in_a_loop():
 
 
 def four_bar_on_a_bar(small):
-    """A four-bar of links of some `small` metres at the end of a bar of 1 / small."""
+    """Return a four-bar with links of about `small` metres at the end of a bar of 1 / small."""
     bar = lambda *p: (
         f'<geom type="capsule" fromto="0 0 0 {" ".join(repr(x * small) for x in p)}"'
         f' size="{0.03 * small}" mass="1" contype="0"/>'
@@ -172,6 +177,7 @@ def four_bar_on_a_bar(small):
 
 
 def test_a_kilometre_at_the_end_of_a_millimetre(bounds):
+    """A large four-bar on a short bar conserves energy and stays closed."""
     chain = four_bar_on_a_bar(1e3)
     traj = svkc.simulate(chain, chain.state(v={"crank": 4.0}), 1.0, ts=TIMES, **bounds.fine)
     assert relative_energy_drift(chain, traj) < bounds.large[0]
@@ -179,8 +185,11 @@ def test_a_kilometre_at_the_end_of_a_millimetre(bounds):
 
 
 def test_a_millimetre_at_the_end_of_a_kilometre():
-    """Its inertia about the far root is 1e12 times its own and round-off of it shows: energy drifts
-    by 9e-3 of the kinetic energy. It is below what float32 can tell apart there: said by a code."""
+    """A small four-bar on a long bar: round-off of the inertia about the distant root shows.
+
+    That inertia is 1e12 times the one of the four-bar. Energy drifts by 9e-3 of the kinetic energy.
+    float32 cannot resolve the four-bar; a result code reports that.
+    """
     chain = four_bar_on_a_bar(1e-3)
     state = chain.state(v={"crank": 4.0})
     assert svkc.mobility(chain, state).freedoms == 2
@@ -196,7 +205,7 @@ def test_a_millimetre_at_the_end_of_a_kilometre():
 
 
 def two_bars():
-    """Two bars on a hinge, thrown."""
+    """Return two bars joined by a hinge, floating."""
     return svkc.load(
         models.MJCF.format(
             models.bar(
@@ -213,8 +222,10 @@ THROWN = [0.5, 0.1, 0.2, 1, 2, 3, 1.5]
 
 
 def test_far_away_and_fast(bounds):
-    """1e6 m from the origin at 1e3 m/s: turned and moving as at the origin, to the digits that
-    positions of 1e6 m leave."""
+    """1e6 m from the origin at 1e3 m/s the relative motion is that at the origin.
+
+    The bound is the resolution of positions of 1e6 m.
+    """
     chain = two_bars()
     run = jax.jit(lambda state: svkc.simulate(chain, state, 1.0, throw=False, **bounds.fine))
     q, v = np.array(chain.q_load), np.array(THROWN, chain.q_load.dtype)
@@ -236,7 +247,7 @@ SPIN = [0, 0, 0, 1e3, 20, -30.0]
 
 
 def test_fast_spin(bounds):
-    """1e3 rad/s for 160 turns."""
+    """1e3 rad/s for 160 turns conserve energy and angular momentum."""
     chain = svkc.load(WEIGHTLESS)
     state = chain.state(v=np.array(SPIN, chain.q_load.dtype))
     traj = svkc.simulate(chain, state, 1.0, ts=TIMES, **bounds.spin_by)
@@ -246,14 +257,14 @@ def test_fast_spin(bounds):
 
 
 def test_two_hundred_links(bounds):
-    """Twenty metres of links of ten centimetres."""
+    """A chain of twenty metres of links of ten centimetres conserves energy."""
     chain = rods([0.1] * 200, [0.1] * 200)
     traj = svkc.simulate(chain, zigzag(chain, 0.05), 0.1, ts=0.1 * TIMES, **bounds.links_by)
     assert relative_energy_drift(chain, traj) < bounds.links
 
 
 def parallel_legs(count):
-    """Parallel legs under one plate, one more than `count` pins."""
+    """Return a plate on parallel legs, one leg more than `count` pins."""
     bodies = ""
     for i in range(count + 1):
         plate = models.bar("plate", models.Y, "20 0 0", "0 0 1") if i == 0 else ""
@@ -277,8 +288,7 @@ def parallel_legs(count):
 
 
 def test_twenty_loops(bounds):
-    """Twenty-one parallel legs under one plate, all loops but one redundant: one freedom, that of
-    the two-legged one."""
+    """Twenty-one parallel legs under one plate have one freedom; all loops but one are redundant."""
     chain = parallel_legs(20)
     state = chain.state({"leg0": 0.3})
     assert svkc.mobility(chain, state).freedoms == 1
@@ -290,7 +300,7 @@ def test_twenty_loops(bounds):
 
 
 def sprung_and_rigid():
-    """A pendulum on a spring of 1e9 N/m, and on a rigid pivot."""
+    """Return a pendulum on a spring of 1e9 N/m, and one on a rigid pivot."""
     slide = '<joint name="a" type="slide" axis="0 0 1" stiffness="1e9" damping="1e4"/>'
     ball = '<geom size=".1" mass="1" contype="0"/>'
     pendulum = (
@@ -305,8 +315,10 @@ def sprung_and_rigid():
     "solver", [diffrax.Tsit5(), diffrax.Kvaerno5()], ids=["explicit", "implicit"]
 )
 def test_stiff_springs(bounds, solver):
-    """1e9 N/m under a pendulum: as on a rigid pivot, to the stretch of the spring; the implicit
-    solver needs fewer steps."""
+    """A pendulum on a spring of 1e9 N/m moves as on a rigid pivot, up to the stretch of the spring.
+
+    The implicit solver takes fewer steps.
+    """
     chain, rigid = sprung_and_rigid()
     traj = svkc.simulate(chain, chain.state({"b": 0.5}), 0.1, solver=solver)
     expected = svkc.simulate(rigid, rigid.state({"b": 0.5}), 0.1, **bounds.fine)
@@ -316,11 +328,10 @@ def test_stiff_springs(bounds, solver):
 
 
 def test_no_inertia_at_the_end_of_a_ball():
-    """A body without inertia that a ball would have to turn is refused, by name; a tiny one is
-    simulated, at the defaults too.
+    """A body without inertia at a ball joint is refused by name; one of tiny inertia is simulated.
 
-    Its spin's inertia is 4e-12 of its swing's, so the round-off of its acceleration is 5e-5: asked
-    for less than that, solvers take ever more steps.
+    The inertia about its axis is 4e-12 of the other two, so its acceleration has a round-off of
+    5e-5. Solvers with tolerances below that take ever more steps.
     """
     point = (
         '<body name="tip"><joint name="tip" type="ball"/><inertial pos="0 0 -{}" mass="{}"'
@@ -345,8 +356,10 @@ def test_no_inertia_at_the_end_of_a_ball():
 
 
 def test_chattering_ends_with_a_code():
-    """A joint locked and let go infinitely often before 0.1 s: as many events as allowed, then the
-    code, the last state kept."""
+    """A joint that is locked and unlocked infinitely often ends the run with `max_events`.
+
+    The state of the last event is kept.
+    """
     body = (
         '<body name="ball"><joint name="z" type="slide" axis="0 0 1"/><geom size="0.1" mass="1"'
         ' contype="0"/></body>'
@@ -369,7 +382,7 @@ def test_chattering_ends_with_a_code():
 
 
 def test_velocities_inconsistent_with_the_loops_are_projected():
-    """What the loops allow of it is kept: the least change, said by the velocity's gap."""
+    """An inconsistent velocity is projected by the least change; gap_rates reports it."""
     chain = models.four_bar()
     state = chain.state(v=np.array([1.0, -3.0, 2.0]))
     assert float(jnp.max(jnp.abs(svkc.loop_gap_rates(chain, state)))) < 1e-13
@@ -382,8 +395,10 @@ def test_velocities_inconsistent_with_the_loops_are_projected():
 
 
 def test_single_precision():
-    """float32: the N four-bar and a chain of unlike masses, with bounds of their own; float64 input
-    where x64 is off warns once."""
+    """float32 has bounds of its own; float64 input where x64 is off warns once.
+
+    The scenes are the N four-bar and a chain of unlike masses.
+    """
     with jax.enable_x64(False):
         chain, state = maximal.load(n_four_bar(2))
         assert state.q.dtype == jnp.float32
@@ -408,7 +423,7 @@ def test_single_precision():
 
 
 def test_the_high_bar_in_single_precision():
-    """Ten seconds on the bar by both hands: the loops stay closed by projection."""
+    """Ten seconds on the bar by both hands: projection keeps the loops closed."""
     with jax.enable_x64(False):
         chain, state = svkc.scenes.high_bar(ignore=("limit",))
         traj = svkc.simulate(chain, state, 10.0, ts=jnp.linspace(0, 10, 101))
@@ -419,8 +434,10 @@ def test_the_high_bar_in_single_precision():
 
 
 def test_a_hundred_thousand_steps(single):
-    """The loop stays closed; the steps are those that time in float32 can tell apart, a thousandth
-    off at the end of ten seconds."""
+    """The loop stays closed over 1e5 fixed steps in float32.
+
+    Rounding of the time changes their number by a thousandth.
+    """
     chain = models.four_bar()
     traj = svkc.simulate(
         chain,
@@ -437,7 +454,8 @@ def test_a_hundred_thousand_steps(single):
 
 @pytest.mark.parametrize("name", ["four_bar", "two_bars", "deep"])
 def test_both_precisions_in_one_process(name):
-    """One model in float64, then in float32, then in float64 again: each as if it were alone."""
+    """One model in float64, then float32, then float64 again gives the results of separate
+    processes."""
     make = {
         "four_bar": models.four_bar,
         "two_bars": two_bars,

@@ -1,5 +1,5 @@
-"""The paper's own examples and formulas: section VII-A to the printed digit, attachment in flight,
-Rodrigues' integration."""
+"""The paper's examples: section VII-A to the printed digit, attachment in flight, Rodrigues'
+integration."""
 
 import importlib.util
 import pathlib
@@ -18,6 +18,7 @@ from svkc.tree.spatial import quat_exp, quat_multiply
 
 @pytest.fixture(scope="module")
 def links():
+    """The two-link scene."""
     return two_links()
 
 
@@ -54,8 +55,10 @@ def test_printed_matrices(links):
 
 
 def planar_impact(model, x, theta, v):
-    """Velocities [base x, y, turn; link turn] after the tip of link 1 is pinned to the ground, by
-    Newton and Euler: three planar impulses."""
+    """Return the velocities [base x, y, angle; link angle] after the tip of link 1 is pinned.
+
+    Newton's and Euler's equations for three planar impulses.
+    """
     m = model.body_mass[1:]
     inertia = [np.max(i) for i in model.body_inertia[1:]]
     c = [b[1] for b in model.body_ipos[1:]]
@@ -105,8 +108,10 @@ SERIAL = """<mujoco><option gravity="0 -9.81 0"/><worldbody><body name="link1" p
 
 @pytest.mark.slow
 def test_attached_in_flight_it_is_the_serial_chain(links):
-    """Fig. 13: flight, the tip pinned to the ground as it passes, then the motion of the serial
-    two-joint chain for 5 s, to 1e-9."""
+    """Fig. 13: flight, the tip pinned to the ground as it passes, then 5 s of the serial chain.
+
+    The positions agree with those of the serial two-joint chain to 1e-9.
+    """
     chain, _ = links
     theta, v = np.array([0.5, -0.9]), np.array([0.4, 1.1, 0.7, -1.3])
     along = lambda a: np.array([-np.sin(a), np.cos(a)])
@@ -153,8 +158,7 @@ FREE_TOP = (
 
 @pytest.mark.slow
 def test_rodrigues_euler_is_of_first_order():
-    """(39)-(44) on a tumbling free top: halving the step halves the error of orientation and
-    velocity."""
+    """(39)-(44) on a tumbling free top: half the step has half the error."""
     chain = svkc.load(FREE_TOP)
     state = chain.state(v=np.array([0, 0, 0, 3.0, 0.1, 2.0]))
     exact = svkc.simulate(chain, state, 1.0, rtol=1e-12, atol=1e-13).final
@@ -175,8 +179,10 @@ def test_rodrigues_euler_is_of_first_order():
 
 @pytest.mark.slow
 def test_rodrigues_euler_keeps_quaternions_at_unit_length():
-    """1e5 steps of a tumbling top: the length is one to round-off at the end, and Rodrigues'
-    formula by itself loses no more than adds up of round-off."""
+    """After 1e5 steps of a tumbling top the quaternion's norm is one up to round-off.
+
+    Rodrigues' formula alone loses no more than accumulated round-off.
+    """
     chain = svkc.load(FREE_TOP)
     state = chain.state(v=np.array([0, 0, 0, 3.0, 0.1, 2.0]))
     traj = svkc.simulate(
@@ -193,7 +199,7 @@ def test_rodrigues_euler_keeps_quaternions_at_unit_length():
 
 @pytest.fixture(scope="module")
 def benchmark():
-    """benchmarks/joints.py, which builds both figures."""
+    """The module benchmarks/joints.py, which builds both figures."""
     spec = importlib.util.spec_from_file_location(
         "joints", pathlib.Path(__file__).parents[2] / "benchmarks" / "joints.py"
     )
@@ -204,7 +210,7 @@ def benchmark():
 
 @pytest.mark.slow
 def test_the_figure_of_40_freedoms(benchmark):
-    """Fig. 16: 17 links, 4 hinges, 12 balls; as 41 links of one freedom it moves the same."""
+    """Fig. 16: 17 links, 4 hinges and 12 balls move as 41 links of one freedom each."""
     spec, balls = benchmark.hinges_for_balls()
     chains = {"balls": svkc.load(str(benchmark.FIGURE)), "hinges": svkc.load(spec)}
     links = {name: len(chain.topology.parent) - 1 for name, chain in chains.items()}
@@ -221,7 +227,7 @@ def test_the_figure_of_40_freedoms(benchmark):
 
 @pytest.mark.slow
 def test_rodrigues_euler_on_the_figure():
-    """Balls in a tree, two of them virtual: first order, loops closed, unit quaternions."""
+    """With balls in a tree, two of them virtual: first order, closed loops, unit quaternions."""
     chain = models.figure40()
     rng = np.random.default_rng(1)
     state = chain.state(v=rng.normal(size=chain.nv))

@@ -1,4 +1,4 @@
-"""Independent solutions of other people's problems, and what they hold this library to."""
+"""Published problems with independent solutions."""
 
 import os
 import pathlib
@@ -26,15 +26,18 @@ import svkc
 
 
 def align_quaternion_signs(q, expected):
-    """Quaternions, the sign of each as expected."""
+    """Return two arrays of quaternions, the first with the signs of the second."""
     q, expected = np.asarray(q), np.asarray(expected)
     return q * np.sign(np.sum(q * expected, 1))[:, None], expected
 
 
 @pytest.mark.parametrize("case", load_reference("free_top")["cases"], ids=lambda case: case["name"])
 def test_free_top(case):
-    """1e-9; where the motion itself amplifies round-off, three times what a plain integration in
-    double precision loses."""
+    """Orientation and rates agree to 1e-9.
+
+    Where the motion amplifies round-off, the bound is three times the error of a plain integration
+    in double precision.
+    """
     chain = svkc.load(ROTATION.format("0 0 0", "0 0 0", 1, numbers(case["inertia"])))
     traj = svkc.simulate(
         chain,
@@ -56,6 +59,7 @@ def test_free_top(case):
     "case", load_reference("heavy_top")["cases"], ids=lambda case: case["name"]
 )
 def test_heavy_top(case):
+    """Orientations agree with the reference."""
     model = load_reference("heavy_top")["model"]
     chain = svkc.load(
         ROTATION.format(
@@ -92,8 +96,10 @@ ERROR_AT = {1e-9: 1e-5, 1e-12: 1e-8}
     ],
 )
 def test_n_four_bar_through_its_singular_configurations(windows, tolerances):
-    """10 s, two windows 20 s, some forty times through configurations where the rank drops: angle,
-    energy, loops; coordinates are swapped."""
+    """Angle, energy and loops of 10 s (two windows: 20 s) with some forty drops of the rank.
+
+    The dependent coordinates change on the way.
+    """
     case = next(case for case in load_reference("n_four_bar")["cases"] if case["N"] == windows)
     chain, state = maximal.load(n_four_bar(windows))
     ts = jnp.array([*case["t"], 20.0] if windows == 2 else case["t"])
@@ -114,7 +120,7 @@ def test_n_four_bar_through_its_singular_configurations(windows, tolerances):
 
 
 def forty_windows():
-    """20 s of them, through all their singular configurations."""
+    """Simulate 20 s of forty windows through all their singular configurations."""
     case = next(case for case in load_reference("n_four_bar")["cases"] if case["N"] == 40)
     chain, state = maximal.load(n_four_bar(40))
     assert svkc.mobility(chain, state).freedoms == 1
@@ -136,7 +142,10 @@ def forty_windows():
 
 @pytest.mark.slow
 def test_n_four_bar_of_forty_windows():
-    """In a process of its own, whose programs are optimized: otherwise it takes eight minutes."""
+    """Forty windows, in a process whose XLA programs are optimized.
+
+    Without optimization the run takes eight minutes.
+    """
     flags = os.environ["XLA_FLAGS"].replace("--xla_backend_optimization_level=0", "")
     tests = pathlib.Path(__file__).parents[1]
     paths = os.pathsep.join(map(str, (tests, tests / "references")))
@@ -155,7 +164,7 @@ def test_n_four_bar_of_forty_windows():
 
 @pytest.mark.slow
 def test_andrews_mechanism():
-    """Every angle and rate over 0.05 s; at 0.03 s the digits that are published, to 1e-8."""
+    """Every angle and rate over 0.05 s agree; at 0.03 s the published digits, to 1e-8."""
     reference = load_reference("andrews")
     chain, state = maximal.load(reference["problem"])
     traj = svkc.simulate(
@@ -199,6 +208,7 @@ def test_andrews_mechanism():
     "variant", load_reference("slider_crank_3d")["variants"], ids=lambda variant: variant["name"]
 )
 def test_slider_crank_3d(variant):
+    """Position and velocity of the slider agree with the reference over 5 s."""
     chain, state = maximal.load(variant["problem"])
     traj = svkc.simulate(chain, state, 5.0, ts=jnp.array(variant["t"]), **tight(1e-12))
     np.testing.assert_allclose(
@@ -211,7 +221,7 @@ def test_slider_crank_3d(variant):
 
 @pytest.mark.slow
 def test_rssr_motion_is_independent_of_the_idle_spin():
-    """A coupler that spins at 200 rad/s about itself: crank and rocker as with one at rest."""
+    """A coupler that spins at 200 rad/s about its own axis does not change the motion."""
     crank_velocities = []
     for variant in load_reference("rssr")["variants"]:
         chain, state = maximal.load(variant["problem"])
@@ -240,7 +250,7 @@ CART = (
     ("number", "tolerance", "error"), [(0, 1e-11, 1e-8), (1, 1e-13, 1e-10), (2, 1e-9, 1e-5)]
 )
 def test_light_cartpole(number, tolerance, error):
-    """A cart of 1e-6, 1e-3, 1e-9 of its pole: rates of 4e3, 1e2, 1e5 rad/s in each swing."""
+    """Carts of 1e-6, 1e-3 and 1e-9 of the pole: rates of 4e3, 1e2 and 1e5 rad/s in each swing."""
     case = load_reference("light_cartpole")["cases"][number]
     chain = svkc.load(CART.format(case["M"]))
     traj = svkc.simulate(
@@ -252,8 +262,10 @@ def test_light_cartpole(number, tolerance, error):
 
 @pytest.mark.slow
 def test_slider_crank_with_gradients():
-    """SUNDIALS' own example: the path, the integral of the kinetic energy, and its derivatives by
-    the spring and the damper."""
+    """SUNDIALS' slider-crank: path, integral of the kinetic energy, and its gradient.
+
+    The gradient is by the spring's stiffness and the damper's constant.
+    """
     reference = load_reference("sundials_slider_crank")
     crank = (
         '<body name="crank"><joint name="crank" axis="0 0 1"/><inertial pos="0 0 0" mass="1"'
@@ -274,7 +286,7 @@ def test_slider_crank_with_gradients():
     state = chain.state({"crank": np.pi / 2, "x": np.sqrt(0.75), "rod": -np.pi / 6})
 
     def points(q):
-        """The spring's two ends, and the end of the rod that is pushed."""
+        """Return the spring's two ends and the end of the rod that the force acts on."""
         crank, x, rod = q[0], q[1], q[2]
         tip, slider = 0.5 * jnp.stack([jnp.cos(crank), jnp.sin(crank)]), jnp.stack([x, 0 * x])
         beyond = jnp.stack([jnp.cos(rod), jnp.sin(rod)])
@@ -315,7 +327,7 @@ def test_slider_crank_with_gradients():
 
 @pytest.mark.slow
 def test_two_rods_latched():
-    """Velocities after a hinge and after a weld, momenta and kinetic energy: the closed form."""
+    """Velocities, momenta and kinetic energy after a hinge and after a weld have closed forms."""
     case = load_reference("events")["latch_two_rods"]
     rod = (
         '<body name="{0}" pos="{1} 0 0"><joint name="{0}.x" type="slide" axis="1 0 0"/><joint'
@@ -347,8 +359,7 @@ def test_two_rods_latched():
 
 @pytest.mark.slow
 def test_pendulum_released():
-    """A rod comes off its pin at an angle and flies: the time, the rate, and the path of both
-    parts."""
+    """A rod cut off its pin at an angle: time and rate of the event, and the flight."""
     case = load_reference("events")["pendulum_release"]
     rod = '<body name="rod"><joint name="pin" axis="0 0 1"/><inertial pos="0 -0.5 0" mass="1" '
     rod += f'diaginertia="{1 / 12!r} 0.01 {1 / 12!r}"/></body>'
@@ -381,7 +392,7 @@ def test_pendulum_released():
 
 @pytest.mark.slow
 def test_simple_pendulum_for_a_long_time():
-    """IFToMM A01: a point mass on a rod without mass, from the level, 42 periods and more."""
+    """IFToMM A01: a point mass on a massless rod over more than 42 periods."""
     case = load_reference("events")["a01_simple_pendulum"]
     rod = (
         '<body name="rod"><joint name="pin" axis="0 0 1"/><inertial pos="1 0 0" mass="1"'
@@ -399,8 +410,7 @@ def test_simple_pendulum_for_a_long_time():
 
 @pytest.mark.slow
 def test_locking_an_elbow():
-    """Rate, angular momentum and kinetic energy of a double pendulum whose elbow is locked in full
-    swing: the closed form."""
+    """Rate, angular momentum and kinetic energy after an elbow is locked have closed forms."""
     case = load_reference("events")["joint_lock"]
     rod = (
         '<body name="{0}" pos="{1}"><joint name="{0}" axis="0 0 1"/><inertial pos="0 -0.5 0"'
@@ -425,8 +435,11 @@ def test_locking_an_elbow():
 
 @pytest.mark.slow
 def test_a_bouncing_ball_with_restitution():
-    """Impacts are plastic here; one with restitution is a run that ends, a velocity put in by hand,
-    and the next run: 25 of them, towards a last instant."""
+    """25 bounces with restitution, towards the accumulation point of their times.
+
+    Impacts of svkc are plastic: each bounce is a run that ends at the ground, a reversed velocity,
+    and the next run.
+    """
     case = load_reference("events")["bouncing_ball_zeno"]
     ball = (
         '<body name="ball"><joint name="z" type="slide" axis="0 0 1"/><inertial pos="0 0 0"'

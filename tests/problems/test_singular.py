@@ -1,5 +1,7 @@
-"""Loops that are singular, nearly so, redundant, of no length, or not to be closed: what goes on
-goes on, what cannot says so, when, and in which loop."""
+"""Loops that are singular, nearly singular, redundant, of zero length, or impossible to close.
+
+A motion that exists is found; otherwise a result code names the time and the loop.
+"""
 
 import equinox as eqx
 import jax
@@ -17,15 +19,17 @@ FINE = {"rtol": 1e-9, "atol": 1e-11}
 
 
 def tilted_four_bar(angle):
-    """The four-bar with the axis of its last pin out of the others' direction by a small angle."""
+    """Return the four-bar with the axis of its last pin tilted by a small angle (rad)."""
     pin = models.pin(axis=(np.sin(angle), np.cos(angle), 0))
     return svkc.load(models.MJCF.format(models.FOUR_BAR), virtual_links=[pin])
 
 
 @pytest.mark.slow
 def test_nearly_redundant_loops():
-    """Tilted by 1e-8 rad a pin's rows still count as redundant, and the bars go round; by 1e-6 they
-    do not, and nothing moves: the margin tells."""
+    """A tilt of 1e-8 rad leaves the pin's rows redundant; one of 1e-6 rad blocks the motion.
+
+    The margin shows the difference.
+    """
     run = eqx.filter_jit(lambda chain, state: svkc.simulate(chain, state, 1.0, **FINE))
     ends = {}
     for angle in (0.0, 1e-8, 1e-6):
@@ -46,7 +50,7 @@ def test_nearly_redundant_loops():
 
 @pytest.mark.slow
 def test_a_wrong_rank_is_reported():
-    """Too low, a loop opens and the run stops there; too high, the margin is round-off."""
+    """A rank set too low ends the run as a loop opens; one set too high shows in the margin."""
     chain = models.four_bar()
     state = chain.state(v={"crank": 4.0})
     with_rank = lambda rank: eqx.tree_at(
@@ -67,8 +71,10 @@ def test_a_wrong_rank_is_reported():
 
 @pytest.mark.slow
 def test_loops_that_allow_only_the_first_order():
-    """The pelvis turned on the swing's seat: two parallel slides allow the rate, not the turn. The
-    run stops as they open, and names one of them."""
+    """Two parallel slides allow a rate of the pelvis on the swing's seat, but no finite turn.
+
+    The run stops as the slides open, and names one of them.
+    """
     from svkc.scenes.swing import swing
 
     chain, seated = swing(ignore="limit")
@@ -82,7 +88,7 @@ def test_loops_that_allow_only_the_first_order():
 
 @pytest.mark.slow
 def test_a_pin_on_a_hinge_is_redundant():
-    """A second pin on a hinge that is there already takes nothing away."""
+    """A second pin on a hinge removes no freedom."""
     rods = models.TWO_RODS
     pin = svkc.VirtualLink(
         "again",
@@ -110,8 +116,10 @@ def test_a_pin_on_a_hinge_is_redundant():
 
 @pytest.mark.slow
 def test_a_crank_that_turns_back_at_a_dead_centre():
-    """A crank longer than its rod reaches no further than a dead centre, where the coordinate that
-    drove it stands still: it turns back there, with all its energy, on other coordinates."""
+    """A crank longer than its rod reaches a dead centre and turns back, with all its energy.
+
+    The driving coordinate stands still there, so the run changes to other independent coordinates.
+    """
     slider = (
         '<body name="slider"><joint name="slider" type="slide" axis="1 0 0"/><geom size="0.05"'
         ' mass="1" contype="0"/></body>'
@@ -143,8 +151,10 @@ def test_a_crank_that_turns_back_at_a_dead_centre():
 
 @pytest.mark.slow
 def test_without_pivots_a_singular_configuration_may_end_the_run():
-    """A slider-crank of equal bars whose slider weighs nothing: as the bars align, nothing but the
-    choice of pivots tells where it goes."""
+    """A slider-crank of equal bars with a massless slider has a bifurcation as the bars align.
+
+    Pivots determine the branch. Without pivots the run ends with a result code.
+    """
     bar = (
         '<body name="{0}" pos="{1} 0 0"><joint name="{0}" axis="0 1 0"/><geom type="capsule"'
         ' fromto="0 0 0 1 0 0" size="0.02"/>'
@@ -174,8 +184,10 @@ def test_without_pivots_a_singular_configuration_may_end_the_run():
 @pytest.mark.slow
 @pytest.mark.parametrize("before", [1e-2, 1e-4, 1e-6, 0.0])
 def test_start_near_a_singular_configuration(offset):
-    """The N four-bar as its bars align, or nearly: it goes on as the parallelogram that it moves
-    as, the direction of its velocity kept."""
+    """The N four-bar started with its bars nearly aligned moves on as a parallelogram.
+
+    The direction of its velocity is kept.
+    """
     case = next(case for case in load_reference("n_four_bar")["cases"] if case["N"] == 2)
     chain, state = maximal.load(n_four_bar(2))
     signs = np.sign(np.asarray(state.v))

@@ -1,5 +1,7 @@
-"""A flyball governor after IFToMM's A05, springs of 8e5 N/m with dampers of 4e4 N s/m, against its
-own equations of motion."""
+"""A flyball governor after IFToMM's A05 against its own equations of motion.
+
+Its springs have 8e5 N/m, its dampers 4e4 N s/m.
+"""
 
 import diffrax
 import jax
@@ -29,7 +31,7 @@ GOVERNOR = (
 
 
 def spring_length(angle, height, jnp=np):
-    """Length of a spring, from the middle of an arm to the slider."""
+    """Return the length of a spring, from the middle of an arm to the slider."""
     return jnp.sqrt((jnp.sin(angle) / 2) ** 2 + (height - 1 + jnp.cos(angle) / 2) ** 2)
 
 
@@ -38,8 +40,10 @@ REST_LENGTH = spring_length(START_ANGLE, START_HEIGHT)
 
 
 def reference_motion(t1):
-    """Angle of the shaft, of the arms, height of the slider at the end: Lagrange's equations of the
-    symmetric motion, by LSODA."""
+    """Return the angles of the shaft and of the arms, and the height of the slider, at t1.
+
+    Lagrange's equations of the symmetric motion, integrated by LSODA.
+    """
     inertia = lambda angle: 2 * SHAFT_INERTIA + 2 * ARM_INERTIA + 2 * BALL_MASS * np.sin(angle) ** 2
     momentum = inertia(START_ANGLE) * 2 * np.pi
 
@@ -75,7 +79,7 @@ def reference_motion(t1):
 
 
 def control(t, state, args):
-    """The springs and dampers, as joint torques."""
+    """Return the joint torques of the springs and dampers."""
     lengths = lambda q: spring_length(q[1:3], q[3], jnp)
     length, pull_back = jax.vjp(lengths, state.q)
     return pull_back(
@@ -85,6 +89,7 @@ def control(t, state, args):
 
 @pytest.fixture(scope="module")
 def governor():
+    """Simulate half a second of the governor, as a function of options."""
     chain = svkc.load(GOVERNOR)
     state = chain.state(
         {"left": START_ANGLE, "right": START_ANGLE, "slider": START_HEIGHT}, {"shaft": 2 * np.pi}
@@ -98,6 +103,7 @@ def governor():
     ids=["explicit", "implicit"],
 )
 def test_flyball_governor(governor, solver, error, max_steps):
+    """Both kinds of solvers agree with the reference; the implicit one takes few steps."""
     traj = governor(solver=solver)
     np.testing.assert_allclose(
         traj.final.q[jnp.array([0, 1, 3])], reference_motion(0.5), atol=error
@@ -107,7 +113,9 @@ def test_flyball_governor(governor, solver, error, max_steps):
 
 
 def test_an_explicit_root_finder_is_kept(governor):
-    """Stages that are solved with one Jacobian for all give steps up far sooner than by Newton's
-    method, which svkc fills in where none is given."""
+    """A root finder of the solver is not replaced by the one that svkc fills in.
+
+    This root finder makes the solver reject far more steps.
+    """
     solver = diffrax.Kvaerno5(root_finder=diffrax.VeryChord(rtol=1e-7, atol=1e-9))
     assert int(governor(solver=solver).report().accepted) > 500
