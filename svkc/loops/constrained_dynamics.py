@@ -1,6 +1,7 @@
 """Methods to compute the accelerations of a chain with loops, each an `AbstractDynamics`."""
 
 import abc
+import dataclasses
 from collections.abc import Callable
 from typing import ClassVar
 
@@ -89,11 +90,13 @@ class ArticulatedBodies(AbstractDynamics):
 
     def prepare(self, chain, structure, loops, selection=None):
         column, active = jacobian_scales(chain)[1], active_dofs(chain, structure)
-        rows, frozen, static = jax.lax.stop_gradient((loops.J, (chain, loops.kin), structure))
+        J, chain_and_kin, locked = jax.lax.stop_gradient(
+            (loops.J, (chain, loops.kin), structure.locked)
+        )
         solve = loop_force_solver(
-            *frozen,
-            jnp.where(active[None], rows / column[None], 0),
-            None if static.locked is None else active[: chain.nv],
+            *chain_and_kin,
+            jnp.where(active[None], J / column[None], 0),
+            None if locked is None else active[: chain.nv],
         )
         # all rows, dependent ones included
         used = jnp.ones(loops.J.shape[0], bool)
@@ -115,10 +118,10 @@ class AbstractMassMatrix(AbstractDynamics):
 
     def prepare(self, chain, structure, loops, selection=None):
         assert selection is not None
-        qr, rows, frozen, static = jax.lax.stop_gradient(
+        qr, J, chain_and_kin, frozen_structure = jax.lax.stop_gradient(
             (selection, loops.J, (chain, loops.kin), structure)
         )
-        solve = _solve_by_partitioning(*frozen, static, qr, rows, self.mass_matrix)
+        solve = _solve_by_partitioning(*chain_and_kin, frozen_structure, qr, J, self.mass_matrix)
         return _implicit_solve(chain, structure, loops, solve, lambda x: qr.Q @ x, qr.active)
 
     def prepare_open(self, chain, structure, kin):
@@ -195,7 +198,7 @@ class Dynamics(eqx.Module):
 
 def _check_hold(hold) -> None:
     if hold is not None and not 0 <= scalar("dynamics.hold", hold) <= 1:
-        raise ValueError(f"dynamics.hold: got {hold}, expected None or a part between 0 and 1")
+        raise ValueError(f"dynamics.hold: got {hold}, expected None or a number between 0 and 1")
 
 
 def _implicit_solve(

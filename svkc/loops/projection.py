@@ -121,7 +121,7 @@ def project(
 ) -> tuple[Float[Array, " q"], Float[Array, " dofs"], ProjectionInfo]:
     """Take `iterations` Newton steps on q to close the loops, then project v once.
 
-    Both are turns of one loop, so that its body is compiled once.
+    Both are iterations of one loop, so that its body is compiled once.
 
     dependent_only: whether only dependent coordinates change; otherwise the change is the least in
     the metric of the mass matrix.
@@ -132,18 +132,18 @@ def project(
     @functools.partial(jax.checkpoint, prevent_cse=False)
     def newton_step(i, carry):
         q, v, _ = carry
-        velocity_turn = i == iterations
+        is_velocity_iteration = i == iterations
         loops = loop_kinematics(chain, structure, q)
         new = pivoted_qr(loops.J, structure.rank, structure.independent)
         kept = (
             new.P
             if pivots is None
-            else _pivots_to_keep(structure, loops.J, new, pivots, hold, velocity_turn)
+            else _pivots_to_keep(structure, loops.J, new, pivots, hold, is_velocity_iteration)
         )
         step, gap = _step_by_pivots(chain, structure, loops, v, new, dependent_only)
         info = ProjectionInfo(gap=gap_norms(gap), margin=pivot_ratio(new), pivots=kept)
-        q = integrate(chain, q, jnp.where(velocity_turn, 0, step[:, 0]))
-        v = jnp.where(velocity_turn, v + step[:, 1], v)
+        q = integrate(chain, q, jnp.where(is_velocity_iteration, 0, step[:, 0]))
+        v = jnp.where(is_velocity_iteration, v + step[:, 1], v)
         return q, v, jax.lax.stop_gradient(info)
 
     start = normalize(chain, q), v, ProjectionInfo.initial(chain, q.dtype, with_pivots=True)
@@ -151,14 +151,21 @@ def project(
 
 
 def _pivots_to_keep(
-    structure: Structure, J, new: PivotedQR, pivots, hold: float, velocity_turn: Bool[Array, ""]
+    structure: Structure,
+    J,
+    new: PivotedQR,
+    pivots,
+    hold: float,
+    is_velocity_iteration: Bool[Array, ""],
 ) -> Float[Array, "steps dofs"]:
-    """Return `pivots` or, if they are poor in the last turn, those of the new QR."""
+    """Return `pivots` or, if they are poor in the velocity's iteration, those of the new QR."""
     poor = lambda: (
         (pivot_ratio(refactor(J, pivots)) < hold * pivot_ratio(new))
         | lacks_pivots(pivots, structure.rank)
     )
-    return jax.lax.cond(velocity_turn, lambda: jnp.where(poor(), new.P, pivots), lambda: pivots)
+    return jax.lax.cond(
+        is_velocity_iteration, lambda: jnp.where(poor(), new.P, pivots), lambda: pivots
+    )
 
 
 def _step_by_pivots(
@@ -192,26 +199,26 @@ def project_by_loop_forces(
     @functools.partial(jax.checkpoint, prevent_cse=False)
     def newton_step(i, carry):
         q, v, _ = carry
-        velocity_turn = i == iterations
-        step, gap = compute_step(chain, structure, q, v, velocity_turn)
-        q = integrate(chain, q, jnp.where(velocity_turn, 0, step))
-        return q, jnp.where(velocity_turn, v + step, v), ProjectionInfo(gap)
+        is_velocity_iteration = i == iterations
+        step, gap = compute_step(chain, structure, q, v, is_velocity_iteration)
+        q = integrate(chain, q, jnp.where(is_velocity_iteration, 0, step))
+        return q, jnp.where(is_velocity_iteration, v + step, v), ProjectionInfo(gap)
 
     start = normalize(chain, q), v, ProjectionInfo.initial(chain, q.dtype, with_pivots=False)
     return jax.lax.fori_loop(0, iterations + 1, newton_step, start)
 
 
 def _step_by_loop_forces(
-    chain: Chain, structure: Structure, q, v, velocity_turn: Bool[Array, ""]
+    chain: Chain, structure: Structure, q, v, is_velocity_iteration: Bool[Array, ""]
 ) -> tuple[Float[Array, " dofs"], Float[Array, "links 2"]]:
-    """Return the change of q that closes the loops or, in the velocity's turn, of v; and the gaps.
+    """Return the change of q that closes the loops or, in the velocity's iteration, of v; and the gaps.
 
     The change is the least in the metric of the mass matrix. Gaps are those at q.
     """
     column = jacobian_scales(chain)[1]
     loops = loop_kinematics(chain, structure, q)
     J, gap, active = loops.J, loops.gap, active_dofs(chain, structure)
-    residual = jnp.where(velocity_turn, J @ jnp.where(active, v / column, 0), gap)
+    residual = jnp.where(is_velocity_iteration, J @ jnp.where(active, v / column, 0), gap)
     solve = ArticulatedBodies().prepare(chain, structure, loops)
     step = solve(jnp.zeros(chain.dofs, q.dtype), residual)
     return step, jax.lax.stop_gradient(gap_norms(gap))

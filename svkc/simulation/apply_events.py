@@ -86,6 +86,7 @@ def _new_masks(
     any_of = lambda name: jnp.any(fired[:, None] & plan.action_mask(chain, name), 0)
     locked = at_current_pose = None
     if plan.has_locks:
+        assert structure.locked is not None
         locked = (structure.locked | any_of("lock")) & ~any_of("unlock")
     if plan.has_binds or plan.action_mask(chain, "at_current_pose").any():
         at_current_pose = any_of("at_current_pose")
@@ -121,12 +122,14 @@ def _write_events(
     row_of_event = (rows[:, None] == row[None]) & fired[None]
     written = jnp.any(row_of_event, 1)
     first = written & (rows == r.count)
-    connects = jnp.any(row_of_event[:, :, None] & connects[None], 1)[:, :, None]
+    connected_by_row = jnp.any(row_of_event[:, :, None] & connects[None], 1)[:, :, None]
     return Events(
         time=jnp.where(written, t, r.time),
         which=jnp.where(written, jnp.argmax(row_of_event, 1).astype(jnp.int32), r.which),
-        impulse=jnp.where(connects, change.impulse[None], r.impulse),
-        angular_impulse=jnp.where(connects, change.angular_impulse[None], r.angular_impulse),
+        impulse=jnp.where(connected_by_row, change.impulse[None], r.impulse),
+        angular_impulse=jnp.where(
+            connected_by_row, change.angular_impulse[None], r.angular_impulse
+        ),
         energy_lost=jnp.where(first, change.energy_lost, r.energy_lost),
         count=jnp.minimum(r.count + count, capacity),
     ), r.count + count > capacity

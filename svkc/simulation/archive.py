@@ -91,7 +91,7 @@ def save(traj: Trajectory, path, chain=None, options=None) -> None:
         if f.name not in _RESULT_CODES
     }
     meta["options"] = options or {}
-    arrays = _flatten(traj)
+    arrays: dict[str, Any] = _flatten(traj)
     if chain is not None:
         meta |= {"bodies": chain.body_names, "joints": chain.joint_names, "links": chain.link_names}
         meta |= {"model": chain.model.text, "arguments": _as_json(chain.model.arguments)}

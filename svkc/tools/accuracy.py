@@ -112,10 +112,14 @@ def default_candidates(dtype, span: float) -> list[Candidate]:
             )
             candidates.append(Candidate(name, options | {"stabilization": Projection()}))
             candidates.append(
-                Candidate(f"{name}, no stabilization", options | {"stabilization": NoStabilization()})
+                Candidate(
+                    f"{name}, no stabilization", options | {"stabilization": NoStabilization()}
+                )
             )
             candidates.append(
-                Candidate(f"{name}, articulated bodies", options | {"dynamics": ArticulatedBodies()})
+                Candidate(
+                    f"{name}, articulated bodies", options | {"dynamics": ArticulatedBodies()}
+                )
             )
         if rtol >= 1e-8:
             candidates.append(
@@ -156,11 +160,11 @@ def estimate_error(chain: Chain, state: State, t1, **options) -> float:
     """
     run = simulate(chain, state, t1, **options)
     if "dt" in options:
-        finer_options = options | {"dt": options["dt"] / 2}
+        finer: dict[str, Any] = {"dt": options["dt"] / 2}
     else:
         rtol, atol = resolve_tolerances(state.q.dtype, options.get("rtol"), options.get("atol"))
-        finer_options = options | {"rtol": rtol / 32, "atol": atol / 32}
-    return configuration_error(chain, run, simulate(chain, state, t1, **finer_options))
+        finer = {"rtol": rtol / 32, "atol": atol / 32}
+    return configuration_error(chain, run, simulate(chain, state, t1, **(options | finer)))
 
 
 def tune(

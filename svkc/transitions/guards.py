@@ -34,7 +34,9 @@ class AbstractGuard(eqx.Module):
     initial_value: eqx.AbstractClassVar[float]
 
     @abc.abstractmethod
-    def value(self, chain: Chain, t, state: State, args, tau: Float[Array, " dofs"]):
+    def value(
+        self, chain: Chain, t, state: State, args, tau: Float[Array, " dofs"]
+    ) -> Float[Array, ""]:
         """Return the guard's value.
 
         tau: joint torques at this time (N m, N); zeros if no guard of the run needs torques.

@@ -61,7 +61,12 @@ def write_mp4(path: pathlib.Path, images: Iterator, fps: float):
         ) from error
     first = next(images)
     writer = imageio_ffmpeg.write_frames(
-        str(path), first.size, fps=fps, macro_block_size=2, quality=7, ffmpeg_log_level="error"
+        str(path),
+        first.size,
+        fps=fps,  # pyright: ignore[reportArgumentType]  (inferred from its default, 16)
+        macro_block_size=2,
+        quality=7,
+        ffmpeg_log_level="error",
     )
     with warnings.catch_warnings():
         # jax warns of forks, because threads may hold locks; this fork executes ffmpeg at once
