@@ -136,7 +136,7 @@ for i in range(int(p.count)):
         f" mobility {int(p.freedoms[i])}"
     )
     if i < int(e.count):
-        happened = f"{('left', 'right')[e.which[i] // 2]} foot {('down', 'up')[e.which[i] % 2]}"
-        print(f"  at {float(e.time[i]):.4f} s: {happened}, {float(e.energy_lost[i]):.2f} J lost")
+        description = f"{('left', 'right')[e.which[i] // 2]} foot {('down', 'up')[e.which[i] % 2]}"
+        print(f"  at {float(e.time[i]):.4f} s: {description}, {float(e.energy_lost[i]):.2f} J lost")
 folder = pathlib.Path(sys.argv[1] if len(sys.argv) > 1 else ".")
 print("wrote", svkc.render(chain, traj, folder / "04_walk.png", frames=9))

@@ -20,8 +20,8 @@ from jax.flatten_util import ravel_pytree
 
 import svkc
 
-# an arm of three links on hinges about y; the wrist can break; bodies without a joint are markers at
-# the ends of links
+# an arm of three links on hinges about y; the wrist can break; bodies without a joint are
+# markers at the ends of links
 ARM = """<mujoco><worldbody>
   <body name="upper"><joint name="shoulder" axis="0 1 0"/><geom type="capsule"
     fromto="0 0 0 0 0 -0.5" size="0.04" mass="3"/>

@@ -54,8 +54,8 @@ def flight() -> tuple[svkc.Chain, svkc.State]:
     """The same figure in flight beside the bar, spinning, its hands still where the grips are."""
     (chain, state), rng = high_bar(), np.random.default_rng(2)
     free = svkc.cut(chain, state, "right_hand_grip", "left_hand_grip")
-    moving = free.v.at[: chain.nv].set(jnp.asarray(rng.normal(size=chain.nv)))
-    return chain, svkc.State(free.q, moving, free.structure)
+    v = free.v.at[: chain.nv].set(jnp.asarray(rng.normal(size=chain.nv)))
+    return chain, svkc.State(free.q, v, free.structure)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

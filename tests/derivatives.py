@@ -23,25 +23,25 @@ ALGEBRA, RUN = 1e-8, DIFFERENCE
 def algebra(chain, state):
     """Everything that is not a run, on one state."""
     rng = np.random.default_rng(3)
-    moving = jnp.asarray(rng.normal(size=chain.dofs))
+    vdot = jnp.asarray(rng.normal(size=chain.dofs))
 
     def f(x):
         c = changed(chain, x)
         s = start(state, x)
         out = {
             "forward": svkc.forward_dynamics(c, s, x["tau"]),
-            "inverse": svkc.inverse_dynamics(c, s, moving),
+            "inverse": svkc.inverse_dynamics(c, s, vdot),
             "energy": svkc.energy(c, s),
         }
         stepped = svkc.step(c, s, x["tau"], 0.01)
         out |= {"stepped_q": stepped.q, "stepped_v": stepped.v}
-        driven = svkc.actuation(c, s, moving)
-        out |= {"actuation": driven.tau, "residual": driven.residual}
+        actuation = svkc.actuation(c, s, vdot)
+        out |= {"actuation": actuation.tau, "residual": actuation.residual}
         if len(chain.link_names):
-            carried = svkc.loop_forces(c, s, x["tau"])
+            loop_forces = svkc.loop_forces(c, s, x["tau"])
             out |= {
-                "loop_force": carried.force,
-                "loop_torque": carried.torque,
+                "loop_force": loop_forces.force,
+                "loop_torque": loop_forces.torque,
                 "W": svkc.coordinates(c, s).W,
                 "margin": svkc.mobility(c, s).margin,
             }
@@ -412,11 +412,11 @@ def main(names):
     )
     for name in names or CASES:
         f, x, _ = CASES[name]()
-        found = svkc.check_grad(f, x, directions=1)
-        worst = f"{found.output[5:]} by {found.input[1:]}".replace("'", "")
+        check = svkc.check_grad(f, x, directions=1)
+        worst = f"{check.output[5:]} by {check.input[1:]}".replace("'", "")
         print(
-            f"| {name} | {', '.join(x)} | {found.error:.1e} | {worst} | {found.uncertainty:.0e} |"
-            f" {found.modes:.0e} |",
+            f"| {name} | {', '.join(x)} | {check.error:.1e} | {worst} | {check.uncertainty:.0e} |"
+            f" {check.modes:.0e} |",
             flush=True,
         )
 

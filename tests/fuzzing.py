@@ -224,13 +224,13 @@ NUMBER_OF = {"four": (4, 4), "tree": (12, 10), "spare": (11, 10)}
 TREE_NUMBER_OF = {"four": (3, 3), "tree": (12, 10), "spare": (3, 3)}
 
 
-def broken(state, how: str, value):
+def broken(state, field: str, value):
     """The state with something wrong: a NaN, or another thing in its place."""
     # (of what is free in space an angle, for nothing depends on where it is)
     at = 3 if state.q.shape == (12,) else 0
-    if how == "q":
+    if field == "q":
         return svkc.State(state.q.at[at].set(jnp.nan), state.v, state.structure)
-    if how == "v":
+    if field == "v":
         return svkc.State(state.q, state.v.at[at].set(jnp.nan), state.structure)
     return {
         "thing": value,
@@ -239,7 +239,7 @@ def broken(state, how: str, value):
         "whole": svkc.State(jnp.arange(state.q.shape[0]), state.v, state.structure),
         "lanes": jax.tree.map(lambda x: x[None], state),
         "": state,
-    }[how]
+    }[field]
 
 
 wrongs = st.sampled_from(

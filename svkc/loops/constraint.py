@@ -29,9 +29,9 @@ def _virtual_motion_subspaces(
     Freedoms that the joint does not have, and those of links not connected, are zero.
     """
     zero = jnp.zeros_like(frames.axes[:, :3])
-    turns = jnp.concatenate([frames.axes[:, :3], zero], -1)
+    rotations = jnp.concatenate([frames.axes[:, :3], zero], -1)
     slides = jnp.concatenate([zero, frames.axes[:, 3:]], -1)
-    S = jnp.concatenate([turns, slides], 1)
+    S = jnp.concatenate([rotations, slides], 1)
     return jnp.where((structure.connected[:, None] & structure.freedoms)[:, :, None], S, 0)
 
 

@@ -211,9 +211,9 @@ def project_by_loop_forces(
 def _step_by_loop_forces(
     chain: Chain, structure: Structure, q, v, is_velocity_iteration: Bool[Array, ""]
 ) -> tuple[Float[Array, " dofs"], Float[Array, "links 2"]]:
-    """Return the change of q that closes the loops or, in the velocity's iteration, of v; and the gaps.
+    """Return the change of q that closes the loops, and the gaps at q.
 
-    The change is the least in the metric of the mass matrix. Gaps are those at q.
+    In the velocity's iteration it is the change of v that makes their rates zero. The change is the least in the metric of the mass matrix.
     """
     column = jacobian_scales(chain)[1]
     loops = loop_kinematics(chain, structure, q)

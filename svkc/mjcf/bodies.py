@@ -77,7 +77,8 @@ def tree_rows(model, cut_bodies) -> tuple[list[tuple[int, int]], Topology]:
     There is one row for each joint, and one for each body without joints, sorted by level.
     """
     joints = tree_joints(model, cut_bodies)
-    order, depth, last, own = [(0, -1, -1)], [0], {0: 0}, {0: None}
+    order, depth, last = [(0, -1, -1)], [0], {0: 0}
+    own: dict[int, TreeJoint | None] = {0: None}
     for body in range(1, model.nbody):
         parent = 0 if body in cut_bodies else last[int(model.body_parentid[body])]
         for joint in [j for j in joints if j.body == body] or [None]:
@@ -88,15 +89,16 @@ def tree_rows(model, cut_bodies) -> tuple[list[tuple[int, int]], Topology]:
         last[body] = parent
     rank = np.argsort(depth, kind="stable")
     new = np.argsort(rank)
+    own_in_rows = [own[int(i)] for i in rank]
     row_of = {joint.name: int(new[i]) for i, joint in own.items() if joint is not None}
     topology = Topology(
         body_names=tuple(name_of(model, "body", i) for i in range(model.nbody)),
         joint_names=tuple(j.name for j in joints),
         link_names=(),
         parent=tuple(int(new[order[i][2]]) if order[i][2] >= 0 else -1 for i in rank),
-        kind=tuple(FIXED if own[i] is None else own[i].kind for i in rank),
-        q_start=tuple(0 if own[i] is None else own[i].q for i in rank),
-        v_start=tuple(0 if own[i] is None else own[i].v for i in rank),
+        kind=tuple(FIXED if joint is None else joint.kind for joint in own_in_rows),
+        q_start=tuple(0 if joint is None else joint.q for joint in own_in_rows),
+        v_start=tuple(0 if joint is None else joint.v for joint in own_in_rows),
         nq=sum(Q_SIZE[j.kind] for j in joints),
         nv=sum(V_SIZE[j.kind] for j in joints),
         body_row=tuple(int(new[last[i]]) for i in range(model.nbody)),

@@ -132,7 +132,7 @@ def _digest(model, text: str | None, arguments: dict[str, Any]) -> str:
     links = tuple(map(_canonical_link, arguments["virtual_links"]))
     sets = (sorted(set(arguments[name])) for name in ("ignore", "ignore_armature"))
     rest = arguments["cuttable"], arguments["spare"], *sets
-    digest = hashlib.sha256(image)
+    digest = hashlib.sha256(image.data)
     digest.update(repr((text, links, rest)).encode())
     return digest.hexdigest()
 

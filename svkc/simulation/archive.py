@@ -49,7 +49,7 @@ def _flatten(node, prefix: str = "") -> dict[str, np.ndarray]:
 
 
 def _build(cls, arrays: dict[str, Any], prefix: str = "", **known):
-    """Return an object of a class from the arrays that `_flatten` returns.
+    """Return an object of a class from arrays as `_flatten` names them.
 
     known: fields that are not stored as arrays.
     """

@@ -93,6 +93,7 @@ def solve_phase(
     armed = None
     if guards is not None:
         mask = plan.armed(field_args.chain, field_args.structure)
+        assert run.guard_values is not None
         armed = stop_gradient_tree(ArmedGuards(guards, run.guard_values, mask))
     y0 = ODEState(run.state.q, run.state.v, run.work)
     # Save times outside the phase are clipped to its ends. Only save times within the phase, ends
@@ -143,7 +144,8 @@ def _integrate(
     times: start and latest end of the phase, and the save times.
     guards: the guards, or the vector field where there are no guards.
     """
-    adjoint, replays = options.adjoint, isinstance(options.adjoint, Replay)
+    adjoint = options.adjoint
+    replays = isinstance(adjoint, Replay)
     solver, armed_guards, (controller, first_step) = stop_gradient_tree(
         (with_scan_kind(options.solver, "lax"), armed, options.step_size_control())
     )
@@ -164,7 +166,8 @@ def _integrate(
     event = None
     if armed is not None:
         # the event is located first, without derivatives; the differentiated solve ends at its time
-        located = integrate_phase(*stop_gradient_tree((y0, times, problem)), stepper_options)
+        frozen = stop_gradient_tree((y0, times, problem))
+        located = integrate_phase(frozen[0], frozen[1], frozen[2], stepper_options)
         stop = jnp.where(located.event.occurred, located.t, stop)
         ts, event = jnp.where(ts > stop, stop, ts), located.event
     controller, first_step = options.step_size_control(ts)

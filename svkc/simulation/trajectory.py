@@ -1,4 +1,4 @@
-"""The result of a run, and its report."""
+"""The result of a run (`Trajectory`), and its certificate (`Report`)."""
 
 import dataclasses
 import functools
@@ -16,11 +16,17 @@ from svkc.simulation.records import RESULTS, Events, Phases
 
 
 class Trajectory(eqx.Module):
-    """A run: `states` at `ts` (leading time axis), the loop gaps (rad, m) and their rates (rad/s,
-    m/s) there, events, phases, the final state and how it ended.
+    """The result of a run of `simulate`.
 
-    `derivative`: successful where the run has derivatives, else why not: a guard that grazed or
-    jumped, events that could change order, rank lost.
+    ts: save times (s).
+    states: states at the save times, with a leading time axis.
+    gaps, gap_rates: largest loop gaps at the save times (rad, m), and their rates (rad/s, m/s).
+    events: records of the events.
+    phases: records of the phases.
+    final, t_final: state and time at the end of the run.
+    result: how the run ended.
+    derivative: `RESULTS.successful` if the run has derivatives; otherwise why not: a guard that
+        grazed zero or jumped, simultaneous events, or a loss of rank.
     """
 
     ts: Float[Array, " times"]
@@ -36,55 +42,68 @@ class Trajectory(eqx.Module):
 
     @property
     def connected(self) -> Bool[Array, "... times links"]:
-        """Which virtual links hold at each time."""
+        """Which virtual links are connected at each save time."""
         return self.states.structure.connected
 
     def save(self, path, chain=None, **options) -> None:
-        """Writes the run to one .npz, whole or not at all, with its certificate;
-        `svkc.load_trajectory` gives back an equal object.
+        """Write the run, or a batch of runs, to one .npz file, with its certificate.
 
-        chain: its model and floats are kept too, for `svkc.load_chain` and the command `svkc view`.
-        options: what else is to be told of the run, such as rtol=1e-8; numbers and text as they
-        are, other things as they print.
+        The file is written atomically. `svkc.load_trajectory` returns an equal object.
+
+        path: of the file.
+        chain: stored as well if given, for `svkc.load_chain` and the command `svkc view`.
+        options: further metadata of the run, such as rtol=1e-8; values that JSON lacks are stored
+            as their `str`.
+
+        Raises OSError if the file cannot be written.
         """
-        # a verb the contract puts on the noun; its room is one floor up
+        # archive imports this module, so the import is deferred
         from svkc.simulation.archive import save
 
         save(self, path, chain, options)
 
     def plot(self, chain=None):
-        """A matplotlib figure of joint coordinates, loop gaps, energy and mobility over time,
-        events as lines."""
+        """Return a matplotlib figure of joint coordinates, loop gaps, energy and mobility over
+        time, with events as vertical lines.
+
+        chain: adds joint names, and kinetic and potential energy at the save times; optional.
+        """
         from svkc.viz.render import plot
 
         return plot(self, chain)
 
     def report(self, halved=None) -> "Report":
-        """The run's certificate. halved: an error estimated by another run, such as `svkc.accuracy.estimate_error`
-        gives, to be told with it."""
-        made = _report(self)
-        return (
-            made if halved is None else dataclasses.replace(made, halved=scalar("halved", halved))
-        )
+        """Return the certificate of the run, or of each run of a batch.
+
+        halved: an error of the run as `svkc.accuracy.estimate_error` returns, to be shown in the
+            report.
+        """
+        report = _report(self)
+        if halved is None:
+            return report
+        return dataclasses.replace(report, halved=scalar("halved", halved))
 
 
 @functools.partial(eager_jit, jit=eqx.filter_jit)
 def _report(traj: Trajectory) -> "Report":
+    """Return the certificate of a trajectory; of a batch if its arrays have leading axes."""
     p = traj.phases
     largest = lambda x: jnp.max(jnp.where(jnp.isfinite(x), x, 0), -2)
-    worst = lambda saved, ends: jnp.maximum(largest(saved), largest(ends))
+    largest_of = lambda at_save_times, at_ends: jnp.maximum(
+        largest(at_save_times), largest(at_ends)
+    )
     gaps, rates, momentum = (
-        worst(traj.gaps, p.gap),
-        worst(traj.gap_rates, p.gap_rate),
+        largest_of(traj.gaps, p.gap),
+        largest_of(traj.gap_rates, p.gap_rate),
         largest(p.momentum_drift),
     )
-    begun = jnp.isfinite(p.start)
+    written = jnp.isfinite(p.start)
     return Report(
         gap=gaps[..., 1],
         angular_gap=gaps[..., 0],
         gap_rate=rates[..., 1],
         angular_gap_rate=rates[..., 0],
-        energy_drift=jnp.sum(jnp.where(begun, p.energy_drift, 0), -1),
+        energy_drift=jnp.sum(jnp.where(written, p.energy_drift, 0), -1),
         energy_lost=jnp.sum(traj.events.energy_lost, -1),
         momentum_drift=momentum[..., 0],
         angular_momentum_drift=momentum[..., 1],
@@ -104,14 +123,28 @@ def _report(traj: Trajectory) -> "Report":
 
 
 class Report(eqx.Module):
-    """Largest loop gaps (m, rad) at the ends of steps, and rates (m/s, rad/s) at the saved times
-    and the ends of phases; energy that no work or impact explains and energy lost in impacts (J);
-    over phases in which nothing holds the bodies to the ground (`free`: there is one), momentum
-    that gravity does not explain (N s, N m s); estimated errors of all steps added up (inf: the
-    solver estimates none); the least rank margin; changes of the dependent coordinates (-1: not
-    looked at); the loop that could not be closed (-1: none); steps, evaluations of the vector
-    field, phases; when and how the run ended, and whether it has derivatives; the error by a finer
-    run, where one was asked for."""
+    """The certificate of a run: how far the numbers of the run can be relied on.
+
+    gap, angular_gap: largest loop gaps at the ends of steps and at save times (m, rad).
+    gap_rate, angular_gap_rate: largest rates of the loop gaps at the save times and at the ends of
+        phases (m/s, rad/s).
+    energy_drift: change of energy that neither work nor impacts explain (J).
+    energy_lost: energy lost in impacts (J).
+    momentum_drift, angular_momentum_drift: over phases in which the bodies are free of the ground,
+        largest change of linear momentum that gravity does not explain (N s), and of angular
+        momentum about the centre of mass (N m s).
+    free: whether there is such a phase.
+    error: sum of the estimated errors of all steps (inf: the solver has no error estimate).
+    margin: least rank margin |R_mm| / |R_11|.
+    swaps: how often the choice of dependent coordinates changed (-1: not recorded).
+    accepted, rejected: numbers of steps.
+    evaluations: of the vector field in steps.
+    loop: index of the loop that could not be closed (-1: none).
+    phases: number of phases.
+    t_final: end of the run (s).
+    result, derivative: of the trajectory.
+    halved: the error that a finer run showed, if `Trajectory.report` was given it.
+    """
 
     gap: Float[Array, ""]
     angular_gap: Float[Array, ""]
@@ -151,7 +184,7 @@ class Report(eqx.Module):
         swaps = (
             f"{int(self.swaps)} changes of the dependent coordinates"
             if self.swaps >= 0
-            else "changes of the dependent coordinates not looked at"
+            else "changes of the dependent coordinates not recorded"
         )
         if self.halved is not None:
             error += f"; by a finer run {float(self.halved):.2e} rad, m"

@@ -31,12 +31,12 @@ def configuration_derivative(
     """
     quat_q, quat_v = chain.topology.quaternion_starts
     scalar_q, scalar_v = chain.topology.scalar_coordinates
-    turn = quat_derivative(
+    quat_dot = quat_derivative(
         static_take(q, quat_q[:, None] + np.arange(4)),
         static_take(v, quat_v[:, None] + np.arange(3)),
     )
     order = np.argsort(np.concatenate([scalar_q, (quat_q[:, None] + np.arange(4)).ravel()]))
-    return static_take(jnp.concatenate([static_take(v, scalar_v), turn.ravel()]), order)
+    return static_take(jnp.concatenate([static_take(v, scalar_v), quat_dot.ravel()]), order)
 
 
 @checked_jit
@@ -77,14 +77,16 @@ def difference(
     quat_q, quat_v = chain.topology.quaternion_starts
     scalar_q, scalar_v = chain.topology.scalar_coordinates
     at = quat_q[:, None] + np.arange(4)
-    turn = quat_log(
+    rotation_vector = quat_log(
         quat_multiply(
             quat_conjugate(quat_normalize(static_take(q1, at))), quat_normalize(static_take(q2, at))
         )
     )
     order = np.argsort(np.concatenate([scalar_v, (quat_v[:, None] + np.arange(3)).ravel()]))
     return static_take(
-        jnp.concatenate([static_take(q2, scalar_q) - static_take(q1, scalar_q), turn.ravel()]),
+        jnp.concatenate(
+            [static_take(q2, scalar_q) - static_take(q1, scalar_q), rotation_vector.ravel()]
+        ),
         order,
     )
 

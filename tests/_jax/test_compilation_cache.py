@@ -34,7 +34,7 @@ def mode(path):
     return stat.S_IMODE(path.stat().st_mode)
 
 
-def test_a_folder_of_the_users_own(tmp_path, monkeypatch):
+def test_the_default_folder_is_private_to_the_user(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "platform", "linux")
     folder = cache.use_cache()
     assert folder.parent == tmp_path / "usual" / "svkc"
@@ -50,7 +50,7 @@ def test_a_folder_of_the_users_own(tmp_path, monkeypatch):
         assert cache._root_folder() == place / "svkc"
 
 
-def test_another_folder_or_none(tmp_path, monkeypatch):
+def test_the_folder_is_set_by_an_environment_variable(tmp_path, monkeypatch):
     for off in "off", "":
         monkeypatch.setenv("SVKC_CACHE_DIR", off)
         assert cache.use_cache() is None
@@ -62,7 +62,7 @@ def test_another_folder_or_none(tmp_path, monkeypatch):
     assert cache.use_cache().parent == tmp_path / "mine"
 
 
-def test_what_the_user_told_jax_stays(tmp_path, monkeypatch):
+def test_a_cache_folder_set_for_jax_is_kept(tmp_path, monkeypatch):
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 2.0)
     assert cache.use_cache() == tmp_path
@@ -89,14 +89,14 @@ def test_a_folder_that_others_can_write_to_is_refused(tmp_path, monkeypatch, cap
     assert cache.use_cache() is None
 
 
-def test_a_place_that_cannot_be_made_is_no_error(tmp_path, monkeypatch, capsys):
+def test_a_folder_that_cannot_be_created_is_no_error(tmp_path, monkeypatch, capsys):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("SVKC_CACHE_DIR", str(tmp_path / "file" / "under"))
     assert cache.use_cache() is None
     assert capsys.readouterr().err == ""
 
 
-def test_processors_and_their_features_differ(tmp_path):
+def test_processor_id_depends_on_model_and_features(tmp_path):
     text = "processor : 0\nmodel name : {}\nflags : {}\n\nprocessor : 1\n"
     names = set()
     for told in ("Some CPU @ 2 GHz", "sse avx"), ("Some CPU @ 2 GHz", "sse"), ("Other", "sse avx"):
@@ -107,7 +107,7 @@ def test_processors_and_their_features_differ(tmp_path):
     assert cache.processor_id(str(tmp_path / "nothing"))
 
 
-def test_entries_are_whole(tmp_path):
+def test_entries_are_written_atomically(tmp_path):
     """Over one that was cut short too; nothing else is left, and where nothing can be written
     nothing is said."""
     entries = lru_cache.LRUCache(str(tmp_path), max_size=-1)
@@ -122,7 +122,7 @@ def test_entries_are_whole(tmp_path):
     cache._write_entry(entries, "program", b"")
 
 
-def test_the_oldest_go(tmp_path, monkeypatch):
+def test_the_least_recently_used_entries_are_removed(tmp_path, monkeypatch):
     monkeypatch.setattr(cache, "SIZE", 250)
     for age, version in enumerate(("one", "two", "three")):
         (tmp_path / f"jaxlib-{version}").mkdir()
@@ -135,31 +135,31 @@ def test_the_oldest_go(tmp_path, monkeypatch):
     assert (tmp_path / "other").exists()
 
 
-def test_preferences_are_not_complaints(monkeypatch, capfd):
+def test_false_warnings_are_dropped_from_stderr(monkeypatch, capfd):
     """What else XLA says stays, an instruction that the processor lacks above all."""
     line = (
         "E1 cpu_aot_loader.cc:195] Loading XLA:CPU AOT result. Target machine feature +{} is not "
         " supported on the host machine. [+prefer-no-gather]\n"
     )
-    said = [line.format(name) for name in ("prefer-no-gather", "avx512f", "prefer-no-scatter")]
+    lines = [line.format(name) for name in ("prefer-no-gather", "avx512f", "prefer-no-scatter")]
 
     def load(key):
-        os.write(2, "".join(said).encode())
+        os.write(2, "".join(lines).encode())
         if key is None:
             raise ValueError("damaged")
         return key
 
     assert cache._without_false_warnings(load)("key") == "key"
-    assert capfd.readouterr().err == said[1]
+    assert capfd.readouterr().err == lines[1]
     with pytest.raises(ValueError, match="damaged"):
         cache._without_false_warnings(load)(None)
-    assert capfd.readouterr().err == said[1]
+    assert capfd.readouterr().err == lines[1]
     monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "0")
     cache._without_false_warnings(load)("key")
-    assert capfd.readouterr().err == "".join(said)
+    assert capfd.readouterr().err == "".join(lines)
 
 
-def test_jax_calls_what_is_put_in_its_place(tmp_path, monkeypatch):
+def test_jax_calls_the_patched_functions(tmp_path, monkeypatch):
     monkeypatch.setenv("SVKC_CACHE_DIR", str(tmp_path))
     cache.use_cache()
     assert lru_cache.LRUCache.put is cache._write_entry

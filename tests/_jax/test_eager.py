@@ -22,12 +22,12 @@ def linkage():
     return chain, traj
 
 
-def every(chain, traj, x):
+def all_results(chain, traj, x):
     """What each of the functions says of the linkage at a crank angle, each given what another
     made."""
     state = chain.state({"crank": x}, {"crank": 2.0 + x})
     tau = jnp.zeros(chain.dofs).at[0].set(x)
-    found = svkc.coordinates(chain, state)
+    co = svkc.coordinates(chain, state)
     again = svkc.connect(chain, svkc.cut(chain, state, "pin"), "pin")
     free = svkc.mobility(chain, again)
     wrench = svkc.loop_forces(
@@ -37,7 +37,7 @@ def every(chain, traj, x):
     return {
         "state": state.v,
         "connect": again.v,
-        "coordinates": jnp.sum(found.W, 1),
+        "coordinates": jnp.sum(co.W, 1),
         "mobility": free.margin,
         "forces": wrench.force,
         "energy": svkc.energy(chain, again),
@@ -45,35 +45,35 @@ def every(chain, traj, x):
     }
 
 
-def close(got, wanted):
-    for name in wanted:
+def assert_close(got, expected):
+    for name in expected:
         np.testing.assert_allclose(
             got[name],
-            wanted[name],
+            expected[name],
             rtol=REFERENCE,
-            atol=REFERENCE * (1 + float(np.abs(wanted[name]).max())),
+            atol=REFERENCE * (1 + float(np.abs(expected[name]).max())),
             err_msg=name,
         )
 
 
 @pytest.fixture(scope="module")
 def eagerly(linkage):
-    return jax.tree.map(lambda *x: np.stack(x), *[every(*linkage, x) for x in XS])
+    return jax.tree.map(lambda *x: np.stack(x), *[all_results(*linkage, x) for x in XS])
 
 
-def test_each_is_the_same_under_jit_and_scan(linkage, eagerly):
-    close(jax.jit(lambda xs: jax.lax.map(lambda x: every(*linkage, x), xs))(XS), eagerly)
-
-
-@pytest.mark.slow
-def test_each_is_the_same_under_vmap(linkage, eagerly):
-    close(jax.vmap(lambda x: every(*linkage, x))(XS), eagerly)
+def test_results_under_jit_and_scan_equal_eager_ones(linkage, eagerly):
+    assert_close(jax.jit(lambda xs: jax.lax.map(lambda x: all_results(*linkage, x), xs))(XS), eagerly)
 
 
 @pytest.mark.slow
-def test_derivatives_of_each(linkage):
+def test_results_under_vmap_equal_eager_ones(linkage, eagerly):
+    assert_close(jax.vmap(lambda x: all_results(*linkage, x))(XS), eagerly)
+
+
+@pytest.mark.slow
+def test_derivatives_of_all_functions(linkage):
     chain, traj = linkage
-    one = lambda x: every(chain, traj, x)
+    one = lambda x: all_results(chain, traj, x)
     x, h = jnp.asarray(0.1), 1e-5
     slopes = jax.tree.map(lambda a, b: np.asarray(a - b) / (2 * h), one(x + h), one(x - h))
     forwards = jax.jacfwd(one)(x)
@@ -92,7 +92,7 @@ def test_derivatives_of_each(linkage):
     )
 
 
-def test_options_that_jaxlib_does_not_know_are_left_out(monkeypatch):
+def test_options_unknown_to_jaxlib_are_dropped(monkeypatch):
     monkeypatch.setattr(
         eager, "_OPTIONS", {"xla_no_such_option": 1, "xla_backend_optimization_level": 0}
     )
@@ -108,18 +108,18 @@ def test_other_errors_are_raised():
         eager.eager_jit(fails)(jnp.asarray(3.0))
 
 
-def test_options_are_given_to_the_outermost_call_alone():
-    asked = []
+def test_options_are_passed_at_the_outermost_jit_only():
+    jit_options = []
 
-    def jit(function, **how):
-        asked.append(how)
-        return jax.jit(function, **how)
+    def jit(function, **options):
+        jit_options.append(options)
+        return jax.jit(function, **options)
 
     double = eager.eager_jit(lambda x: 2 * x, jit)
     assert float(jax.jit(double)(3.0)) == float(jax.jit(lambda: double(3.0))()) == 6
-    assert asked == [{}]
+    assert jit_options == [{}]
     assert float(double(3.0)) == 6
-    assert asked[1:] == [{"compiler_options": eager._FAST_COMPILE_OPTIONS}]
+    assert jit_options[1:] == [{"compiler_options": eager._FAST_COMPILE_OPTIONS}]
 
 
 @pytest.mark.slow

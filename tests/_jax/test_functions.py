@@ -33,10 +33,10 @@ def arm():
 @pytest.fixture
 def programs(monkeypatch):
     """One item for each program of `simulate` that is made."""
-    made, module = [], sys.modules["svkc.simulation.simulate"]
-    whole = module._converted
-    monkeypatch.setattr(module, "_closure_convert", lambda *args: (made.append(0), whole(*args))[1])
-    return made
+    conversions, module = [], sys.modules["svkc.simulation.simulate"]
+    original = module._closure_convert
+    monkeypatch.setattr(module, "_closure_convert", lambda *args: (conversions.append(0), original(*args))[1])
+    return conversions
 
 
 def end(arm, control=None, **kw):
@@ -105,7 +105,7 @@ class Pair(eqx.Module):
         return self.gain * self.scale * jnp.ones_like(state.v)
 
 
-def test_what_is_compared():
+def test_equal_content_compares_equal():
     """By type and value, arrays of floats not at all, those of whole numbers by content."""
     small, large, key = np.ones(2), 3 * np.ones(2), jax.random.key(0)
     makers = {
@@ -186,12 +186,12 @@ def test_what_is_compared():
         assert comparable(thing) is thing
 
 
-def test_what_is_not():
+def test_functions_compared_by_identity():
     """The whole function is compared by identity."""
 
     def writes():
-        nonlocal late
-        late = 1
+        nonlocal assigned
+        assigned = 1
 
     def deletes():
         global GAIN
@@ -235,7 +235,7 @@ def test_what_is_not():
         *map(torque, (*inside, unhashable)),
     ):
         assert static(function) is None, function
-    late = 1
+    assigned = 1
 
     def inner():
         def own():
@@ -249,7 +249,7 @@ def test_what_is_not():
     assert comparable(inner)() == 2
 
 
-def test_what_globals_are():
+def test_globals_of_libraries_are_static():
     """Of the module those that the code names, also through other functions; a function object
     keeps what it was."""
     global GAIN, LIST
@@ -297,12 +297,12 @@ def test_a_loop_compiles_once(arm, expected, programs):
 def test_a_global_that_changes(arm, expected, programs):
     """A number: another program; an array: the same one."""
     global GAIN
-    found = []
+    ends = []
     for gain in (1.0, 2.0, np.asarray([1.0]), np.asarray([2.0])):
         GAIN = gain
-        found.append(end(arm, lambda t, state, args: helper() / 3 * jnp.ones_like(state.v)))
+        ends.append(end(arm, lambda t, state, args: helper() / 3 * jnp.ones_like(state.v)))
     GAIN = 1.0
-    np.testing.assert_allclose(found, expected * 2, rtol=1e-15)
+    np.testing.assert_allclose(ends, expected * 2, rtol=1e-15)
     assert len(programs) == 3
 
 
@@ -314,7 +314,7 @@ def test_a_list_that_counts(arm, expected, programs):
     assert len(traces) == len(programs) == 1
 
 
-def test_arrays_that_python_looks_at(arm, expected, programs):
+def test_arrays_whose_values_python_reads_are_static(arm, expected, programs):
     """Each value has its own program, the right one, and the next goes there at once; other errors
     are told as they are."""
     conditional = lambda gain: (
@@ -376,13 +376,13 @@ def test_rollout(arm, programs):
             **DT,
         ).final.q[:, 0]
 
-    first, seen = run(np.asarray(5.0)), len(programs)
+    first, count = run(np.asarray(5.0)), len(programs)
     assert np.all(np.diff(run(np.asarray(6.0)) - first) > 0)
-    assert len(programs) == seen > 0
+    assert len(programs) == count > 0
 
 
 @pytest.mark.slow
-def test_things_that_cannot_be_compared(arm):
+def test_incomparable_functions_warn_when_compiled_again(arm):
     """A warning after the second compilation, once, and by the argument's name."""
 
     def run(**kw):
@@ -422,9 +422,9 @@ def test_derivatives_and_lanes(arm):
 
 
 @pytest.mark.slow
-def test_nothing_stays():
+def test_no_tracer_or_function_is_leaked():
     """No tracer in what programs are found by, and no function that is gone in the notes."""
-    found, tracers, gone = [], [], []
+    programs, tracers, gone = [], [], []
 
     def traced(x):
         for make in (
@@ -437,20 +437,20 @@ def test_nothing_stays():
             assert [
                 y is x for y in jax.tree.leaves(eqx.filter(comparable(make(x)), eqx.is_array))
             ] == [True]
-            found.append(static(make(x)))
+            programs.append(static(make(x)))
         tracers.append(x)
         return x
 
     jax.jit(traced)(1.0)
-    seen, todo = set(), list(found)
+    visited, todo = set(), list(programs)
     while todo:
         x = todo.pop()
-        if id(x) in seen or isinstance(x, types.ModuleType | type) or x is globals():
+        if id(x) in visited or isinstance(x, types.ModuleType | type) or x is globals():
             continue
-        seen.add(id(x))
+        visited.add(id(x))
         assert x is not tracers[0]
         todo += gc.get_referents(x)
-    notes = sys.modules["svkc._jax.functions"]._first
+    notes = sys.modules["svkc._jax.functions"]._first_static
     before = len(notes)
     for gain in (1.0, np.ones(1)):
         gone.append(torque(gain))

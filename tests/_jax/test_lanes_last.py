@@ -14,7 +14,7 @@ from svkc._jax import lanes_last as rules
 KEY = jax.random.key(3)
 
 
-def several(x, y, which):
+def example(x, y, which):
     """Calls, gathers by numbers that all lanes share and that each has, products of all kinds,
     loops, solves, choices."""
     rows = x[np.array([2, 0, 1])] + x[which][None] + jnp.eye(3)[which][None]
@@ -64,14 +64,14 @@ def several(x, y, which):
 def test_every_rule(count):
     x, y = jax.random.normal(KEY, (2, count, 3, 3))
     which = jnp.arange(count) % 3
-    one = rules.with_lanes_last(several)
+    one = rules.with_lanes_last(example)
     for axes in ((0, 0, 0), (0, None, None), (None, 0, 0), (0, 0, None)):
         args = [
             value if axis == 0 else value[0]
             for value, axis in zip((x, y, which), axes, strict=True)
         ]
         for expected, got in zip(
-            jax.tree.leaves(jax.jit(jax.vmap(several, axes))(*args)),
+            jax.tree.leaves(jax.jit(jax.vmap(example, axes))(*args)),
             jax.tree.leaves(jax.jit(jax.vmap(one, axes))(*args)),
             strict=True,
         ):
@@ -79,7 +79,7 @@ def test_every_rule(count):
             assert got.dtype == expected.dtype
 
 
-def test_no_lanes_and_whole_numbers():
+def test_zero_lanes_and_integers():
     """Sums and products of whole numbers stay what they are; of no lanes there is nothing."""
     counted = lambda x: (jnp.sum(x, dtype=jnp.int32), x @ x, jnp.stack([x, x]))
     one = rules.with_lanes_last(counted)
@@ -90,22 +90,22 @@ def test_no_lanes_and_whole_numbers():
             assert got.dtype == expected.dtype
 
 
-def test_no_operation_of_a_step_goes_the_other_way(monkeypatch):
+def test_every_primitive_of_a_step_has_a_rule(monkeypatch):
     """All that `svkc.step` is made of has a rule: what has none would put its lanes first and last
     again."""
-    seen = []
-    as_jax_does = rules._apply_vmap
+    by_vmap = []
+    apply_vmap = rules._apply_vmap
     monkeypatch.setattr(
         rules,
-        "_as_jax_does",
-        lambda primitive, *rest: (seen.append(primitive.name), as_jax_does(primitive, *rest))[1],
+        "_apply_vmap",
+        lambda primitive, *rest: (by_vmap.append(primitive.name), apply_vmap(primitive, *rest))[1],
     )
     for chain in (models.four_bar(), svkc.load(models.random_tree(8, 1))):
         states = jax.tree.map(lambda x: jnp.stack([x, x]), chain.state())
         jax.eval_shape(
             jax.vmap(lambda s, chain=chain: svkc.step(chain, s, jnp.zeros(chain.nv), 1e-3)), states
         )
-    assert not seen
+    assert not by_vmap
 
 
 @pytest.mark.slow

@@ -31,21 +31,21 @@ def precision(request):
         yield request.param
 
 
-def run(chain, state, **how):
+def run(chain, state, **options):
     events = [
         svkc.at(0.02, cut="pin"),
         svkc.when(lambda t, s, args: s.q[0] - 0.3, connect="pin", here=True),
     ]
-    return svkc.simulate(chain, state, 0.1, events=events, throw=False, **how)
+    return svkc.simulate(chain, state, 0.1, events=events, throw=False, **options)
 
 
 def test_programs(precision):
     chain = models.four_bar()
     state, tau = chain.state(v={"crank": 4.0}), jnp.zeros(chain.nv)
     batch = jax.tree.map(lambda x: jnp.stack([x, x]), state)
-    gradient = lambda how: (
+    gradient = lambda options: (
         lambda v: jax.grad(
-            lambda v: jnp.sum(run(chain, svkc.State(state.q, v, state.structure), **how).final.q)
+            lambda v: jnp.sum(run(chain, svkc.State(state.q, v, state.structure), **options).final.q)
         )(v)
     )
     programs = {
@@ -58,9 +58,9 @@ def test_programs(precision):
         "gradient": lowered(gradient({}), state.v),
     }
     for name, text in programs.items():
-        found = calls(text)
-        assert not any("callback" in call for call in found), (name, found)
-        assert not found or name in ("run", "gradient"), (name, found)
+        custom_calls = calls(text)
+        assert not any("callback" in call for call in custom_calls), (name, custom_calls)
+        assert not custom_calls or name in ("run", "gradient"), (name, custom_calls)
         assert ("f64" in text) == (precision == "float64"), name
         # on a GPU these are its own library's
-        assert all(call.startswith("lapack") for call in found), (name, found)
+        assert all(call.startswith("lapack") for call in custom_calls), (name, custom_calls)

@@ -26,7 +26,7 @@ SLOW = [
 
 
 @pytest.mark.parametrize("index", [pytest.param(INDICES["some"], id="some"), *SLOW])
-def test_it_is_indexing(index):
+def test_static_take_equals_indexing(index):
     x, many = (
         jax.random.normal(jax.random.key(0), (7, 3)),
         jax.random.normal(jax.random.key(1), (7, 5, 3)),
@@ -49,12 +49,12 @@ def test_it_is_indexing(index):
 
 
 def test_derivatives_without_a_scatter():
-    made = lambda rows, index: (
+    gradient_text = lambda rows, index: (
         jax.jit(jax.grad(lambda x: jnp.sum(jnp.sin(static_take(x, index)))))
         .lower(jnp.ones((rows, 3)))
         .as_text()
     )
     for name, index in INDICES.items():
-        assert "scatter" not in made(7, index), name
+        assert "scatter" not in gradient_text(7, index), name
     # what would be a table of 100 x 90 is left to jax
-    assert "scatter" in made(100, INDICES["one row for all"])
+    assert "scatter" in gradient_text(100, INDICES["one row for all"])

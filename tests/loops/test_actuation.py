@@ -1,5 +1,7 @@
-"""Inverse dynamics of closed chains: square, redundant and missing actuation; weights, bounds; the
-round trip through forward dynamics."""
+"""Inverse dynamics of closed chains: square, redundant and deficient actuation, weights, bounds.
+
+Torques are checked by the round trip through forward dynamics.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +19,7 @@ def mask(chain, *names):
     return np.isin(chain.dof_names, names)
 
 
-def moving(chain, seed=0, q=None):
+def random_motion(chain, seed=0, q=None):
     rng = np.random.default_rng(seed)
     return chain.state(q, rng.normal(size=chain.nv)), jnp.asarray(rng.normal(size=chain.dofs))
 
@@ -25,91 +27,94 @@ def moving(chain, seed=0, q=None):
 @pytest.fixture(scope="module")
 def five_bar():
     chain = models.five_bar()
-    state, vdot = moving(chain, q={"left_arm": -0.2, "right_arm": 0.3})
+    state, vdot = random_motion(chain, q={"left_arm": -0.2, "right_arm": 0.3})
     return chain, state, vdot, svkc.coordinates(chain, state)
 
 
-def reached(chain, state, vdot, found):
-    """Largest difference of theta_G's accelerations from those asked for, under the torques
-    found."""
+def acceleration_error(chain, state, vdot, result):
+    """Return the largest error of theta_G's accelerations under the torques of the result."""
     independent = svkc.coordinates(chain, state).independent
     return float(
         jnp.abs(
-            jnp.where(independent, svkc.forward_dynamics(chain, state, found.tau) - vdot, 0)
+            jnp.where(independent, svkc.forward_dynamics(chain, state, result.tau) - vdot, 0)
         ).max()
     )
 
 
 def test_square(five_bar):
-    """Two motors for two freedoms: (22), nothing left over."""
+    """Two motors for two freedoms reach the acceleration, without redundancy (paper (22))."""
     chain, state, vdot, co = five_bar
     motors = mask(chain, "left_arm", "right_arm")
-    found = svkc.actuation(chain, state, vdot, actuated=motors)
-    assert (int(found.rank), int(found.redundancy), int(found.deficiency)) == (2, 0, 0)
-    assert reached(chain, state, vdot, found) < 1e-10 * float(jnp.abs(vdot).max())
-    assert not np.any(np.asarray(found.tau)[~motors])
-    assert not np.any(found.null_space)
-    # theta_G's accelerations alone, in order, say the same
+    result = svkc.actuation(chain, state, vdot, actuated=motors)
+    assert (int(result.rank), int(result.redundancy), int(result.deficiency)) == (2, 0, 0)
+    assert acceleration_error(chain, state, vdot, result) < 1e-10 * float(jnp.abs(vdot).max())
+    assert not np.any(np.asarray(result.tau)[~motors])
+    assert not np.any(result.null_space)
+    # theta_G's accelerations alone, in order, give the same torques
     short = svkc.actuation(chain, state, vdot[np.asarray(co.independent)], actuated=motors)
-    np.testing.assert_allclose(short.tau, found.tau, rtol=ROUND_OFF)
+    np.testing.assert_allclose(short.tau, result.tau, rtol=ROUND_OFF)
 
 
 def test_redundant(five_bar):
-    """Three motors: least norm and least weighted norm by numpy's pseudo-inverse; the null space
-    changes the loop's load and no motion."""
+    """Three motors give torques of least norm, compared with numpy's pseudo-inverse.
+
+    Torques in the null space change the wrenches in the loop, but not the motion.
+    """
     chain, state, vdot, _ = five_bar
     motors = mask(chain, "left_arm", "right_arm", "left_fore")
-    found = svkc.actuation(chain, state, vdot, actuated=motors)
-    assert (int(found.rank), int(found.redundancy), int(found.deficiency)) == (2, 1, 0)
-    assert reached(chain, state, vdot, found) < 1e-10 * float(jnp.abs(vdot).max())
+    result = svkc.actuation(chain, state, vdot, actuated=motors)
+    assert (int(result.rank), int(result.redundancy), int(result.deficiency)) == (2, 1, 0)
+    assert acceleration_error(chain, state, vdot, result) < 1e-10 * float(jnp.abs(vdot).max())
     co = svkc.coordinates(chain, state)
     S = np.asarray(co.W)[motors][:, np.asarray(co.independent)]
-    wanted = S.T @ np.asarray(found.tau)[motors]
+    target_force = S.T @ np.asarray(result.tau)[motors]
     np.testing.assert_allclose(
-        np.asarray(found.tau)[motors], np.linalg.pinv(S.T) @ wanted, rtol=1e-10
+        np.asarray(result.tau)[motors], np.linalg.pinv(S.T) @ target_force, rtol=1e-10
     )
     weight = np.where(mask(chain, "left_fore"), 100.0, 1.0)
     weighted = svkc.actuation(chain, state, vdot, weight, actuated=motors)
     root = np.sqrt(weight[motors])
     np.testing.assert_allclose(
-        np.asarray(weighted.tau)[motors], np.linalg.pinv(S.T / root) @ wanted / root, rtol=REFERENCE
+        np.asarray(weighted.tau)[motors],
+        np.linalg.pinv(S.T / root) @ target_force / root,
+        rtol=REFERENCE,
     )
     assert abs(float(weighted.tau[mask(chain, "left_fore")][0])) < abs(
-        float(found.tau[mask(chain, "left_fore")][0])
+        float(result.tau[mask(chain, "left_fore")][0])
     )
-    null = np.asarray(found.null_space)
+    null = np.asarray(result.null_space)
     assert int(np.any(null, 0).sum()) == 1
     column = null[:, np.any(null, 0)][:, 0]
     before, after = (
-        svkc.forward_dynamics(chain, state, found.tau + k * column) for k in (0.0, 7.0)
+        svkc.forward_dynamics(chain, state, result.tau + k * column) for k in (0.0, 7.0)
     )
     np.testing.assert_allclose(before, after, atol=1e-11 * float(jnp.abs(before).max()))
-    load = [svkc.loop_forces(chain, state, found.tau + k * column) for k in (0.0, 1.0)]
-    which = int(np.flatnonzero(np.any(null, 0))[0])
+    load = [svkc.loop_forces(chain, state, result.tau + k * column) for k in (0.0, 1.0)]
+    column_index = int(np.flatnonzero(np.any(null, 0))[0])
     np.testing.assert_allclose(
-        load[1].force - load[0].force, found.null_force[:, :, which], atol=REFERENCE
+        load[1].force - load[0].force, result.null_force[:, :, column_index], atol=REFERENCE
     )
     np.testing.assert_allclose(
-        load[1].torque - load[0].torque, found.null_torque[:, :, which], atol=REFERENCE
+        load[1].torque - load[0].torque, result.null_torque[:, :, column_index], atol=REFERENCE
     )
-    assert float(jnp.abs(found.null_force).max()) > 1e-3
+    assert float(jnp.abs(result.null_force).max()) > 1e-3
 
 
 def test_missing(five_bar):
-    """One motor for two freedoms: the residual is said, and the direction that nobody drives is a
+    """One motor for two freedoms: the residual is said, and the direction that nobody has_effect is a
     motion without work."""
     chain, state, vdot, _ = five_bar
     motors = mask(chain, "left_arm")
-    found = svkc.actuation(chain, state, vdot, actuated=motors)
-    assert (int(found.rank), int(found.redundancy), int(found.deficiency)) == (1, 0, 1)
-    assert float(jnp.abs(found.residual).max()) > 1e-2
-    undriven = np.asarray(found.undriven)
+    result = svkc.actuation(chain, state, vdot, actuated=motors)
+    assert (int(result.rank), int(result.redundancy), int(result.deficiency)) == (1, 0, 1)
+    assert float(jnp.abs(result.residual).max()) > 1e-2
+    undriven = np.asarray(result.undriven)
     assert int(np.any(undriven, 0).sum()) == 1
     direction = undriven[:, np.any(undriven, 0)][:, 0]
     assert np.abs(direction[motors]).max() < ROUND_OFF
-    there = svkc.State(state.q, jnp.asarray(direction), state.structure)
-    assert float(jnp.abs(svkc.loop_gap_rates(chain, there)).max()) < ROUND_OFF
-    # what can be reached is: with an acceleration that the one motor makes, nothing is left
+    undriven_state = svkc.State(state.q, jnp.asarray(direction), state.structure)
+    assert float(jnp.abs(svkc.loop_gap_rates(chain, undriven_state)).max()) < ROUND_OFF
+    # an acceleration that the one motor produces is reached without residual
     possible = svkc.forward_dynamics(chain, state, jnp.where(motors, 3.0, 0.0))
     exact = svkc.actuation(chain, state, possible, actuated=motors)
     assert float(jnp.abs(exact.residual).max()) < 1e-10
@@ -118,33 +123,37 @@ def test_missing(five_bar):
 
 @pytest.mark.slow
 def test_actuated_virtual_joint():
-    """A four-bar driven at its closing hinge (Fig. 6), with a spring and damper in the tree."""
+    """A four-bar is driven at its closing hinge (Fig. 6), with springs and dampers in the tree."""
     xml = models.MJCF.format(models.FOUR_BAR).replace('damping="0"', 'damping="0.2" stiffness="3"')
     chain = svkc.load(xml, virtual_links=[models.pin(actuated=True)])
-    state, vdot = moving(chain)
+    state, vdot = random_motion(chain)
     assert bool(chain.actuated[-1])
-    found = svkc.actuation(chain, state, vdot, actuated=mask(chain, "pin"))
-    assert float(jnp.abs(found.tau[:-1]).max()) == 0
-    assert reached(chain, state, vdot, found) < 1e-10 * float(jnp.abs(vdot).max())
+    result = svkc.actuation(chain, state, vdot, actuated=mask(chain, "pin"))
+    assert float(jnp.abs(result.tau[:-1]).max()) == 0
+    assert acceleration_error(chain, state, vdot, result) < 1e-10 * float(jnp.abs(vdot).max())
 
 
 @pytest.mark.slow
 def test_over_constrained():
-    """Three parallel legs: a redundant loop, six motors for one freedom."""
+    """Three parallel legs have a redundant loop, and six motors for one freedom."""
     chain = models.parallelogram()
-    state, vdot = moving(chain)
-    found = svkc.actuation(chain, state, vdot)
-    assert (int(found.rank), int(found.redundancy), int(found.deficiency)) == (1, chain.nv - 1, 0)
-    assert reached(chain, state, vdot, found) < 1e-10 * float(jnp.abs(vdot).max())
-    assert not svkc.loop_forces(chain, state, found.tau).unique.any()
-    # seven self-stresses: wrenches of both pins that no joint feels
+    state, vdot = random_motion(chain)
+    result = svkc.actuation(chain, state, vdot)
+    assert (int(result.rank), int(result.redundancy), int(result.deficiency)) == (
+        1,
+        chain.nv - 1,
+        0,
+    )
+    assert acceleration_error(chain, state, vdot, result) < 1e-10 * float(jnp.abs(vdot).max())
+    assert not svkc.loop_forces(chain, state, result.tau).unique.any()
+    # seven self-stresses, wrenches of both pins that need no joint torques
     linear, angular = (np.asarray(x) for x in svkc.loop_jacobian(chain, state))
-    force, torque = np.asarray(found.stress_force), np.asarray(found.stress_torque)
+    force, torque = np.asarray(result.stress_force), np.asarray(result.stress_torque)
     felt = np.einsum("lkd,lkr->dr", linear, force) + np.einsum("lkd,lkr->dr", angular, torque)
     stresses = np.concatenate([force, torque], 1).reshape(12, -1)
     assert np.linalg.matrix_rank(stresses) == int(np.any(stresses, 0).sum()) == 7
     assert np.abs(felt).max() < ROUND_OFF
-    assert svkc.loop_forces(chain, chain.state(connected=["pin2"]), found.tau).unique.tolist() == [
+    assert svkc.loop_forces(chain, chain.state(connected=["pin2"]), result.tau).unique.tolist() == [
         True,
         False,
     ]
@@ -152,24 +161,24 @@ def test_over_constrained():
 
 @pytest.mark.slow
 def test_both_hands_on_the_bar(high_bar):
-    """16 motors, 12 freedoms, of which the swing about the bar is nobody's: reached by the others,
-    over-actuated by five."""
+    """A figure on the bar has 16 motors and 12 freedoms, of which no motor drives the swing."""
     chain, state = high_bar
-    state, vdot = moving(chain, q=state.q[: chain.nq])
-    found = svkc.actuation(chain, state, vdot)
-    assert (int(found.rank), int(found.redundancy), int(found.deficiency)) == (11, 5, 1)
+    state, vdot = random_motion(chain, q=state.q[: chain.nq])
+    result = svkc.actuation(chain, state, vdot)
+    assert (int(result.rank), int(result.redundancy), int(result.deficiency)) == (11, 5, 1)
     possible = svkc.forward_dynamics(chain, state, jnp.where(chain.actuated, vdot, 0))
     exact = svkc.actuation(chain, state, possible)
     assert float(jnp.abs(exact.residual).max()) < REFERENCE
-    assert reached(chain, state, possible, exact) < 1e-10 * float(jnp.abs(possible).max())
-    # the swing, every joint held: no actuator works on it
-    swing = np.asarray(found.undriven)[:, np.any(found.undriven, 0)][:, 0]
+    assert acceleration_error(chain, state, possible, exact) < 1e-10 * float(
+        jnp.abs(possible).max()
+    )
+    # in the undriven direction no actuated joint moves
+    swing = np.asarray(result.undriven)[:, np.any(result.undriven, 0)][:, 0]
     assert np.abs(swing[np.asarray(chain.actuated)]).max() < ROUND_OFF * np.abs(swing).max()
 
 
 def test_bounds(five_bar):
-    """Loose bounds change nothing; tighter ones are kept, and the acceleration with them; too tight
-    ones say what is missing."""
+    """Loose bounds have no effect, tighter ones hold, and too tight ones leave a residual."""
     chain, state, vdot, _ = five_bar
     motors = mask(chain, "left_arm", "right_arm", "left_fore")
     free = svkc.actuation(chain, state, vdot, actuated=motors)
@@ -180,9 +189,9 @@ def test_bounds(five_bar):
     limit[worst] = 0.5 * abs(float(free.tau[worst]))
     tight = svkc.actuation(chain, state, vdot, actuated=motors, bounds=(-limit, limit))
     assert np.all(np.abs(tight.tau) <= limit)
-    assert reached(chain, state, vdot, tight) < 1e-10 * float(jnp.abs(vdot).max())
+    assert acceleration_error(chain, state, vdot, tight) < 1e-10 * float(jnp.abs(vdot).max())
     assert float(jnp.abs(tight.residual).max()) < 1e-10
-    # the least norm on the face of the box: another point of the same line is longer
+    # the norm is the least on the face of the box: other points of the null space are longer
     null = np.asarray(free.null_space)
     step = null[:, np.any(null, 0)][:, 0]
     for k in (-1e-3, 1e-3):
@@ -190,20 +199,19 @@ def test_bounds(five_bar):
         assert np.any(np.abs(other) > limit) or np.sum(other**2) > np.sum(
             np.asarray(tight.tau) ** 2
         )
-    never = svkc.actuation(chain, state, 1e3 * vdot, actuated=motors, bounds=(-1.0, 1.0))
-    assert float(jnp.abs(never.residual).max()) > 1
-    assert float(jnp.abs(never.tau).max()) <= 1
+    unreachable = svkc.actuation(chain, state, 1e3 * vdot, actuated=motors, bounds=(-1.0, 1.0))
+    assert float(jnp.abs(unreachable.residual).max()) > 1
+    assert float(jnp.abs(unreachable.tau).max()) <= 1
 
 
 @pytest.mark.slow
 def test_open_chain_and_derivative(five_bar):
-    """Without loops actuation is inverse dynamics; the torques' derivative by q against
-    differences, in both modes."""
+    """Without loops actuation is inverse dynamics; derivatives agree with finite differences."""
     tree = svkc.load(models.random_tree(4, 3, kinds=("hinge", "ball")))
-    state, vdot = moving(tree)
-    found = svkc.actuation(tree, state, vdot)
+    state, vdot = random_motion(tree)
+    result = svkc.actuation(tree, state, vdot)
     np.testing.assert_allclose(
-        found.tau, svkc.inverse_dynamics(tree, state, vdot), rtol=1e-10, atol=ROUND_OFF
+        result.tau, svkc.inverse_dynamics(tree, state, vdot), rtol=1e-10, atol=ROUND_OFF
     )
     chain, state, vdot, _ = five_bar
     state = svkc.with_independent(chain, state, "left_arm", "right_arm")
@@ -234,12 +242,12 @@ def test_open_chain_and_derivative(five_bar):
 
 
 def bounded_problem(seed, n=12, dtype=np.float64):
-    """B, wanted, cost and box at random: redundant or deficient, exact or out of reach."""
+    """Return random B, force, cost, lower and upper: of any rank, solvable or not."""
     rng = np.random.default_rng(seed)
     rank = rng.integers(1, n + 1)
     B = rng.normal(size=(n, rank)) @ rng.normal(size=(rank, n))
     B[:, rng.random(n) < 0.1] = 0
-    wanted = B @ rng.normal(size=n) if seed % 2 else 5 * rng.normal(size=n)
+    target_force = B @ rng.normal(size=n) if seed % 2 else 5 * rng.normal(size=n)
     lower, upper = -np.abs(rng.normal(size=n)), np.abs(rng.normal(size=n))
     if seed % 3 == 1:
         lower[:] = 0
@@ -249,20 +257,22 @@ def bounded_problem(seed, n=12, dtype=np.float64):
     lower = np.where(rng.random(n) < 0.15, -np.inf, lower)
     upper = np.where(rng.random(n) < 0.15, np.inf, upper)
     cost = 10 ** rng.uniform(-1, 1, size=n)
-    return tuple(x.astype(dtype) for x in (B, wanted, cost, lower, upper))
+    return tuple(x.astype(dtype) for x in (B, target_force, cost, lower, upper))
 
 
 @jax.jit
-def within(B, wanted, cost, lower, upper):
-    return solve_bounded((B, wanted, jnp.ones_like(wanted)), cost, lower, upper)[0]
+def bounded_solution(B, target_force, cost, lower, upper):
+    return solve_bounded((B, target_force, jnp.ones_like(target_force)), cost, lower, upper)[0]
 
 
-def by_scipy(B, wanted, cost, lower, upper):
-    """The least residual by BVLS, then the least cost by SLSQP with what is reached held."""
+def scipy_solution(B, target_force, cost, lower, upper):
+    """Return the solution by BVLS for the residual, then SLSQP for the cost at this residual."""
     y = np.where(np.any(B != 0, 0), np.clip(0, lower, upper), 0)
     used = np.any(B != 0, 0) & (lower < upper)
     A, box = B[:, used], (lower[used], upper[used])
-    y[used] = lsq_linear(A, wanted - B @ np.where(used, 0, y), box, method="bvls", tol=1e-15).x
+    y[used] = lsq_linear(
+        A, target_force - B @ np.where(used, 0, y), box, method="bvls", tol=1e-15
+    ).x
     U, size, _ = np.linalg.svd(A, full_matrices=False)
     A = U[:, size > 1e-9 * size[0]].T @ A
     kept = {"type": "eq", "fun": lambda x: A @ (x - y[used]), "jac": lambda x: A}
@@ -282,49 +292,57 @@ def by_scipy(B, wanted, cost, lower, upper):
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-7), (np.float32, 1e-3)])
 def test_bounded_against_scipy(dtype, tolerance):
-    """No residual and, at the same residual, no cost above scipy's, whatever the active set."""
+    """Neither residual nor cost are above scipy's, for random active sets."""
     problems = [bounded_problem(seed, dtype=dtype) for seed in range(60)]
-    found = np.asarray(jax.vmap(within)(*map(jnp.asarray, zip(*problems, strict=True))), float)
-    for seed, y in enumerate(found):
-        # as it is in float64, for in float32 the rank of B is not to be seen
-        B, wanted, cost, lower, upper = bounded_problem(seed)
-        drives = np.any(B != 0, 0)
-        assert np.all(((lower - tolerance <= y) & (y <= upper + tolerance))[drives]), seed
-        assert not np.any(y[~drives])
-        other = by_scipy(B, wanted, cost, lower, upper)
-        residual, least = (np.linalg.norm(B @ x - wanted) for x in (y, other))
-        scale = np.linalg.norm(wanted) + np.linalg.norm(B) * np.abs(other).max()
+    result = np.asarray(
+        jax.vmap(bounded_solution)(*map(jnp.asarray, zip(*problems, strict=True))), float
+    )
+    for seed, y in enumerate(result):
+        # compared in float64, as B's rank is not well defined in float32
+        B, target_force, cost, lower, upper = bounded_problem(seed)
+        has_effect = np.any(B != 0, 0)
+        assert np.all(((lower - tolerance <= y) & (y <= upper + tolerance))[has_effect]), seed
+        assert not np.any(y[~has_effect])
+        other = scipy_solution(B, target_force, cost, lower, upper)
+        residual, least = (np.linalg.norm(B @ x - target_force) for x in (y, other))
+        scale = np.linalg.norm(target_force) + np.linalg.norm(B) * np.abs(other).max()
         assert residual <= least + tolerance * scale, seed
         if residual > least - tolerance * scale:
             assert np.sum(cost * y**2) <= np.sum(cost * other**2) * (1 + 10 * tolerance), seed
         if dtype == np.float64:
-            np.testing.assert_allclose(within(B, wanted, cost, lower, upper), y, atol=1e-9)
+            np.testing.assert_allclose(
+                bounded_solution(B, target_force, cost, lower, upper), y, atol=1e-9
+            )
 
 
 @pytest.mark.slow
 def test_derivative_of_bounded():
-    """By the matrix, what is wanted, the cost and the bounds, both modes against differences."""
+    """Derivatives with respect to every input agree with finite differences, in both modes."""
     for seed in range(6):
-        B, *given = bounded_problem(seed, n=6)
-        ways = [np.random.default_rng(k).normal(size=B.shape) for k in range(4)]
-        at = [np.where(np.isfinite(x), x, np.sign(x) * 50) for x in given]
-        # the rank of B, its empty columns and equal bounds stay as they are
-        along = [ways[0] @ B, *(w[0] for w in ways[:2]), w3 := ways[3][0], w3]
-        f = lambda h, B=B, at=at, along=along: within(
+        B, *numbers = bounded_problem(seed, n=6)
+        directions = [np.random.default_rng(k).normal(size=B.shape) for k in range(4)]
+        at = [np.where(np.isfinite(x), x, np.sign(x) * 50) for x in numbers]
+        # a direction that keeps the rank of B, its empty columns and equal bounds
+        along = [directions[0] @ B, *(w[0] for w in directions[:2]), w3 := directions[3][0], w3]
+        f = lambda h, B=B, at=at, along=along: bounded_solution(
             *(x + h * d for x, d in zip((B, *at), along, strict=True))
         )
         forward = jax.jacfwd(f)(0.0)
         np.testing.assert_allclose(jax.jacrev(f)(0.0), forward, rtol=1e-8, atol=1e-8)
         h = 1e-6
         np.testing.assert_allclose(forward, (f(h) - f(-h)) / (2 * h), rtol=1e-5, atol=1e-5)
-    B, wanted, cost, _, _ = bounded_problem(1)
-    loose = jax.grad(lambda u: jnp.sum(within(B, wanted, cost, -u, u)))(np.full(12, np.inf))
+    B, target_force, cost, _, _ = bounded_problem(1)
+    loose = jax.grad(lambda u: jnp.sum(bounded_solution(B, target_force, cost, -u, u)))(
+        np.full(12, np.inf)
+    )
     assert not np.any(loose)
 
 
 def test_bounds_under_transformations(five_bar):
-    """Under jit, vmap and grad: another active set in each lane, NaN where a lane's bounds cross or
-    its numbers are not finite."""
+    """Under jit, vmap and grad each lane has its own active set.
+
+    A lane whose bounds cross, or whose numbers are not finite, gives NaN.
+    """
     chain, state, vdot, _ = five_bar
     motors = mask(chain, "left_arm", "right_arm", "left_fore")
     limited = jax.jit(

@@ -1,5 +1,4 @@
-"""Closed chains: accelerations against multipliers, whatever coordinates are chosen; redundant
-loops; the loop forces."""
+"""Forward dynamics of closed chains, compared with an independent KKT solution; loop forces."""
 
 import cases
 import jax
@@ -12,13 +11,13 @@ from references import paper
 from tolerances import REFERENCE, ROUND_OFF
 
 import svkc
-from svkc.loops.forward_dynamics import acceleration as accelerated
+from svkc.loops.forward_dynamics import acceleration as acceleration_by
 from svkc.tree.configuration import configuration_derivative
 
 
 @pytest.fixture(params=cases.params("loops"), scope="module")
 def case(request):
-    """Name, chain, and a state in motion with torques."""
+    """Return the name of a case, its chain, a moving state and joint torques."""
     return request.param, *cases.CASES[request.param].random_motion()
 
 
@@ -29,7 +28,7 @@ def test_acceleration_is_that_of_the_multipliers(case):
     scale = np.abs(expected).max()
     fast = svkc.forward_dynamics(chain, state, tau)
     columns = paper.forward_dynamics_by_unit_vectors(chain, state, tau)
-    bodies = accelerated(
+    bodies = acceleration_by(
         chain, state.structure, state.q, state.v, tau, svkc.dynamics.ArticulatedBodies()
     )
     assert np.abs(fast[: chain.nv] - expected).max() < REFERENCE * scale
@@ -37,8 +36,8 @@ def test_acceleration_is_that_of_the_multipliers(case):
     assert np.abs(bodies - fast).max() < 1e-10 * np.abs(fast).max()
 
 
-def keeps_the_loops(chain, state, vdot):
-    """J_C vdot + Jdot_C v = 0, against the derivative of J_C v along the motion."""
+def assert_loops_stay_closed(chain, state, vdot):
+    """Assert that the derivative of J_C v along the motion is zero."""
     relative = lambda q, v: svkc.loop_gap_rates(chain, svkc.State(q, v, state.structure))
     _, change = jax.jvp(
         relative, (state.q, state.v), (configuration_derivative(chain, state.q, state.v), vdot)
@@ -47,27 +46,26 @@ def keeps_the_loops(chain, state, vdot):
 
 
 def test_velocities_and_accelerations_keep_the_loops(case):
-    """J_C W = 0 and J_C vdot + Jdot_C v = 0."""
+    """Gaps, their rates and their accelerations are zero."""
     name, chain, state, tau = case
     assert float(jnp.max(jnp.abs(svkc.loop_gaps(chain, state)))) < ROUND_OFF
     assert float(jnp.max(jnp.abs(svkc.loop_gap_rates(chain, state)))) < ROUND_OFF
-    keeps_the_loops(chain, state, svkc.forward_dynamics(chain, state, tau))
+    assert_loops_stay_closed(chain, state, svkc.forward_dynamics(chain, state, tau))
     assert int(svkc.mobility(chain, state).freedoms) == cases.CASES[name].freedoms
 
 
 def test_loop_forces_and_torques_explain_the_acceleration(case):
-    """What the tree needs beyond what is applied is J^T of the loop forces: checked as power on any
-    velocity of the cut-open tree."""
+    """The loop forces do the power that tau lacks, on any velocity of the tree."""
     _, chain, state, tau = case
     force, torque = svkc.loop_forces(chain, state, tau)
     vdot = svkc.forward_dynamics(chain, state, tau)
     missing = svkc.inverse_dynamics(chain, state, vdot) - tau[: chain.nv]
     rng = np.random.default_rng(0)
     v = jnp.asarray(rng.normal(size=chain.nv))
-    moved = svkc.State(
+    tree_motion = svkc.State(
         state.q, jnp.concatenate([v, jnp.zeros(chain.dofs - chain.nv)]), state.structure
     )
-    relative = svkc.loop_gap_rates(chain, moved)
+    relative = svkc.loop_gap_rates(chain, tree_motion)
     power = -jnp.sum(relative[:, :3] * torque) - jnp.sum(relative[:, 3:] * force)
     assert abs(float(missing @ v - power)) < 1e-8 * max(1.0, float(jnp.max(jnp.abs(force))))
 
@@ -82,12 +80,14 @@ def test_redundant_loop_moves_like_its_minimal_form():
     assert int(jnp.sum(m.redundant)) == 12 - int(m.rank)
     tau = jnp.zeros(chain.dofs)
     a, b = svkc.forward_dynamics(chain, both, tau), svkc.forward_dynamics(chain, one, tau)
-    # the leg that is let go swings by itself; the others must not notice only if it moves the same:
-    # compare with it held
-    held = np.array([n in ("leg0", "plate", "leg2") for n in chain.joint_names])
+    # without pin1 the middle leg swings freely, so that each result is compared with its own
+    # KKT solution
+    leg_joints = np.array([n in ("leg0", "plate", "leg2") for n in chain.joint_names])
     assert float(jnp.abs(svkc.loop_gap_rates(chain, both)).max()) < 1e-13
     expected = acceleration(chain, one, tau)
-    np.testing.assert_allclose(np.asarray(b)[: chain.nv][held], expected[held], rtol=REFERENCE)
+    np.testing.assert_allclose(
+        np.asarray(b)[: chain.nv][leg_joints], expected[leg_joints], rtol=REFERENCE
+    )
     np.testing.assert_allclose(
         np.asarray(a)[: chain.nv], acceleration(chain, both, tau), rtol=REFERENCE, atol=ROUND_OFF
     )
@@ -109,8 +109,10 @@ JOINTS = [
 @pytest.mark.slow
 @pytest.mark.parametrize("joint", JOINTS)
 def test_every_kind_of_virtual_joint(joint):
-    """Two free bodies joined by the joint: rank, acceleration that keeps the loop, coordinates read
-    off and back."""
+    """Two free bodies connected by the joint have the expected rank and keep the loop closed.
+
+    The joint's coordinates computed from the bodies' poses are those of the state.
+    """
     xml = models.MJCF.format(
         '<body name="a" pos="0 0 1"><freejoint/><geom type="box" size="0.1 0.2 0.3"'
         ' contype="0"/></body><body name="b" pos="0.5 0.1 1" quat="0.8 0 0.6 0"><freejoint/><geom'
@@ -129,7 +131,7 @@ def test_every_kind_of_virtual_joint(joint):
     assert int(svkc.mobility(chain, state).freedoms) == 6 + freedoms
     assert float(jnp.max(jnp.abs(svkc.loop_gap_rates(chain, state)))) < ROUND_OFF
     tau = jnp.asarray(rng.normal(size=chain.nv))
-    keeps_the_loops(chain, state, svkc.forward_dynamics(chain, state, tau))
+    assert_loops_stay_closed(chain, state, svkc.forward_dynamics(chain, state, tau))
     if joint not in (
         "weld",
         "universal",
@@ -168,8 +170,10 @@ GRIP = svkc.Grip("world", "rocker", joint="ball", real_pos=(0.2, 0, -0.6))
 
 @pytest.fixture(scope="module")
 def gripped():
-    """A four-bar whose pin is a grip in a spare slot: the chain, its state before the grip, and
-    with it; the four-bar with a declared pin and its state."""
+    """Return a four-bar whose pin is a grip in a spare slot, and one with a declared pin.
+
+    The first comes with its states before and after the grip, the second with its state.
+    """
     declared = models.four_bar()
     a = declared.state(v={"crank": 1.0})
     chain = svkc.load(models.MJCF.format(models.FOUR_BAR), spare=1)
@@ -181,8 +185,7 @@ def gripped():
 
 
 def test_bind_a_spare_slot(gripped):
-    """A grip between bodies not known beforehand: the same motion as the declared link. Given up it
-    leaves an empty slot, and the motion as it was."""
+    """A grip bound at run time moves as a declared link; unbinding empties its slot."""
     chain, _, gripped, declared, a = gripped
     np.testing.assert_allclose(gripped.v[:3], a.v[:3], atol=ROUND_OFF)
     f = svkc.forward_dynamics
@@ -197,7 +200,7 @@ def test_bind_a_spare_slot(gripped):
 
 @pytest.mark.slow
 def test_bind_a_spare_slot_in_a_run(gripped):
-    """At the start of a run, as by verbs."""
+    """An event at the start of a run gives the same state as `bind` and `connect`."""
     chain, open_, gripped, *_ = gripped
     traj = svkc.simulate(chain, open_, 1e-3, dt=1e-3, events=[svkc.at(0.0, bind=GRIP)])
     for ours, theirs in zip(

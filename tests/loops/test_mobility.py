@@ -1,5 +1,4 @@
-"""Mobility where counting freedoms goes wrong, the table, and the loop forces of redundant
-loops."""
+"""Mobility of overconstrained linkages, its table, and the loop forces of redundant loops."""
 
 import cases
 import jax.numpy as jnp
@@ -23,17 +22,20 @@ def linkage(request):
 def test_one_freedom_where_counting_says_none(linkage):
     case, chain, state = linkage
     m = svkc.mobility(chain, state)
-    found = int(m.joint_freedoms), int(m.rank), int(m.freedoms)
-    assert found == (case.joint_freedoms, case.rank, 1)
+    actual = int(m.joint_freedoms), int(m.rank), int(m.freedoms)
+    assert actual == (case.joint_freedoms, case.rank, 1)
     assert case.joint_freedoms - 6 * len(chain.link_names) == case.counted
     assert int(jnp.sum(m.redundant)) == 6 * len(chain.link_names) - case.rank
     assert float(m.margin) > 1e-3
 
 
 @pytest.mark.slow
-def test_it_moves_a_finite_way(linkage):
-    """Not only to first order: pushed along its freedom it goes through 0.6 s and tenths of a
-    radian, loop closed, energy kept, rank as it was."""
+def test_the_linkage_moves_a_finite_distance(linkage):
+    """The freedom is not only of first order.
+
+    A run of 0.6 s moves by tenths of a radian, with closed loops, conserved energy and unchanged
+    rank.
+    """
     case, chain, state = linkage
     W = svkc.coordinates(chain, state).W
     direction = np.asarray(W)[:, np.any(W != 0, 0)][:, 0]
@@ -51,7 +53,7 @@ def test_it_moves_a_finite_way(linkage):
     np.testing.assert_allclose(vdot[: chain.nv], expected, atol=REFERENCE * np.abs(expected).max())
 
 
-def test_the_table_names_things():
+def test_str_is_a_table_with_names():
     chain = models.parallelogram()
     state = chain.state()
     text = str(svkc.mobility(chain, state))
@@ -62,16 +64,14 @@ def test_the_table_names_things():
     assert "independent coordinates: " in text
     assert "pin1: not connected" in str(svkc.mobility(chain, chain.state(connected=["pin2"])))
     for name in ("leg0", "plate"):
-        chosen = svkc.mobility(chain, svkc.with_independent(chain, state, name)).independent
-        assert chain.dof_names[int(jnp.argmax(chosen))] == name
+        independent = svkc.mobility(chain, svkc.with_independent(chain, state, name)).independent
+        assert chain.dof_names[int(jnp.argmax(independent))] == name
 
 
-@pytest.mark.slow
 @pytest.mark.slow
 @pytest.mark.parametrize("name", cases.params("forces"))
 def test_loop_forces_are_the_multipliers(name):
-    """Against numpy's multipliers of the same rows: equal where unique, of least norm and said not
-    to be unique where not."""
+    """Loop forces are numpy's least-norm multipliers, and `unique` tells which are determined."""
     case = cases.CASES[name]
     chain = case.build()
     rng = np.random.default_rng(4)
@@ -79,8 +79,8 @@ def test_loop_forces_are_the_multipliers(name):
     tau = jnp.concatenate(
         [jnp.asarray(rng.normal(size=chain.nv)), jnp.zeros(chain.dofs - chain.nv)]
     )
-    carried = svkc.loop_forces(chain, state, tau)
-    assert carried.unique.tolist() == list(case.unique)
+    forces = svkc.loop_forces(chain, state, tau)
+    assert forces.unique.tolist() == list(case.unique)
     linear, angular = (np.asarray(x) for x in svkc.loop_jacobian(chain, state))
     J = np.concatenate([angular, linear / float(chain.length)], 1).reshape(-1, chain.dofs)
     vdot = acceleration(chain, state, tau)
@@ -89,18 +89,17 @@ def test_loop_forces_are_the_multipliers(name):
         np.asarray(svkc.inverse_dynamics(chain, state, jnp.asarray(vdot)))
         - np.asarray(tau)[: chain.nv]
     )
-    # on the real link from the virtual one: the other sign
+    # the multipliers act on the virtual link, loop forces on the real one
     wrench = -np.linalg.lstsq(J.T, excess, rcond=1e-9)[0].reshape(-1, 6)
     scale = max(1.0, np.abs(wrench).max())
-    np.testing.assert_allclose(carried.torque, wrench[:, :3], atol=REFERENCE * scale)
+    np.testing.assert_allclose(forces.torque, wrench[:, :3], atol=REFERENCE * scale)
     np.testing.assert_allclose(
-        carried.force, wrench[:, 3:] / float(chain.length), atol=REFERENCE * scale
+        forces.force, wrench[:, 3:] / float(chain.length), atol=REFERENCE * scale
     )
 
 
-def test_of_columns_that_are_equal_the_first_is_chosen():
-    """Limbs that mirror each other are equal but for round-off, which other machines have
-    otherwise."""
+def test_the_first_of_equal_columns_becomes_the_pivot():
+    """Mirrored limbs have columns equal but for round-off, which differs between machines."""
     rng = np.random.default_rng(0)
     half = rng.normal(size=(6, 8))
     J = np.concatenate([half, -half], 1) * (1 + 1e-13 * rng.normal(size=(6, 16)))

@@ -31,7 +31,7 @@ XML = """<mujoco><worldbody><body name="a" pos="0 0 1"><joint name="a" axis="0 1
 
 
 @pytest.mark.parametrize("cuttable", [(), pytest.param("c", marks=pytest.mark.slow)])
-def test_there_and_back(cuttable):
+def test_states_survive_conversion_to_mujoco_and_back(cuttable):
     """MuJoCo puts the bodies where svkc has them and moves them so; with a joint that may be cut as
     well; <equality> as they hold."""
     chain, rng = svkc.load(XML, cuttable=cuttable), np.random.default_rng(0)
@@ -66,7 +66,7 @@ def test_there_and_back(cuttable):
     assert data.eq_active.tolist() == [1]
 
 
-def test_scalar_last():
+def test_quaternions_scalar_last():
     chain = svkc.load(XML)
     turns = Rotation.from_rotvec([[0.3, -0.2, 0.5], [1.0, 0.1, 0.0]])
     ball, free = turns.as_quat(scalar_first=True)
@@ -160,8 +160,8 @@ def residual(chain, state):
 def test_a_scene_as_mjcf_and_back(scene):
     """The same bodies, joints, links, masses to the last digit; the same loops and motion; MuJoCo
     finds the loops closed."""
-    chain, how = SCENES[scene]()
-    again = svkc.load(chain.to_mjcf(), **how)
+    chain, options = SCENES[scene]()
+    again = svkc.load(chain.to_mjcf(), **options)
     assert (again.body_names, again.joint_names) == (chain.body_names, chain.joint_names)
     for name in (
         "pos",
@@ -209,7 +209,7 @@ def test_a_scene_as_mjcf_and_back(scene):
     assert residual(again, other) < REFERENCE
 
 
-def test_what_has_no_mjcf_is_said():
+def test_links_without_an_mjcf_form_are_listed_in_a_comment():
     """Other joints, motors on virtual joints, slots and what may be cut: a comment, from which the
     links can be declared; connected is the chain's."""
     screw = svkc.VirtualLink(
@@ -245,7 +245,7 @@ def test_what_has_no_mjcf_is_said():
     np.testing.assert_allclose(again.structure.real_pos[1], chain.structure.real_pos[0], atol=1e-15)
 
 
-def test_names_that_are_taken():
+def test_new_sites_get_unused_names():
     """Sites and second connects keep out of the way of the scene's own."""
     hinges = [
         svkc.VirtualLink(name, "a", "b", "hinge", connected=True) for name in ("pin", "pin_axis")

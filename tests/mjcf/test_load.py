@@ -20,7 +20,7 @@ MINITAUR = pathlib.Path(__file__).parent / "robots" / "minitaur_v1.urdf"
 PENDULUM = models.ARM
 
 
-def test_four_ways_in(tmp_path):
+def test_all_kinds_of_sources(tmp_path):
     path = tmp_path / "model.xml"
     path.write_text(PENDULUM)
     sources = [
@@ -191,7 +191,7 @@ def test_motors():
     assert svkc.load(PENDULUM).actuated.tolist() == [True]
 
 
-def test_what_is_not_simulated_is_listed_once():
+def test_unsupported_elements_are_listed_once():
     xml = PENDULUM.replace("<worldbody>", '<option density="1.2"/><worldbody>').replace(
         'name="arm" type="hinge"', 'name="arm" frictionloss="0.1" type="hinge"'
     )
@@ -384,7 +384,7 @@ def test_the_example_of_the_gallery_runs():
 
 
 @pytest.mark.slow
-def test_a_robot_of_others():
+def test_a_robot_from_a_public_collection():
     """Minitaur's URDF, loops as virtual links: balls find its axes parallel to five digits only,
     balls that slide along them leave each leg its two motors."""
     feet = {}

@@ -16,7 +16,7 @@ import svkc
 ROD = models.bar("rod", models.Y, "0 0 -1")
 
 
-def same(one, two):
+def assert_equal_leaves(one, two):
     """Bit for bit, and of one kind."""
     assert jax.tree.structure(one) == jax.tree.structure(two)
     for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True):
@@ -24,7 +24,7 @@ def same(one, two):
         assert np.asarray(a).tobytes() == np.asarray(b).tobytes()
 
 
-def only(thing, where):
+def differentiable_part(thing, where):
     """The chosen leaf alone, and the rest."""
     return eqx.partition(thing, eqx.tree_at(where, jax.tree.map(lambda _: False, thing), True))
 
@@ -35,11 +35,11 @@ def four_bar():
     return chain, chain.state(), chain.state({"crank": 0.3}, {"crank": 1.0})
 
 
-def test_optax_moves_a_leaf_of_a_chain(four_bar):
+def test_optax_optimises_a_leaf_of_a_chain(four_bar):
     """The floats of a chain are an optimiser's parameters: centres of mass that give the energy
     asked for; the rest stays bit for bit."""
     chain, _, state = four_bar
-    free, rest = only(chain, lambda c: c.com)
+    free, rest = differentiable_part(chain, lambda c: c.com)
     loss = lambda free: (svkc.potential_energy(eqx.combine(free, rest), state) - 1.0) ** 2
     adam = optax.adam(0.01)
 
@@ -57,10 +57,10 @@ def test_optax_moves_a_leaf_of_a_chain(four_bar):
     assert float(loss(free)) < 1e-3 * first
     moved = eqx.combine(free, rest)
     assert not np.array_equal(moved.com, chain.com)
-    same(eqx.tree_at(lambda c: c.com, moved, chain.com), chain)
+    assert_equal_leaves(eqx.tree_at(lambda c: c.com, moved, chain.com), chain)
 
 
-def test_optax_moves_a_state(four_bar):
+def test_optax_optimises_a_state(four_bar):
     """A whole state as parameters, whole numbers and masks aside."""
     chain, _, state = four_bar
     free, rest = eqx.partition(state, eqx.is_inexact_array)
@@ -73,23 +73,23 @@ def test_optax_moves_a_state(four_bar):
 
 
 @pytest.mark.slow
-def test_optimistix_finds_a_throw():
+def test_optimistix_finds_a_launch_velocity():
     """A root through a whole run, over a State: the rate with which a hanging rod must begin to be
     level at 0.4 s."""
     chain = svkc.load(models.MJCF.format(ROD))
-    free, rest = only(eqx.tree_at(lambda s: s.v, chain.state(), jnp.array([6.0])), lambda s: s.v)
+    free, rest = differentiable_part(eqx.tree_at(lambda s: s.v, chain.state(), jnp.array([6.0])), lambda s: s.v)
     level = lambda free, args: (
         svkc.simulate(chain, eqx.combine(free, rest), 0.4, dt=0.02, throw=False).final.q
         - jnp.pi / 2
     )
-    found = optimistix.root_find(level, optimistix.Newton(rtol=1e-10, atol=1e-10), free)
-    assert isinstance(found.value, svkc.State)
-    np.testing.assert_allclose(level(found.value, None), 0, atol=REFERENCE)
-    assert 1 < float(found.value.v[0]) < 20
+    solution = optimistix.root_find(level, optimistix.Newton(rtol=1e-10, atol=1e-10), free)
+    assert isinstance(solution.value, svkc.State)
+    np.testing.assert_allclose(level(solution.value, None), 0, atol=REFERENCE)
+    assert 1 < float(solution.value.v[0]) < 20
 
 
 @pytest.mark.slow
-def test_optimistix_finds_where_a_chain_rests():
+def test_optimistix_finds_the_equilibrium():
     """The least of the potential energy over a State; there nothing accelerates."""
     chain = svkc.load(
         models.MJCF.format(
@@ -101,12 +101,12 @@ def test_optimistix_finds_where_a_chain_rests():
             )
         )
     )
-    free, rest = only(chain.state({"upper": 0.5, "lower": -0.8}), lambda s: s.q)
+    free, rest = differentiable_part(chain.state({"upper": 0.5, "lower": -0.8}), lambda s: s.q)
     energy = lambda free, args: svkc.potential_energy(chain, eqx.combine(free, rest))
-    found = optimistix.minimise(energy, optimistix.BFGS(rtol=1e-10, atol=1e-10), free)
-    resting = eqx.combine(found.value, rest)
+    solution = optimistix.minimise(energy, optimistix.BFGS(rtol=1e-10, atol=1e-10), free)
+    resting = eqx.combine(solution.value, rest)
     np.testing.assert_allclose(svkc.forward_dynamics(chain, resting, jnp.zeros(2)), 0, atol=1e-5)
-    assert energy(found.value, None) < energy(free, None)
+    assert energy(solution.value, None) < energy(free, None)
 
 
 @pytest.mark.slow
@@ -115,13 +115,13 @@ def test_optimistix_finds_masses(four_bar):
     chain, _, state = four_bar
     torques = lambda chain: svkc.inverse_dynamics(chain, state, jnp.arange(1.0, 1.0 + chain.nv))
     measured = torques(eqx.tree_at(lambda c: c.mass, chain, 1.3 * chain.mass))
-    free, rest = only(chain, lambda c: c.mass)
+    free, rest = differentiable_part(chain, lambda c: c.mass)
     misses = lambda free, args: torques(eqx.combine(free, rest)) - measured
-    found = optimistix.least_squares(
+    solution = optimistix.least_squares(
         misses, optimistix.LevenbergMarquardt(rtol=1e-10, atol=1e-10), free
     )
-    assert isinstance(found.value, svkc.Chain)
-    np.testing.assert_allclose(torques(eqx.combine(found.value, rest)), measured, rtol=1e-6)
+    assert isinstance(solution.value, svkc.Chain)
+    np.testing.assert_allclose(torques(eqx.combine(solution.value, rest)), measured, rtol=1e-6)
 
 
 def test_equinox_writes_and_reads_bit_for_bit(four_bar, tmp_path):
@@ -130,18 +130,18 @@ def test_equinox_writes_and_reads_bit_for_bit(four_bar, tmp_path):
     eqx.tree_serialise_leaves(path, (chain, state))
     blank = jax.tree.map(jnp.zeros_like, (chain, state))
     again = eqx.tree_deserialise_leaves(path, blank)
-    same(again, (chain, state))
-    same(svkc.mobility(*again), svkc.mobility(chain, state))
+    assert_equal_leaves(again, (chain, state))
+    assert_equal_leaves(svkc.mobility(*again), svkc.mobility(chain, state))
 
 
-def test_leaves_alone_make_the_same_thing_again(four_bar):
+def test_leaves_rebuild_an_equal_object(four_bar):
     """As libraries do that know nothing of svkc: flattened, moved through jit and scan, and put
     together."""
     chain, rest, state = four_bar
     for thing in (chain, state):
         leaves, tree = jax.tree.flatten(thing)
         assert all(isinstance(x, jax.Array) for x in leaves)
-        same(jax.tree.unflatten(tree, leaves), thing)
-        same(jax.jit(lambda x: x)(thing), thing)
+        assert_equal_leaves(jax.tree.unflatten(tree, leaves), thing)
+        assert_equal_leaves(jax.jit(lambda x: x)(thing), thing)
     both = jax.tree.map(lambda *x: jnp.stack(x), rest, state)
-    same(jax.tree.map(lambda x: x[1], jax.lax.scan(lambda _, s: (None, s), None, both)[1]), state)
+    assert_equal_leaves(jax.tree.map(lambda x: x[1], jax.lax.scan(lambda _, s: (None, s), None, both)[1]), state)

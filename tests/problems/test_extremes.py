@@ -26,29 +26,29 @@ SPACE = (
 FINE = {"rtol": 1e-9, "atol": 1e-11}
 
 
-# what each precision is held to, a drift being of the kinetic energy
+# Bounds of each precision. A drift of energy is relative to the kinetic energy.
 BOUNDS = {
     "double": types.SimpleNamespace(
         # tolerances of the runs
         fine=FINE,
-        # a four-bar of a kilometre at the end of a millimetre's bar: drift, loop gap (rad)
+        # a four-bar of a kilometre on a bar of a millimetre: energy drift, loop gap (m)
         large=(1e-8, np.inf),
         # 1e6 m from the origin: coordinates, velocities
         far=(3e-7, 3e-6),
-        # 1e3 rad/s for 160 turns: drift, angular momentum of itself
+        # 1e3 rad/s for 160 turns: energy drift, relative drift of the angular momentum
         spin=(1e-7, 1e-7),
         spin_by={"rtol": 1e-10, "atol": 1e-12, "solver": diffrax.Dopri8()},
-        # two hundred links: drift
+        # two hundred links: energy drift
         links=1e-6,
         links_by={},
-        # twenty loops: drift, gap
+        # twenty loops: energy drift, loop gap
         loops=(1e-5, 1e-12),
-        # 1e9 N/m: the angle (rad) of a pendulum on it, and the most steps of an implicit solver
+        # 1e9 N/m: angle of a pendulum (rad), the most steps of an implicit solver
         springs=1e-6,
         springs_steps=200,
     ),
-    # positions of 1e6 m are told apart by 6 cm; accelerations of two hundred links are good to some
-    # 1e-2, finer than which no tolerance can ask: fixed steps
+    # float32 resolves positions of 1e6 m to 6 cm. Accelerations of two hundred links have errors of
+    # 1e-2, which no tolerance can go below: these runs use fixed steps.
     "single": types.SimpleNamespace(
         fine={},
         large=(3e-4, 1e-3),
@@ -104,7 +104,7 @@ def relative_energy_drift(chain, traj):
     return float(np.max(np.abs(energy - energy[0])) / np.max(kinetic_energy))
 
 
-# (as numpy: taken in the precision of the run)
+# A numpy array is converted to the precision of the run.
 TIMES = np.linspace(0, 1, 11)
 
 
@@ -288,7 +288,7 @@ def parallel_legs(count):
 
 
 def test_twenty_loops(bounds):
-    """Twenty-one parallel legs under one plate have one freedom; all loops but one are redundant."""
+    """Twenty-one parallel legs under one plate have one freedom: most loops are redundant."""
     chain = parallel_legs(20)
     state = chain.state({"leg0": 0.3})
     assert svkc.mobility(chain, state).freedoms == 1
@@ -344,9 +344,9 @@ def test_no_inertia_at_the_end_of_a_ball():
     for tolerances in ({}, {"rtol": 1e-8, "atol": 1e-10}):
         traj = svkc.simulate(chain, state, 1.0, ts=TIMES, **tolerances)
         assert relative_energy_drift(chain, traj) < ROUND_OFF
-        # nothing turns it about its own axis
+        # No torque acts about the axis of symmetry.
         np.testing.assert_allclose(traj.states.v[:, 2], 0.1, atol=1e-6)
-    # asked for more, in 23 thousand steps
+    # A smaller tolerance takes 23 thousand steps.
     traj = svkc.simulate(chain, state, 1.0, ts=TIMES, solver=diffrax.Tsit5(), **FINE)
     assert relative_energy_drift(chain, traj) < 1e-7
     assert (
@@ -391,7 +391,7 @@ def test_velocities_inconsistent_with_the_loops_are_projected():
     assert float(traj.gap_rates[-1].max()) < ROUND_OFF
 
 
-# ---- float32 alone
+# Limits of float32.
 
 
 def test_single_precision():
@@ -465,9 +465,9 @@ def test_both_precisions_in_one_process(name):
     def results():
         chain = make()
         state = chain.state(v=np.linspace(-1, 1, chain.nv, dtype=chain.q_load.dtype))
-        fast = svkc.dynamics.ArticulatedBodies()
+        articulated = svkc.dynamics.ArticulatedBodies()
         stepped = svkc.step(chain, state, jnp.zeros(chain.nv), 1e-3)
-        run = svkc.simulate(chain, state, 0.01, dt=2e-3, dynamics=fast)
+        run = svkc.simulate(chain, state, 0.01, dt=2e-3, dynamics=articulated)
         return [
             np.asarray(x, float)
             for x in (

@@ -69,8 +69,8 @@ def planar_impact(model, x, theta, v):
     w1, w2 = v[2], v[2] + v[3]
     u1 = v[:2] + w1 * perpendicular(c[0] * elbow)
     u2 = v[:2] + w1 * perpendicular(elbow) + w2 * perpendicular(c[1] * tip)
-    # unknowns: u1, w1, u2, w2 after, the impulse P from link 1 on the base, and G from the ground
-    # on link 1
+    # Unknowns: u1, w1, u2, w2 after the impact, the impulse P of link 1 on the base, and the
+    # impulse G of the ground on link 1.
     A, b = np.zeros((10, 10)), np.zeros(10)
     r1, r2, r2e = (1 - c[0]) * elbow, (1 - c[1]) * tip, -c[1] * tip
     A[0:2, 0:2], A[0:2, 6:8], b[0:2] = m[0] * np.eye(2), -np.eye(2), m[0] * u1
@@ -118,7 +118,7 @@ def test_attached_in_flight_it_is_the_serial_chain(links):
     foot = np.array([0, 2]) - along(theta[0]) - along(theta[0] + theta[1])
     q = {"base": [*foot, 0, np.cos(theta[0] / 2), 0, 0, np.sin(theta[0] / 2)], "link1": theta[1]}
     tol = {"rtol": 1e-12, "atol": 1e-13}
-    # back in time from the moment of contact, then forth
+    # Integrate back in time from the contact, then forward.
     before = svkc.simulate(
         chain,
         chain.state(q, {"base": [-v[0], -v[1], 0, 0, 0, -v[2]], "link1": -v[3]}, connected=()),
@@ -134,7 +134,7 @@ def test_attached_in_flight_it_is_the_serial_chain(links):
     assert float(traj.events.energy_lost[0]) > 0.1
     assert np.linalg.norm(traj.events.impulse[0]) > 0.1
     serial = svkc.load(SERIAL)
-    # the serial chain's joints turn link 1 first, then the base
+    # The serial chain starts at the ground: its first joint carries link 1, its second the base.
     serial_start = serial.state(
         {"ground": theta[0] + theta[1], "elbow": -theta[1]},
         {"ground": after[2] + after[3], "elbow": -after[3]},

@@ -81,7 +81,7 @@ def test_heavy_top(case):
     )
 
 
-# largest error of the angles at each tolerance
+# the largest error of the angles at each tolerance
 ERROR_AT = {1e-9: 1e-5, 1e-12: 1e-8}
 
 
@@ -175,8 +175,8 @@ def test_andrews_mechanism():
         control=springs(chain, reference["problem"]),
         **tight(1e-12),
     )
-    # K1 turns by beta, K2 on it by Theta, K3 by gamma, K5 and K7 by delta and epsilon, K4 and K6 on
-    # them by Phi and Omega
+    # Absolute angles: beta of K1, gamma of K3, delta of K5, epsilon of K7. Relative angles: Theta of
+    # K2 on K1, Phi of K4 on K5, Omega of K6 on K7.
     bodies_of_angle = {
         "beta": ("K1",),
         "gamma": ("K1", "K2", "K3"),
@@ -289,18 +289,22 @@ def test_slider_crank_with_gradients():
         """Return the spring's two ends and the end of the rod that the force acts on."""
         crank, x, rod = q[0], q[1], q[2]
         tip, slider = 0.5 * jnp.stack([jnp.cos(crank), jnp.sin(crank)]), jnp.stack([x, 0 * x])
-        beyond = jnp.stack([jnp.cos(rod), jnp.sin(rod)])
-        return tip / 2, slider - beyond / 2, slider + beyond
+        direction = jnp.stack([jnp.cos(rod), jnp.sin(rod)])
+        return tip / 2, slider - direction / 2, slider + direction
 
     def control(t, state, args):
-        (one, other, _), back = jax.vjp(points, state.q)
+        (one, other, _), pull_back = jax.vjp(points, state.q)
         rates = jax.jvp(points, (state.q,), (state.v,))[1]
-        apart, opening = other - one, rates[1] - rates[0]
-        length = jnp.linalg.norm(apart)
-        pull = (args[0] * (length - 1) + args[1] * (apart @ opening) / length) * apart / length
-        return back((pull, -pull, jnp.array([1.0, 0.0])))[0]
+        separation, separation_rate = other - one, rates[1] - rates[0]
+        length = jnp.linalg.norm(separation)
+        force = (
+            (args[0] * (length - 1) + args[1] * (separation @ separation_rate) / length)
+            * separation
+            / length
+        )
+        return pull_back((force, -force, jnp.array([1.0, 0.0])))[0]
 
-    # Gauss' nodes of 40 parts
+    # Gauss-Legendre nodes of 40 intervals
     node, weight = np.polynomial.legendre.leggauss(8)
     nodes = (np.arange(40)[:, None] + (node + 1) / 2).ravel() / 4
 
@@ -367,7 +371,7 @@ def test_pendulum_released():
         f'<mujoco><option gravity="0 -9.81 0"/><worldbody>{rod}</worldbody></mujoco>',
         cuttable="pin",
     )
-    # half the angle's sine: its angle is -0.5
+    # The z entry of the quaternion is sin(angle / 2): the event is at the angle -0.5.
     event = svkc.when(
         lambda t, s, args: svkc.poses(chain, s)[1][1, 3] + jnp.sin(0.25), cut="pin", direction=False
     )
@@ -427,7 +431,7 @@ def test_locking_an_elbow():
     np.testing.assert_allclose(after.v, [case["rate_after"], 0], atol=1e-14)
     for state, energy in zip((before, after), case["kinetic"], strict=True):
         assert float(svkc.kinetic_energy(chain, state)) == pytest.approx(energy, rel=1e-14)
-        # about the shoulder: of what the ground's pin cannot change
+        # The angular momentum about the shoulder, which the pin on the ground cannot change.
         assert float((svkc.mass_matrix(chain, state) @ state.v)[0]) == pytest.approx(
             case["angular_momentum"], rel=1e-14
         )
@@ -452,10 +456,10 @@ def test_a_bouncing_ball_with_restitution():
 
     @jax.jit
     def simulate_flight(state):
-        # a step over the whole of a short flight would see the ground at both its ends
-        longest = jnp.maximum(jnp.abs(state.v[0]) / 9.81, jnp.where(state.q[0] > 0.5, 0.1, 0))
-        steps = diffrax.PIDController(rtol=1e-12, atol=1e-15, dtmax=longest)
-        return svkc.simulate(chain, state, 2.0, events=[ground], stepsize_controller=steps)
+        # Steps are shorter than a flight: a longer one has the ball below the ground at both ends.
+        max_step = jnp.maximum(jnp.abs(state.v[0]) / 9.81, jnp.where(state.q[0] > 0.5, 0.1, 0))
+        controller = diffrax.PIDController(rtol=1e-12, atol=1e-15, dtmax=max_step)
+        return svkc.simulate(chain, state, 2.0, events=[ground], stepsize_controller=controller)
 
     state, time = chain.state({"z": 1.0}), 0.0
     for impact in case["impacts"]:

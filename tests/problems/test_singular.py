@@ -142,7 +142,7 @@ def test_a_crank_that_turns_back_at_a_dead_centre():
     ts = jnp.linspace(0, 3.0, 301)
     traj = svkc.simulate(chain, state, 3.0, ts=ts, **FINE)
     crank_angle = np.asarray(traj.states.q[:, chain.dof_names.index("crank")])
-    # the rod reaches the slider's line only while the crank's end is within half a metre of it
+    # The rod of half a metre reaches the slider's line only from within that distance.
     assert np.abs(-np.cos(crank_angle) + 0.9).max() <= 0.5 + 1e-9
     assert np.diff(np.sign(np.diff(crank_angle))).any()
     assert abs(float(traj.report().energy_drift)) < 1e-6
@@ -182,7 +182,7 @@ def test_without_pivots_a_singular_configuration_may_end_the_run():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("before", [1e-2, 1e-4, 1e-6, 0.0])
+@pytest.mark.parametrize("offset", [1e-2, 1e-4, 1e-6, 0.0])
 def test_start_near_a_singular_configuration(offset):
     """The N four-bar started with its bars nearly aligned moves on as a parallelogram.
 
@@ -192,7 +192,7 @@ def test_start_near_a_singular_configuration(offset):
     chain, state = maximal.load(n_four_bar(2))
     signs = np.sign(np.asarray(state.v))
     theta = np.pi / 2 - offset
-    # three bars that turn about their ends and two that are carried, a kilogram and a metre each
+    # Three bars rotate about their ends, two translate; each has one kilogram and one metre.
     rate = np.sqrt(2 * (case["energy"] - 9.81 * (3 / 2 + 2) * np.cos(theta)) / (3 / 3 + 2))
     start = svkc.State(jnp.asarray(signs * theta), jnp.asarray(signs * rate), state.structure)
     traj = svkc.simulate(chain, start, 1.0, ts=jnp.linspace(0, 1, 5), **FINE)

@@ -48,29 +48,29 @@ def reference_motion(t1):
     momentum = inertia(START_ANGLE) * 2 * np.pi
 
     def rates(t, y):
-        _, angle, height, opening, rising = y
+        _, angle, height, angle_rate, height_rate = y
         length = spring_length(angle, height)
-        by_angle = (
+        d_angle = (
             (np.sin(angle) * np.cos(angle) / 2 - (height - 1 + np.cos(angle) / 2) * np.sin(angle))
             / 2
             / length
         )
-        by_height = (height - 1 + np.cos(angle) / 2) / length
-        pull = STIFFNESS * (length - REST_LENGTH) + DAMPING * (
-            by_angle * opening + by_height * rising
+        d_height = (height - 1 + np.cos(angle) / 2) / length
+        force = STIFFNESS * (length - REST_LENGTH) + DAMPING * (
+            d_angle * angle_rate + d_height * height_rate
         )
         rate = momentum / inertia(angle)
-        swung = (
+        torque = (
             BALL_MASS * np.sin(angle) * np.cos(angle) * rate**2
             - BALL_MASS * GRAVITY * np.sin(angle)
-            - pull * by_angle
+            - force * d_angle
         )
         return [
             rate,
-            opening,
-            rising,
-            swung / (BALL_MASS + ARM_INERTIA),
-            -GRAVITY - 2 * pull * by_height / SLIDER_MASS,
+            angle_rate,
+            height_rate,
+            torque / (BALL_MASS + ARM_INERTIA),
+            -GRAVITY - 2 * force * d_height / SLIDER_MASS,
         ]
 
     return solve_ivp(
@@ -98,7 +98,7 @@ def governor():
 
 
 @pytest.mark.parametrize(
-    ("solver", "error", "most"),
+    ("solver", "error", "max_steps"),
     [(None, 1e-8, 3000), (diffrax.Kvaerno5(), 5e-6, 200)],
     ids=["explicit", "implicit"],
 )

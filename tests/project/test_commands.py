@@ -39,13 +39,13 @@ def test_a_model_of_ones_own(tmp_path):
         path.name for path in out.iterdir()
     }
     assert "libegl1" in done.stdout or (out / "rod.mp4").read_bytes()[4:8] == b"ftyp"
-    seen = command("view --no-open", out / "rod.npz")
-    assert seen.returncode == 0, seen.stdout + seen.stderr
-    assert "largest loop gap" in seen.stdout
-    assert "rod.html" in seen.stdout
+    view = command("view --no-open", out / "rod.npz")
+    assert view.returncode == 0, view.stdout + view.stderr
+    assert "largest loop gap" in view.stdout
+    assert "rod.html" in view.stdout
 
 
-def test_what_is_wrong_is_said(tmp_path):
+def test_wrong_arguments_are_reported(tmp_path):
     """One line that names it and a status that is not zero; no traceback."""
     (tmp_path / "rod.xml").write_text(ROD)
     (tmp_path / "no.npz").write_text("nothing")
@@ -66,10 +66,10 @@ def test_what_is_wrong_is_said(tmp_path):
         assert "Traceback" not in done.stderr, done.stderr
 
 
-def test_scenes_are_listed():
-    listed = command("scenes")
+def test_the_scenes_command():
+    scenes = command("scenes")
     for name in ("high_bar", "swing", "brachiation", "walking"):
-        assert name in listed.stdout
+        assert name in scenes.stdout
 
 
 def test_main_job(tmp_path):

@@ -43,11 +43,11 @@ def escaped(text: str) -> str:
 @st.composite
 def attributes(draw, usual: dict, odd: dict):
     """XML attributes: the usual ones, and now and then odd ones."""
-    chosen = dict(usual)
+    values = dict(usual)
     for name, strategy in odd.items():
         if draw(st.integers(0, 7)) == 0:
-            chosen[name] = draw(strategy)
-    return "".join(f' {name}="{escaped(value)}"' for name, value in chosen.items())
+            values[name] = draw(strategy)
+    return "".join(f' {name}="{escaped(value)}"' for name, value in values.items())
 
 
 several = lambda n: st.lists(

@@ -39,12 +39,12 @@ class Asked(Exception):
 @pytest.fixture
 def only_traced(monkeypatch):
     """Runs are traced for their shapes, and not compiled."""
-    whole = functools.partial(
+    trace = functools.partial(
         eqx.filter_eval_shape, sys.modules["svkc.simulation.simulate"]._run.__wrapped__
     )
 
     def run(*args):
-        whole(*args)
+        trace(*args)
         raise Asked
 
     monkeypatch.setattr(sys.modules["svkc.simulation.simulate"], "_run", run)
@@ -242,7 +242,7 @@ def test_rollouts_and_tuning(only_traced, t1, options, states):
     outcome(lambda: svkc.rollout(chain, lanes, t1, progress=False, **options), Asked)
 
 
-SEEN = ["size", "lookat", "distance", "azimuth", "camera", "trails"]
+CAMERA_OPTIONS = ["size", "lookat", "distance", "azimuth", "camera", "trails"]
 calls = st.sampled_from(
     [
         "tune",
@@ -258,7 +258,7 @@ calls = st.sampled_from(
         "load_trajectory",
         "save",
         "plot",
-        *SEEN,
+        *CAMERA_OPTIONS,
     ]
 )
 
@@ -274,7 +274,7 @@ def test_other_calls(only_traced, place, call, value, other):
         name: lambda name=name: svkc.render(
             chain, traj, path, **({"size": (64, 48)} | {name: value})
         )
-        for name in SEEN
+        for name in CAMERA_OPTIONS
     }
     made = {
         "tune": lambda: svkc.accuracy.tune(chain, state, value, target=other),
@@ -363,18 +363,18 @@ def test_runs(q, v, pull, t1, dt, at, lossy):
 @hypothesis.given(data=st.data())
 def test_files(kept, data):
     """A file that was cut short, written over, or made of other arrays."""
-    whole, path = kept
-    how = data.draw(st.integers(0, 3))
+    content_of_file, path = kept
+    corruption = data.draw(st.integers(0, 3))
     path = path.with_name("changed.npz")
-    if how == 0:
-        content = whole[: data.draw(st.integers(0, len(whole)))]
-    elif how == 1:
-        at = data.draw(st.integers(0, len(whole) - 1))
+    if corruption == 0:
+        content = content_of_file[: data.draw(st.integers(0, len(content_of_file)))]
+    elif corruption == 1:
+        at = data.draw(st.integers(0, len(content_of_file) - 1))
         piece = data.draw(st.binary(min_size=1, max_size=8))
-        content = whole[:at] + piece + whole[at + len(piece) :]
-    elif how == 2:
+        content = content_of_file[:at] + piece + content_of_file[at + len(piece) :]
+    elif corruption == 2:
         content = data.draw(st.binary(max_size=100))
-    if how < 3:
+    if corruption < 3:
         path.write_bytes(content)
     else:
         with np.load(kept[1]) as file:

@@ -37,33 +37,33 @@ FILES = sorted(
 @functools.cache
 def imports(file: str) -> list[tuple[str, str | None]]:
     """What a file imports, late imports too: the full name, and the function about it."""
-    found = []
+    result = []
 
     def visit(node, function):
         if isinstance(node, ast.FunctionDef):
             function = node.name
         if isinstance(node, ast.Import):
-            found.extend((alias.name, function) for alias in node.names)
+            result.extend((alias.name, function) for alias in node.names)
         if isinstance(node, ast.ImportFrom):
-            found.extend((f"{node.module}.{alias.name}", function) for alias in node.names)
+            result.extend((f"{node.module}.{alias.name}", function) for alias in node.names)
         for child in ast.iter_child_nodes(node):
             visit(child, function)
 
     visit(ast.parse((ROOT / f"{file}.py").read_text()), None)
-    return found
+    return result
 
 
 def targets(file: str) -> set[tuple[str, str | None]]:
     """The files of svkc that a file imports from."""
-    found = set()
+    result = set()
     for name, function in imports(file):
         parts = name.split(".")[1:] if name.startswith("svkc.") else []
         for end in range(len(parts), 0, -1):
             candidate = "/".join(parts[:end])
             if candidate in FILES or f"{candidate}/__init__" in FILES:
-                found.add((candidate if candidate in FILES else f"{candidate}/__init__", function))
+                result.add((candidate if candidate in FILES else f"{candidate}/__init__", function))
                 break
-    return found
+    return result
 
 
 def package(file: str) -> str:

@@ -59,8 +59,8 @@ def executed():
             resources={"metadata": {"path": folder}},
             config=config,
         ).execute()
-    found = printed(notebook.cells.pop())
-    return notebook, found.split("\n")
+    output = printed(notebook.cells.pop())
+    return notebook, output.split("\n")
 
 
 def printed(cell):
@@ -123,10 +123,10 @@ def test_the_tour_is_small_and_says_nothing_of_a_machine():
 
 
 if __name__ == "__main__":
-    made, _ = executed()
-    for cell in made.cells:
+    notebook, _ = executed()
+    for cell in notebook.cells:
         for out in cell.get("outputs", ()):
             if "image/png" in out.get("data", ()):
                 out.data["image/png"] = smaller(out.data["image/png"])
-    made.metadata = nbformat.read(TOUR, 4).metadata
-    nbformat.write(made, TOUR)
+    notebook.metadata = nbformat.read(TOUR, 4).metadata
+    nbformat.write(notebook, TOUR)

@@ -15,7 +15,7 @@ FILES = {path.stem: path for path in TESTS.rglob("*.py")}
 # calls that are there to be refused
 REFUSED = ("test_messages", "test_fuzz_models", "test_fuzz_verbs", "test_fuzz_runs")
 # nouns that are made by a function, not by their name
-MADE_BY = {
+CREATED_BY = {
     "Chain": "load",
     "Check": "check_grad",
     "Structure": "transition",
@@ -32,15 +32,15 @@ def parsed(name: str) -> ast.Module:
 def defined(name: str) -> dict[str, ast.AST]:
     """What a file defines by name: functions, classes, constants, and the helper files that it
     imports."""
-    found: dict[str, ast.AST] = {}
+    definitions: dict[str, ast.AST] = {}
     for node in parsed(name).body:
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
-            found[node.name] = node
+            definitions[node.name] = node
         elif isinstance(node, ast.Assign):
-            found |= {
+            definitions |= {
                 target.id: node.value for target in node.targets if isinstance(target, ast.Name)
             }
-    return found
+    return definitions
 
 
 def says(node: ast.AST, what: str) -> bool:
@@ -51,11 +51,11 @@ def says(node: ast.AST, what: str) -> bool:
 
 def slow(test: ast.FunctionDef, file: str) -> bool:
     """As a whole: a test of which only some parameters are marked has others in the fast tier."""
-    whole = any(
+    is_slow = any(
         isinstance(node, ast.Assign) and ast.unparse(node) == "pytestmark = pytest.mark.slow"
         for node in parsed(file).body
     )
-    return whole or any(
+    return is_slow or any(
         ast.unparse(decorator) == "pytest.mark.slow" for decorator in test.decorator_list
     )
 
@@ -119,16 +119,16 @@ def test_the_fast_tier_names_every_public_function():
     public = {
         name for name in dir(svkc) if not name.startswith("_") and callable(getattr(svkc, name))
     }
-    wanted = {MADE_BY.get(name, name) for name in public}
-    missing = wanted - names.public
+    expected = {CREATED_BY.get(name, name) for name in public}
+    missing = expected - names.public
     assert not missing, ", ".join(sorted(missing))
 
 
 @pytest.mark.parametrize(
-    ("given", "collected"),
+    ("arguments", "collected"),
     [((), ["fast"]), (("-m", "slow"), ["slow"]), (("-m", "slow or not slow"), ["fast", "slow"])],
 )
-def test_which_tier_is_run(pytester, given, collected):
+def test_which_tier_is_run(pytester, arguments, collected):
     """Without -m the fast one, by the project's own settings; -m on the command line comes last and
     holds."""
     settings = (TESTS.parent / "pyproject.toml").read_text()
@@ -138,7 +138,7 @@ def test_which_tier_is_run(pytester, given, collected):
     pytester.makepyfile(
         "import pytest\ndef test_fast(): pass\n@pytest.mark.slow\ndef test_slow(): pass\n"
     )
-    reports = pytester.inline_run("-n", "0", "test_which_tier_is_run.py", *given).getreports(
+    reports = pytester.inline_run("-n", "0", "test_which_tier_is_run.py", *arguments).getreports(
         "pytest_runtest_logreport"
     )
     assert (

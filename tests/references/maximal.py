@@ -1,4 +1,4 @@
-"""Mechanisms given body by body in the world, as the reference problems are: a spanning tree of
+"""Mechanisms specs body by body in the world, as the reference problems are: a spanning tree of
 their joints as MJCF, virtual links for those left over."""
 
 import numpy as np
@@ -23,36 +23,38 @@ def _quat(R) -> np.ndarray:
 
 
 class Body:
-    """Where a body is at the start, and how it moves: of the world, nothing does."""
+    """Initial pose and velocity of a body. Without `specs`: the ground, which is at rest."""
 
-    def __init__(self, given=None):
-        given = given or {}
-        self.place, self.turn = (
-            np.asarray(given.get("com_world0", np.zeros(3))),
-            np.asarray(given.get("R0", np.eye(3))),
+    def __init__(self, specs=None):
+        specs = specs or {}
+        self.position, self.rotation = (
+            np.asarray(specs.get("com_world0", np.zeros(3))),
+            np.asarray(specs.get("R0", np.eye(3))),
         )
         self.v, self.omega = (
-            np.asarray(given.get("v0", np.zeros(3))),
-            np.asarray(given.get("omega0_world", np.zeros(3))),
+            np.asarray(specs.get("v0", np.zeros(3))),
+            np.asarray(specs.get("omega0_world", np.zeros(3))),
         )
 
     def velocity(self, point):
-        return self.v + np.cross(self.omega, point - self.place)
+        return self.v + np.cross(self.omega, point - self.position)
 
 
 def load(problem: dict, **options) -> tuple[svkc.Chain, svkc.State]:
-    """Chain and state of a problem: bodies' frames at their centres of mass, named as there; joints
-    by their child, virtual links by both."""
+    """Return the chain and the initial state of a problem.
+
+    Frames of bodies are at their centres of mass. Joints of the tree are named by their child,
+    virtual links by parent and child.
+    """
     text, bodies, tree, loops = mjcf(problem)
     chain = svkc.load(text, virtual_links=[_link(joint, bodies) for joint in loops], **options)
     return chain, chain.state(v={name: _rate(joint, bodies) for name, joint in tree.items()})
 
 
 def mjcf(problem: dict) -> tuple[str, dict, dict, list]:
-    """The spanning tree as MJCF, the bodies and the tree's joints by name, and the joints left
-    over."""
-    given = {body["name"]: body for body in problem["bodies"]}
-    bodies = {"ground": Body()} | {name: Body(body) for name, body in given.items()}
+    """Return the spanning tree as MJCF, its bodies and joints by name, and the loop joints."""
+    specs = {body["name"]: body for body in problem["bodies"]}
+    bodies = {"ground": Body()} | {name: Body(body) for name, body in specs.items()}
     tree, loops = {}, []
     for joint in problem["joints"]:
         open_ = (
@@ -63,22 +65,26 @@ def mjcf(problem: dict) -> tuple[str, dict, dict, list]:
         tree.update({joint["child"]: joint}) if open_ else loops.append(joint)
 
     def element(name):
-        joint, body, mass = tree[name], bodies[name], given[name]
+        joint, body, mass = tree[name], bodies[name], specs[name]
         parent, point = bodies[joint["parent"]], np.asarray(joint["point_world0"])
         inertia = np.asarray(mass["inertia_com_body"])
         kind, axis = (
             JOINTS[joint["type"]],
-            body.turn.T @ np.asarray(joint.get("axis_world0", (0, 0, 1))),
+            body.rotation.T @ np.asarray(joint.get("axis_world0", (0, 0, 1))),
         )
-        inside = "".join(element(child) for child, other in tree.items() if other["parent"] == name)
+        position = parent.rotation.T @ (body.position - parent.position)
+        anchor = body.rotation.T @ (point - body.position)
+        children = "".join(
+            element(child) for child, other in tree.items() if other["parent"] == name
+        )
         return (
-            f'<body name="{name}" pos="{_numbers(parent.turn.T @ (body.place - parent.place))}"'
-            f' quat="{_numbers(_quat(parent.turn.T @ body.turn))}">'
+            f'<body name="{name}" pos="{_numbers(position)}"'
+            f' quat="{_numbers(_quat(parent.rotation.T @ body.rotation))}">'
             f'<joint name="{name}" type="{kind}"'
-            f' pos="{_numbers(body.turn.T @ (point - body.place))}" axis="{_numbers(axis)}"/>'
+            f' pos="{_numbers(anchor)}" axis="{_numbers(axis)}"/>'
             f'<inertial pos="0 0 0" mass="{mass["mass"]!r}"'
             f' fullinertia="{_numbers([*np.diag(inertia), *inertia[np.triu_indices(3, 1)]])}"/>'
-            f"{inside}</body>"
+            f"{children}</body>"
         )
 
     text = (
@@ -93,35 +99,34 @@ def mjcf(problem: dict) -> tuple[str, dict, dict, list]:
 
 
 def _rate(joint, bodies):
-    """Rate of a tree's joint from how its bodies move."""
+    """Return the rate of a tree joint, given the velocities of its bodies."""
     parent, child, point = (
         bodies[joint["parent"]],
         bodies[joint["child"]],
         np.asarray(joint["point_world0"]),
     )
     if joint["type"] == "spherical":
-        return child.turn.T @ (child.omega - parent.omega)
-    moved = (
+        return child.rotation.T @ (child.omega - parent.omega)
+    velocity = (
         child.omega - parent.omega
         if joint["type"] == "revolute"
         else child.velocity(point) - parent.velocity(point)
     )
     axis = np.asarray(joint["axis_world0"])
-    return float(axis @ moved / np.linalg.norm(axis))
+    return float(axis @ velocity / np.linalg.norm(axis))
 
 
 def _link(joint, bodies):
-    """A joint left over, as a virtual link that is connected."""
+    """Return a loop joint as a connected virtual link."""
     parent, point = bodies[joint["parent"]], np.asarray(joint["point_world0"])
     names = ["world" if joint[end] == "ground" else joint[end] for end in ("parent", "child")]
-    options = {"pos": parent.turn.T @ (point - parent.place)}
+    options = {"pos": parent.rotation.T @ (point - parent.position)}
     if joint["type"] == "universal":
-        # turns about x, then about y carried along: the frame whose x is the parent's axis and
-        # whose y is the child's
+        # The axes are x and the rotated y: x is the axis of the parent, y that of the child.
         x, y = np.asarray(joint["axis_parent_world0"]), np.asarray(joint["axis_child_world0"])
-        options["quat"] = _quat(parent.turn.T @ np.stack([x, y, np.cross(x, y)], 1))
+        options["quat"] = _quat(parent.rotation.T @ np.stack([x, y, np.cross(x, y)], 1))
     elif "axis_world0" in joint:
-        options["axis"] = parent.turn.T @ np.asarray(joint["axis_world0"])
+        options["axis"] = parent.rotation.T @ np.asarray(joint["axis_world0"])
     return svkc.VirtualLink(
         f"{names[0]}_{names[1]}",
         *names,

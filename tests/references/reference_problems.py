@@ -1,5 +1,7 @@
-"""Problems of others and their independent solutions: the data (where each comes from stands in its
-file), and how a problem becomes a model."""
+"""Published problems as models, and their independent solutions.
+
+Each data file names its source.
+"""
 
 import json
 import pathlib
@@ -33,14 +35,14 @@ def numbers(x):
 
 
 def body_positions(chain, traj, body):
-    """[times 3] of the body's frame."""
+    """Return the positions of a body's frame, [times 3] (m)."""
     return np.asarray(jax.vmap(lambda s: svkc.poses(chain, s)[0])(traj.states))[
         :, chain.body_names.index(body)
     ]
 
 
 def n_four_bar(windows):
-    """The problem of two windows with as many as asked for."""
+    """Return the N four-bar problem with this number of windows."""
     problem = load_reference("n_four_bar")["problem"]
     upright, level = problem["bodies"][0], problem["bodies"][-1]
     hinge = {"type": "revolute", "axis_world0": [0, 0, 1]}
@@ -61,14 +63,14 @@ def n_four_bar(windows):
 
 
 def springs(chain, problem):
-    """control: two-point springs and constant torques of a problem, as joint torques."""
+    """Return a control: the joint torques of the springs and torques of a problem."""
 
     def end(q, structure, body, point, name):
-        place, quat = svkc.poses(chain, svkc.State(q, jnp.zeros(chain.dofs), structure))
+        position, quat = svkc.poses(chain, svkc.State(q, jnp.zeros(chain.dofs), structure))
         row = chain.body_names.index("world" if name == "ground" else name)
-        local = body.turn.T @ (np.asarray(point) - body.place)
+        local = body.rotation.T @ (np.asarray(point) - body.position)
         w, u = quat[row, 0], quat[row, 1:]
-        return place[row] + local + 2 * jnp.cross(u, jnp.cross(u, local) + w * local)
+        return position[row] + local + 2 * jnp.cross(u, jnp.cross(u, local) + w * local)
 
     bodies = {body["name"]: maximal.Body(body) for body in problem["bodies"]} | {
         "ground": maximal.Body()

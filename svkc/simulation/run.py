@@ -1,0 +1,169 @@
+"""The scan over the phases of a run: its initial state and its body.
+
+The body integrates one phase and applies the events at the end of the phase.
+"""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Int
+
+from svkc._jax.pytrees import stop_gradient_tree
+from svkc.integration.event_location import GuardValues, event_tolerance
+from svkc.integration.ode import FieldArgs, ODEState
+from svkc.model.chain import Chain, State
+from svkc.simulation.apply_events import apply_events, reevaluated_guards
+from svkc.simulation.options import Options
+from svkc.simulation.phase import PhaseOutcome, RunState, solve_phase
+from svkc.simulation.records import RESULTS, empty_events, empty_phase_records, write_phase_row
+from svkc.transitions.plan import Plan
+
+
+def with_lock_mask(chain: Chain, state: State, plan: Plan) -> State:
+    """Return the state with a mask of locked joints if an event locks or unlocks joints, so that
+    the structure has one pytree structure throughout the run."""
+    if not plan.has_locks or state.structure.locked is not None:
+        return state
+    return eqx.tree_at(
+        lambda s: s.structure.locked,
+        state,
+        jnp.zeros(chain.dofs, bool),
+        is_leaf=lambda x: x is None,
+    )
+
+
+def initial_run_state(chain: Chain, state: State, t0, ts, plan: Plan, options: Options) -> RunState:
+    """Return the state of a run before its first phase, with empty records."""
+    links, rows, dtype = len(chain.link_names), options.max_events, state.q.dtype
+    state = with_lock_mask(chain, state, plan)
+    # a link that is overloaded from the start breaks at once; guards that need no torques are
+    # re-evaluated at the start of the first phase
+    initial = [g.initial_value for g in plan.guards]
+    return RunState(
+        t=t0,
+        state=state,
+        work=jnp.zeros((), dtype) if options.has_work else None,
+        guard_values=jnp.asarray(initial, dtype) if plan.guards else None,
+        stale=jnp.asarray(reevaluated_guards(plan)) if plan.guards else None,
+        pending=jnp.ones(len(plan.timed), bool),
+        events=empty_events(rows, links, dtype),
+        records=empty_phase_records(rows + 1, state),
+        count=jnp.asarray(0, jnp.int32),
+        saved=jax.tree.map(lambda x: jnp.broadcast_to(x[None], (ts.shape[0], *x.shape)), state),
+        result=RESULTS.successful,
+        derivative=RESULTS.successful,
+        invalid_from=jnp.asarray(rows + 1, jnp.int32),
+    )  # fmt: skip
+
+
+def _rearm_guards(chain: Chain, run: RunState, plan: Plan, options: Options, args) -> RunState:
+    """Return the run with its stale guards re-evaluated at the start of a phase."""
+    if not plan.guards or not reevaluated_guards(plan).any():
+        return run
+    field_args = FieldArgs(chain, run.state.structure, args)
+    values = stop_gradient_tree(GuardValues(plan, options.field))(
+        *stop_gradient_tree((run.t, ODEState(run.state.q, run.state.v), field_args))
+    )
+    return replace(run, guard_values=jnp.where(run.stale, values, run.guard_values))
+
+
+def _next_stop(run: RunState, t1, plan: Plan):
+    """Return the scheduled end of the next phase: the time of the next timed event, or t1.
+
+    Of two equal times the one taken receives the derivative: the event's where it coincides with
+    t1. A run that has ended keeps its time, so that its phases have zero length.
+    """
+    next_time = jnp.min(jnp.where(run.pending, plan.times, jnp.inf), initial=jnp.inf)
+    stop = jnp.where(next_time <= t1, next_time, t1)
+    return jnp.where((stop < run.t) | (run.result != RESULTS.successful), run.t, stop)
+
+
+def run_phase(
+    chain: Chain, run: RunState, index, times, *, plan: Plan, options: Options, args
+) -> RunState:
+    """Integrate one phase, apply the events at its end, and write the records of both.
+
+    index: of the phase.
+    times: end of the run, and the save times.
+    """
+    t1, ts = times
+    run = _rearm_guards(chain, run, plan, options, args)
+    active = (run.t < t1) | jnp.any(run.pending & (plan.times <= t1))
+    active = active & (run.result == RESULTS.successful)
+    stop = _next_stop(run, t1, plan)
+    outcome = solve_phase(run, stop, ts, plan, options, FieldArgs(chain, run.state.structure, args))
+    timed, fired = _fired_events(run, outcome, active, plan)
+    end_state = State(outcome.y.q, outcome.y.v, run.state.structure)
+    saved = _write_saved_states(run, end_state, outcome, ts)
+    row = (jnp.arange(run.records.start.shape[0]) == index) & active
+    work = jnp.zeros_like(run.t) if run.work is None else outcome.y.work - run.work
+    records = write_phase_row(
+        run.records, row, (run.t, run.state), (outcome.t, end_state), work, outcome.solution
+    )
+    derivative, invalid_from = _check_derivative(run, outcome, active, timed, index)
+    after, events, result = end_state, run.events, outcome.result
+    if plan.actions:
+        after, events, result = apply_events(chain, run, end_state, outcome, fired, plan)
+    result = RESULTS.where(run.result == RESULTS.successful, result, run.result)
+    stale = None
+    if plan.guards:
+        # a guard that is exactly zero after its event is not re-evaluated: it has not crossed again
+        stale = jnp.asarray(reevaluated_guards(plan)) & jnp.any(fired) & (outcome.guard_values != 0)
+    return RunState(
+        t=outcome.t,
+        state=after,
+        work=outcome.y.work,
+        guard_values=outcome.guard_values,
+        stale=stale,
+        pending=run.pending & ~timed,
+        events=events,
+        records=records,
+        count=run.count + active.astype(jnp.int32),
+        saved=saved,
+        result=result,
+        derivative=derivative,
+        invalid_from=invalid_from,
+    )
+
+
+def _fired_events(run: RunState, outcome: PhaseOutcome, active, plan: Plan):
+    """Return which timed events, and which of all events, happened at the end of a phase."""
+    reached = active & (outcome.result == RESULTS.successful)
+    timed = run.pending & (plan.times <= outcome.t + event_tolerance(outcome.t)) & reached
+    indices = np.array(plan.timed + plan.guarded, int)
+    fired = jnp.concatenate([timed, outcome.fired & reached])
+    return timed, jnp.zeros(len(plan.actions), bool).at[indices].set(fired)
+
+
+def _check_derivative(
+    run: RunState, outcome: PhaseOutcome, active, timed: Bool[Array, " timed"], index
+) -> tuple[RESULTS, Int[Array, ""]]:
+    """Return the first reason why the run has no derivative, and the index of its phase. The
+    certificate checks ranks after the run.
+
+    active: whether the run had not ended before this phase.
+    timed: which timed events happened.
+    """
+    code = RESULTS.where(
+        jnp.sum(outcome.fired) + jnp.sum(timed) > 1, RESULTS.together, outcome.derivative
+    )
+    first = (run.derivative == RESULTS.successful) & active & (code != RESULTS.successful)
+    return RESULTS.where(first, code, run.derivative), jnp.where(
+        first, index.astype(jnp.int32), run.invalid_from
+    )
+
+
+def _write_saved_states(run: RunState, end_state: State, outcome: PhaseOutcome, ts) -> State:
+    """Return the saved states with those of a phase written: at save times from its start to its
+    end, both included. Later save times hold the state at its end."""
+    within, later = ((ts >= run.t) & (ts <= outcome.t))[:, None], (ts > outcome.t)[:, None]
+    q = jnp.where(within, outcome.ys.q, jnp.where(later, end_state.q[None], run.saved.q))
+    v = jnp.where(within, outcome.ys.v, jnp.where(later, end_state.v[None], run.saved.v))
+
+    def write(new, old):
+        return jnp.where((ts >= run.t).reshape(-1, *(1,) * new.ndim), new[None], old)
+
+    return State(q, v, jax.tree.map(write, end_state.structure, run.saved.structure))
