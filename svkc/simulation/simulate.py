@@ -17,7 +17,7 @@ from svkc._jax.eager import eager_jit
 from svkc._jax.functions import call_with_comparable
 from svkc._jax.primitive import ClosureConverted
 from svkc.model.chain import Chain, State
-from svkc.simulation.certificate import certificate
+from svkc.simulation.certificate import certificate, evaluations_per_step
 from svkc.simulation.options import Options, prepare_options
 from svkc.simulation.phase import RunState
 from svkc.simulation.records import RESULTS

@@ -81,7 +81,7 @@ def test_after_it_there_are_two_systems(case):
         rtol=1e-10,
         atol=1e-12,
     )
-    part = carried(chain)
+    part = carried_rows(chain)
     at_cut, later = (
         part_momentum(weightless, jax.tree.map(lambda x, i=i: x[i], traj.states), part)
         for i in (0, 1)
@@ -94,7 +94,7 @@ def test_after_it_there_are_two_systems(case):
     )
 
 
-def carried(chain):
+def carried_rows(chain):
     """Bodies beyond the first joint that may be cut, as the model has them."""
     model, inside = chain.model.model, np.zeros(len(chain.body_names), bool)
     inside[chain.topology.body_row.index(chain.topology.link_child[0])] = True
@@ -228,8 +228,8 @@ def test_a_joint_that_breaks():
     assert int(svkc.mobility(chain, traj.final).freedoms) == 6
     # the moment before
     broken = svkc.State(traj.final.q, traj.final.v, start.structure)
-    carried = svkc.loop_forces(chain, broken, jnp.zeros(chain.dofs))
-    assert abs(float(jnp.linalg.norm(carried.force[0])) - limit) < 1e-6
+    loop_forces = svkc.loop_forces(chain, broken, jnp.zeros(chain.dofs))
+    assert abs(float(jnp.linalg.norm(loop_forces.force[0])) - limit) < 1e-6
 
 
 ROTORS = models.MJCF.format(
@@ -326,8 +326,8 @@ def test_grips_bound_during_a_run(gripped):
         traj.states.v[4, :7],
         atol=1e-7,
     )
-    emptied = svkc.unbind(chain, by_hand, "spare_0")
-    assert int(svkc.mobility(chain, emptied).freedoms) == 7
+    unbound = svkc.unbind(chain, by_hand, "spare_0")
+    assert int(svkc.mobility(chain, unbound).freedoms) == 7
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ PRIVATE_WORDS = frozenset(
     """.split()
 )
 # named by the libraries whose interfaces these identifiers implement or call
-OF_LIBRARIES = frozenset({"made_jump", "slice_sizes"})
+OF_LIBRARIES = frozenset({"FileNotFoundError", "made_jump", "slice_sizes"})
 
 
 def words(identifier: str) -> list[str]:
