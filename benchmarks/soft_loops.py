@@ -30,7 +30,7 @@ def mechanism_model(problem, problem_data: dict, dt: float):
     numbers, equalities, sites, tendons = maximal._numbers, "", {}, ""
     for joint in loops:
         parent = bodies[joint["parent"]]
-        anchor = parent.turn.T @ (np.array(joint["point_world0"]) - parent.place)
+        anchor = parent.rotation.T @ (np.array(joint["point_world0"]) - parent.position)
         first, second = (
             "world" if name == "ground" else name for name in (joint["parent"], joint["child"])
         )
@@ -43,7 +43,7 @@ def mechanism_model(problem, problem_data: dict, dt: float):
     ):
         for end in ("parent", "child"):
             body = bodies[spring[end]]
-            local = body.turn.T @ (np.array(spring[f"point_{end}_world0"]) - body.place)
+            local = body.rotation.T @ (np.array(spring[f"point_{end}_world0"]) - body.position)
             sites.setdefault(spring[end], []).append(
                 f'<site name="{end}{i}" pos="{numbers(local)}"/>'
             )

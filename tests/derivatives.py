@@ -341,7 +341,7 @@ def swing():
             )
         )
 
-    x = {"t1": jnp.asarray(0.15), "torque": jnp.ones(8), "edge": jnp.asarray(EDGE)}
+    x = {"t1": jnp.asarray(0.15), "torque": jnp.ones(8), "edge": jnp.asarray(PLATE_EDGE)}
     return f, x | {"heavier": jnp.ones(index.max() + 1)}, RUN
 
 

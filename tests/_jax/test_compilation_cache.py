@@ -123,7 +123,7 @@ def test_entries_are_written_atomically(tmp_path):
 
 
 def test_the_least_recently_used_entries_are_removed(tmp_path, monkeypatch):
-    monkeypatch.setattr(cache, "SIZE", 250)
+    monkeypatch.setattr(cache, "MAX_BYTES", 250)
     for age, version in enumerate(("one", "two", "three")):
         (tmp_path / f"jaxlib-{version}").mkdir()
         path = tmp_path / f"jaxlib-{version}" / "program-cache"

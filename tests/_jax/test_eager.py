@@ -62,7 +62,9 @@ def eagerly(linkage):
 
 
 def test_results_under_jit_and_scan_equal_eager_ones(linkage, eagerly):
-    assert_close(jax.jit(lambda xs: jax.lax.map(lambda x: all_results(*linkage, x), xs))(XS), eagerly)
+    assert_close(
+        jax.jit(lambda xs: jax.lax.map(lambda x: all_results(*linkage, x), xs))(XS), eagerly
+    )
 
 
 @pytest.mark.slow
@@ -94,7 +96,9 @@ def test_derivatives_of_all_functions(linkage):
 
 def test_options_unknown_to_jaxlib_are_dropped(monkeypatch):
     monkeypatch.setattr(
-        eager, "_OPTIONS", {"xla_no_such_option": 1, "xla_backend_optimization_level": 0}
+        eager,
+        "_FAST_COMPILE_OPTIONS",
+        {"xla_no_such_option": 1, "xla_backend_optimization_level": 0},
     )
     assert float(eager.eager_jit(lambda x: 2 * x)(jnp.asarray(3.0))) == 6
     assert eager._FAST_COMPILE_OPTIONS == {"xla_backend_optimization_level": 0}

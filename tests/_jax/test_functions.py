@@ -35,7 +35,9 @@ def programs(monkeypatch):
     """One item for each program of `simulate` that is made."""
     conversions, module = [], sys.modules["svkc.simulation.simulate"]
     original = module._closure_convert
-    monkeypatch.setattr(module, "_closure_convert", lambda *args: (conversions.append(0), original(*args))[1])
+    monkeypatch.setattr(
+        module, "_closure_convert", lambda *args: (conversions.append(0), original(*args))[1]
+    )
     return conversions
 
 
@@ -423,7 +425,7 @@ def test_derivatives_and_lanes(arm):
 
 @pytest.mark.slow
 def test_no_tracer_or_function_is_leaked():
-    """No tracer in what programs are found by, and no function that is gone in the notes."""
+    """Static parts hold no tracer, and deleted functions leave the table of static parts."""
     programs, tracers, gone = [], [], []
 
     def traced(x):

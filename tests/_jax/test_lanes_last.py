@@ -91,8 +91,7 @@ def test_zero_lanes_and_integers():
 
 
 def test_every_primitive_of_a_step_has_a_rule(monkeypatch):
-    """All that `svkc.step` is made of has a rule: what has none would put its lanes first and last
-    again."""
+    """Every primitive of `svkc.step` has a rule, so that none goes through `jax.vmap`."""
     by_vmap = []
     apply_vmap = rules._apply_vmap
     monkeypatch.setattr(

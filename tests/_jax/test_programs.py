@@ -45,7 +45,9 @@ def test_programs(precision):
     batch = jax.tree.map(lambda x: jnp.stack([x, x]), state)
     gradient = lambda options: (
         lambda v: jax.grad(
-            lambda v: jnp.sum(run(chain, svkc.State(state.q, v, state.structure), **options).final.q)
+            lambda v: jnp.sum(
+                run(chain, svkc.State(state.q, v, state.structure), **options).final.q
+            )
         )(v)
     )
     programs = {

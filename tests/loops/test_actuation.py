@@ -100,9 +100,8 @@ def test_redundant(five_bar):
     assert float(jnp.abs(result.null_force).max()) > 1e-3
 
 
-def test_missing(five_bar):
-    """One motor for two freedoms: the residual is said, and the direction that nobody has_effect is a
-    motion without work."""
+def test_deficient(five_bar):
+    """One motor for two freedoms leaves a residual and one undriven direction."""
     chain, state, vdot, _ = five_bar
     motors = mask(chain, "left_arm")
     result = svkc.actuation(chain, state, vdot, actuated=motors)

@@ -52,8 +52,8 @@ def free_links():
 def test_every_admissible_choice_gives_the_same_motion(scene, admissible, n_simulated):
     """Runs of 1 s on a four-bar and on the paper's two links end in the same state.
 
-    The four-bar's rocker and pin are simulated for no choice: their velocity becomes zero on the
-    way, where they are not independent.
+    Only the first `n_simulated` choices are simulated: the four-bar's rocker and pin come to rest
+    on the way, where they cannot be independent.
     """
     chain, state = scene()
     admitted, states = [], []

@@ -69,7 +69,7 @@ def test_two_loads_of_one_model_are_one_program(tmp_path):
         ([mujoco.MjModel.from_xml_string(PENDULUM) for _ in range(2)], [{}]),
     ):
         same, traces = kept_as_is()
-        chains = [svkc.load(source, **given) for source in sources for given in arguments]
+        chains = [svkc.load(source, **options) for source in sources for options in arguments]
         assert len({jax.tree.structure(chain) for chain in chains}) == 1
         for chain in chains:
             same(chain)

@@ -77,7 +77,9 @@ def test_optimistix_finds_a_launch_velocity():
     """A root through a whole run, over a State: the rate with which a hanging rod must begin to be
     level at 0.4 s."""
     chain = svkc.load(models.MJCF.format(ROD))
-    free, rest = differentiable_part(eqx.tree_at(lambda s: s.v, chain.state(), jnp.array([6.0])), lambda s: s.v)
+    free, rest = differentiable_part(
+        eqx.tree_at(lambda s: s.v, chain.state(), jnp.array([6.0])), lambda s: s.v
+    )
     level = lambda free, args: (
         svkc.simulate(chain, eqx.combine(free, rest), 0.4, dt=0.02, throw=False).final.q
         - jnp.pi / 2
@@ -144,4 +146,6 @@ def test_leaves_rebuild_an_equal_object(four_bar):
         assert_equal_leaves(jax.tree.unflatten(tree, leaves), thing)
         assert_equal_leaves(jax.jit(lambda x: x)(thing), thing)
     both = jax.tree.map(lambda *x: jnp.stack(x), rest, state)
-    assert_equal_leaves(jax.tree.map(lambda x: x[1], jax.lax.scan(lambda _, s: (None, s), None, both)[1]), state)
+    assert_equal_leaves(
+        jax.tree.map(lambda x: x[1], jax.lax.scan(lambda _, s: (None, s), None, both)[1]), state
+    )

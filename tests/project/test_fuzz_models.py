@@ -182,16 +182,16 @@ link_arguments = some_of(
 )
 
 
-def made_link(given):
+def make_link(fields):
     return outcome(
-        lambda: svkc.VirtualLink(**({"name": "x", "parent": "world", "real": "rocker"} | given))
+        lambda: svkc.VirtualLink(**({"name": "x", "parent": "world", "real": "rocker"} | fields))
     )
 
 
-links = link_arguments.map(made_link)
+links = link_arguments.map(make_link)
 
 
-def look_at(chain):
+def use_chain(chain):
     """Every chain that loads is whole."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(chain):
         assert not np.isnan(leaf).any(), path
@@ -217,7 +217,7 @@ def look_at(chain):
 def test_models(source, options):
     chain = outcome(lambda: svkc.load(source, **options))
     if chain is not NOTHING:
-        look_at(chain)
+        use_chain(chain)
 
 
 @examples(0.02)
@@ -230,9 +230,11 @@ def test_files_that_are_no_models(tmp_path_factory, data, folder):
 
 @examples(0.1)
 @hypothesis.given(st.lists(links, max_size=2), load_options(links))
-def test_links(given, options):
+def test_links(declared, options):
     chain = outcome(
-        lambda: svkc.load(models.MJCF.format(models.FOUR_BAR), **options | {"virtual_links": given})
+        lambda: svkc.load(
+            models.MJCF.format(models.FOUR_BAR), **options | {"virtual_links": declared}
+        )
     )
     if chain is not NOTHING:
-        look_at(chain)
+        use_chain(chain)

@@ -32,8 +32,8 @@ import svkc
 pytestmark = pytest.mark.slow
 
 
-class Asked(Exception):
-    """A run would begin."""
+class RunStarted(Exception):
+    """Raised instead of a run."""
 
 
 @pytest.fixture
@@ -45,7 +45,7 @@ def only_traced(monkeypatch):
 
     def run(*args):
         trace(*args)
-        raise Asked
+        raise RunStarted
 
     monkeypatch.setattr(sys.modules["svkc.simulation.simulate"], "_run", run)
     rollout = sys.modules["svkc.tools.rollout"]
@@ -77,7 +77,7 @@ functions = st.sampled_from(RETURNS).map(lambda value: lambda t, state, args: va
 good_guard = st.just(lambda t, state, args: state.q[0] + t)
 link_names = or_anything(st.sampled_from(["pin", "spare_0", ("pin", "spare_0"), ["pin"], ()]), 6)
 grips = st.builds(
-    lambda given: outcome(lambda: svkc.Grip(**({"parent": "world", "real": "rocker"} | given))),
+    lambda options: outcome(lambda: svkc.Grip(**({"parent": "world", "real": "rocker"} | options))),
     some_of(
         parent=or_anything(st.just("crank")),
         joint=or_anything(st.just("ball")),
@@ -198,8 +198,8 @@ def few(draw, strategies: dict, most: int = 3):
 @hypothesis.given(t1=or_anything(times, 8), options=few(simulations), wrong=wrongs, value=anything)
 def test_requests(only_traced, t1, options, wrong, value):
     chain, state = scenes()["spare"]
-    given = broken(state, wrong, value)
-    outcome(lambda: svkc.simulate(chain, given, t1, **options), Asked)
+    broken_state = broken(state, wrong, value)
+    outcome(lambda: svkc.simulate(chain, broken_state, t1, **options), RunStarted)
 
 
 LANES = [
@@ -239,7 +239,7 @@ def test_rollouts_and_tuning(only_traced, t1, options, states):
         if isinstance(states, str) and states == "lanes"
         else states
     )
-    outcome(lambda: svkc.rollout(chain, lanes, t1, progress=False, **options), Asked)
+    outcome(lambda: svkc.rollout(chain, lanes, t1, progress=False, **options), RunStarted)
 
 
 CAMERA_OPTIONS = ["size", "lookat", "distance", "azimuth", "camera", "trails"]
@@ -270,13 +270,13 @@ def test_other_calls(only_traced, place, call, value, other):
     zero, path = np.zeros(chain.dofs), place.with_name("seen.gif")
     traj = svkc.load_trajectory(place)
     # (what is no fault is drawn)
-    seen = {
+    camera_options = {
         name: lambda name=name: svkc.render(
             chain, traj, path, **({"size": (64, 48)} | {name: value})
         )
         for name in CAMERA_OPTIONS
     }
-    made = {
+    call_by_name = {
         "tune": lambda: svkc.accuracy.tune(chain, state, value, target=other),
         "halved": lambda: svkc.accuracy.estimate_error(chain, state, value, dt=other),
         "check_grad": lambda: svkc.check_grad(
@@ -294,8 +294,8 @@ def test_other_calls(only_traced, place, call, value, other):
         "load_trajectory": lambda: svkc.load_trajectory(value),
         "save": lambda: traj.save(place.with_name("saved.npz"), value),
         "plot": lambda: traj.plot(value),
-    } | seen
-    outcome(made[call], Asked, FileNotFoundError)
+    } | camera_options
+    outcome(call_by_name[call], RunStarted, FileNotFoundError)
 
 
 # ---- runs
@@ -363,15 +363,15 @@ def test_runs(q, v, pull, t1, dt, at, lossy):
 @hypothesis.given(data=st.data())
 def test_files(kept, data):
     """A file that was cut short, written over, or made of other arrays."""
-    content_of_file, path = kept
+    original, path = kept
     corruption = data.draw(st.integers(0, 3))
     path = path.with_name("changed.npz")
     if corruption == 0:
-        content = content_of_file[: data.draw(st.integers(0, len(content_of_file)))]
+        content = original[: data.draw(st.integers(0, len(original)))]
     elif corruption == 1:
-        at = data.draw(st.integers(0, len(content_of_file) - 1))
+        at = data.draw(st.integers(0, len(original) - 1))
         piece = data.draw(st.binary(min_size=1, max_size=8))
-        content = content_of_file[:at] + piece + content_of_file[at + len(piece) :]
+        content = original[:at] + piece + original[at + len(piece) :]
     elif corruption == 2:
         content = data.draw(st.binary(max_size=100))
     if corruption < 3:

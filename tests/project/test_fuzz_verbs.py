@@ -31,7 +31,7 @@ pytestmark = pytest.mark.slow
 
 
 @st.composite
-def coordinates_given(draw, which: int, name: str):
+def coordinate_arguments(draw, which: int, name: str):
     """q or v for `chain.state`: an array, now and then near a good one, or a dict."""
     chain, state = scenes()[name]
     size = draw(st.sampled_from([NUMBER_OF[name][which], TREE_NUMBER_OF[name][which], 2]))
@@ -54,12 +54,13 @@ def coordinates_given(draw, which: int, name: str):
 def test_states(data):
     name = data.draw(scene)
     chain, _ = scenes()[name]
-    given = data.draw(
+    arguments_ = data.draw(
         some_of(
-            q=or_anything(coordinates_given(0, name)), v=or_anything(coordinates_given(1, name))
+            q=or_anything(coordinate_arguments(0, name)),
+            v=or_anything(coordinate_arguments(1, name)),
         )
     )
-    given |= data.draw(
+    arguments_ |= data.draw(
         some_of(
             connected=or_anything(
                 st.one_of(
@@ -69,7 +70,7 @@ def test_states(data):
             )
         )
     )
-    state = outcome(lambda: chain.state(**given))
+    state = outcome(lambda: chain.state(**arguments_))
     if state is not NOTHING:
         assert all_finite(state)
         starts, _ = chain.topology.quaternion_starts
@@ -82,7 +83,7 @@ def test_states(data):
 
 
 # what each reads besides the state, and whether a NaN in q, v or that shows
-VERBS = {
+FUNCTIONS = {
     "poses": ((), "q"),
     "velocities": ((), "qv"),
     "energy": ((), "qv"),
@@ -111,31 +112,31 @@ WITHOUT_STATE = ("integrate", "difference", "tangent", "xyzw")
 
 @st.composite
 def arguments(draw, name: str):
-    """One argument of a verb, and whether it is good: finite, of the right size, or good but for a
+    """One argument of a function, and whether it is good: finite, of the right size, or good but for a
     NaN."""
-    sizes = {"tau": NUMBER_OF, "v": NUMBER_OF, "q": NUMBER_OF}
+    counts = {"tau": NUMBER_OF, "v": NUMBER_OF, "q": NUMBER_OF}
 
     def one(kind):
         if kind == "dt":
             return draw(
                 st.sampled_from([(1e-3, ""), (0.1, ""), (0.1, ""), (math.nan, "x"), ("a", None)])
             )
-        n = sizes[kind][name][0 if kind == "q" else 1]
-        how = draw(st.integers(0, 7))
-        if how == 0:
+        n = counts[kind][name][0 if kind == "q" else 1]
+        choice = draw(st.integers(0, 7))
+        if choice == 0:
             return draw(anything), None
         good = (
             np.asarray(scenes()[name][1].q)
             if kind == "q"
             else np.array(draw(st.lists(st.floats(-3, 3), min_size=n, max_size=n)))
         )
-        if how == 1:
+        if choice == 1:
             good = good.copy()
             good[0] = draw(st.sampled_from([math.nan, math.inf]))
             return good, "x"
         return (jnp.asarray(good), list(good), good, good.astype(np.float32), good.astype(int))[
-            how % 5
-        ], ("" if how % 5 != 4 or kind != "q" else None)
+            choice % 5
+        ], ("" if choice % 5 != 4 or kind != "q" else None)
 
     return one
 
@@ -143,31 +144,31 @@ def arguments(draw, name: str):
 @examples(0.14)
 @hypothesis.given(st.data())
 def test_verbs(data):
-    name, verb, wrong, value = (
+    name, function, wrong, value = (
         data.draw(st.sampled_from(["tree", "spare"])),
-        data.draw(st.sampled_from(sorted(VERBS))),
+        data.draw(st.sampled_from(sorted(FUNCTIONS))),
         data.draw(wrongs),
         data.draw(anything),
     )
     chain, state = scenes()[name]
-    kinds, shows = VERBS[verb]
-    if verb in WITHOUT_STATE:
+    kinds, shows = FUNCTIONS[function]
+    if function in WITHOUT_STATE:
         wrong = ""
     one = data.draw(arguments(name))
     rest, kept = zip(*map(one, kinds), strict=True) if kinds else ((), ())
-    first = () if verb in WITHOUT_STATE else (broken(state, wrong, value),)
+    first = () if function in WITHOUT_STATE else (broken(state, wrong, value),)
     called = data.draw(or_anything(st.just(chain), 20))
-    done = outcome(lambda: getattr(svkc, verb)(called, *first, *rest))
+    done = outcome(lambda: getattr(svkc, function)(called, *first, *rest))
     if done is NOTHING:
         assert called is not chain or wrong not in ("", "q", "v") or None in kept, (
-            verb,
+            function,
             wrong,
             rest,
         )
     elif wrong == "" and not any(kept) and None not in kept:
-        assert all_finite(done), (verb, rest)
+        assert all_finite(done), (function, rest)
     elif ("x" in kept and "x" in shows) or (wrong in shows and wrong != ""):
-        assert not all_finite(done), (verb, wrong, rest)
+        assert not all_finite(done), (function, wrong, rest)
 
 
 @examples(0.03)
@@ -176,26 +177,26 @@ def test_changes_of_structure(data):
     chain, state = scenes()["spare"]
     wrong, value = data.draw(wrongs), data.draw(anything)
     name = or_anything(st.sampled_from(["pin", "spare_0", "crank", "rocker"]))
-    given = broken(state, wrong, value)
+    arguments_ = broken(state, wrong, value)
     body = or_anything(st.sampled_from(["world", "rocker", "crank"]), 6)
     calls = {
         "connect": lambda: svkc.connect(
             chain,
-            given,
+            arguments_,
             *data.draw(st.lists(name, max_size=2)),
             here=data.draw(or_anything(st.booleans())),
         ),
-        "cut": lambda: svkc.cut(chain, given, *data.draw(st.lists(name, max_size=2))),
-        "lock": lambda: svkc.lock(chain, given, data.draw(name)),
-        "unlock": lambda: svkc.unlock(chain, given, data.draw(name)),
-        "unbind": lambda: svkc.unbind(chain, given, data.draw(name)),
+        "cut": lambda: svkc.cut(chain, arguments_, *data.draw(st.lists(name, max_size=2))),
+        "lock": lambda: svkc.lock(chain, arguments_, data.draw(name)),
+        "unlock": lambda: svkc.unlock(chain, arguments_, data.draw(name)),
+        "unbind": lambda: svkc.unbind(chain, arguments_, data.draw(name)),
         "transition": lambda: svkc.transition(
-            chain, given, data.draw(or_anything(st.just("pin"), 2))
+            chain, arguments_, data.draw(or_anything(st.just("pin"), 2))
         ),
-        "prefer": lambda: svkc.with_independent(chain, given, data.draw(name)),
+        "prefer": lambda: svkc.with_independent(chain, arguments_, data.draw(name)),
         "bind": lambda: svkc.bind(
             chain,
-            given,
+            arguments_,
             data.draw(or_anything(st.just("spare_0"), 6)),
             data.draw(body),
             data.draw(body),

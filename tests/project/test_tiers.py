@@ -61,17 +61,17 @@ def slow(test: ast.FunctionDef, file: str) -> bool:
 
 
 class Names(ast.NodeVisitor):
-    """Names of svkc that a definition comes upon, by way of what it names in its own file, its
-    fixtures and its helpers; but for what it has refused."""
+    """Collects the public names of svkc that a definition uses, directly, or through its file,
+    fixtures and helpers. Calls that the definition expects to raise do not count."""
 
     def __init__(self):
-        self.public, self.seen = set(), set()
+        self.public, self.visited = set(), set()
 
-    def come_upon(self, file: str, name: str):
+    def follow(self, file: str, name: str):
         node = defined(file).get(name)
-        if node is None or (file, name) in self.seen:
+        if node is None or (file, name) in self.visited:
             return
-        self.seen.add((file, name))
+        self.visited.add((file, name))
         before, self.file = getattr(self, "file", None), file
         if isinstance(node, ast.FunctionDef) and says(node, "pytest.raises"):
             # parameters of such a test are the calls that it has refused
@@ -87,18 +87,18 @@ class Names(ast.NodeVisitor):
 
     def visit_arg(self, node):
         # a fixture
-        self.come_upon(self.file, node.arg)
-        self.come_upon("conftest", node.arg)
+        self.follow(self.file, node.arg)
+        self.follow("conftest", node.arg)
 
     def visit_Name(self, node):
-        self.come_upon(self.file, node.id)
+        self.follow(self.file, node.id)
 
     def visit_Attribute(self, node):
         if isinstance(node.value, ast.Name):
             if node.value.id == "svkc":
                 self.public.add(node.attr)
             elif node.value.id in FILES:
-                self.come_upon(node.value.id, node.attr)
+                self.follow(node.value.id, node.attr)
         self.generic_visit(node)
 
 
@@ -115,7 +115,7 @@ def test_the_fast_tier_names_every_public_function():
                 and isinstance(node, ast.FunctionDef)
                 and not slow(node, path.stem)
             ):
-                names.come_upon(path.stem, name)
+                names.follow(path.stem, name)
     public = {
         name for name in dir(svkc) if not name.startswith("_") and callable(getattr(svkc, name))
     }

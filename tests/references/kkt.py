@@ -1,18 +1,22 @@
-"""Accelerations of closed chains another way: MuJoCo's tree and point Jacobians, constraints
-eliminated of joint freedoms, multipliers by least squares."""
+"""Accelerations of closed chains by an independent method, in numpy.
+
+Mass matrix and point Jacobians are MuJoCo's. Each loop has only the constraints of its joint, and
+multipliers are least squares.
+"""
 
 import mujoco
 import numpy as np
 
 
 def _rotation(quat):
+    """Return the rotation matrix of a quaternion."""
     R = np.zeros(9)
     mujoco.mju_quat2Mat(R, quat)
     return R.reshape(3, 3)
 
 
 def acceleration(chain, state, tau) -> np.ndarray:
-    """vdot of the tree, numpy: [M J'; J 0][vdot; -l] = [tau - bias + passive; -Jdot v]."""
+    """Return vdot of the tree from [M J'; J 0][vdot; -l] = [tau - bias + passive; -Jdot v]."""
     model, s = chain.model.model, state.structure
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = np.asarray(state.q)[: model.nq], np.asarray(state.v)[: model.nv]
@@ -20,35 +24,34 @@ def acceleration(chain, state, tau) -> np.ndarray:
     M = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, M)
     bodies = {row: body for body, row in enumerate(chain.topology.body_row)}
-    J, drift = [], []
+    J, Jdot_v = [], []
     for i in np.flatnonzero(np.asarray(s.connected)):
-        sides = []
+        ends = []
         for row, pos in ((s.parent[i], s.pos[i]), (s.real[i], s.real_pos[i])):
             body = bodies[int(row)]
             point = data.xpos[body] + data.xmat[body].reshape(3, 3) @ np.asarray(pos)
             jac, dot = np.zeros((6, model.nv)), np.zeros((6, model.nv))
             mujoco.mj_jac(model, data, jac[3:], jac[:3], point, body)
             mujoco.mj_jacDot(model, data, dot[3:], dot[:3], point, body)
-            sides.append((jac, dot @ data.qvel, jac @ data.qvel, body))
-        (jp, ap, vp, parent), (jr, ar, vr, _) = sides
+            ends.append((jac, dot @ data.qvel, jac @ data.qvel, body))
+        (jp, ap, vp, parent), (jr, ar, vr, _) = ends
         frame = data.xmat[parent].reshape(3, 3) @ _rotation(np.asarray(s.quat[i], float))
         free = np.asarray(s.freedoms[i])
         assert not free[3:].any(), "slides of virtual links are not part of this check"
         w = vp[:3]
-        # what a hinge or ball leaves free is not constrained; the constrained axes turn with the
-        # parent
+        # axes that the joint leaves free are not constrained; the others rotate with the parent
         for k in range(3):
             if not free[k]:
                 n = frame[:, k]
                 J.append(n @ (jp[:3] - jr[:3]))
-                drift.append(n @ (ap[:3] - ar[:3]) + np.cross(w, n) @ (vp[:3] - vr[:3]))
+                Jdot_v.append(n @ (ap[:3] - ar[:3]) + np.cross(w, n) @ (vp[:3] - vr[:3]))
         J.extend(jp[3:] - jr[3:])
-        drift.extend(ap[3:] - ar[3:])
-    J, drift = np.array(J).reshape(-1, model.nv), np.array(drift)
+        Jdot_v.extend(ap[3:] - ar[3:])
+    J, Jdot_v = np.array(J).reshape(-1, model.nv), np.array(Jdot_v)
     force = np.asarray(tau)[: model.nv] - data.qfrc_bias + data.qfrc_passive
-    # M^-1/2 metric: the multipliers that are least squares there, whatever rows are redundant
-    Lc = np.linalg.cholesky(M)
+    # in the metric of M^-1/2, least squares give the constraint forces even if rows are redundant
+    L = np.linalg.cholesky(M)
     free_acceleration = np.linalg.solve(M, force)
-    Jm = np.linalg.solve(Lc, J.T).T
-    correction = np.linalg.lstsq(Jm, -drift - J @ free_acceleration, rcond=1e-9)[0]
-    return free_acceleration + np.linalg.solve(Lc.T, correction)
+    J_scaled = np.linalg.solve(L, J.T).T
+    correction = np.linalg.lstsq(J_scaled, -Jdot_v - J @ free_acceleration, rcond=1e-9)[0]
+    return free_acceleration + np.linalg.solve(L.T, correction)

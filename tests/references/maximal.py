@@ -13,7 +13,7 @@ def _numbers(x) -> str:
 
 
 def _quat(R) -> np.ndarray:
-    """Quaternion of a rotation matrix: the eigenvector of its own 4 by 4 (Bar-Itzhack)."""
+    """Return the quaternion of a rotation matrix, as an eigenvector (Bar-Itzhack, 2000)."""
     R = np.asarray(R)
     K = np.zeros((4, 4))
     K[0, 0] = np.trace(R)
@@ -57,12 +57,12 @@ def mjcf(problem: dict) -> tuple[str, dict, dict, list]:
     bodies = {"ground": Body()} | {name: Body(body) for name, body in specs.items()}
     tree, loops = {}, []
     for joint in problem["joints"]:
-        open_ = (
+        in_tree = (
             joint["child"] not in tree
             and joint["type"] != "universal"
             and (joint["parent"] == "ground" or joint["parent"] in tree)
         )
-        tree.update({joint["child"]: joint}) if open_ else loops.append(joint)
+        tree.update({joint["child"]: joint}) if in_tree else loops.append(joint)
 
     def element(name):
         joint, body, mass = tree[name], bodies[name], specs[name]

@@ -1,4 +1,4 @@
-"""The paper's own forms of what svkc computes in other ways, to compare with."""
+"""The paper's joint_dofs formulas, where svkc uses other ones."""
 
 import functools
 
@@ -26,8 +26,7 @@ from svkc.tree.mass_matrix import mass_matrix_crba
 def forward_dynamics_by_unit_vectors(
     chain: Chain, state: State, tau: Float[Array, " torques"]
 ) -> Float[Array, " dofs"]:
-    """Return the accelerations of every joint coordinate with the inertia matrix column by column
-    from inverse dynamics: the paper's (23), (24)."""
+    """Return the accelerations of every joint coordinate by unit vectors, the paper's (23), (24)."""
     return acceleration(
         chain, state.structure, state.q, state.v, joint_torques(chain, tau), UnitVectors()
     )
@@ -37,10 +36,10 @@ def forward_dynamics_by_unit_vectors(
 def velocity_by_impulse(
     chain: Chain, state: State, name: str
 ) -> tuple[Float[Array, " dofs"], Float[Array, "6"]]:
-    """Return the velocity after connecting one link and the impulse F_1 on it, by the paper's
-    (34)-(38) in the coordinates theta_G of the old structure.
+    """Return the velocity after connecting one link, and the impulse F_1 on it.
 
-    B must be regular. In `state` the link is not connected yet and its bodies are in place.
+    By the paper's (34)-(38), in the coordinates theta_G of the old structure. B must be regular. In
+    `state` the link is not connected yet, and its gap is zero.
     """
     slot, nv = link_index(chain, name), chain.nv
     loops = loop_kinematics(chain, state.structure, state.q)
@@ -58,19 +57,19 @@ def velocity_by_impulse(
     J = assemble_loop_jacobian(chain, after, kin, loop_frames(chain, after, kin, q))[
         6 * slot : 6 * slot + 6
     ]
-    own = np.array([d for d in chain.topology.links.dof[slot] if d < chain.dofs], int)
-    # J_1 - J_2 along theta_G, and the axes of the new joint, on the side where (27) has them
-    J_G, J_r = J[:, :nv] @ before.W[:nv], -J[:, own]
+    joint_dofs = np.array([d for d in chain.topology.links.dof[slot] if d < chain.dofs], int)
+    # J_1 - J_2 along theta_G, and the axes of the new joint with the sign of (27)
+    J_G, J_r = J[:, :nv] @ before.W[:nv], -J[:, joint_dofs]
     A = cho_factor(reduced_mass_matrix(chain, before, mass_matrix_crba(chain, kin)))
     B_inverse = jnp.linalg.inv(J_G @ cho_solve(A, J_G.T))
     C = (
         J_r @ jnp.linalg.solve(J_r.T @ B_inverse @ J_r, J_r.T @ B_inverse)
-        if len(own)
+        if len(joint_dofs)
         else jnp.zeros_like(B_inverse)
     )
     u = J[:, :nv] @ state.v[:nv]
     F = -B_inverse @ (jnp.eye(6, dtype=u.dtype) - C) @ u
     v = state.v + before.W @ cho_solve(A, J_G.T @ F)
-    if len(own):
-        v = v.at[own].set(jnp.linalg.lstsq(J_r, J[:, :nv] @ v[:nv])[0])
+    if len(joint_dofs):
+        v = v.at[joint_dofs].set(jnp.linalg.lstsq(J_r, J[:, :nv] @ v[:nv])[0])
     return v, F

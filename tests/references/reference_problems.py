@@ -79,7 +79,7 @@ def springs(chain, problem):
     def potential(q, structure):
         total = 0.0
         for spring in (force for force in problem["forces"] if force["type"] == "spring_damper"):
-            one, other = (
+            start, stop = (
                 end(q, structure, bodies[spring[e]], spring[f"point_{e}_world0"], spring[e])
                 for e in ("parent", "child")
             )
@@ -87,7 +87,7 @@ def springs(chain, problem):
                 total
                 + spring["stiffness"]
                 / 2
-                * (jnp.linalg.norm(other - one) - spring["rest_length"]) ** 2
+                * (jnp.linalg.norm(stop - start) - spring["rest_length"]) ** 2
             )
         return total
 

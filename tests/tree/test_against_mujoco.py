@@ -1,5 +1,7 @@
-"""Open chains against MuJoCo, every intermediate along a trajectory: random trees, figures nobody
-here wrote, one URDF."""
+"""Open chains against MuJoCo, with every intermediate quantity along a trajectory.
+
+The cases are random trees, models written by others, and one URDF.
+"""
 
 import cases
 import jax
@@ -17,14 +19,16 @@ from svkc.tree.configuration import configuration_derivative
 from svkc.tree.kinematics import kinematics
 from svkc.tree.mass_matrix import mass_matrix_unit_vectors
 
-# MuJoCo says it of gymnasium's half_cheetah.xml
+# MuJoCo warns so of gymnasium's half_cheetah.xml
 pytestmark = pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass' is deprecated")
 
 
 @pytest.fixture(params=cases.params("tree"), scope="module")
 def run(request):
-    """A chain, MuJoCo's data without constraints, and eight states along MuJoCo's own motion with
-    random torques."""
+    """Return a chain, MuJoCo's model and data without constraints, and eight states.
+
+    The states are those of MuJoCo's own motion under random torques.
+    """
     chain = cases.CASES[request.param].build()
     model = chain.model.model
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
@@ -42,7 +46,7 @@ def run(request):
 
 
 @jax.jit
-def everything(chain, state, tau):
+def all_quantities(chain, state, tau):
     kin = kinematics(chain, state.q)
     position, quat = svkc.poses(chain, state)
     linear, angular = svkc.velocities(chain, state)
@@ -70,7 +74,7 @@ def everything(chain, state, tau):
     }
 
 
-def test_every_intermediate(run):
+def test_every_intermediate_quantity(run):
     chain, model, data, states = run
     for q, v, tau in states:
         data.qpos[:], data.qvel[:], data.qfrc_applied[:] = q, v, tau
@@ -79,10 +83,10 @@ def test_every_intermediate(run):
         mujoco.mj_fullM(model, data, M)
         for body in range(model.nbody):
             mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, body, twist[body], 0)
-        got = everything(chain, chain.state(q, v), jnp.asarray(tau))
+        computed = all_quantities(chain, chain.state(q, v), jnp.asarray(tau))
         R = np.zeros((model.nbody, 9))
         for body in range(model.nbody):
-            mujoco.mju_quat2Mat(R[body], np.asarray(got["quat"])[body])
+            mujoco.mju_quat2Mat(R[body], np.asarray(computed["quat"])[body])
         damping = (
             data.qfrc_damper @ v
             if hasattr(data, "qfrc_damper")
@@ -106,9 +110,9 @@ def test_every_intermediate(run):
         for name, value in expected.items():
             scale = max(np.abs(value).max(), 1e-3)
             if name in ("inverse", "power"):
-                # differences of larger numbers: their scale is that of the terms
+                # these are differences of larger terms, whose scale counts
                 scale = max(scale, np.abs(data.qfrc_bias).max() * max(1, np.abs(v).max()))
-            assert np.abs(np.asarray(got[name]) - value).max() <= 1e-10 * scale, name
+            assert np.abs(np.asarray(computed[name]) - value).max() <= 1e-10 * scale, name
 
 
 def test_integrate_and_difference_are_inverse():
@@ -122,20 +126,22 @@ def test_integrate_and_difference_are_inverse():
     np.testing.assert_allclose(rate, configuration_derivative(chain, q, dv), atol=1e-13)
 
 
-def test_open_chain_has_nothing_of_the_closure():
+def test_open_chain_computes_no_loop_constraints():
     chain = cases.CASES["hopper"].build()
     text = str(jax.make_jaxpr(lambda s: svkc.forward_dynamics(chain, s, s.v))(chain.state()))
-    for foreign in ("while", "scan", "argmax"):
-        assert foreign not in text
-    # one solve: with the inertia matrix itself
+    for primitive in ("while", "scan", "argmax"):
+        assert primitive not in text
+    # the only solve is that with the mass matrix
     assert text.count("custom_linear_solve[") == 1
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("twigs", [0, 1, 6])
 def test_deep_chain_agrees_with_mujoco(twigs):
-    """40 levels, past the depth that is unrolled: a chain, one with a twig on every third link, one
-    with a ball and as many twigs there as make it wide."""
+    """Trees of 40 levels, too deep to be unrolled.
+
+    They have no twigs, one on every third link, or several there, one of them on a ball joint.
+    """
     xml, rod = "", '<geom type="capsule" fromto="0 0 0 0 0 -0.1" size="0.02" contype="0"/>'
     for i in range(40):
         for k in range(twigs if i % 3 == 1 else 0):
@@ -160,7 +166,7 @@ def test_deep_chain_agrees_with_mujoco(twigs):
     state = chain.state(data.qpos, data.qvel)
     vdot = svkc.forward_dynamics(chain, state, jnp.zeros(model.nv))
     np.testing.assert_allclose(vdot, data.qacc, rtol=1e-8, atol=1e-8 * np.abs(data.qacc).max())
-    by_composites = acceleration(
+    crba_acceleration = acceleration(
         chain,
         state.structure,
         state.q,
@@ -169,13 +175,13 @@ def test_deep_chain_agrees_with_mujoco(twigs):
         svkc.dynamics.CompositeBodies(),
     )
     np.testing.assert_allclose(
-        vdot, by_composites, rtol=REFERENCE, atol=1e-10 * np.abs(data.qacc).max()
+        vdot, crba_acceleration, rtol=REFERENCE, atol=1e-10 * np.abs(data.qacc).max()
     )
 
 
 @pytest.mark.slow
 def test_derivatives_of_a_deep_chain():
-    """Forward and reverse against differences, through loops over levels."""
+    """Derivatives in both modes agree with finite differences, through loops over levels."""
     xml = ""
     for i in range(30):
         xml = (
