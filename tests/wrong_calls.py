@@ -1,4 +1,4 @@
-"""Calls that are to be refused, by the message that each is refused with."""
+"""Calls that raise, by the message that each raises."""
 
 from unittest import mock
 
@@ -19,7 +19,7 @@ FREE = models.MJCF.format(models.bar("base", 'type="free"', "0 0 1"))
 
 
 class Setting:
-    """What calls are made on."""
+    """Chains, states and files on which the calls are made."""
 
     def __init__(self, folder):
         self.folder = folder
@@ -57,7 +57,7 @@ class Setting:
         return svkc.load(text or models.MJCF.format(models.FOUR_BAR), **kw)
 
     def file(self, **changed):
-        """Loads a run whose file was changed."""
+        """Load a saved run whose file was modified."""
         path = self.folder / "run.npz"
         if not path.exists():
             self.short().save(path)
@@ -76,8 +76,8 @@ class Setting:
         return svkc.bind(self.spare, self.empty, "spare_0", *args, **kw)
 
 
-def away(s):
-    """A link that is to hold what is elsewhere."""
+def connect_elsewhere(s):
+    """Connect a virtual link whose bodies are not at its placement."""
     chain = s.load(virtual_links=[link(pos=(5, 0, 0), real_pos=(0, 0, 0))])
     return svkc.connect(chain, chain.state(), "x")
 
@@ -86,34 +86,34 @@ def link(**kw):
     return svkc.VirtualLink(**({"name": "x", "parent": "world", "real": "rocker"} | kw))
 
 
-def far(s):
-    """A link that its bars are too short for."""
+def unclosable_loop(s):
+    """Return a chain whose loop cannot be closed: the bars are too short."""
     return s.load(virtual_links=[link(pos=(50, 0, 0), real_pos=(0, 0, 0), connected=True)])
 
 
-def endless():
+def infinite_mass():
     model = mujoco.MjModel.from_xml_string(models.MJCF.format(models.bar("a", models.Y, "0 0 -1")))
     model.body_mass[1] = np.inf
     return model
 
 
-def single(s):
+def simulate_without_x64(s):
     with jax.enable_x64(False):
         s.simulate()
 
 
-def crowded(s):
+def rollout_with_nine_processes(s):
     with mock.patch("jax.process_count", return_value=9):
         s.rollout()
 
 
-def too_large(s):
+def rollout_out_of_memory(s):
     exhausted = jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory.")
-    with mock.patch("svkc.tools.rollout._piece", side_effect=exhausted):
+    with mock.patch("svkc.tools.rollout._run_chunk", side_effect=exhausted):
         s.rollout()
 
 
-def undrawn(s):
+def render_without_opengl(s):
     traj = s.short()
     with mock.patch.dict(
         "sys.modules", {"mujoco.egl": None, "mujoco.osmesa": None, "mujoco.glfw": None}
@@ -121,7 +121,7 @@ def undrawn(s):
         svkc.render(s.four, traj, s.folder / "x.gif")
 
 
-def twice(s):
+def clashing_prefixes(s):
     """Two specs attached with one prefix: two default classes of one name."""
     spec = mujoco.MjSpec()
     for name in ("a", "b"):
@@ -133,36 +133,36 @@ def twice(s):
     svkc.load(spec).to_mjcf()
 
 
-def without_ffmpeg(s):
+def render_without_ffmpeg(s):
     with mock.patch.dict("sys.modules", {"imageio_ffmpeg": None}):
         svkc.render(s.four, s.short(), s.folder / "x.mp4")
 
 
-def nameless(s):
-    path = s.folder / "nameless.npz"
+def load_chain_without_model(s):
+    path = s.folder / "no_model.npz"
     s.short().save(path)
     svkc.load_chain(path)
 
 
-def undrawable(s):
+def plot_without_matplotlib(s):
     with mock.patch.dict("sys.modules", {"matplotlib": None}):
         s.short().plot()
 
 
 CASES = {
-    "pictures need": undrawable,
-    "... holds no model": nameless,
+    "pictures need": plot_without_matplotlib,
+    "... holds no model": load_chain_without_model,
     "camera: no": lambda s: s.drawn(camera="nobody's"),
-    "mp4 needs": without_ffmpeg,
-    "run: no scene": lambda s: commands._scene("nowhere", ()),
-    "run: no virtual": lambda s: commands._asked(s.four, [("release", "nobody", 0.1)]),
+    "mp4 needs": render_without_ffmpeg,
+    "run: no scene": lambda s: commands._load_scene("nowhere", ()),
+    "run: no virtual": lambda s: commands._requested_events(s.four, [("release", "nobody", 0.1)]),
     "trails: no": lambda s: s.drawn(trails=("nobody",)),
     "... is not linear": lambda s: jax.linear_transpose(
         custom_primitive("odd", jnp.sin, lambda p, t: (p[0], t[0])), jnp.ones(2)
     )(jnp.ones(2)),
-    "no library to draw with": undrawn,
-    "state and chain are float64": single,
-    "states: ... lanes": crowded,
+    "no library to draw with": render_without_opengl,
+    "state and chain are float64": simulate_without_x64,
+    "states: ... lanes": rollout_with_nine_processes,
     "... has schema": lambda s: s.file(metadata=np.array('{"schema": 99}')),
     "... is not a complete trajectory": lambda s: s.file(metadata=None),
     "... lacks": lambda s: s.file(ts=None),
@@ -207,8 +207,8 @@ CASES = {
     "check_grad: f(x) has": lambda s: svkc.check_grad(lambda x: 1, jnp.asarray(1.0)),
     "check_grad: f(x)...": lambda s: svkc.check_grad(lambda x: jnp.log(x), jnp.asarray(-1.0)),
     "check_grad: x has": lambda s: svkc.check_grad(lambda x: x, jnp.asarray(1)),
-    "chunk=... lanes": too_large,
-    "connect: the bodies": away,
+    "chunk=... lanes": rollout_out_of_memory,
+    "connect: the bodies": connect_elsewhere,
     "connected: expected": lambda s: s.four.state(connected=np.ones(3)),
     "cost: got": lambda s: s.rollout(cost=jnp.ones((1, 2))),
     "cuttable: ... belongs": lambda s: s.load(
@@ -266,7 +266,7 @@ CASES = {
         )
     ),
     "source: the model has no joints": lambda s: svkc.load("<mujoco/>"),
-    "source: the model has numbers": lambda s: svkc.load(endless()),
+    "source: the model has numbers": lambda s: svkc.load(infinite_mass()),
     "...: expected a diffrax object": lambda s: s.simulate(stepsize_controller=3),
     "source: the model cannot": lambda s: s.load("<mujoco><nonsense/></mujoco>"),
     "stabilization": lambda s: s.simulate(stabilization=3),
@@ -291,13 +291,13 @@ CASES = {
         control=lambda t, x, args: jnp.full(s.four.dofs, jnp.nan),
     ),
     "tau: got": lambda s: svkc.forward_dynamics(s.four, s.state, jnp.zeros(9)),
-    "the loops cannot": lambda s: far(s).state(),
+    "the loops cannot": lambda s: unclosable_loop(s).state(),
     "the model has elements": lambda s: s.load(
         s.motor.replace("</worldbody>", '<site name="s"/></worldbody>').replace(
             "<motor", "<position"
         )
     ),
-    "to_mjcf: MuJoCo": twice,
+    "to_mjcf: MuJoCo": clashing_prefixes,
     "to_mjcf: the": lambda s: svkc.load(s.four.model.model).to_mjcf(),
     "traj: expected": lambda s: svkc.render(s.four, 3, "x.gif"),
     "touch: axes": lambda s: svkc.touch(s.four, "pin", 0.1, axes="w"),
@@ -374,7 +374,7 @@ ALSO = [
     ("real numbers", lambda s: s.four.state(v=["x"] * 3)),
     ("foot", lambda s: s.four.state({"crank": 0.1}, connected="foot")),
     # how far two bars reach
-    (r"cannot be closed.*x by \d+\.\d+ m and", lambda s: far(s).state()),
+    (r"cannot be closed.*x by \d+\.\d+ m and", lambda s: unclosable_loop(s).state()),
     # grips in a run
     ("no body 'nose'", lambda s: s.gripped("crank", "nose")),
     ("no coordinates for 'universal'", lambda s: s.gripped("crank", "rocker", joint="universal")),

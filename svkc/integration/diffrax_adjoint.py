@@ -131,11 +131,9 @@ def integrate_with_diffrax(
         throw=False,
         progress_meter=options.progress_meter,
     )
-    assert solution.ts is not None and solution.ys is not None
-    (y_end, ys), result = solution.ys, solution.result._value
-    result = jnp.where(result == diffrax.RESULTS.internal_error._value, NON_FINITE, result)
-    if event is not None:
-        result = jnp.where((result == SUCCESSFUL) & event.occurred, EVENT, result)
+    assert solution.ts is not None
+    assert solution.ys is not None
+    y_end, ys = solution.ys
     accepted = jnp.asarray(solution.stats["num_accepted_steps"], jnp.int32)
     rejected = jnp.asarray(solution.stats["num_rejected_steps"], jnp.int32)
     return PhaseSolution(
@@ -146,7 +144,16 @@ def integrate_with_diffrax(
         checkpoints=ys,
         accepted=accepted,
         rejected=rejected,
-        result=result,
+        result=_result_code(solution, event),
         stats=Stats.attempts_only(t0.dtype, accepted + rejected),
         event=event,
     )
+
+
+def _result_code(solution: diffrax.Solution, event: EventInfo | None):
+    """Return the result code of a phase. `FixedSteps` reports a non-finite state as internal."""
+    result = solution.result._value
+    result = jnp.where(result == diffrax.RESULTS.internal_error._value, NON_FINITE, result)
+    if event is None:
+        return result
+    return jnp.where((result == SUCCESSFUL) & event.occurred, EVENT, result)

@@ -222,13 +222,11 @@ def update_search(
     starts = jnp.any(crossed)
     new_sides = jnp.where(crossed, jnp.where(values >= before, 1, -1), 0).astype(values.dtype)
     sides = jnp.where(starts, new_sides, old.sides)
-    # The bracketed function is negative before the first of the crossings, not negative after it.
-    bracketed = lambda values: jnp.max(jnp.where(sides != 0, sides * values, -jnp.inf))
-    bracket = tree_where(old.narrowing, old.bracket.update(t1, bracketed(values)), old.bracket)
-    bracket = tree_where(
-        starts, Bracket.around(t0, t1, bracketed(before), bracketed(values)), bracket
-    )
-    at_right_end = starts | (old.narrowing & (bracketed(values) >= 0))
+    # The largest of the guards that crossed is negative before the first crossing only.
+    f0, f1 = (jnp.max(jnp.where(sides != 0, sides * x, -jnp.inf)) for x in (before, values))
+    bracket = tree_where(old.narrowing, old.bracket.update(t1, f1), old.bracket)
+    bracket = tree_where(starts, Bracket.around(t0, t1, f0, f1), bracket)
+    at_right_end = starts | (old.narrowing & (f1 >= 0))
     magnitudes = jnp.maximum(jnp.abs(before), jnp.abs(values))
     done = old.active & ~old.narrowing
     active = starts | (old.active & ~done)

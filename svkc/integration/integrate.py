@@ -68,7 +68,8 @@ def integrate_phase(
         ys = jax.tree.map(lambda x: x[jnp.searchsorted(save_ts, save_ts)], ys)
     event, stopped = None, jnp.where(end.t < stop, MAX_STEPS, SUCCESSFUL)
     if options.armed_guards is not None:
-        assert end.search is not None and end.guard_values is not None
+        assert end.search is not None
+        assert end.guard_values is not None
         event = event_info(end.search, end.guard_values, end.t)
         stopped = jnp.where(event.occurred, EVENT, stopped)
     result = jnp.where(end.result == SUCCESSFUL, stopped, end.result)
@@ -143,12 +144,7 @@ def _attempt_step(
     )
     y, info = project_state(field, field_args, y_solver)
     if error is not None and field.projects_by_loop_forces:
-        # Reject a step that projection moves by more than 1000 times its tolerance: without pivots
-        # nothing else shows that loops lose rank.
-        correction = jax.tree.map(lambda new, old: jnp.abs(new - old), y, y_solver)
-        error = jax.tree.map(
-            lambda e, d: jnp.maximum(jnp.abs(e), PROJECTION_ERROR_WEIGHT * d), error, correction
-        )
+        error = _with_projection_error(error, y, y_solver)
     ok = is_finite(y)
     failure = jnp.where(ok, LOOP_OPEN, NON_FINITE)
     if info is not None:
@@ -187,6 +183,20 @@ def _attempt_step(
     )
 
 
+def _with_projection_error(error: ODEState, y: ODEState, y_solver: ODEState) -> ODEState:
+    """Return the error estimate, raised in proportion to the change by projection.
+
+    The controller then rejects a step that projection moves by more than 1000 times its tolerance:
+    without pivots nothing else shows that loops lose rank.
+    """
+    return jax.tree.map(
+        lambda e, new, old: jnp.maximum(jnp.abs(e), PROJECTION_ERROR_WEIGHT * jnp.abs(new - old)),
+        error,
+        y,
+        y_solver,
+    )
+
+
 def _locate_event(
     s: StepperState, attempt: StepAttempt, t1, problem: PhaseProblem, options: StepperOptions
 ) -> tuple[StepAttempt, Array, EventSearch, Array]:
@@ -195,7 +205,8 @@ def _locate_event(
     Return the attempt as the loop takes it, the values of the guards, the search, and whether the
     loop stands still because a root is being located.
     """
-    assert s.search is not None and s.guard_values is not None
+    assert s.search is not None
+    assert s.guard_values is not None
     assert options.armed_guards is not None
     guard_values, search = update_search(
         s.search,

@@ -188,7 +188,8 @@ def update_stats(
     old, keep_step, info = s.stats, attempt.keep_step, attempt.projection_info
     margin, swaps, loop, gap = old.margin, old.swaps, old.loop, old.gap
     if info is not None and info.pivots is not None:
-        assert info.margin is not None and s.projection_info is not None
+        assert info.margin is not None
+        assert s.projection_info is not None
         margin = jnp.where(keep_step, jnp.minimum(margin, info.margin), margin)
         dependent = s.projection_info.dependent
         # The first selection of a phase is not a swap.

@@ -166,8 +166,9 @@ def _integrate(
     event = None
     if armed is not None:
         # the event is located first, without derivatives; the differentiated solve ends at its time
-        frozen = stop_gradient_tree((y0, times, problem))
-        located = integrate_phase(frozen[0], frozen[1], frozen[2], stepper_options)
+        constants = stop_gradient_tree((y0, times, problem))
+        located = integrate_phase(constants[0], constants[1], constants[2], stepper_options)
+        assert located.event is not None
         stop = jnp.where(located.event.occurred, located.t, stop)
         ts, event = jnp.where(ts > stop, stop, ts), located.event
     controller, first_step = options.step_size_control(ts)

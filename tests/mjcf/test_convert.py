@@ -209,7 +209,7 @@ def test_a_scene_as_mjcf_and_back(scene):
     assert residual(again, other) < REFERENCE
 
 
-def test_links_without_an_mjcf_form_are_listed_in_a_comment():
+def test_a_comment_names_links_without_an_mjcf_form():
     """Other joints, motors on virtual joints, slots and what may be cut: a comment, from which the
     links can be declared; connected is the chain's."""
     screw = svkc.VirtualLink(

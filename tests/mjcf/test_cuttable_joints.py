@@ -81,7 +81,7 @@ def test_after_it_there_are_two_systems(case):
         rtol=1e-10,
         atol=1e-12,
     )
-    part = carried_rows(chain)
+    part = bodies_beyond_cut(chain)
     at_cut, later = (
         part_momentum(weightless, jax.tree.map(lambda x, i=i: x[i], traj.states), part)
         for i in (0, 1)
@@ -94,8 +94,8 @@ def test_after_it_there_are_two_systems(case):
     )
 
 
-def carried_rows(chain):
-    """Bodies beyond the first joint that may be cut, as the model has them."""
+def bodies_beyond_cut(chain):
+    """Return the mask of bodies on the far side of the first cuttable joint."""
     model, inside = chain.model.model, np.zeros(len(chain.body_names), bool)
     inside[chain.topology.body_row.index(chain.topology.link_child[0])] = True
     for body in range(1, len(inside)):

@@ -191,7 +191,7 @@ def test_motors():
     assert svkc.load(PENDULUM).actuated.tolist() == [True]
 
 
-def test_unsupported_elements_are_listed_once():
+def test_one_error_names_all_unsupported_elements():
     xml = PENDULUM.replace("<worldbody>", '<option density="1.2"/><worldbody>').replace(
         'name="arm" type="hinge"', 'name="arm" frictionloss="0.1" type="hinge"'
     )

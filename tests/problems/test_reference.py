@@ -175,8 +175,8 @@ def test_andrews_mechanism():
         control=springs(chain, reference["problem"]),
         **tight(1e-12),
     )
-    # Absolute angles: beta of K1, gamma of K3, delta of K5, epsilon of K7. Relative angles: Theta of
-    # K2 on K1, Phi of K4 on K5, Omega of K6 on K7.
+    # Absolute angles: beta of K1, gamma of K3, delta of K5, epsilon of K7. Relative angles: Theta
+    # of K2 on K1, Phi of K4 on K5, Omega of K6 on K7.
     bodies_of_angle = {
         "beta": ("K1",),
         "gamma": ("K1", "K2", "K3"),

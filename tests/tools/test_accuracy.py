@@ -1,5 +1,4 @@
-"""The dial: orders of the integrators, what each way against drift holds, and the certificate of a
-run."""
+"""Orders of integrators, stabilizations, error estimates, tuning, and the report of a run."""
 
 import diffrax
 import equinox as eqx
@@ -19,7 +18,7 @@ from svkc.tools.accuracy import Candidate, default_candidates
 
 @pytest.fixture(scope="module")
 def arm():
-    """A free body with a ball and a hinge on it, thrown and spinning: orientations all the way."""
+    """A free body with a ball and a hinge on it, thrown and spinning."""
     rods = models.bar(
         "base",
         'type="free"',
@@ -52,7 +51,7 @@ def arm():
     ids=lambda x: type(x).__name__ if isinstance(x, diffrax.AbstractSolver) else None,
 )
 def test_order_of_integrators(arm, exact, solver, order, dt):
-    """Halving the step divides the error by two to the order, on balls and free joints as well."""
+    """Halving the step divides the error by two to the order, also on balls and free joints."""
     chain, state = arm
     run = jax.jit(
         lambda dt: svkc.simulate(chain, state, 0.4, dt=dt, solver=solver, max_steps=2000).final
@@ -62,7 +61,7 @@ def test_order_of_integrators(arm, exact, solver, order, dt):
         for end in (run(dt), run(dt / 2))
     ]
     assert errors[1] > 1e-13
-    # (Tsit5's leading term is so small that it goes by the sixth order here)
+    # the leading error term of Tsit5 is so small that its order appears as six here
     assert order - 0.3 < np.log2(errors[0] / errors[1]) < order + 1.3
 
 
@@ -73,8 +72,10 @@ def exact(arm):
 
 @pytest.mark.slow
 def test_symplectic_euler_keeps_energy():
-    """A pendulum for 100 swings with 60 steps each: the energy's error does not grow, that of the
-    explicit one does."""
+    """The energy error of symplectic Euler does not grow; that of Rodrigues-Euler does.
+
+    A pendulum swings 100 times, with 60 steps each.
+    """
     chain = svkc.load(
         models.MJCF.format(models.bar("rod", models.Y, "0 0 -1")).replace("0.3 -0.2", "0 0")
     )
@@ -100,7 +101,7 @@ def test_symplectic_euler_keeps_energy():
     ],
 )
 def test_each_stabilization_closes_the_loops(stabilization):
-    """One motion, loops closed to round-off. By short steps, and by one that is too long."""
+    """Short steps close the loops to round-off; one step that is too long reduces the gap."""
     chain = models.four_bar()
     state = chain.state(v={"crank": 4.0})
     unstabilized = lambda t1, dt: svkc.simulate(
@@ -118,7 +119,7 @@ def test_each_stabilization_closes_the_loops(stabilization):
 
 
 def test_partitioning_moves_only_dependent_coordinates():
-    """Where no other may: the loops are closed, and the independent coordinates stay."""
+    """Coordinate partitioning closes the loops and leaves the independent coordinates unchanged."""
     chain = models.four_bar()
     drifted = svkc.simulate(
         chain,
@@ -139,7 +140,7 @@ def test_partitioning_moves_only_dependent_coordinates():
     assert np.abs(svkc.loop_gaps(chain, drifted)).max() > 1e-6
     assert np.abs(svkc.loop_gaps(chain, closed)).max() < 1e-13
     assert np.abs(svkc.loop_gap_rates(chain, closed)).max() < ROUND_OFF
-    # in the metric of the inertia they move too
+    # projection in the metric of the mass matrix moves independent coordinates as well
     assert np.abs(projected(False)[0][independent] - drifted.q[independent]).max() > 1e-9
 
 
@@ -164,8 +165,7 @@ def test_former_names_of_dynamics():
 
 
 def test_every_line_of_the_report():
-    """Every line of it against what is known otherwise: four bars driven round, a figure in flight,
-    lanes."""
+    """Each number of the report equals an independent computation, for a driven four-bar."""
     chain = models.four_bar()
     control = lambda t, s, args: jnp.zeros(chain.dofs).at[0].set(3.0)
     dynamics = svkc.dynamics.CompositeBodies(hold=None)
@@ -204,8 +204,7 @@ def test_every_line_of_the_report():
         int(report.evaluations),
         int(report.phases),
     ) == (50, 0, 350, 1)
-    # the sum of what steps are estimated to err is an estimate of what the run does, within an
-    # order or two
+    # the sum of the steps' error estimates is within two or three orders of the run's error
     error = float(np.sqrt(np.mean((coarse.final.q - fine.final.q) ** 2)))
     assert 0.01 * error < float(report.error) < 1000 * error
     assert int(report.swaps) > 0
@@ -228,8 +227,9 @@ def test_every_line_of_the_report():
 
 @pytest.mark.slow
 def test_the_report_covers_steps_between_saved_times():
-    """A loop that drifts open and is cut: no saved state shows it, the certificate does, and the
-    run's code."""
+    """A loop drifts open and is cut before the next save time: the report and the result code show
+    it.
+    """
     chain = models.four_bar()
     options = {
         "dt": 0.02,
@@ -263,8 +263,10 @@ def test_momentum_drift_of_a_free_system(arm):
 
 @pytest.mark.slow
 def test_a_non_finite_lane_stops_and_keeps_its_last_finite_state(arm):
-    """By control, by a guard, with fixed steps and adaptive ones: the time and the phase, the last
-    state that was whole; other lanes are untouched."""
+    """NaN from control or a guard stops its lane at that time; other lanes are unaffected.
+
+    Tested with fixed steps, adaptive steps and diffrax's adjoint.
+    """
     chain, state = arm
 
     def run(times, **kw):
@@ -296,7 +298,7 @@ def test_a_non_finite_lane_stops_and_keeps_its_last_finite_state(arm):
         assert lanes.phases.count.tolist() == [2, 2, 1]
         assert np.isfinite(lanes.final.q).all()
         assert np.isfinite(lanes.states.q).all()
-        # beside lanes in which nothing goes wrong
+        # the finite lane equals itself in a batch without NaN
         finite_lanes = batch(jnp.ones((3, 2)))
         assert np.all(finite_lanes.result == svkc.RESULTS.successful)
         np.testing.assert_allclose(lanes.final.q[0], finite_lanes.final.q[0], atol=ROUND_OFF)
@@ -311,7 +313,7 @@ def test_a_non_finite_lane_stops_and_keeps_its_last_finite_state(arm):
 
 @pytest.mark.slow
 def test_a_non_finite_event_keeps_the_state_before_it():
-    """Made by an event, at the very end: the state before it is kept."""
+    """An event at the end of the run produces NaN: the final state is the one before the event."""
     four = models.four_bar()
     hanging = four.state(connected=())
 
@@ -327,7 +329,8 @@ def test_a_non_finite_event_keeps_the_state_before_it():
 
 
 def test_tune(capsys):
-    """The fastest of those that hold the target on this scene; a target that nobody holds."""
+    """`tune` returns the fastest candidate that reaches the target, and None if no candidate does.
+    """
     chain = models.four_bar()
     state = chain.state(v={"crank": 4.0})
     candidates = [
@@ -364,7 +367,7 @@ def test_tune(capsys):
 
 
 def test_estimate_error_agrees_with_the_true_error(arm, exact):
-    """The difference of a run and a finer one is what the run errs by."""
+    """The estimate is within a factor of two of the true error."""
     chain, state = arm
     for options in ({"dt": 0.02, "solver": diffrax.Heun()}, {"rtol": 1e-5, "atol": 1e-7}):
         estimate = svkc.accuracy.estimate_error(chain, state, 0.4, **options)

@@ -1,5 +1,4 @@
-"""Many runs at once: lanes that differ in all they can, chunks, devices, processes,
-interruptions."""
+"""Rollouts: lanes that differ in all arguments, chunks, devices, processes, interruptions."""
 
 import os
 import pathlib
@@ -22,7 +21,7 @@ LANES = 11
 
 
 def lane(chain, x):
-    """Every lane its own release, torque, gravity and end."""
+    """Return a lane's own release, torque, gravity and end time."""
     chain = eqx.tree_at(lambda c: c.gravity, chain, chain.gravity * x["gravity"])
     return {
         "chain": chain,
@@ -37,7 +36,7 @@ def control(t, state, torque):
 
 
 def held_rods():
-    """Two rods held by a grip at the far end, let go at some time."""
+    """Return two rods whose far end a grip holds until a release, states, and data of the lanes."""
     rods = models.bar(
         "upper",
         models.Y,
@@ -56,7 +55,7 @@ def held_rods():
     )
     chain = svkc.load(models.MJCF.format(rods), virtual_links=[grip])
     share = jnp.linspace(0, 1, LANES)
-    # every other lane is not held from the first
+    # the grip of every other lane is cut from the start
     starts = [chain.state({"upper": 0.0}), chain.state({"upper": 0.3}, connected=())]
     states = jax.tree.map(lambda *x: jnp.stack([x[i % 2] for i in range(LANES)]), *starts)
     return (
@@ -78,7 +77,8 @@ def run_rollout(chain, states, data, **options):
 
 
 def main(rank, count, port, out, dies=""):
-    """One process of several; `dies`: the one that is killed after its first chunk."""
+    """Run one process of several. dies: rank of the process that is killed after its first chunk.
+    """
     if rank == dies:
         save = svkc.Trajectory.save
         svkc.Trajectory.save = lambda *args: (save(*args), os.kill(os.getpid(), signal.SIGKILL))
@@ -101,7 +101,7 @@ def case():
 
 @pytest.fixture(scope="module")
 def single_runs(case):
-    """Each lane by itself."""
+    """Run each lane alone."""
     chain, states, data = case
     simulate_lane = lambda s, own: svkc.simulate(
         own.pop("chain"), s, control=control, rtol=1e-6, atol=1e-8, throw=False, **own
@@ -120,7 +120,7 @@ def assert_equal_to_single_runs(traj, single_runs):
 
 
 def test_lanes_equal_single_runs(case, single_runs, capsys):
-    """Whatever the chunks, and the order in which lanes are taken."""
+    """Lanes equal single runs, for several chunks and an order by cost."""
     traj = run_rollout(*case, chunk=4, cost=-np.arange(LANES) % 3)
     assert_equal_to_single_runs(traj, single_runs)
     assert "3 of 3 chunks (11 lanes)" in capsys.readouterr().err
@@ -128,13 +128,13 @@ def test_lanes_equal_single_runs(case, single_runs, capsys):
 
 @pytest.mark.slow
 def test_all_lanes_at_once(case, single_runs, capsys):
-    """In one chunk, and without a word."""
+    """One chunk gives equal results, without progress output."""
     assert_equal_to_single_runs(run_rollout(*case, progress=False), single_runs)
     assert capsys.readouterr().err == ""
 
 
 def test_out_of_memory_names_the_chunk(case, monkeypatch):
-    """The one that was given, or the default of a CPU; other errors of XLA are passed on."""
+    """The message names the chunk size, given or default; other XLA errors are raised unchanged."""
     chain, states, data = case
     more_lanes = jax.tree.map(lambda x: jnp.concatenate([x] * 8), (states, data))
 
@@ -174,7 +174,7 @@ def test_an_interrupted_rollout_resumes(case, single_runs, tmp_path, monkeypatch
     first_chunk = tmp_path / "run" / "chunk_00000.npz"
     stamp = first_chunk.stat().st_mtime_ns
     assert_equal_to_single_runs(run_rollout(*case, chunk=4, out=tmp_path / "run"), single_runs)
-    # the finished chunk was read, not made again
+    # the finished chunk was loaded, not run again
     assert saved_names == [
         "chunk_00000.npz",
         "chunk_00001.npz",
@@ -210,7 +210,7 @@ def start_processes(count, out, dies=""):
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [2, 4])
 def test_several_processes(single_runs, tmp_path, count):
-    """Each takes its share, all have the whole."""
+    """Each process runs a share of the chunks, and all return the complete result."""
     for process in start_processes(count, tmp_path):
         _, stderr = process.communicate(timeout=600)
         assert process.returncode == 0, stderr[-3000:]
@@ -225,13 +225,15 @@ def test_several_processes(single_runs, tmp_path, count):
 
 @pytest.mark.slow
 def test_a_killed_process_keeps_its_chunks(case, single_runs, tmp_path):
-    """The other one ends and says why; what is finished stays, and the next run goes on from it."""
+    """The surviving process ends with an explanation, and the next rollout uses the finished
+    chunks.
+    """
     surviving, killed = start_processes(2, tmp_path, dies="1")
     _, stderr = surviving.communicate(timeout=600)
     killed.communicate(timeout=600)
     assert killed.returncode == -signal.SIGKILL
     assert surviving.returncode != 0
-    # ours, or that of jax, whichever sees it first
+    # the message is svkc's or jax's, whichever notices first
     assert "another process has ended" in stderr or "another task died" in stderr
     finished = sorted(path.name for path in tmp_path.glob("chunk_*.npz"))
     assert finished == ["chunk_00000.npz", "chunk_00001.npz", "chunk_00002.npz", "chunk_00004.npz"]

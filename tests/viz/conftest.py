@@ -1,4 +1,4 @@
-"""Runs that pages show."""
+"""Runs whose pages are tested."""
 
 import html
 
@@ -12,7 +12,7 @@ import svkc
 
 @pytest.fixture(scope="module")
 def release(high_bar):
-    """Two hands, one, none, in half a second."""
+    """The high bar for half a second: two hands, one, none."""
     chain, state = high_bar
     events = [svkc.at(t, cut=link) for t, link in CUTS.items()]
     return chain, svkc.simulate(
@@ -22,7 +22,7 @@ def release(high_bar):
 
 @pytest.fixture(scope="module")
 def stopped():
-    """A four-bar that is let go and caught again, to a stop of the run before its time."""
+    """A four-bar that is cut and connected again; the second event stops the run before t1."""
     chain = models.four_bar()
     events = [svkc.at(0.023, cut="pin"), svkc.at(0.035, connect="pin", here=True, stop=True)]
     return chain, svkc.simulate(
@@ -37,7 +37,8 @@ def stopped():
 
 @pytest.fixture(scope="module")
 def pendulum():
-    """Nothing virtual in it, and a body whose name would end the script, were it let."""
+    """A chain without virtual links, and with a body name that would end a script if not escaped.
+    """
     body = (
         f'<body name="{html.escape(NAME)}"><joint name="j" axis="0 1'
         f' 0"/>{models.BAR.format("0 0 -1")}</body>'

@@ -1,4 +1,4 @@
-"""What pages show: names, times, kinds of geoms, and runs of no length."""
+"""Models and runs of the page tests: names, times, kinds of geoms, runs of zero duration."""
 
 import jax.numpy as jnp
 
@@ -23,6 +23,7 @@ KINDS = """<mujoco><asset>
 
 
 def static_run(chain):
+    """Return a run of zero duration."""
     return svkc.simulate(chain, chain.state(), 0.0, ts=jnp.zeros(1))
 
 

@@ -8,7 +8,7 @@ ROD = """<mujoco><worldbody><light pos="0 0 5"/>{}
 
 
 def test_each_camera_gives_another_image(tmp_path):
-    """The model's own by its name, and those that are placed, each see something else."""
+    """The model's camera and each placement of the free camera give different images."""
     from PIL import Image
 
     camera = '<camera name="above" pos="0 -1 4" xyaxes="1 0 0 0 1 0"/>'
@@ -26,7 +26,7 @@ def test_each_camera_gives_another_image(tmp_path):
                 chain, traj, tmp_path / f"{i}.gif", size=(96, 64), trails=("rod",), **view
             )
         except RuntimeError:
-            # without an offscreen OpenGL there is no picture: test_messages has what is said then
+            # no offscreen OpenGL: test_messages checks the message
             return
         with Image.open(path) as image:
             assert image.width == 96

@@ -1,4 +1,4 @@
-"""What a browser makes of the page of a run."""
+"""Behaviour of a run's page in a browser."""
 
 import html
 import io
@@ -43,7 +43,7 @@ def browser():
 
 @pytest.fixture
 def open_page(browser):
-    """Opens a page from its file, with no network; whatever the console has to say is an error."""
+    """Open a page from its file, without a network. Any console message is a failure."""
     messages, pages = [], []
 
     def visit_(path, width=1000, height=640):
@@ -63,10 +63,10 @@ def open_page(browser):
 
 
 def screenshot(page):
-    """What is drawn, without numbers and timeline."""
+    """Return the pixels of the drawing, without numbers and time line."""
     from PIL import Image
 
-    # two frames: the one that was asked for, and the one in which it is shown
+    # the requested frame is shown in the frame after it
     page.evaluate(
         "() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
     )
@@ -76,7 +76,7 @@ def screenshot(page):
 
 
 def count_changed_pixels(one, other) -> int:
-    """Pixels that differ."""
+    """Return the number of pixels that differ."""
     return int(np.sum(np.abs(one - other).max(-1) > 24))
 
 
@@ -86,13 +86,13 @@ def read_number(page, name):
 
 @pytest.mark.slow
 def test_playing_seeking_and_keys(release, open_page, tmp_path):
-    """The numbers at every time are the trajectory's."""
+    """At every time the page's numbers are the trajectory's."""
     chain, traj = release
     page = open_page(svkc.render(chain, traj, tmp_path / "run.html"))
     first = screenshot(page)
     assert len(np.unique(first.reshape(-1, 3), axis=0)) > 200
     assert read_number(page, "time") == 0
-    # by hand: a click into each phase
+    # click into each phase
     bar, phases_shown = page.locator("#track").bounding_box(), []
     for t, mobility, held in (
         (0.1, 12, "right_hand_grip\nleft_hand_grip"),
@@ -116,28 +116,28 @@ def test_playing_seeking_and_keys(release, open_page, tmp_path):
     )
     assert len({gap for _, gap, _ in phases_shown}) == 3
     assert phases_shown[0][2] != phases_shown[1][2]
-    # at a saved time: bodies, energy and gap of the trajectory
+    # at a save time: bodies, energy and gap of the trajectory
     page.evaluate("svkc.seek(svkc.run.times[13])")
     state = jax.tree.map(lambda x: x[13], traj.states)
     place = page.evaluate("svkc.bodies.map(body => body.matrixWorld.elements.slice(12, 15))")
     np.testing.assert_allclose(place, svkc.poses(chain, state)[0], atol=1e-5)
     assert read_number(page, "energy") == pytest.approx(float(svkc.energy(chain, state)), abs=2e-4)
     assert read_number(page, "gap") == pytest.approx(float(traj.gaps[13, 1]), rel=0.1)
-    # half way between two saved times
+    # half way between two save times
     page.evaluate("svkc.seek((svkc.run.times[2] + svkc.run.times[3]) / 2)")
     midway = page.evaluate("svkc.bodies.map(body => body.matrixWorld.elements.slice(12, 15))")
     both = [svkc.poses(chain, jax.tree.map(lambda x, i=i: x[i], traj.states))[0] for i in (2, 3)]
     np.testing.assert_allclose(midway, (both[0] + both[1]) / 2, atol=1e-5)
-    # by itself, to its end, and from there once more
+    # play to the end, then press Home
     page.evaluate("svkc.seek(0)")
     page.click("#play")
     page.wait_for_function("svkc.time > 0.02")
     page.wait_for_function("svkc.time === 0.5")
     page.wait_for_selector("#play[aria-label=play]")
-    # (the button that was pressed last takes no keys but its own)
+    # the focused button takes no keys but its own
     page.keyboard.press("Home")
     assert read_number(page, "time") == 0
-    # by the keys: on and off, a frame at a time
+    # keys: play, pause, single frames
     page.locator("#track").focus()
     page.keyboard.press("ArrowRight")
     assert read_number(page, "time") == pytest.approx(0.025)
@@ -153,7 +153,9 @@ def test_playing_seeking_and_keys(release, open_page, tmp_path):
 
 @pytest.mark.slow
 def test_event_marks(release, open_page, tmp_path):
-    """A mark says what happened, leads there, and the links that hold are drawn until then."""
+    """A mark on the time line names its event and seeks to it; connected links are drawn until
+    then.
+    """
     page = open_page(svkc.render(*release, tmp_path / "run.html"))
     marks, bar = page.locator(".mark"), page.locator("#track").bounding_box()
     assert marks.count() == len(CUTS)
@@ -183,7 +185,7 @@ def test_event_marks(release, open_page, tmp_path):
 
 @pytest.mark.slow
 def test_energy_jumps_where_a_link_is_connected(stopped, open_page, tmp_path):
-    """Between saved times too, numbers are those of one phase."""
+    """Between save times, too, the numbers are those of one phase."""
     chain, traj = stopped
     page = open_page(svkc.render(chain, traj, tmp_path / "run.html"))
 
@@ -197,14 +199,14 @@ def test_energy_jumps_where_a_link_is_connected(stopped, open_page, tmp_path):
     assert read_number(page, "time") == 0.035
     assert [read_number(page, "mobility"), page.inner_text("#links").strip()] == [1, "pin"]
     assert energy(0.0229) == pytest.approx(float(traj.phases.energy[0, 1]), rel=1e-5)
-    # no state was saved between the cut and this: where nothing holds, nothing is drawn
+    # no state was saved since the cut: placements are unknown and no link is drawn
     assert energy(0.0231) == pytest.approx(float(traj.phases.energy[1, 0]), rel=1e-5)
     assert page.evaluate("[...svkc.holds.values()].filter(([ball]) => ball.visible).length") == 0
 
 
 @pytest.mark.slow
 def test_the_camera_turns_and_keeps_all_bodies_in_view(release, open_page, tmp_path):
-    """Also in a narrow window, and after its size changed."""
+    """All bodies are in view, also in a narrow window and after a change of size."""
     path = svkc.render(*release, tmp_path / "run.html")
     page = open_page(path)
     first = screenshot(page)
@@ -251,7 +253,7 @@ def test_every_kind_of_geom_is_drawn(open_page, tmp_path):
 
 @pytest.mark.slow
 def test_names_are_escaped_in_the_browser(pendulum, open_page, tmp_path):
-    """And a run of one moment can be looked at."""
+    """A name with HTML tags stays text; a run of zero duration has a page."""
     chain = pendulum
     page = open_page(svkc.render(chain, static_run(chain), tmp_path / "one.html"))
     assert page.evaluate("svkc.bodies[1].name") == chain.body_names[1]
@@ -265,7 +267,7 @@ def test_names_are_escaped_in_the_browser(pendulum, open_page, tmp_path):
 
 @pytest.mark.slow
 def test_a_notebook_shows_the_page(release, open_page, tmp_path):
-    """As a frame in its own document."""
+    """The notebook's representation is a frame with its own document."""
     shown = svkc.show(*release, height=400)
     cell = shown._repr_html_()
     assert html.unescape(re.search(r'srcdoc="([^"]*)"', cell).group(1)) == shown.text

@@ -1,4 +1,4 @@
-"""The page of a run: what is in its file."""
+"""Contents of the file of a run's page."""
 
 import base64
 import json
@@ -19,7 +19,7 @@ import svkc
 
 
 def page_data(path) -> dict:
-    """The run inside a page."""
+    """Return the data of the run inside a page."""
     inside = re.findall(
         r'<script type="application/json" id="run">(.*?)</script>',
         pathlib.Path(path).read_text(),
@@ -35,7 +35,7 @@ def test_the_page_is_self_contained(release, tmp_path):
     path = svkc.render(chain, traj, tmp_path / "run.html")
     assert path == tmp_path / "run.html"
     text, run = path.read_text(), page_data(path)
-    # nothing is fetched, the licence goes with what it is for, every part was put in
+    # nothing is fetched, the licence of three.js is included, every placeholder is replaced
     assert not re.search(
         r'src=|<link(?! rel="icon" href="data:,")|@import|url\(', text.split("<script", 1)[0]
     )
@@ -63,7 +63,7 @@ def test_the_page_is_self_contained(release, tmp_path):
     assert [(e["time"], e["text"], e["lost"]) for e in run["events"]] == [
         (t, f"cut {link}", 0) for t, link in CUTS.items()
     ]
-    # both ends of a link that holds are at one place
+    # both ends of a connected link coincide
     (parent, at), (real, there) = run["phases"][0]["links"][0]["ends"]
     assert (chain.body_names[parent], chain.body_names[real]) == ("world", "right_hand")
     x, R = poses[0, real, :3], svkc.mjcf.bodies.matrix(poses[0, real, 3:].astype(float))
@@ -72,7 +72,7 @@ def test_the_page_is_self_contained(release, tmp_path):
 
 @pytest.mark.slow
 def test_ten_seconds_are_below_five_megabytes(release, tmp_path):
-    """At 40 saved times a second."""
+    """The page of ten seconds at 40 save times a second is below five megabytes."""
     chain, traj = release
     again = np.arange(401) % 21
     parts = lambda t: (t.ts, t.states, t.gaps, t.t_final)
@@ -103,8 +103,7 @@ def test_names_are_escaped(pendulum, tmp_path):
 
 @pytest.mark.slow
 def test_the_page_of_a_stopped_run_ends_at_its_stop(stopped, tmp_path):
-    """Times asked for past the end are left out, what the last event made is there, what is no
-    number is null."""
+    """Save times after the end are left out, the last event's phase is there, NaN is null."""
     chain, traj = stopped
     run = page_data(svkc.render(chain, traj, tmp_path / "stopped.html"))
     np.testing.assert_allclose(run["times"], [0, 0.01, 0.02, 0.03, 0.035])
@@ -139,7 +138,7 @@ def test_every_kind_of_geom(tmp_path):
         "mesh",
         "mesh",
     ]
-    # the material's colour; a mesh that is used twice is there once
+    # a geom has its material's color; a mesh that is used twice is stored once
     assert run["geoms"][2]["rgba"] == [0, 1, 0, 1]
     assert [g.get("mesh") for g in run["geoms"]].count(1) == 2
     hill = np.frombuffer(base64.b64decode(run["meshes"][0]["vertices"]), "<f4").reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""Flat pictures of a run."""
+"""Plots of a run."""
 
 import jax.numpy as jnp
 import matplotlib.image
@@ -11,8 +11,8 @@ import svkc
 
 @pytest.mark.slow
 def test_a_long_floor_does_not_shrink_the_figure(tmp_path):
-    """What is fixed is shown no further than a metre beyond what moves: however long the floor, the
-    picture is the same."""
+    """Ground shapes are shown at most a metre beyond the bodies: the floor's length has no effect.
+    """
 
     def drawn(half: float):
         floor = (
@@ -30,7 +30,7 @@ def test_a_long_floor_does_not_shrink_the_figure(tmp_path):
 
 
 def test_plot_draws_coordinates_and_events():
-    """Lines over the saved times, the axes named, an event marked."""
+    """Axes have labels, coordinates are curves over the save times, an event is a vertical line."""
     chain = svkc.load(models.ARM)
     traj = svkc.simulate(
         chain,

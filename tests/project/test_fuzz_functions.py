@@ -54,13 +54,13 @@ def coordinate_arguments(draw, which: int, name: str):
 def test_states(data):
     name = data.draw(scene)
     chain, _ = scenes()[name]
-    arguments_ = data.draw(
+    state_arguments = data.draw(
         some_of(
             q=or_anything(coordinate_arguments(0, name)),
             v=or_anything(coordinate_arguments(1, name)),
         )
     )
-    arguments_ |= data.draw(
+    state_arguments |= data.draw(
         some_of(
             connected=or_anything(
                 st.one_of(
@@ -70,7 +70,7 @@ def test_states(data):
             )
         )
     )
-    state = outcome(lambda: chain.state(**arguments_))
+    state = outcome(lambda: chain.state(**state_arguments))
     if state is not NOTHING:
         assert all_finite(state)
         starts, _ = chain.topology.quaternion_starts
@@ -112,8 +112,7 @@ WITHOUT_STATE = ("integrate", "difference", "tangent", "xyzw")
 
 @st.composite
 def arguments(draw, name: str):
-    """One argument of a function, and whether it is good: finite, of the right size, or good but for a
-    NaN."""
+    """Draw one argument, and whether it is valid, invalid, or valid except for a NaN."""
     counts = {"tau": NUMBER_OF, "v": NUMBER_OF, "q": NUMBER_OF}
 
     def one(kind):
@@ -177,26 +176,26 @@ def test_changes_of_structure(data):
     chain, state = scenes()["spare"]
     wrong, value = data.draw(wrongs), data.draw(anything)
     name = or_anything(st.sampled_from(["pin", "spare_0", "crank", "rocker"]))
-    arguments_ = broken(state, wrong, value)
+    broken_state = broken(state, wrong, value)
     body = or_anything(st.sampled_from(["world", "rocker", "crank"]), 6)
     calls = {
         "connect": lambda: svkc.connect(
             chain,
-            arguments_,
+            broken_state,
             *data.draw(st.lists(name, max_size=2)),
             here=data.draw(or_anything(st.booleans())),
         ),
-        "cut": lambda: svkc.cut(chain, arguments_, *data.draw(st.lists(name, max_size=2))),
-        "lock": lambda: svkc.lock(chain, arguments_, data.draw(name)),
-        "unlock": lambda: svkc.unlock(chain, arguments_, data.draw(name)),
-        "unbind": lambda: svkc.unbind(chain, arguments_, data.draw(name)),
+        "cut": lambda: svkc.cut(chain, broken_state, *data.draw(st.lists(name, max_size=2))),
+        "lock": lambda: svkc.lock(chain, broken_state, data.draw(name)),
+        "unlock": lambda: svkc.unlock(chain, broken_state, data.draw(name)),
+        "unbind": lambda: svkc.unbind(chain, broken_state, data.draw(name)),
         "transition": lambda: svkc.transition(
-            chain, arguments_, data.draw(or_anything(st.just("pin"), 2))
+            chain, broken_state, data.draw(or_anything(st.just("pin"), 2))
         ),
-        "prefer": lambda: svkc.with_independent(chain, arguments_, data.draw(name)),
+        "prefer": lambda: svkc.with_independent(chain, broken_state, data.draw(name)),
         "bind": lambda: svkc.bind(
             chain,
-            arguments_,
+            broken_state,
             data.draw(or_anything(st.just("spare_0"), 6)),
             data.draw(body),
             data.draw(body),
