@@ -320,7 +320,7 @@ CASES = {
 
 # other ways to some of the messages, by words of those
 ALSO = [
-    ("libegl1 libgl1", undrawn),
+    ("libegl1 libgl1", render_without_opengl),
     # runs
     ("ts", lambda s: s.simulate(ts=[0.0, 2.0])),
     ("rtol", lambda s: s.simulate(rtol=0.0)),

@@ -205,9 +205,8 @@ def update_search(
 ) -> tuple[Float[Array, " guards"], EventSearch]:
     """Evaluate the guards after an attempted step from t0 to t1, and advance the event search.
 
-    A search starts if a guard crosses zero in a step that is kept. The search then narrows the
-    bracket, and ends with one evaluation just after the root. Return the values of the guards after
-    the step, or at the root once the search is done, and the search.
+    A search starts if a guard crosses zero in a step that is kept, narrows its bracket, and ends
+    with one evaluation after the root. Return the guards at t1 or, once done, at the root.
 
     before: values of the guards at t0.
     y: state at t1.

@@ -21,7 +21,6 @@ from svkc.integration.solution import (
     LOOP_OPEN,
     MAX_STEPS,
     NON_FINITE,
-    PROJECTION_ERROR_WEIGHT,
     SUCCESSFUL,
     PhaseProblem,
     PhaseSolution,
@@ -32,7 +31,11 @@ from svkc.integration.solution import (
     update_stats,
 )
 from svkc.integration.stabilization import needs_projection
-from svkc.integration.step_size import clip_to_save_time, unclipped_step_size
+from svkc.integration.step_size import (
+    clip_to_save_time,
+    unclipped_step_size,
+    with_projection_error,
+)
 from svkc.integration.vector_field import initial_projection_info, project_state
 
 
@@ -144,7 +147,7 @@ def _attempt_step(
     )
     y, info = project_state(field, field_args, y_solver)
     if error is not None and field.projects_by_loop_forces:
-        error = _with_projection_error(error, y, y_solver)
+        error = with_projection_error(error, y, y_solver)
     ok = is_finite(y)
     failure = jnp.where(ok, LOOP_OPEN, NON_FINITE)
     if info is not None:
@@ -180,20 +183,6 @@ def _attempt_step(
         result=result.astype(jnp.int32),
         error_norm=jnp.asarray(jnp.inf, t.dtype) if error is None else rms_norm(error),
         projection_info=info,
-    )
-
-
-def _with_projection_error(error: ODEState, y: ODEState, y_solver: ODEState) -> ODEState:
-    """Return the error estimate, raised in proportion to the change by projection.
-
-    The controller then rejects a step that projection moves by more than 1000 times its tolerance:
-    without pivots nothing else shows that loops lose rank.
-    """
-    return jax.tree.map(
-        lambda e, new, old: jnp.maximum(jnp.abs(e), PROJECTION_ERROR_WEIGHT * jnp.abs(new - old)),
-        error,
-        y,
-        y_solver,
     )
 
 

@@ -21,8 +21,6 @@ SUCCESSFUL, EVENT, MAX_STEPS = (
     diffrax.RESULTS.event_occurred._value,
     diffrax.RESULTS.max_steps_reached._value,
 )
-# Projection by the loops' forces adds this fraction of its correction to the error estimate.
-PROJECTION_ERROR_WEIGHT = 1e-3
 
 
 class PhaseProblem(eqx.Module):

@@ -1,13 +1,16 @@
-"""Step sizes: fixed steps as a controller of diffrax, and steps clipped at save times."""
+"""Step-size control: fixed steps, steps clipped at save times, and errors by projection."""
 
 import diffrax
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from svkc.integration.ode import is_finite
+from svkc.integration.ode import ODEState, is_finite
 
 # A step is stretched by up to this fraction of its length if it then ends at a save time.
 MAX_STRETCH = 1e-6
+# A step has at least this fraction of its change by projection as its estimated error.
+PROJECTION_ERROR_WEIGHT = 1e-3
 
 
 class FixedSteps(diffrax.AbstractStepSizeController):
@@ -65,3 +68,17 @@ def unclipped_step_size(controller, keep_step, taken, *, proposed, before):
         return proposed
     at_bound = keep_step & (proposed >= 0.99 * controller.factormax * taken)
     return jnp.where(at_bound, jnp.maximum(proposed, before), proposed)
+
+
+def with_projection_error(error: ODEState, y: ODEState, y_solver: ODEState) -> ODEState:
+    """Return the error estimate, raised in proportion to the change by projection.
+
+    The controller then rejects a step that projection moves by more than 1000 times its tolerance:
+    without pivots nothing else shows that loops lose rank.
+    """
+    return jax.tree.map(
+        lambda e, new, old: jnp.maximum(jnp.abs(e), PROJECTION_ERROR_WEIGHT * jnp.abs(new - old)),
+        error,
+        y,
+        y_solver,
+    )

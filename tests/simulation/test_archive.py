@@ -1,5 +1,7 @@
-"""Files of trajectories: saved/schema_4.npz was written by `traj.save(path, chain)` when schema 4
-was the current one, other schemas are refused, and what is written is read again bit for bit."""
+"""Trajectory files: a stored file of the current schema, rejected schemas, and round trips.
+
+saved/schema_4.npz was written by `traj.save(path, chain)` with schema 4.
+"""
 
 import json
 import pathlib
@@ -28,14 +30,14 @@ def simulate(chain, state):
 
 @pytest.fixture(scope="module")
 def run():
-    """The chain and the run that the file holds."""
+    """Return the chain and the trajectory of the stored file, simulated again."""
     chain = svkc.load(
         ROD, virtual_links=[svkc.VirtualLink("hook", parent="world", real="rod", joint="weld")]
     )
     return chain, simulate(chain, chain.state({"pivot": 1.2}))
 
 
-def test_a_file_of_the_current_schema_is_read():
+def test_load_file_of_current_schema():
     traj = svkc.load_trajectory(FILE)
     np.testing.assert_allclose(traj.ts, [0, 0.1, 0.2, 0.3])
     np.testing.assert_allclose(traj.states.q[0, 0], 1.2)
@@ -46,8 +48,8 @@ def test_a_file_of_the_current_schema_is_read():
 
 
 @pytest.mark.slow
-def test_its_numbers_are_those_of_the_run(run, tmp_path):
-    """And those that it has when it is saved again."""
+def test_stored_file_equals_a_new_run(run, tmp_path):
+    """The stored file, a new run and its own file hold equal numbers."""
     chain, traj = run
     traj.save(tmp_path / "again.npz", chain)
     old, new = svkc.load_trajectory(FILE), svkc.load_trajectory(tmp_path / "again.npz")
@@ -62,7 +64,7 @@ def test_its_numbers_are_those_of_the_run(run, tmp_path):
 
 
 @pytest.mark.parametrize("schema", [1, 3, 5])
-def test_other_schemas_are_refused(schema, tmp_path):
+def test_other_schemas_are_rejected(schema, tmp_path):
     with np.load(FILE) as file:
         arrays = dict(file)
     metadata = json.loads(str(arrays["metadata"])) | {"schema": schema}
@@ -73,15 +75,16 @@ def test_other_schemas_are_refused(schema, tmp_path):
             load(path)
 
 
-def test_save_and_load(run, tmp_path):
-    """Bit for bit, with the report; what is cut short is refused, and no part of a file stays."""
+def test_save_and_load_round_trip(run, tmp_path):
+    """A loaded trajectory equals the saved one bit for bit; truncated files are rejected, and no
+    temporary file is left."""
     chain, traj = run
     traj.save(tmp_path / "run.npz", chain)
     again = svkc.load_trajectory(tmp_path / "run.npz")
     assert bool(eqx.tree_equal(traj, again))
     assert str(again.report()) == str(traj.report())
-    whole = (tmp_path / "run.npz").read_bytes()
-    (tmp_path / "cut.npz").write_bytes(whole[: len(whole) // 2])
+    content = (tmp_path / "run.npz").read_bytes()
+    (tmp_path / "cut.npz").write_bytes(content[: len(content) // 2])
     (tmp_path / "text.npz").write_text("no")
     for name in ("cut.npz", "text.npz"):
         with pytest.raises(ValueError, match="not a complete trajectory"):
@@ -89,30 +92,30 @@ def test_save_and_load(run, tmp_path):
     assert [p.name for p in tmp_path.glob("*.part")] == []
 
 
-def test_a_saved_run_goes_on(run, tmp_path):
+def test_continue_a_saved_run(run, tmp_path):
     """Chain and state from the file, the chain's floats no longer those of its model: on bit for
-    bit. What else is told of the run."""
+    bit. What else is metadata of the run."""
     chain, _ = run
     heavier = eqx.tree_at(lambda c: c.mass, chain, chain.mass * 1.1)
     traj = simulate(heavier, chain.state({"pivot": 1.2}))
     traj.save(tmp_path / "run.npz", heavier, rtol=1e-8, solver=diffrax.Tsit5())
-    kept = svkc.load_chain(tmp_path / "run.npz")
-    assert bool(eqx.tree_equal(kept, heavier))
-    assert kept.model.text == chain.model.text
-    again = simulate(kept, svkc.load_trajectory(tmp_path / "run.npz").final)
+    loaded = svkc.load_chain(tmp_path / "run.npz")
+    assert bool(eqx.tree_equal(loaded, heavier))
+    assert loaded.model.text == chain.model.text
+    again = simulate(loaded, svkc.load_trajectory(tmp_path / "run.npz").final)
     assert bool(eqx.tree_equal(again, simulate(heavier, traj.final)))
     with np.load(tmp_path / "run.npz") as file:
-        told = json.loads(str(file["metadata"]))
-    assert told["options"] == {"rtol": 1e-8, "solver": "Tsit5()"}
-    assert told["certificate"]["gap"] == float(traj.report().gap)
-    assert "<mujoco" in told["model"]
+        metadata = json.loads(str(file["metadata"]))
+    assert metadata["options"] == {"rtol": 1e-8, "solver": "Tsit5()"}
+    assert metadata["certificate"]["gap"] == float(traj.report().gap)
+    assert "<mujoco" in metadata["model"]
 
 
-def test_a_chain_from_a_file_is_the_same_program(run, tmp_path):
-    """With every argument that `load` takes, as numbers and arrays: equal, and traced once."""
-    hold = svkc.VirtualLink("hold", "world", "rod", "ball", axis=np.array([0, 1e-3, 1 / 3]))
-    given = {"cuttable": "pivot", "ignore": "all", "ignore_armature": {"pivot"}}
-    chain = svkc.load(ROD, virtual_links=hold, spare=np.int64(1), **given)
+def test_a_loaded_chain_does_not_retrace(run, tmp_path):
+    """A chain loaded with all arguments of `load` equals the saved chain and is traced once."""
+    link = svkc.VirtualLink("hold", "world", "rod", "ball", axis=np.array([0, 1e-3, 1 / 3]))
+    arguments = {"cuttable": "pivot", "ignore": "all", "ignore_armature": {"pivot"}}
+    chain = svkc.load(ROD, virtual_links=link, spare=np.int64(1), **arguments)
     run[1].save(tmp_path / "run.npz", chain)
     again = svkc.load_chain(tmp_path / "run.npz")
     assert bool(eqx.tree_equal(again, chain))

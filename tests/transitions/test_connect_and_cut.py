@@ -1,5 +1,5 @@
-"""Structure changes: the velocity after, two ways; cuts, locks, grips where the
-hand is."""
+"""Changes of structure: the velocity after an impact in two formulations, cuts, locks, and
+connections at the current poses."""
 
 import cases
 import jax
@@ -13,7 +13,7 @@ from tolerances import ROUND_OFF
 import svkc
 
 
-def test_both_forms_of_the_impact_agree():
+def test_impact_equals_impulse_equation_for_figure():
     chain, state = cases.flight()
     for name in ("left_hand_grip", "right_hand_grip"):
         v, F = paper.velocity_by_impulse(chain, state, name)
@@ -23,13 +23,13 @@ def test_both_forms_of_the_impact_agree():
         )
         hinge = chain.dofs - 2 + chain.link_names.index(name)
         np.testing.assert_allclose(after.v[hinge], v[hinge], atol=1e-10 * float(jnp.abs(v).max()))
-        # the new joint's freedom carries nothing: J_r^T F = 0 for a hinge about y
+        # the freedom of the new joint transmits no impulse: J_r^T F = 0 for a hinge about y
         assert abs(float(F[1])) < 1e-10 * float(jnp.abs(F).max())
         state = after
 
 
-def test_one_by_one_or_together_is_the_same():
-    """Plastic latches are projections; their order does not matter."""
+def test_order_of_connections_does_not_matter():
+    """Inelastic impacts are projections, so their order does not matter."""
     chain, state = cases.flight()
     together = svkc.connect(chain, state, "left_hand_grip", "right_hand_grip")
     left_first = svkc.connect(
@@ -38,16 +38,16 @@ def test_one_by_one_or_together_is_the_same():
     np.testing.assert_allclose(together.v, left_first.v, atol=1e-10)
 
 
-def test_connecting_what_moves_together_changes_nothing(high_bar):
+def test_reconnecting_consistent_motion_is_a_no_op(high_bar):
     chain, state = high_bar
     rng = np.random.default_rng(3)
-    moving = chain.state(state.q[: chain.nq], rng.normal(size=chain.nv))
-    again = svkc.connect(chain, svkc.cut(chain, moving, "left_hand_grip"), "left_hand_grip")
-    np.testing.assert_allclose(again.v, moving.v, atol=ROUND_OFF)
-    np.testing.assert_allclose(again.q, moving.q, atol=ROUND_OFF)
+    consistent = chain.state(state.q[: chain.nq], rng.normal(size=chain.nv))
+    again = svkc.connect(chain, svkc.cut(chain, consistent, "left_hand_grip"), "left_hand_grip")
+    np.testing.assert_allclose(again.v, consistent.v, atol=ROUND_OFF)
+    np.testing.assert_allclose(again.q, consistent.q, atol=ROUND_OFF)
 
 
-def test_a_cut_keeps_every_bit(high_bar):
+def test_a_cut_keeps_q_and_v_bit_for_bit(high_bar):
     chain, state = high_bar
     after = svkc.cut(chain, state, "right_hand_grip")
     assert bool(jnp.all(after.q == state.q))
@@ -62,7 +62,7 @@ def test_a_cut_keeps_every_bit(high_bar):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("joint", ["hinge", "weld", "ball", "slide"])
-def test_both_forms_of_it_agree_between_free_bodies(joint):
+def test_impact_equals_impulse_equation_for_free_bodies(joint):
     chain, rng = models.two_boxes(joint), np.random.default_rng(1)
     state = chain.state(v=rng.normal(size=12))
     after = svkc.connect(chain, state, "grip")
@@ -71,8 +71,8 @@ def test_both_forms_of_it_agree_between_free_bodies(joint):
     np.testing.assert_allclose(after.v, v, atol=1e-10)
 
 
-def test_grip_where_it_is():
-    """Bodies away from the declared placement: here=True makes the joint where the real link is."""
+def test_connect_at_current_pose():
+    """With here=True the joint is made at the current poses, away from the declared placement."""
     chain = svkc.load(
         models.TWO_BOXES,
         virtual_links=[
@@ -87,11 +87,11 @@ def test_grip_where_it_is():
 
 
 def test_lock_and_unlock(high_bar):
-    """A locked knee stops with the impact of stopping and stays; unlocked it moves again."""
+    """A locked knee has zero velocity and acceleration; an unlocked knee accelerates again."""
     chain, state = high_bar
     rng = np.random.default_rng(4)
-    moving = chain.state(state.q[: chain.nq], rng.normal(size=chain.nv))
-    locked = svkc.lock(chain, moving, "right_knee")
+    consistent = chain.state(state.q[: chain.nq], rng.normal(size=chain.nv))
+    locked = svkc.lock(chain, consistent, "right_knee")
     knee = chain.topology.v_start[chain.topology.joint_row[chain.joint_names.index("right_knee")]]
     assert float(locked.v[knee]) == 0
     assert int(svkc.mobility(chain, locked).freedoms) == 11
@@ -104,21 +104,21 @@ def test_lock_and_unlock(high_bar):
 
 
 @pytest.mark.slow
-def test_states_and_changes_under_jit_and_vmap(high_bar):
-    """The verbs are functions of arrays: the same numbers compiled, and lane by lane."""
+def test_state_and_connect_under_jit_and_vmap(high_bar):
+    """Compiled and batched calls give the numbers of single eager calls."""
     chain, state = high_bar
     v = jnp.stack([jnp.full(chain.nv, s) for s in (0.1, -0.2)])
 
     @jax.jit
     @jax.vmap
-    def lanes(v):
-        moving = chain.state(state.q[: chain.nq], v)
-        return moving, svkc.connect(
-            chain, svkc.cut(chain, moving, "left_hand_grip"), "left_hand_grip"
+    def reconnect(v):
+        consistent = chain.state(state.q[: chain.nq], v)
+        return consistent, svkc.connect(
+            chain, svkc.cut(chain, consistent, "left_hand_grip"), "left_hand_grip"
         )
 
-    moving, again = lanes(v)
+    consistent, again = reconnect(v)
     np.testing.assert_allclose(
-        moving.v[1], chain.state(state.q[: chain.nq], v[1]).v, atol=ROUND_OFF
+        consistent.v[1], chain.state(state.q[: chain.nq], v[1]).v, atol=ROUND_OFF
     )
-    np.testing.assert_allclose(again.v, moving.v, atol=ROUND_OFF)
+    np.testing.assert_allclose(again.v, consistent.v, atol=ROUND_OFF)

@@ -1,5 +1,5 @@
-"""Catching: a figure in flight takes hold of the bar, by declared grips and where it is; batches
-of scenes; guards."""
+"""Guards and grips: a figure in flight catches the bar, at declared placements and at current poses;
+batches of runs; values of guards."""
 
 import equinox as eqx
 import jax
@@ -39,7 +39,7 @@ def figure():
     return chain, chain.state(near.q[: chain.nq], connected=("right_grip", "left_grip"))
 
 
-def tossed(chain, state, up, roll):
+def toss(chain, state, up, roll):
     """Thrown up from there, rolling about x through the point between the hands, with rigid
     limbs."""
     hips = np.asarray(state.q[:3])
@@ -81,9 +81,9 @@ def catches(figure):
 
 
 @pytest.mark.slow
-def test_caught_by_one_hand_then_the_other(figure, catches):
+def test_catch_with_one_hand_then_the_other(figure, catches):
     chain, state = figure
-    traj = catches(tossed(chain, state, 1.4, 0.25))
+    traj = catches(toss(chain, state, 1.4, 0.25))
     assert int(traj.events.count) == 2
     assert traj.phases.joint_freedoms[:3].tolist() == [
         22,
@@ -105,23 +105,23 @@ def test_caught_by_one_hand_then_the_other(figure, catches):
 
 
 @pytest.mark.slow
-def test_caught_by_both_at_once(figure, catches):
+def test_catch_with_both_hands_at_once(figure, catches):
     """Thrown straight up the rigid figure comes back: two guards at one instant, at the time of the
     parabola; declared grips at the place itself."""
     chain, state = figure
-    start = tossed(chain, state, 1.4, 0.0)
+    start = toss(chain, state, 1.4, 0.0)
     traj = catches(start)
     assert int(traj.events.count) == 2
     assert float(traj.events.time[0]) == float(traj.events.time[1])
-    down = np.sqrt(1.4**2 - 2 * 9.81 * 0.04)
-    assert abs(float(traj.events.time[0]) - (1.4 + down) / 9.81) < 1e-8
-    falling = svkc.State(start.q, start.v.at[2].set(-down), start.structure)
+    impact_speed = np.sqrt(1.4**2 - 2 * 9.81 * 0.04)
+    assert abs(float(traj.events.time[0]) - (1.4 + impact_speed) / 9.81) < 1e-8
+    falling = svkc.State(start.q, start.v.at[2].set(-impact_speed), start.structure)
     above = svkc.State(falling.q.at[2].add(0.04), falling.v, falling.structure)
-    for place, here in ((falling, False), (above, True)):
-        caught = svkc.connect(chain, place, "right_grip", "left_grip", here=here)
-        lost = svkc.kinetic_energy(chain, place) - svkc.kinetic_energy(chain, caught)
+    for start_state, here in ((falling, False), (above, True)):
+        caught = svkc.connect(chain, start_state, "right_grip", "left_grip", here=here)
+        lost = svkc.kinetic_energy(chain, start_state) - svkc.kinetic_energy(chain, caught)
         assert float(lost) > 0
-        np.testing.assert_allclose(caught.q[: chain.nq], place.q[: chain.nq], atol=ROUND_OFF)
+        np.testing.assert_allclose(caught.q[: chain.nq], start_state.q[: chain.nq], atol=ROUND_OFF)
     np.testing.assert_allclose(traj.events.energy_lost[0], lost, rtol=1e-6)
 
 
@@ -131,7 +131,7 @@ def pair():
 
 
 @pytest.mark.slow
-def test_connecting_what_is_connected_changes_nothing(pair):
+def test_connecting_a_connected_link_is_a_no_op(pair):
     state = svkc.connect(pair, pair.state(v=np.arange(pair.nv) / 10.0), "weld", here=True)
     again = svkc.connect(pair, state, "weld", "limb", here=True)
     assert bool(eqx.tree_equal(again, state))
@@ -141,7 +141,7 @@ def test_connecting_what_is_connected_changes_nothing(pair):
 
 
 @pytest.mark.slow
-def test_a_batch_of_scenes_is_its_single_runs(pair):
+def test_batched_runs_equal_single_runs(pair):
     """Another starting structure, grip and event times in each lane: the numbers of the single runs
     to 1e-10."""
     rng = np.random.default_rng(3)
@@ -151,12 +151,12 @@ def test_a_batch_of_scenes_is_its_single_runs(pair):
     starts = [start, svkc.connect(pair, start, "weld", here=True), svkc.cut(pair, start, "limb")]
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *starts)
     first, second = jnp.array([0.05, 0.12, 0.2]), jnp.array([0.22, 0.04, 0.15])
-    place = jnp.array([[-0.2, 0, 0], [0.1, 0.05, 0], [0, 0, 0.1]])
+    real_pos = jnp.array([[-0.2, 0, 0], [0.1, 0.05, 0], [0, 0, 0.1]])
 
     @eqx.filter_jit
-    def run(state, first, second, place):
+    def run(state, first, second, real_pos):
         events = [
-            svkc.at(first, bind=svkc.Grip("limb", "b", joint="ball", real_pos=place)),
+            svkc.at(first, bind=svkc.Grip("limb", "b", joint="ball", real_pos=real_pos)),
             svkc.at(second, cut=("weld", "limb")),
             svkc.at(0.25, unbind="spare_0"),
         ]
@@ -164,9 +164,9 @@ def test_a_batch_of_scenes_is_its_single_runs(pair):
             pair, state, 0.3, ts=jnp.linspace(0, 0.3, 4), events=events, dt=0.01, throw=False
         )
 
-    batch = eqx.filter_vmap(run)(stacked, first, second, place)
+    batch = eqx.filter_vmap(run)(stacked, first, second, real_pos)
     for i in range(3):
-        one = run(starts[i], first[i], second[i], place[i])
+        one = run(starts[i], first[i], second[i], real_pos[i])
         np.testing.assert_allclose(batch.states.q[i], one.states.q, atol=1e-10)
         np.testing.assert_allclose(batch.final.v[i], one.final.v, atol=1e-10)
         np.testing.assert_allclose(batch.events.energy_lost[i], one.events.energy_lost, atol=1e-10)
@@ -186,7 +186,7 @@ def box():
     )
 
 
-def test_guards_say_what_they_are_to():
+def test_values_of_guards():
     """Called by hand: the ground carries 20 N less what pulls; over a limit of 10 N that is once
     too much; the box is where the ground is."""
     chain = box()
@@ -203,7 +203,7 @@ def test_guards_say_what_they_are_to():
 
 
 @pytest.mark.slow
-def test_a_support_that_can_only_push():
+def test_unilateral_support():
     """A box thrown on the ground under a growing pull: it sticks, and is let go when the ground
     would have to pull; the force by Newton's law.
 
@@ -211,7 +211,7 @@ def test_a_support_that_can_only_push():
     """
     chain = box()
     pull = lambda t, state, args: jnp.where(jnp.arange(1) == 0, 40 * t, 0.0)
-    told = [
+    observers = [
         svkc.when(svkc.overload(chain, "ground", force=10.0), direction=False),
         svkc.when(svkc.touch(chain, "ground", 0.02, axes="z"), direction=True),
     ]
@@ -220,7 +220,7 @@ def test_a_support_that_can_only_push():
         events = [
             svkc.at(again, connect="ground"),
             svkc.when(svkc.leaves(chain, "ground"), cut="ground", direction=False),
-            *told,
+            *observers,
         ]
         return svkc.simulate(
             chain,

@@ -151,10 +151,11 @@ def test_every_kind_of_geom(tmp_path):
 
 def test_the_page_files_are_read_lazily():
     code = (
-        "import sys; opened = []; sys.addaudithook(lambda name, args: opened.append(str(args[0]))"
-        " if name == 'open' else None);import svkc.viz.html_page; assert any('render' in path for path in"
-        " opened); assert not [path for path in opened if 'three.min' in path or 'page.html' in"
-        " path]"
+        "import sys; opened = [];"
+        " audit = lambda name, args: opened.append(str(args[0])) if name == 'open' else None;"
+        " sys.addaudithook(audit); import svkc.viz.html_page;"
+        " assert any('render' in path for path in opened);"
+        " assert not [path for path in opened if 'three.min' in path or 'page.html' in path]"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
