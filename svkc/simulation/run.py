@@ -64,6 +64,7 @@ def _rearm_guards(chain: Chain, run: RunState, plan: Plan, options: Options, arg
     if not plan.guards or not reevaluated_guards(plan).any():
         return run
     field_args = FieldArgs(chain, run.state.structure, args)
+    assert run.stale is not None and run.guard_values is not None
     values = stop_gradient_tree(GuardValues(plan, options.field))(
         *stop_gradient_tree((run.t, ODEState(run.state.q, run.state.v), field_args))
     )
@@ -99,7 +100,9 @@ def run_phase(
     end_state = State(outcome.y.q, outcome.y.v, run.state.structure)
     saved = _write_saved_states(run, end_state, outcome, ts)
     row = (jnp.arange(run.records.start.shape[0]) == index) & active
-    work = jnp.zeros_like(run.t) if run.work is None else outcome.y.work - run.work
+    work = jnp.zeros_like(run.t)
+    if run.work is not None and outcome.y.work is not None:
+        work = outcome.y.work - run.work
     records = write_phase_row(
         run.records, row, (run.t, run.state), (outcome.t, end_state), work, outcome.solution
     )

@@ -65,9 +65,9 @@ def simulate(
         dynamics=dynamics, adjoint=adjoint, max_events=max_events, max_steps=max_steps,
         progress_meter=progress_meter,
     )  # fmt: skip
-    times = (*(jnp.asarray(t, state.q.dtype) for t in (t0, t1)), save_at)
+    times = jnp.asarray(t0, state.q.dtype), jnp.asarray(t1, state.q.dtype), save_at
     run = lambda control, events: _run(
-        chain, state, *times, replace(plan, guards=events), replace(options, control=control), args
+        chain, state, times, replace(plan, guards=events), replace(options, control=control), args
     )
     run = call_with_comparable(run, control=options.control, events=plan.guards)
     traj = _certified(chain, run, times, options)
@@ -89,8 +89,12 @@ def _raise_on_failure(chain: Chain, traj: Trajectory) -> Trajectory:
 
 
 @eqx.filter_jit
-def _run(chain: Chain, state: State, t0, t1, ts, plan: Plan, options: Options, args) -> RunState:
-    """Run all phases. The capacity for events bounds their number."""
+def _run(chain: Chain, state: State, times, plan: Plan, options: Options, args) -> RunState:
+    """Run all phases. The capacity for events bounds their number.
+
+    times: start, end and save times.
+    """
+    t0, t1, ts = times
     plan, options = _closure_convert(chain, state, t0, plan, options, args)
     run = initial_run_state(chain, state, t0, ts, plan, options)
 

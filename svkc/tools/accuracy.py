@@ -180,7 +180,8 @@ def tune(
     """Measure candidate options on this scene and return them, the fastest sufficient one first.
 
     A candidate is sufficient if its `configuration_error` relative to a reference run is at most
-    `target`. The reference run is Dopri8 with a relative tolerance of target / 1000.
+    `target`. The reference run is Dopri8 at rtol = target / 1000, or 50 machine epsilons if
+    that is larger.
 
     t1: end time (s).
     target: allowed error (rad, m; root mean square over coordinates, largest over save times).
@@ -188,7 +189,7 @@ def tune(
     repeats: timed runs of each candidate, after one that compiles. The shortest run counts. A
         candidate that takes ten times as long as the best so far is not repeated.
     show: whether to print progress and the final table.
-    call: keyword arguments of `simulate` that all runs share, such as `ts`, `events`, `control`,
+    common: keyword arguments of `simulate` that all runs share, such as `ts`, `events`, `control`,
         `args`.
 
     Raises ValueError if `target` is not positive or if the reference run fails.

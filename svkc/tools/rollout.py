@@ -44,7 +44,7 @@ def rollout(
     cost: expected duration of each lane, in any unit [lanes]. Lanes of similar cost share a chunk,
         so that short runs do not wait for long ones.
     chunk: lanes that one device runs at once. Default: 64 on a CPU, else 4096, and at most the
-        number of lanes. Memory grows in proportion.
+        number of lanes. The memory of a chunk grows with its lanes.
     out: folder for finished chunks (chunk_00000.npz and so on, readable by `svkc.load_trajectory`).
         A call with equal arguments continues an interrupted rollout from this folder.
     devices: devices to use. Default: all of this process. For several CPU devices call
@@ -55,7 +55,7 @@ def rollout(
 
     Raises ValueError if leading axes differ, if an option is invalid, or if `out` holds another
     rollout. Raises RuntimeError if a chunk does not fit into memory or if another process ended
-    early. In both cases finished chunks stay in `out`.
+    early; finished chunks stay in `out`.
     """
     check_chain(chain)
     lanes = _count_lanes(states, data, cost)
@@ -124,8 +124,8 @@ def _chunk_runner(chain: Chain, t1, lane: Callable | None, options: dict, device
     functions = {"control": options.get("control"), "events": options.get("events", ())}
 
     def run(lanes):
-        piece = lambda lane, **own: _run_chunk((chain, t1, common | own, lane), lanes, mesh)
-        return call_with_comparable(piece, lane=lane, **functions)
+        run_with = lambda lane, **other: _run_chunk((chain, t1, common | other, lane), lanes, mesh)
+        return call_with_comparable(run_with, lane=lane, **functions)
 
     return run
 
@@ -159,8 +159,8 @@ def _run_chunk(common, lanes, mesh: Mesh) -> Trajectory:
     """
     arrays, static = eqx.partition(common, eqx.is_array)
 
-    def run_lane(fixed, state, data):
-        chain, t1, options, lane = eqx.combine(fixed, static)
+    def run_lane(arrays, state, data):
+        chain, t1, options, lane = eqx.combine(arrays, static)
         own = {} if lane is None else lane(chain, data)
         if not isinstance(own, dict):
             raise ValueError(f"lane: expected a dict of arguments of simulate from it, got {own!r}")

@@ -1,5 +1,4 @@
-"""Derivatives through every change of structure: against differences, against closed forms, at the
-hard points."""
+"""Derivatives through changes of structure, against finite differences and closed forms."""
 
 import derivatives
 import jax
@@ -21,20 +20,22 @@ BUDGET = 42500
     "name", [*derivatives.ALGEBRAIC, "pendulum_cut", "breaking", "four_bar_turning"]
 )
 def test_against_differences(name):
-    """Both modes, along a random direction of each parameter; forward and reverse to 1e-10.
-    Figures: examples 05 and 06, and
-    `python tests/derivatives.py`."""
+    """Derivatives agree with differences, and both modes to 1e-10.
+
+    Differences are along a random direction of each parameter. `python tests/derivatives.py` prints
+    the errors of all cases.
+    """
     f, x, limit = derivatives.CASES[name]()
-    found = svkc.check_grad(f, x, directions=1, step=0.1 if name in derivatives.ALGEBRAIC else 0.05)
-    assert found.error <= limit, found
-    assert found.modes <= 1e-10, found
+    check = svkc.check_grad(f, x, directions=1, step=0.1 if name in derivatives.ALGEBRAIC else 0.05)
+    assert check.error <= limit, check
+    assert check.modes <= 1e-10, check
 
 
 def test_a_release_against_differences():
-    """A rod comes off its pivot at an angle and flies: the gradient of where and how fast it ends
-    and of the time, along a direction in which all change.
+    """A rod comes off its pivot at an angle and flies.
 
-    It is one program, whose size is that of a gradient through a change of structure.
+    The gradient of its final state and of the event's time agrees with differences, along a
+    direction in which all parameters change. The size of its program is bounded.
     """
     chain = svkc.load(models.MJCF.format(models.bar("rod", models.Y, "0.2 0 -1")), cuttable="rod")
     state = chain.state({"rod": 1.2}, {"rod": 0.5})
@@ -53,19 +54,19 @@ def test_a_release_against_differences():
             adjoint=svkc.integrators.Replay(),
             **parameters.TIGHT,
         )
-        # (without the event its time is infinite, and so is this)
+        # infinite if the event does not occur
         return traj.events.time[0] + jnp.sum(jnp.sin(traj.final.q)) + jnp.sum(traj.final.v**2) / 10
 
     x = {"sine": jnp.asarray(0.3), "speed": jnp.asarray(1.0)} | parameters.heavier(chain)
     rng = np.random.default_rng(0)
-    way = {name: jnp.asarray(rng.normal(size=leaf.shape)) for name, leaf in x.items()}
+    direction = {name: jnp.asarray(rng.normal(size=leaf.shape)) for name, leaf in x.items()}
 
     @jax.jit
     def program(part, along):
         value, slope = jax.value_and_grad(loss)(
-            {name: leaf + part["part"] * way[name] for name, leaf in x.items()}
+            {name: leaf + part["part"] * direction[name] for name, leaf in x.items()}
         )
-        return value, along["part"] * sum(jnp.vdot(slope[name], way[name]) for name in x)
+        return value, along["part"] * sum(jnp.vdot(slope[name], direction[name]) for name in x)
 
     part = {"part": jnp.asarray(0.0)}
     lowered = program.lower(part, part)
@@ -74,15 +75,14 @@ def test_a_release_against_differences():
     assert parameters.worst(lowered.compile(), part) <= derivatives.RUN
 
 
-def both_ways(f):
-    """The value, the Jacobian forwards, from whose program the value is, and the Jacobian
-    backwards."""
+def jacobians_in_both_modes(f):
+    """Return x -> (value, forward Jacobian, reverse Jacobian) of f."""
 
-    def given(x):
+    def value_and_jacobians(x):
         forward, value = jax.jacfwd(lambda x: (f(x),) * 2, has_aux=True)(x)
         return value, forward, jax.jacrev(f)(x)
 
-    return jax.jit(given)
+    return jax.jit(value_and_jacobians)
 
 
 BALL = (
@@ -93,7 +93,7 @@ BALL = (
 
 @pytest.fixture(scope="module")
 def balls():
-    """Two balls on a line, which a weld may join."""
+    """Return two balls on a line, with a weld that can connect them."""
     weld = svkc.VirtualLink("weld", "a", "b", "weld")
     return svkc.load(
         models.MJCF.format(BALL.format("a", "0 0 0", 1) + BALL.format("b", "1 0 0", 2)).replace(
@@ -103,26 +103,25 @@ def balls():
     )
 
 
-def meeting(chain, x):
-    """Balls at x[:2] with velocities x[2:] until their centres meet."""
+def balls_on_a_line(chain, x):
+    """Return the balls at x[:2] with velocities x[2:], and the guard of their contact."""
     state = svkc.State(x[:2], x[2:], chain.state(connected=()).structure)
-    met = lambda t, s, args: s.q[1] + 1.0 - s.q[0]
-    return state, met
+    contact = lambda t, s, args: s.q[1] + 1.0 - s.q[0]
+    return state, contact
 
 
 @pytest.mark.slow
 def test_a_catch_with_a_closed_form(balls):
-    """They meet at T = gap / closing speed and go on together: where and when, and every
-    derivative, as the formula says."""
+    """Balls that stick at T = gap / closing speed have closed-form results and derivatives."""
     start = jnp.array([0.1, 0.2, 1.0, -0.5])
 
     def simulated(x):
-        state, met = meeting(balls, x)
+        state, contact = balls_on_a_line(balls, x)
         traj = svkc.simulate(
             balls,
             state,
             2.0,
-            events=[svkc.when(met, connect="weld", here=True)],
+            events=[svkc.when(contact, connect="weld", here=True)],
             **parameters.TIGHT,
         )
         return jnp.array([traj.final.q[0], traj.events.time[0], traj.events.energy_lost[0]])
@@ -130,10 +129,10 @@ def test_a_catch_with_a_closed_form(balls):
     def formula(x):
         gap, closing = 1 + x[1] - x[0], x[2] - x[3]
         time = gap / closing
-        together = (x[2] + 2 * x[3]) / 3
-        return jnp.array([x[0] + x[2] * time + together * (2.0 - time), time, closing**2 / 3])
+        joint_velocity = (x[2] + 2 * x[3]) / 3
+        return jnp.array([x[0] + x[2] * time + joint_velocity * (2.0 - time), time, closing**2 / 3])
 
-    value, *jacobians = both_ways(simulated)(start)
+    value, *jacobians = jacobians_in_both_modes(simulated)(start)
     np.testing.assert_allclose(value, formula(start), atol=1e-11)
     for jacobian in jacobians:
         np.testing.assert_allclose(jacobian, jax.jacfwd(formula)(start), atol=1e-10)
@@ -141,29 +140,30 @@ def test_a_catch_with_a_closed_form(balls):
 
 @pytest.mark.slow
 def test_a_collision_that_swaps_velocities(balls):
-    """Equal balls, elastic: the exact Jacobian is a permutation. Two runs, the second from the time
-    and state where the first one's guard stopped it."""
+    """The Jacobian of an elastic collision of equal balls is a permutation.
+
+    It is two runs; the second starts where the guard of the first stopped it.
+    """
     start = jnp.array([0.1, 0.2, 1.0, -0.5])
 
-    def bounced(x):
-        state, met = meeting(balls, x)
+    def after_collision(x):
+        state, contact = balls_on_a_line(balls, x)
         first = svkc.simulate(
-            balls, state, 2.0, events=[svkc.when(met, stop=True)], **parameters.TIGHT
+            balls, state, 2.0, events=[svkc.when(contact, stop=True)], **parameters.TIGHT
         )
         swapped = svkc.State(first.final.q, first.final.v[::-1], first.final.structure)
         return svkc.simulate(balls, swapped, 2.0, t0=first.t_final, **parameters.TIGHT).final.q
 
-    for jacobian in both_ways(bounced)(start)[1:]:
+    for jacobian in jacobians_in_both_modes(after_collision)(start)[1:]:
         np.testing.assert_allclose(jacobian, np.array([[0, 1, 0, 2], [1, 0, 2, 0]]), atol=REFERENCE)
 
 
 @pytest.mark.slow
-def test_times_that_coincide(balls):
-    """t0 and its save time, an event and its save time, t1 and its save time, an event at t0: each
-    of them is to be differentiated by alone, twice too."""
+def test_coincident_times(balls):
+    """Equal times, such as t1 and a save time, have separate first and second derivatives."""
 
     def simulated(x):
-        state, _ = meeting(balls, jnp.concatenate([jnp.zeros(2), x["v"]]))
+        state, _ = balls_on_a_line(balls, jnp.concatenate([jnp.zeros(2), x["v"]]))
         events = [svkc.at(x["event"], connect="weld", here=True)]
         traj = svkc.simulate(
             balls, state, x["t1"], t0=x["t0"], ts=x["ts"], events=events, **parameters.TIGHT
@@ -171,9 +171,9 @@ def test_times_that_coincide(balls):
         return jnp.append(traj.states.q[:, 0], traj.final.q[0])
 
     def formula(x):
-        together = (x["v"][0] + 2 * x["v"][1]) / 3
+        joint_velocity = (x["v"][0] + 2 * x["v"][1]) / 3
         before = lambda t: x["v"][0] * (t - x["t0"])
-        after = lambda t: before(x["event"]) + together * (t - x["event"])
+        after = lambda t: before(x["event"]) + joint_velocity * (t - x["event"])
         return jnp.stack([before(x["ts"][0]), after(x["ts"][1]), after(x["ts"][2]), after(x["t1"])])
 
     twice = lambda f: jax.jit(
@@ -182,7 +182,7 @@ def test_times_that_coincide(balls):
         )[1]
     )
     twice_simulated = twice(simulated)
-    both = both_ways(simulated)
+    both = jacobians_in_both_modes(simulated)
     for event in (0.5, 0.0):
         x = {
             "v": jnp.array([1.0, -0.5]),
@@ -192,7 +192,7 @@ def test_times_that_coincide(balls):
             "ts": jnp.array([0.0, 0.5, 2.0]),
         }
         if event == 0.0:
-            # what is saved at the time of an event is the state after it
+            # the state saved at the time of an event is that after it
             x["ts"] = jnp.array([0.1, 0.5, 2.0])
             formula_here = lambda x: (
                 formula(x)
@@ -217,9 +217,12 @@ def test_times_that_coincide(balls):
 
 
 @pytest.mark.slow
-def test_nothing_is_not_a_number():
-    """Zero velocity, identity rotations, a link of no length, an empty slot, a locked joint: every
-    derivative is a number, in both modes."""
+def test_derivatives_are_finite_at_degenerate_points():
+    """Derivatives are finite in both modes at degenerate points.
+
+    These are zero velocity, identity rotations, a link of length zero, an empty slot, and a locked
+    joint.
+    """
     rods = models.bar(
         "base", 'type="ball"', "0 0 -0.5", inside=models.bar("fore", models.Y, "0 0 -0.3", "0 0 0")
     )
@@ -230,7 +233,7 @@ def test_nothing_is_not_a_number():
     )
     state = chain.state()
 
-    def everything(x):
+    def all_outputs(x):
         c = parameters.changed(chain, x)
         s = svkc.lock(c, svkc.State(x["q"], x["v"], state.structure), "fore")
         traj = svkc.simulate(
@@ -248,7 +251,7 @@ def test_nothing_is_not_a_number():
     x = {"q": state.q, "v": state.v, "time": jnp.asarray(0.05)} | parameters.model(
         chain, "mass", "inertia", "com", "pos", "gravity"
     )
-    total = lambda x: sum(jnp.sum(leaf) for leaf in jax.tree.leaves(everything(x)))
+    total = lambda x: sum(jnp.sum(leaf) for leaf in jax.tree.leaves(all_outputs(x)))
     backwards = jax.grad(total)(x)
     forwards = jax.jvp(total, (x,), (jax.tree.map(jnp.ones_like, x),))[1]
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(backwards))
@@ -258,8 +261,7 @@ def test_nothing_is_not_a_number():
 
 
 def test_gradients_in_the_tangent():
-    """Of a ball's quaternion: along integrate(q, dv), three numbers; steps along it keep unit
-    length and go downhill."""
+    """The tangent gradient of a ball's quaternion has three components, and descends along dv."""
     chain = svkc.load(models.MJCF.format(models.bar("arm", 'type="ball"', "0.3 0.2 -1")))
     state = chain.state()
 
@@ -268,10 +270,10 @@ def test_gradients_in_the_tangent():
 
     slope = svkc.tangent_gradient(chain, state.q, jax.grad(height)(state.q))
     assert slope.shape == (3,)
-    found = svkc.check_grad(
+    check = svkc.check_grad(
         lambda dv: height(svkc.integrate(chain, state.q, dv)), jnp.zeros(3), step=0.2
     )
-    assert found.error <= 1e-8, found
+    assert check.error <= 1e-8, check
     np.testing.assert_allclose(
         jax.grad(lambda dv: height(svkc.integrate(chain, state.q, dv)))(jnp.zeros(3)),
         slope,
@@ -282,26 +284,26 @@ def test_gradients_in_the_tangent():
     assert abs(float(jnp.linalg.norm(lower)) - 1) < 1e-14
 
 
-def test_the_check_finds_what_is_wrong():
-    """A wrong derivative is named by both paths."""
+def test_check_grad_names_a_wrong_derivative():
+    """A wrong derivative is named by the paths of its input and its output."""
 
     @jax.custom_jvp
     def wrong(x):
         return x**2
 
     wrong.defjvp(lambda p, t: (p[0] ** 2, 2.1 * p[0] * t[0]))
-    found = svkc.check_grad(
+    check = svkc.check_grad(
         lambda x: {"good": x["a"] * x["b"], "bad": wrong(x["b"])},
         {"a": jnp.arange(3.0), "b": jnp.ones(3), "count": 4},
     )
-    assert found.error == pytest.approx(0.1 / 2.1, rel=DIFFERENCE)
-    assert "bad" in found.output
-    assert "'b'" in found.input
+    assert check.error == pytest.approx(0.1 / 2.1, rel=DIFFERENCE)
+    assert "bad" in check.output
+    assert "'b'" in check.input
     for part in ("bad", "'b'", "by differentiation"):
-        assert part in str(found)
+        assert part in str(check)
     assert svkc.check_grad(jnp.sin, 1.0).error < REFERENCE
-    # a derivative that is no number is as wrong as can be
-    found = svkc.check_grad(
+    # a derivative that is not finite has an infinite error
+    check = svkc.check_grad(
         lambda x: {"a": x, "root": jnp.where(x > 0, jnp.sqrt(x), x)}, jnp.zeros(())
     )
-    assert found.modes == np.inf
+    assert check.modes == np.inf

@@ -1,6 +1,8 @@
-"""Every method of dynamics gives one acceleration, one motion and one derivative. Against
-multipliers: loops/test_forward_dynamics.py; against a mechanism's own equation of motion:
-problems/test_bricard.py."""
+"""All methods of dynamics give equal accelerations, motions and derivatives.
+
+They are compared with a KKT solution in loops/test_forward_dynamics.py, and with a mechanism's own
+equation of motion in problems/test_bricard.py.
+"""
 
 import cases
 import diffrax
@@ -13,14 +15,17 @@ import pytest
 from tolerances import REFERENCE
 
 import svkc
-from svkc.loops.forward_dynamics import acceleration as accelerated
+from svkc.loops.forward_dynamics import acceleration as acceleration_by
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", cases.params("loops"))
-def test_articulated_bodies_carry_what_acts_on_virtual_joints(name):
-    """The accelerations of composite ones, with torques at the joints of the loops and with a joint
-    of the tree locked; and their derivatives by masses and along the loops, on each side."""
+def test_articulated_bodies_transmit_torques_at_virtual_joints(name):
+    """Articulated and composite bodies give equal accelerations and derivatives.
+
+    Torques act on virtual joints, and a joint of the tree is locked. Derivatives are with respect
+    to masses and along the loops, in both modes.
+    """
     chain, state, tau = cases.CASES[name].random_motion()
     locked = (
         svkc.lock(chain, state, chain.joint_names[-1])
@@ -29,7 +34,7 @@ def test_articulated_bodies_carry_what_acts_on_virtual_joints(name):
     )
     along = svkc.coordinates(chain, locked).W @ jnp.linspace(-1.0, 1.0, chain.dofs)
 
-    def both(scale):
+    def both_methods(scale):
         c = eqx.tree_at(
             lambda c: c.mass,
             chain,
@@ -37,20 +42,22 @@ def test_articulated_bodies_carry_what_acts_on_virtual_joints(name):
         )
         q = svkc.integrate(chain, locked.q, scale * along)
         return [
-            accelerated(c, locked.structure, q, locked.v, tau, way)
-            for way in (svkc.dynamics.CompositeBodies(), svkc.dynamics.ArticulatedBodies())
+            acceleration_by(c, locked.structure, q, locked.v, tau, method)
+            for method in (svkc.dynamics.CompositeBodies(), svkc.dynamics.ArticulatedBodies())
         ]
 
-    for usual, bodies in (both(0.0), jax.jvp(both, (0.0,), (1.0,))[1]):
-        assert np.abs(bodies - usual).max() < REFERENCE * np.abs(usual).max()
+    for reference, bodies in (both_methods(0.0), jax.jvp(both, (0.0,), (1.0,))[1]):
+        assert np.abs(bodies - reference).max() < REFERENCE * np.abs(reference).max()
     back = [
-        jax.grad(lambda x, i=i: jnp.sum(both(x)[i] * jnp.linspace(-1.0, 2.0, chain.dofs)))(0.0)
+        jax.grad(lambda x, i=i: jnp.sum(both_methods(x)[i] * jnp.linspace(-1.0, 2.0, chain.dofs)))(
+            0.0
+        )
         for i in (0, 1)
     ]
     np.testing.assert_allclose(*back, rtol=1e-8)
 
 
-WAYS = {
+METHODS = {
     "exact": {"stabilization": svkc.stabilization.CoordinatePartitioning()},
     "unit vectors": {"dynamics": svkc.dynamics.UnitVectors()},
     "bodies": {"dynamics": svkc.dynamics.ArticulatedBodies()},
@@ -61,8 +68,10 @@ WAYS = {
 
 @pytest.fixture(scope="module")
 def swinging():
-    """Three equal bars that swing on a base too long for any of them to go round: whatever two
-    coordinates depend on the third, they come in line."""
+    """Return the run of a four-bar whose bars come in line for every choice of coordinates.
+
+    Its three equal bars swing on a base that is too long for full revolutions.
+    """
     inner = models.bar(
         "coupler",
         models.Y,
@@ -86,34 +95,36 @@ def swinging():
     )
     start, ts = chain.state(v={"crank": 1.0}), jnp.linspace(0, 1.5, 16)
 
-    def run(crank, **way):
+    def run(crank, **method):
         state = eqx.tree_at(lambda s: s.v, start, crank * start.v)
         return svkc.simulate(
-            chain, state, 1.5, ts=ts, rtol=1e-10, atol=1e-12, solver=diffrax.Dopri8(), **way
+            chain, state, 1.5, ts=ts, rtol=1e-10, atol=1e-12, solver=diffrax.Dopri8(), **method
         )
 
     return run, run(1.0)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("way", WAYS)
-def test_each_way_to_compute_is_the_same_motion(swinging, way):
-    run, usual = swinging
-    other = run(1.0, **WAYS[way])
-    # the steps' own errors, and what the ways back onto the loops make of them
-    np.testing.assert_allclose(other.states.q, usual.states.q, atol=1e-8)
-    swaps = int(other.phases.swaps[0])
-    # (articulated bodies do without pivots)
-    assert swaps == {"held": 0, "bodies": -1}[way] if way in ("held", "bodies") else swaps >= 3
-    tries = [int(r.report().accepted + r.report().rejected) for r in (other, usual)]
-    assert tries[0] < 1.5 * tries[1]
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_gives_the_same_motion(swinging, method):
+    run, reference = swinging
+    result = run(1.0, **METHODS[method])
+    # the errors of the steps and of their projections
+    np.testing.assert_allclose(result.states.q, reference.states.q, atol=1e-8)
+    swaps = int(result.phases.swaps[0])
+    # articulated bodies use no pivots, which is recorded as -1
+    assert (
+        swaps == {"held": 0, "bodies": -1}[method] if method in ("held", "bodies") else swaps >= 3
+    )
+    steps = [int(r.report().accepted + r.report().rejected) for r in (result, reference)]
+    assert steps[0] < 1.5 * steps[1]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("way", ["held", "bodies"])
-def test_how_loops_are_kept_leaves_derivatives_as_they_are(swinging, way):
+@pytest.mark.parametrize("method", ["held", "bodies"])
+def test_derivatives_do_not_depend_on_the_method(swinging, method):
     run, _ = swinging
-    end = lambda x: run(x, **WAYS[way]).final.q
+    end = lambda x: run(x, **METHODS[method]).final.q
     forward, step = jax.jacfwd(end)(1.0), 1e-4
     differences = (end(1 + step) - end(1 - step)) / (2 * step)
     np.testing.assert_allclose(forward, differences, rtol=1e-5, atol=1e-5)

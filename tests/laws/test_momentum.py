@@ -1,4 +1,4 @@
-"""Momentum: of what hangs on nothing it is kept; otherwise it changes by what the world gives."""
+"""Momentum changes by external forces and impulses only."""
 
 import cases
 import equinox as eqx
@@ -15,10 +15,10 @@ from svkc.tree.configuration import configuration_derivative
 
 
 @pytest.mark.parametrize("name", cases.params("afloat"))
-def test_its_rate(name):
-    """That of the weight and of the loop forces: joint torques change neither of the two."""
+def test_the_rate_of_momentum_is_the_external_force(name):
+    """The rate is that of the weight and of the loop forces; joint torques have no part in it."""
     chain, state, tau = cases.CASES[name].random_motion()
-    # the base is moved by none, and no grip is driven
+    # no torque acts on the floating base or on grips
     tau = tau.at[:6].set(0).at[chain.nv :].set(0)
     vdot = svkc.forward_dynamics(chain, state, tau)
 
@@ -29,22 +29,24 @@ def test_its_rate(name):
         both, (state.q, state.v), (configuration_derivative(chain, state.q, state.v), vdot)
     )
     force, torque = svkc.loop_forces(chain, state, tau)
-    weighed = lambda g: svkc.potential_energy(eqx.tree_at(lambda c: c.gravity, chain, g), state)
-    # the mass times the place of its centre
-    place = -jax.grad(weighed)(chain.gravity)
-    weight, held = jnp.sum(chain.mass) * chain.gravity, np.cross(state.structure.pos, force)
-    moment = np.cross(place, chain.gravity) + torque.sum(0) + held.sum(0)
+    weight_potential = lambda g: svkc.potential_energy(
+        eqx.tree_at(lambda c: c.gravity, chain, g), state
+    )
+    # total mass times center of mass
+    first_moment = -jax.grad(weight_potential)(chain.gravity)
+    weight, moments = jnp.sum(chain.mass) * chain.gravity, np.cross(state.structure.pos, force)
+    moment = np.cross(first_moment, chain.gravity) + torque.sum(0) + moments.sum(0)
     largest = max(float(jnp.abs(value).max()), float(jnp.abs(force).max(initial=0)))
     np.testing.assert_allclose(rate, [weight + force.sum(0), moment], atol=1e-10 * largest)
 
 
-def by_itself(step):
-    """A change in which the world gives nothing."""
+def without_external_impulse(step):
+    """Return the step with zero external impulse."""
     return lambda state: (step(state), np.zeros((2, 3)))
 
 
-def caught():
-    """The figure beside the bar, caught by both hands: their impulses, and the moments of those."""
+def catch():
+    """Return a figure in flight that catches the bar with both hands, and their impulses."""
     chain, state = cases.flight()
 
     def hands(state):
@@ -52,22 +54,22 @@ def caught():
         moment = np.cross(chain.structure.pos, done.impulse) + np.asarray(done.angular_impulse)
         lost = svkc.kinetic_energy(chain, state) - svkc.kinetic_energy(chain, done.state)
         np.testing.assert_allclose(done.energy_lost, lost, rtol=1e-10)
-        # about the bar the hands turn freely
+        # the hands rotate freely about the bar
         assert np.abs(np.asarray(done.angular_impulse)[:, 1]).max() < 1e-10
         return done.state, np.stack([done.impulse.sum(0), moment.sum(0)])
 
     return chain, state, [("connect", hands)]
 
 
-def joined(joint):
-    """Two free boxes."""
+def two_boxes_joined(joint):
+    """Return two free boxes that a joint connects."""
     chain, rng = models.two_boxes(joint), np.random.default_rng(1)
-    connect = by_itself(lambda s: svkc.connect(chain, s, "grip"))
+    connect = without_external_impulse(lambda s: svkc.connect(chain, s, "grip"))
     return chain, chain.state(v=rng.normal(size=12)), [("connect", connect)]
 
 
 def every_kind():
-    """Connect, cut, bind, unbind, lock, unlock, a joint coming off and made again."""
+    """Return a sequence of all changes of structure."""
     chain, rng = models.box_with_a_limb(), np.random.default_rng(7)
     state = chain.state(
         {"limb": 0.3}, {"a": rng.normal(size=6), "b": rng.normal(size=6), "limb": 1.0}
@@ -84,12 +86,15 @@ def every_kind():
         ("move", lambda s: svkc.simulate(chain, s, 0.1, rtol=1e-9, atol=1e-11).final),
         ("connect", lambda s: svkc.connect(chain, s, "limb", here=True)),
     ]
-    return chain, state, [(name, by_itself(step)) for name, step in steps]
+    return chain, state, [(name, without_external_impulse(step)) for name, step in steps]
 
 
 CHANGES = {
-    "caught": caught,
-    **{joint: lambda joint=joint: joined(joint) for joint in ("hinge", "weld", "ball", "slide")},
+    "catch": catch,
+    **{
+        joint: lambda joint=joint: two_boxes_joined(joint)
+        for joint in ("hinge", "weld", "ball", "slide")
+    },
     "every_kind": every_kind,
 }
 
@@ -97,25 +102,27 @@ CHANGES = {
 @pytest.mark.parametrize(
     "name",
     [
-        "caught",
-        *(pytest.param(name, marks=pytest.mark.slow) for name in CHANGES if name != "caught"),
+        "catch",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in CHANGES if name != "catch"),
     ],
 )
-def test_across_changes(name):
-    """It changes by the impulses of the world, to round-off; energy never grows; cuts change no
-    velocity."""
+def test_momentum_across_changes_of_structure(name):
+    """Momentum changes by external impulses, to round-off.
+
+    Kinetic energy does not grow, and cuts change no velocity.
+    """
     chain, state, steps = CHANGES[name]()
     for kind, step in steps:
-        after, given = step(state)
-        for before, now, by_world in zip(
-            svkc.momentum(chain, state), svkc.momentum(chain, after), given, strict=True
+        after, external = step(state)
+        for before, now, impulse in zip(
+            svkc.momentum(chain, state), svkc.momentum(chain, after), external, strict=True
         ):
             bound = (1e-8 if kind == "move" else 1e-12) * float(jnp.abs(before).max())
-            np.testing.assert_allclose(now - before, by_world, atol=bound, err_msg=kind)
-        gain = float(svkc.kinetic_energy(chain, after) - svkc.kinetic_energy(chain, state))
-        # (of the boxes some are caught that move together already)
-        assert gain < 0 or name == "every_kind"
-        assert gain <= ROUND_OFF or kind == "move"
+            np.testing.assert_allclose(now - before, impulse, atol=bound, err_msg=kind)
+        energy_gain = float(svkc.kinetic_energy(chain, after) - svkc.kinetic_energy(chain, state))
+        # in "every_kind" some boxes that are connected move together already
+        assert energy_gain < 0 or name == "every_kind"
+        assert energy_gain <= ROUND_OFF or kind == "move"
         if kind in ("cut", "unlock"):
             assert bool(jnp.all(after.v == state.v))
         state = after

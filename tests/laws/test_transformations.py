@@ -1,5 +1,7 @@
-"""Derivatives of runs with a guard: under every transformation, twice, by every adjoint, and where
-there are none."""
+"""Derivatives of runs with a guard: under transformations, of second order, by every adjoint.
+
+Also the verdicts where a derivative does not exist.
+"""
 
 import equinox as eqx
 import jax
@@ -25,9 +27,8 @@ def angle(t, state, args):
     return state.q[0] - args
 
 
-def held(chain, x, ts=None, **kw):
-    """Swings from x[0], held at the angle x[1] if it comes by, let go at the time x[2], until
-    x[3]."""
+def hooked_run(chain, x, ts=None, **kw):
+    """Run from angle x[0] to time x[3], hooked at angle x[1] if reached, released at time x[2]."""
     state = chain.state({"arm": 1.2})
     state = svkc.State(state.q.at[0].set(x[0]), state.v, state.structure)
     events = [svkc.when(angle, connect="hook", here=True), svkc.at(x[2], cut="hook")]
@@ -45,11 +46,10 @@ def held(chain, x, ts=None, **kw):
 
 @pytest.mark.slow
 def test_the_end_and_an_event_at_a_save_time(pendulum):
-    """dL/dt1 is the rate at the end; what is saved at the time of an event moves with what came
-    before."""
+    """The derivative with respect to t1 is the rate at the end, also with events and save times."""
 
     def f(x):
-        traj = held(
+        traj = hooked_run(
             pendulum,
             jnp.stack([x["start"], x["angle"], jnp.asarray(0.8), x["t1"]]),
             ts=jnp.array([0.5, 0.8]),
@@ -57,18 +57,19 @@ def test_the_end_and_an_event_at_a_save_time(pendulum):
         return {"end": traj.final.q[0], "saved": traj.states.q[:, 0], "rate": traj.final.v[0]}
 
     x = {"start": jnp.asarray(1.2), "angle": jnp.asarray(0.3), "t1": jnp.asarray(1.3)}
-    found = svkc.check_grad(f, x)
-    assert found.error <= 1e-8, found
-    assert found.modes <= 1e-10, found
-    along = {"start": jnp.zeros(()), "angle": jnp.zeros(()), "t1": jnp.ones(())}
-    value, rate = jax.jvp(f, (x,), (along,))
+    check = svkc.check_grad(f, x)
+    assert check.error <= 1e-8, check
+    assert check.modes <= 1e-10, check
+    direction = {"start": jnp.zeros(()), "angle": jnp.zeros(()), "t1": jnp.ones(())}
+    value, rate = jax.jvp(f, (x,), (direction,))
     np.testing.assert_allclose(rate["end"], value["rate"], rtol=REFERENCE)
 
 
 @pytest.mark.slow
 def test_every_order_of_the_transformations(pendulum):
-    """Lanes with other structures, numbers of events and times: vmap(grad), vmap(jacfwd),
-    grad(vmap), grad of a scan, under jit: all the same.
+    """The orders of transformations agree: vmap(grad), vmap(jacfwd), grad(vmap), grad(scan).
+
+    Lanes differ in structures, numbers of events and times.
 
     (The gradient of one run alone, in both modes and against differences:
     `test_the_end_and_an_event_at_a_save_time`.)
@@ -77,8 +78,8 @@ def test_every_order_of_the_transformations(pendulum):
     com, both = pendulum.com, (0, 1)
 
     def loss(x, com):
-        """By the lanes' own starts and times, and by what they share."""
-        traj = held(parameters.changed(pendulum, {"com": com}), x)
+        """Return the final angle and the number of events, of lane x with a shared com."""
+        traj = hooked_run(parameters.changed(pendulum, {"com": com}), x)
         return traj.final.q[0], traj.events.count
 
     one = lambda x, com: loss(x, com)[0]
@@ -98,21 +99,23 @@ def test_every_order_of_the_transformations(pendulum):
         "grad(scan)": jax.jit(jax.grad(looped, both))(lanes, com),
     }.items():
         np.testing.assert_allclose(got, single, atol=REFERENCE, err_msg=name)
-        # gradients by what is shared add up
+        # gradients with respect to shared parameters add up
         np.testing.assert_allclose(
             share, shares if share.ndim > com.ndim else shares.sum(0), atol=REFERENCE, err_msg=name
         )
 
 
 def twice(f, x):
-    """The largest relative error of the gradient's derivative, as `svkc.check_grad(jax.grad(f), x,
-    "forward", directions=1)` has it, by one program."""
+    """Return the largest relative error of the gradient's derivative, by one program.
+
+    It is that of `svkc.check_grad(jax.grad(f), x, "forward", directions=1)`.
+    """
     return parameters.worst(jax.jit(lambda x, along: jax.jvp(jax.grad(f), (x,), (along,))), x)
 
 
 @pytest.mark.slow
 def test_second_derivatives_of_forward_dynamics():
-    """Hessian-vector products with a loop that is closed on the way."""
+    """Hessian-vector products of forward dynamics, with a loop that `state` closes."""
     chain = models.four_bar()
 
     def power(x):
@@ -135,10 +138,10 @@ def test_second_derivatives_of_forward_dynamics():
 
 @pytest.mark.slow
 def test_second_derivatives_of_a_run(pendulum):
-    """Hessian-vector products with a guard and a scheduled event."""
+    """Hessian-vector products of a run with a guard and a scheduled event."""
 
     def loss(x):
-        traj = held(parameters.changed(pendulum, x), x["held"])
+        traj = hooked_run(parameters.changed(pendulum, x), x["held"])
         return traj.final.q[0] ** 2 + traj.final.v[0] + traj.events.time[0]
 
     assert twice(loss, {"held": jnp.array([1.2, 0.3, 0.8, 1.0]), "com": pendulum.com}) <= DIFFERENCE
@@ -146,13 +149,15 @@ def test_second_derivatives_of_a_run(pendulum):
 
 @pytest.mark.slow
 def test_adjoints_pass_through(pendulum):
-    """diffrax's own give the same gradient; one that keeps fewer states, too."""
+    """Adjoints of diffrax, and a replay with fewer checkpoints, give the same gradient."""
     import diffrax
 
     x = jnp.array([1.2, 0.3, 0.8, 1.3])
 
     def loss(x, adjoint):
-        traj = held(pendulum, x, ts=jnp.array([0.5, 0.9]), dt=0.01, adjoint=adjoint, max_steps=300)
+        traj = hooked_run(
+            pendulum, x, ts=jnp.array([0.5, 0.9]), dt=0.01, adjoint=adjoint, max_steps=300
+        )
         return traj.final.q[0] + jnp.sum(traj.states.q)
 
     expected = jax.grad(loss)(x, svkc.integrators.Replay(every=5))
@@ -164,8 +169,7 @@ def test_adjoints_pass_through(pendulum):
 
 
 class Choice(eqx.Module):
-    """A guard of which the case chooses by numbers: what it is at rest, a step of time, a joint's
-    angle, the time itself."""
+    """A guard that `args` weights: a constant, a jump in time, a joint's angle, the time."""
 
     which: int = eqx.field(static=True)
 
@@ -181,11 +185,14 @@ class Choice(eqx.Module):
 
 @pytest.mark.slow
 def test_where_there_is_no_derivative(pendulum):
-    """A guard that grazes, one that jumps, two at one instant, a rank that is lost: a code says so;
-    a grazing guard gives no number."""
+    """The code of a run tells why it has no derivative.
+
+    The cases are a guard that grazes, one that jumps, two at one time, and a lost rank. A grazing
+    guard has the derivative NaN.
+    """
 
     def grazed(size):
-        """A guard that is above zero for a moment only, at a time where the run stops to save."""
+        """Stop at a guard that is positive for a moment only, around a save time."""
         above = lambda t, s, args: args - (t - 0.5) ** 2
         state = pendulum.state({"arm": 1.2})
         traj = svkc.simulate(
@@ -199,7 +206,7 @@ def test_where_there_is_no_derivative(pendulum):
         )
         return traj.events.time[0], traj.derivative
 
-    # at 0.4 it goes through zero at a rate; 3e-8 s before 0.5 s at almost none
+    # at 0.4 s its rate is not zero; 3e-8 s before 0.5 s it nearly is
     slopes, codes = jax.jit(jax.vmap(jax.grad(grazed, has_aux=True)))(jnp.array([0.01, 1e-15]))
     assert (codes == svkc.RESULTS.successful).tolist() == [True, False]
     assert (codes == svkc.RESULTS.grazing).tolist() == [False, True]
@@ -207,14 +214,16 @@ def test_where_there_is_no_derivative(pendulum):
     assert np.isnan(slopes[1])
 
     @jax.jit
-    def code(first, second, at, also):
-        """Two guards, each by its four numbers, and two times; the first of them takes hold. Past
-        the end of the run there are none."""
+    def code(first, second, at, at_second):
+        """Return the code of a run with two guards, given by their weights, and two events.
+
+        The first event connects the hook. Events after the end of the run do not occur.
+        """
         events = [
             svkc.when(Choice(0)),
             svkc.when(Choice(1)),
             svkc.at(at, connect="hook", here=True),
-            svkc.at(also),
+            svkc.at(at_second),
         ]
         return svkc.simulate(
             pendulum,
@@ -236,9 +245,9 @@ def test_where_there_is_no_derivative(pendulum):
     assert code(turned, 2 * turned, never, never) == svkc.RESULTS.together
     assert code(rest, rest, 0.5, 0.5) == svkc.RESULTS.together
     assert code(clock, rest, 0.5, never) == svkc.RESULTS.together
-    # one guard by itself, that goes through zero at a rate, may be differentiated
+    # a single guard that crosses zero at a finite rate has a derivative
     assert code(clock, rest, never, never) == svkc.RESULTS.successful
-    # a parallelogram laid flat: its bars in one line
+    # a flat parallelogram, with its bars in line, is singular
     flat = models.parallelogram(middle=False)
     lost = svkc.simulate(flat, flat.state({"leg0": np.pi / 2}, {"leg0": 1.0}), 1e-3, throw=False)
     assert lost.derivative == svkc.RESULTS.rank_lost

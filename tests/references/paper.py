@@ -26,7 +26,7 @@ from svkc.tree.mass_matrix import mass_matrix_crba
 def forward_dynamics_by_unit_vectors(
     chain: Chain, state: State, tau: Float[Array, " torques"]
 ) -> Float[Array, " dofs"]:
-    """Return the accelerations of every joint coordinate by unit vectors, the paper's (23), (24)."""
+    """Return the accelerations of every coordinate by unit vectors, the paper's (23), (24)."""
     return acceleration(
         chain, state.structure, state.q, state.v, joint_torques(chain, tau), UnitVectors()
     )

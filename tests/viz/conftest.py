@@ -37,8 +37,7 @@ def stopped():
 
 @pytest.fixture(scope="module")
 def pendulum():
-    """A chain without virtual links, and with a body name that would end a script if not escaped.
-    """
+    """A chain without virtual links, and with a body name that would end a script if not escaped."""
     body = (
         f'<body name="{html.escape(NAME)}"><joint name="j" axis="0 1'
         f' 0"/>{models.BAR.format("0 0 -1")}</body>'
