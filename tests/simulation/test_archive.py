@@ -93,8 +93,8 @@ def test_save_and_load_round_trip(run, tmp_path):
 
 
 def test_continue_a_saved_run(run, tmp_path):
-    """Chain and state from the file, the chain's floats no longer those of its model: on bit for
-    bit. What else is metadata of the run."""
+    """A run continued from a file equals one continued from memory, bit for bit, although the
+    chain's arrays differ from those of its model. Options are stored as metadata."""
     chain, _ = run
     heavier = eqx.tree_at(lambda c: c.mass, chain, chain.mass * 1.1)
     traj = simulate(heavier, chain.state({"pivot": 1.2}))

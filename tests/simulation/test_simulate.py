@@ -1,4 +1,4 @@
-"""Runs: the high bar end to end, events, batches, steps, results."""
+"""`simulate`: the high bar, events, batches, step sizes, result codes."""
 
 import diffrax
 import equinox as eqx
@@ -16,7 +16,7 @@ PENDULUM = models.ARM.replace('gravity="0.3 -0.2 -9.81"', 'gravity="0 0 -10"')
 
 @pytest.fixture(scope="module")
 def pendulum():
-    """A rod on a hinge, and beside it a hook: a weld that can hold the rod where it is."""
+    """Return a rod on a hinge, with a weld ("hook") that can connect the rod to the ground."""
     return svkc.load(PENDULUM, virtual_links=[svkc.VirtualLink("hook", "world", "arm", "weld")])
 
 
@@ -33,14 +33,13 @@ def high_bar_run(chain, state, right, left, again):
 
 @pytest.fixture(scope="module")
 def compiled():
-    """One compiled program for every run of the high bar in this file, and proof that it was traced
-    once."""
+    """Return the compiled high bar run for all tests of this file; it fails if traced twice."""
     return eqx.filter_jit(eqx.debug.assert_max_traces(high_bar_run, max_traces=1))
 
 
 def test_high_bar(high_bar, compiled):
-    """24, 23, 22 freedoms; energy within each phase to 1e-8, loops to 1e-9 m and rad at every saved
-    time; then a re-catch: one trace."""
+    """Freedoms, ranks, energy in each phase to 1e-8 and loop gaps at every save time, for two
+    releases, and for two releases and a catch, with one trace."""
     chain, state = high_bar
     traj = compiled(chain, state, *jnp.array([0.5, 0.75, 10.0]))
     p = traj.phases
@@ -51,7 +50,7 @@ def test_high_bar(high_bar, compiled):
     assert float(traj.gaps.max()) <= REFERENCE
     np.testing.assert_array_equal(traj.events.time[:2], [0.5, 0.75])
     assert traj.events.which[:2].tolist() == [0, 1]
-    # what is saved is on the loops as seen from outside, too
+    # the saved poses satisfy the loop closure
     positions, _ = jax.vmap(lambda s: svkc.poses(chain, s))(traj.states)
     hand = positions[:20, chain.body_names.index("right_hand")]
     assert (
@@ -67,8 +66,8 @@ def test_high_bar(high_bar, compiled):
 
 @pytest.mark.slow
 def test_a_batch_of_different_runs_equals_single_runs(high_bar, compiled):
-    """Another release time and another starting structure in each lane, one trace, equal to the
-    single runs."""
+    """Batched runs with different release times and initial structures equal the single runs and
+    are traced once."""
     chain, state = high_bar
     masks = [[True, True], [True, False], [False, False]]
     starts = [svkc.transition(chain, state, np.array(m)) for m in masks]
@@ -91,7 +90,7 @@ def test_a_batch_of_different_runs_equals_single_runs(high_bar, compiled):
 
 
 class AngleGuard(eqx.Module):
-    """A guard at an angle that is data: runs with other angles share one program."""
+    """A guard whose angle is data, so that runs with other angles share one program."""
 
     value: jax.Array
 
@@ -103,7 +102,7 @@ def angle_guard(value):
     return AngleGuard(jnp.asarray(float(value)))
 
 
-# runs without events save at these, so that those that differ by numbers alone are one program
+# save times of runs without events, equal so that runs share one program
 SAVE_TIMES = jnp.linspace(0, 1, 5)
 
 
@@ -113,8 +112,8 @@ def simulate_pendulum(pendulum, **kw):
 
 @pytest.mark.slow
 def test_the_earliest_of_two_guards_in_one_step_fires(pendulum):
-    """Fixed steps of 0.2 s: both guards are crossed within one; in either order the earlier one is
-    found, to what a step of 0.2 s is good for."""
+    """Both guards cross within one fixed step of 0.2 s. In either order the earlier one fires, with
+    the accuracy of a step of 0.2 s."""
     fine = simulate_pendulum(
         pendulum, events=[svkc.when(angle_guard(g), stop=True) for g in (0.7, 0.3)], dt=1e-3
     )
@@ -131,7 +130,7 @@ def test_the_earliest_of_two_guards_in_one_step_fires(pendulum):
 
 @pytest.fixture(scope="module")
 def caught(pendulum):
-    """Two guards of one crossing; the second takes hold."""
+    """Return a run in which two guards cross at one instant; the event of the second connects."""
     events = [
         svkc.when(angle_guard(0.7)),
         svkc.when(lambda t, s, a: 0.7 - s.q[0], connect="hook", here=True),
@@ -142,7 +141,7 @@ def caught(pendulum):
 
 
 def test_simultaneous_guards_make_one_change(caught):
-    """Two guards of the same crossing happen together, in one change of structure."""
+    """Guards that cross at one instant fire together, in one change of structure."""
     traj = caught
     assert int(traj.events.count) == 2
     assert traj.events.which[:2].tolist() == [0, 1]
@@ -154,8 +153,8 @@ def test_simultaneous_guards_make_one_change(caught):
 
 @pytest.mark.slow
 def test_event_time_has_the_accuracy_of_the_solver(pendulum):
-    """The time at which the rod passes the vertical: a quarter period, by the arithmetic-geometric
-    mean; and no more events than were asked for."""
+    """The rod passes the vertical after a quarter period, which the arithmetic-geometric mean
+    gives. A longer run ends with `max_events` at its capacity for events."""
     m, length, com = 1.0, 1.0, 0.5
     model = pendulum.model.model
     inertia = 1 / model.dof_invweight0[0]
@@ -168,7 +167,7 @@ def test_event_time_has_the_accuracy_of_the_solver(pendulum):
         pendulum, events=[svkc.when(angle_guard(0.0))], rtol=1e-11, atol=1e-13, max_events=2
     )
     assert abs(float(traj.events.time[0]) - expected) < 1e-10
-    # the program of that run, for longer than it has room
+    # the program of the run above, for a run with more events than its capacity
     many = svkc.simulate(
         pendulum,
         pendulum.state({"arm": 1.0}),
@@ -184,8 +183,8 @@ def test_event_time_has_the_accuracy_of_the_solver(pendulum):
 
 @pytest.mark.slow
 def test_directions_and_repeated_crossings(pendulum):
-    """A guard without an action records every crossing; with a direction every second one; one that
-    starts at zero has not crossed."""
+    """A guard without an action records every crossing, with a direction every second one. A guard
+    that starts at zero has not crossed."""
     state = pendulum.state({"arm": 0.5})
     events = [
         svkc.when(angle_guard(0.0)),
@@ -196,7 +195,7 @@ def test_directions_and_repeated_crossings(pendulum):
     which = traj.events.which[: int(traj.events.count)].tolist()
     assert which.count(0) == 2 * which.count(1) or which.count(0) == 2 * which.count(1) + 1
     assert which.count(1) >= 1
-    # (at the top of the swing it is touched again, by a hair or not)
+    # at the top of the swing round-off decides whether the guard crosses again
     assert all(
         time > 1
         for time, i in zip(traj.events.time.tolist(), traj.events.which.tolist(), strict=True)
@@ -206,7 +205,7 @@ def test_directions_and_repeated_crossings(pendulum):
 
 @pytest.mark.slow
 def test_simultaneous_events_at_start_and_end(pendulum):
-    """At t0, at t1, and there a guard's as well."""
+    """Timed events at t0 and t1, and a guard that crosses at t1."""
     state = pendulum.state({"arm": 0.5}, {"arm": 1.0})
     last = svkc.when(lambda t, s, args: t - 1.0, stop=True)
     events = [
@@ -236,8 +235,8 @@ def test_fixed_and_adaptive_steps_are_consistent(pendulum):
 
 
 def test_control_and_work(pendulum, capsys):
-    """Torque of a control, and the energy it puts in, are accounted for; one that is no number from
-    some time on ends the run with a code."""
+    """The work of a control explains the change of energy. A control that is NaN from some time on
+    ends the run with `non_finite`."""
 
     def control(t, state, args):
         return args[0] * jnp.ones(1) * jnp.sin(5 * t) + 0 * jnp.log(args[1] - t)
@@ -276,16 +275,15 @@ def max_gap_after_two_seconds(stabilization) -> float:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "held", [svkc.stabilization.Projection(), svkc.stabilization.CoordinatePartitioning()]
+    "stabilization", [svkc.stabilization.Projection(), svkc.stabilization.CoordinatePartitioning()]
 )
 def test_projection_removes_drift(stabilization):
-    """A four-bar for 2 s: projection keeps the loop to round-off, after steps or at every
-    evaluation."""
+    """Projection after steps, or in every evaluation, keeps a four-bar's loop gap at round-off."""
     assert max_gap_after_two_seconds(stabilization) < 1e-13
 
 
 def test_baumgarte_bounds_drift():
-    """By Baumgarte's term, below the 6e-6 that it comes to without (next test)."""
+    """Baumgarte's term keeps the gap below the 6e-6 of the run without stabilization."""
     assert 1e-13 < max_gap_after_two_seconds(svkc.stabilization.Baumgarte(30.0)) < 1e-6
 
 
@@ -296,8 +294,7 @@ def test_drift_grows_without_stabilization():
 
 @pytest.mark.slow
 def test_result_codes_of_failed_runs(pendulum):
-    """Too few steps; a link that is elsewhere. (Too many events: with the time of one; numbers that
-    are none: with control.)"""
+    """Codes `max_steps` and `not_in_place`; tests above cover `max_events` and `non_finite`."""
     state = pendulum.state({"arm": 1.0})
     short = svkc.simulate(pendulum, state, 1.0, dt=1e-3, max_steps=10, throw=False)
     assert short.result == svkc.RESULTS.max_steps
@@ -309,8 +306,8 @@ def test_result_codes_of_failed_runs(pendulum):
 
 @pytest.mark.slow
 def test_discontinuous_guards(pendulum):
-    """A guard that jumps in time happens where it jumps; one that a change of structure makes jump
-    has not crossed."""
+    """The event of a guard that jumps in time is located at the jump. A guard that jumps by a
+    change of structure has not crossed."""
     state = pendulum.state({"arm": 1.2})
     jumps = svkc.when(lambda t, s, a: jnp.where(t > 0.5, 1.0 + t, -1.0))
     later = svkc.when(lambda t, s, a: jnp.where(s.structure.connected[0], s.q[0] - 2.0, 1.0))
@@ -327,16 +324,16 @@ def test_discontinuous_guards(pendulum):
 
 @pytest.mark.slow
 def test_step_equals_a_step_of_simulate():
-    """What `simulate` does in a step of that kind; of first order, loops kept, in a batch of lanes
-    that are joined differently."""
+    """`svkc.step` equals a step of `simulate` with its solver and stabilization. It is of first
+    order and bounds loop gaps, also in a batch with different structures."""
     chain = models.four_bar()
     state, dt = chain.state(v={"crank": 3.0}), 1e-3
     alone = svkc.step(chain, state, jnp.zeros(chain.nv), dt)
-    held = {
+    options = {
         "solver": svkc.integrators.SymplecticEuler(),
         "stabilization": svkc.stabilization.Baumgarte(0.5 / dt),
     }
-    run = svkc.simulate(chain, state, dt, dt=dt, **held).final
+    run = svkc.simulate(chain, state, dt, dt=dt, **options).final
     np.testing.assert_allclose(alone.q, run.q, atol=1e-14)
     np.testing.assert_allclose(alone.v, run.v, atol=1e-11)
     other = svkc.cut(chain, state, "pin")
@@ -345,7 +342,7 @@ def test_step_equals_a_step_of_simulate():
         0, n, lambda _, s: svkc.step(chain, s, jnp.zeros(chain.nv), 0.5 / n.astype(float)), s
     )
     ends = jax.jit(jax.vmap(walk))(lanes, jnp.array([500, 1000, 500, 1000]))
-    # what loops are open by is of second order
+    # loop gaps are of second order
     gaps = [
         float(
             jnp.abs(svkc.loop_gaps(chain, jax.tree.map(lambda x, lane=lane: x[lane], ends))).max()
@@ -369,7 +366,7 @@ def test_step_equals_a_step_of_simulate():
     ],
 )
 def test_default_absolute_tolerance(pendulum, dtype, rtol, atol):
-    """It is a hundredth, or what round-off leaves, so that rtol alone says how exact a run is."""
+    """The default of atol is a hundredth of rtol, but at least eight times round-off."""
     chain, start = jax.tree.map(
         lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x,
         (pendulum, pendulum.state({"arm": 0.3})),
@@ -385,8 +382,8 @@ def test_default_absolute_tolerance(pendulum, dtype, rtol, atol):
 
 @pytest.mark.slow
 def test_step_size_below_the_lower_bound(pendulum):
-    """A controller that may not go below its bound gives up where it would have to: a code, the
-    state it came to, and an error when asked to throw."""
+    """A step size below the controller's bound ends the run with a code, a finite state, and an
+    error with throw=True."""
     controller = diffrax.PIDController(rtol=1e-12, atol=1e-14, dtmin=0.02, force_dtmin=False)
     traj = simulate_pendulum(
         pendulum, stepsize_controller=controller, solver=diffrax.Tsit5(), throw=False

@@ -1,5 +1,5 @@
-"""Guards and grips: a figure in flight catches the bar, at declared placements and at current poses;
-batches of runs; values of guards."""
+"""Guards and grips: a figure in flight catches the bar, at declared placements and at current
+poses; batches of runs; values of guards."""
 
 import equinox as eqx
 import jax
@@ -18,8 +18,8 @@ SIDES = (("right", -HALF_GRIP_WIDTH, "ball"), ("left", HALF_GRIP_WIDTH, "hinge")
 
 @pytest.fixture(scope="module")
 def figure():
-    """The figure below the bar, arms up and hands on it, not holding: a hinge for one hand, a ball
-    for the other."""
+    """Return a figure below a bar with raised arms and both hands connected to the bar, one by a
+    ball and one by a hinge."""
     spec = mujoco.MjSpec.from_file(str(FOLDER / "figure16.xml"))
     links = [
         svkc.VirtualLink(
@@ -40,8 +40,8 @@ def figure():
 
 
 def toss(chain, state, up, roll):
-    """Thrown up from there, rolling about x through the point between the hands, with rigid
-    limbs."""
+    """Return the state of the released figure with rigid limbs, with an upward velocity and an
+    angular velocity about the axis x through the point between the hands."""
     hips = np.asarray(state.q[:3])
     linear = np.array([0, 0, up]) + np.cross([roll, 0, 0], hips - np.array([0, 0, BAR_HEIGHT]))
     q = {
@@ -55,7 +55,7 @@ def toss(chain, state, up, roll):
 
 @pytest.fixture(scope="module")
 def catches(figure):
-    """A run with a catch by each hand where it comes within four centimetres of the bar's axis."""
+    """Return a compiled run in which each hand catches the bar within 4 cm of the bar's axis."""
     chain, _ = figure
 
     @eqx.filter_jit
@@ -94,7 +94,7 @@ def test_catch_with_one_hand_then_the_other(figure, catches):
     assert np.all(np.asarray(traj.events.energy_lost[:2]) > 0)
     assert float(traj.gaps.max()) < REFERENCE
     assert float(jnp.abs(traj.phases.energy_drift[:3]).max()) < 1e-4
-    # each hand is where it took hold: within reach of the bar's axis
+    # each hand is connected where it caught the bar, 4 cm from the bar's axis
     for side in (0, 1):
         grip = traj.final.structure.pos[side]
         assert (
@@ -106,8 +106,8 @@ def test_catch_with_one_hand_then_the_other(figure, catches):
 
 @pytest.mark.slow
 def test_catch_with_both_hands_at_once(figure, catches):
-    """Thrown straight up the rigid figure comes back: two guards at one instant, at the time of the
-    parabola; declared grips at the place itself."""
+    """The rigid figure, thrown straight up, falls back: both guards fire at one instant, at the
+    time of the parabola. Connecting at the declared placements loses an equal energy."""
     chain, state = figure
     start = toss(chain, state, 1.4, 0.0)
     traj = catches(start)
@@ -142,7 +142,7 @@ def test_connecting_a_connected_link_is_a_no_op(pair):
 
 @pytest.mark.slow
 def test_batched_runs_equal_single_runs(pair):
-    """Another starting structure, grip and event times in each lane: the numbers of the single runs
+    """Batched runs with different initial structures, grips and event times equal the single runs
     to 1e-10."""
     rng = np.random.default_rng(3)
     start = pair.state(
@@ -175,7 +175,7 @@ def test_batched_runs_equal_single_runs(pair):
 
 
 def box():
-    """A box of 2 kg on the ground, which holds it; it can move up."""
+    """Return a box of 2 kg that slides vertically and is connected to the ground."""
     xml = models.MJCF.format(
         '<body name="box"><joint name="z" type="slide" axis="0 0 1"/><geom type="box" size="0.1 0.1'
         ' 0.1" mass="2"/></body>'
@@ -187,8 +187,8 @@ def box():
 
 
 def test_values_of_guards():
-    """Called by hand: the ground carries 20 N less what pulls; over a limit of 10 N that is once
-    too much; the box is where the ground is."""
+    """Guards called as functions: the ground carries the weight of 20 N less the pull of 5 N,
+    which is 1.5 times the limit of 10 N; the distance of the box from the ground is zero."""
     chain = box()
     state, pull = chain.state(), jnp.array([5.0])
     np.testing.assert_allclose(
@@ -204,10 +204,11 @@ def test_values_of_guards():
 
 @pytest.mark.slow
 def test_unilateral_support():
-    """A box thrown on the ground under a growing pull: it sticks, and is let go when the ground
-    would have to pull; the force by Newton's law.
+    """A box on the ground under a growing upward force leaves the ground when the ground would have
+    to pull, at the time that Newton's law gives.
 
-    Told on the way are when it is pressed with less than 10 N, and when it is at a height.
+    Two guards without actions record when the contact force falls below 10 N and when the box
+    passes a height.
     """
     chain = box()
     pull = lambda t, state, args: jnp.where(jnp.arange(1) == 0, 40 * t, 0.0)
@@ -241,7 +242,7 @@ def test_unilateral_support():
     )
     # z'' = 20 t - 10 from 0.5 s on
     np.testing.assert_allclose(traj.final.q[0], 20 / 6 * 0.2**3, rtol=1e-8)
-    # one that would have to pull from the first moment leaves at once
+    # a link that would have to pull as soon as it connects is cut at once
     early = run(0.55, 0.6, 0.55)
     assert early.events.which[: int(early.events.count)].tolist() == [0, 1]
     assert abs(float(early.events.time[1]) - 0.55) < REFERENCE
