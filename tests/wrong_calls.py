@@ -257,7 +257,7 @@ CASES = {
         rtol=1e-3, stepsize_controller=diffrax.PIDController(rtol=1e-3, atol=1e-6)
     ),
     "simulate stopped": lambda s: s.simulate(t1=1e-2, dt=1e-3, max_steps=2),
-    "solver: ... does not": lambda s: s.simulate(solver=diffrax.Euler()),
+    "solver: ... has no error": lambda s: s.simulate(solver=diffrax.Euler()),
     "solver: expected": lambda s: s.simulate(solver="euler"),
     "source: expected": lambda s: svkc.load(3),
     "source: names of": lambda s: s.load(

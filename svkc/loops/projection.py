@@ -213,7 +213,8 @@ def _step_by_loop_forces(
 ) -> tuple[Float[Array, " dofs"], Float[Array, "links 2"]]:
     """Return the change of q that closes the loops, and the gaps at q.
 
-    In the velocity's iteration it is the change of v that makes their rates zero. The change is the least in the metric of the mass matrix.
+    In the velocity's iteration it is the change of v that makes their rates zero. The change is the
+    least in the metric of the mass matrix.
     """
     column = jacobian_scales(chain)[1]
     loops = loop_kinematics(chain, structure, q)

@@ -4,14 +4,7 @@ import numpy as np
 
 from svkc.mjcf.load import load
 from svkc.model.chain import Chain, State
-from svkc.scenes.figure import (
-    ARM_LENGTH,
-    BAR_HEIGHT,
-    add_rod,
-    figure16,
-    hand_on_bar,
-    hanging_base_pose,
-)
+from svkc.scenes.figure import ARM_LENGTH, BAR_HEIGHT, add_rod, figure16, hand_on_bar, hanging_pose
 
 BAR_RADIUS = 0.02  # m: bars, and the rails that carry them
 BAR_SPACING = 0.5  # m: distance between bars
@@ -54,7 +47,7 @@ def hanging_state(chain: Chain, angle: float) -> State:
     angle: rotation of the figure about the bar, backwards (rad).
     """
     q = {
-        "base": hanging_base_pose(ARM_LENGTH, angle),
+        "base": hanging_pose(ARM_LENGTH, angle),
         "right_shoulder_flexion": np.pi - 0.1,
         "right_elbow": 0.1,
         "left_shoulder_flexion": 1.2,

@@ -53,7 +53,7 @@ def hand_on_bar(name: str, side: str, *, x: float, y: float, connected: bool) ->
     )
 
 
-def hanging_base_pose(arm: float, angle: float) -> list[float]:
+def hanging_pose(arm: float, angle: float) -> list[float]:
     """Return the base's position (m) and quaternion for a figure that hangs from a bar.
 
     The bar is above the origin.

@@ -4,14 +4,7 @@ import numpy as np
 
 from svkc.mjcf.load import load
 from svkc.model.chain import Chain, State
-from svkc.scenes.figure import (
-    ARM_LENGTH,
-    BAR_HEIGHT,
-    add_rod,
-    figure16,
-    hand_on_bar,
-    hanging_base_pose,
-)
+from svkc.scenes.figure import ARM_LENGTH, BAR_HEIGHT, add_rod, figure16, hand_on_bar, hanging_pose
 
 HALF_GRIP_WIDTH = 0.30  # m: half the distance between the hands
 
@@ -43,7 +36,7 @@ def hanging_state(chain: Chain, angle: float) -> State:
     angle: rotation of the figure about the bar, backwards (rad).
     """
     spread = np.arcsin((HALF_GRIP_WIDTH - 0.18) / ARM_LENGTH)
-    q = {"base": hanging_base_pose(ARM_LENGTH * np.cos(spread), angle)}
+    q = {"base": hanging_pose(ARM_LENGTH * np.cos(spread), angle)}
     for side in ("right", "left"):
         q |= {
             f"{side}_shoulder_flexion": np.pi - 0.1,

@@ -60,6 +60,11 @@ def model_and_links():
         size=[0.03, 0, 0],
         **look,
     )
+    return spec, _links()
+
+
+def _links() -> list[VirtualLink]:
+    """Return the virtual links of hands and thighs."""
     quarter = np.sqrt(0.5)
     links = []
     for side, y in (("right", -1), ("left", 1)):
@@ -85,7 +90,7 @@ def model_and_links():
             connected=True,
         )
         links += [hand, thigh]
-    return spec, links
+    return links
 
 
 def seat_events(chain: Chain) -> list[When]:

@@ -168,15 +168,9 @@ def estimate_error(chain: Chain, state: State, t1, **options) -> float:
 
 
 def tune(
-    chain: Chain,
-    state: State,
-    t1,
-    target: float = 1e-6,
-    options: Sequence[Candidate] | None = None,
-    repeats: int = 3,
-    show: bool = True,
-    **common,
-) -> Tuning:
+    chain: Chain, state: State, t1, target: float = 1e-6,
+    options: Sequence[Candidate] | None = None, repeats: int = 3, show: bool = True, **common,
+) -> Tuning:  # fmt: skip
     """Measure candidate options on this scene and return them, the fastest sufficient one first.
 
     A candidate is sufficient if its `configuration_error` relative to a reference run is at most
@@ -195,45 +189,41 @@ def tune(
     Raises ValueError if `target` is not positive or if the reference run fails.
     """
     check_state(chain, state)
-    target, t1, repeats = (
-        positive_scalar("target", target),
-        scalar("t1", t1),
-        integer("repeats", repeats, 1),
-    )
-    dtype, span = state.q.dtype, float(t1) - float(common.get("t0", 0.0))
-    reference_rtol = float(max(target * 1e-3, 50 * np.finfo(dtype).eps))
-    common = {
-        "ts": jnp.linspace(common.get("t0", 0.0), t1, 11, dtype=dtype),
-        **common,
-        "throw": False,
-    }
+    target, t1 = positive_scalar("target", target), scalar("t1", t1)
+    repeats = integer("repeats", repeats, 1)
+    t0, dtype = common.get("t0", 0.0), state.q.dtype
+    common = {"ts": jnp.linspace(t0, t1, 11, dtype=dtype), **common, "throw": False}
     run = lambda **options: simulate(chain, state, t1, **common, **options)
-    reference = run(solver=diffrax.Dopri8(), rtol=reference_rtol, atol=reference_rtol / 100)
-    if reference.result != RESULTS.successful:
-        raise ValueError(
-            f"target: {target} cannot be judged, a run at rtol {reference_rtol:.1e} ends with:"
-            f" {RESULTS[reference.result]}"
-        )
+    reference = _reference_run(run, target, dtype)
     error = lambda traj: configuration_error(chain, traj, reference)
     measured, best = [], np.inf
-    for candidate in default_candidates(dtype, span) if options is None else options:
+    if options is None:
+        options = default_candidates(dtype, float(t1) - float(t0))
+    for candidate in options:
         measured.append(_measure(run, candidate, error=error, repeats=repeats, limit=10 * best))
         if measured[-1].error <= target:
             best = min(best, measured[-1].seconds)
         if show:
-            print(
-                f"\r{len(measured)} tried, {candidate.name:<40}",
-                end="",
-                file=sys.stderr,
-                flush=True,
-            )
-    table = sorted(measured, key=lambda c: (not c.error <= target, c.seconds))
-    tuning = Tuning(
-        target, table[0].options if table and table[0].error <= target else None, tuple(table)
-    )
+            line = f"\r{len(measured)} tried, {candidate.name:<40}"
+            print(line, end="", file=sys.stderr, flush=True)
+    table = tuple(sorted(measured, key=lambda c: (not c.error <= target, c.seconds)))
+    reached = bool(table) and table[0].error <= target
+    tuning = Tuning(target, table[0].options if reached else None, table)
     if show:
         print(f"\r{tuning}", flush=True)
     return tuning
+
+
+def _reference_run(run: Callable, target: float, dtype) -> Trajectory:
+    """Return an accurate run. Raise ValueError if it does not succeed."""
+    rtol = float(max(target * 1e-3, 50 * np.finfo(dtype).eps))
+    reference = run(solver=diffrax.Dopri8(), rtol=rtol, atol=rtol / 100)
+    if reference.result != RESULTS.successful:
+        raise ValueError(
+            f"target: {target} cannot be judged, a run at rtol {rtol:.1e} ends with:"
+            f" {RESULTS[reference.result]}"
+        )
+    return reference
 
 
 def _measure(

@@ -68,55 +68,53 @@ def check_grad(
     positive_scalar("step", step)
     if mode not in ("forward", "reverse", "both"):
         raise ValueError(f"mode: got {mode!r}, expected 'forward', 'reverse' or 'both'")
+    differentiable, static = _partition(x)
+    value = lambda free: _outputs(f, free, static)
+    base = _finite_outputs(value(differentiable))
+    rng, checks = np.random.default_rng(seed), []
+    weights = {name: rng.normal(size=leaf.shape) for name, leaf in base.items()}
+    gradients = {} if mode == "forward" else _reverse_gradients(f, differentiable, static, weights)
+    leaves = jax.tree_util.tree_flatten_with_path(differentiable)[0]
+    for index, (path, leaf) in enumerate(leaves):
+        for _ in range(directions if leaf.size else 0):
+            direction, forward = _direction(differentiable, index, rng), None
+            difference, uncertainty = _central_differences(value, differentiable, direction, step)
+            if mode != "reverse":
+                forward = _forward_derivative(f, differentiable, static, direction)
+            for name, weight in weights.items():
+                derivatives = (
+                    None if forward is None else np.asarray(forward[name]),
+                    _directional_derivative(gradients[name], direction) if gradients else None,
+                )
+                paths = f"f(x){name}", f"x{jax.tree_util.keystr(path)}"
+                estimate = difference[name], uncertainty[name]
+                checks.append(_compare_leaf(*derivatives, weight, *estimate, paths))
+    worst = max(checks, key=lambda c: c.error)
+    return dataclasses.replace(worst, modes=max(c.modes for c in checks), mode=mode)
+
+
+def _partition(x):
+    """Return x as (floating-point arrays, the rest). Raise ValueError if x has no such arrays."""
     differentiable, static = eqx.partition(
         jax.tree.map(lambda leaf: jnp.asarray(leaf) if isinstance(leaf, float) else leaf, x),
         eqx.is_inexact_array,
     )
     # weak types would compile the program again for every parameter
     differentiable = jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype), differentiable)
-    leaves = jax.tree_util.tree_flatten_with_path(differentiable)[0]
-    if not any(leaf.size for _, leaf in leaves):
+    if not any(leaf.size for leaf in jax.tree.leaves(differentiable)):
         raise ValueError("check_grad: x has no floating-point arrays to differentiate by")
+    return differentiable, static
 
-    value = lambda free: _outputs(f, free, static)
-    base = {name: np.asarray(leaf) for name, leaf in value(differentiable).items()}
+
+def _finite_outputs(outputs) -> dict[str, np.ndarray]:
+    """Return the leaves as numpy arrays. Raise ValueError if there are none or one is not finite."""
+    base = {name: np.asarray(leaf) for name, leaf in outputs.items()}
     for name, leaf in base.items():
         if not np.isfinite(leaf).all():
             raise ValueError(f"check_grad: f(x){name} is not finite: {leaf}")
     if not any(leaf.size for leaf in base.values()):
         raise ValueError("check_grad: f(x) has no floating-point arrays to be differentiated")
-    rng, checks = np.random.default_rng(seed), []
-    weights = {name: rng.normal(size=leaf.shape) for name, leaf in base.items()}
-    gradients = {} if mode == "forward" else _reverse_gradients(f, differentiable, static, weights)
-    for index, (path, leaf) in enumerate(leaves):
-        for _ in range(directions if leaf.size else 0):
-            direction = _direction(differentiable, index, rng)
-            difference, uncertainty = _central_differences(value, differentiable, direction, step)
-            forward = (
-                None
-                if mode == "reverse"
-                else _forward_derivative(f, differentiable, static, direction)
-            )
-            for name, weight in weights.items():
-                reverse_value = (
-                    None
-                    if mode == "forward"
-                    else _directional_derivative(gradients[name], direction)
-                )
-                forward_value = None if forward is None else np.asarray(forward[name])
-                paths = f"f(x){name}", f"x{jax.tree_util.keystr(path)}"
-                checks.append(
-                    _compare_leaf(
-                        forward_value,
-                        reverse_value,
-                        weight,
-                        difference[name],
-                        uncertainty[name],
-                        paths,
-                    )
-                )
-    worst = max(checks, key=lambda c: c.error)
-    return dataclasses.replace(worst, modes=max(c.modes for c in checks), mode=mode)
+    return base
 
 
 def _direction(differentiable, index: int, rng: np.random.Generator):

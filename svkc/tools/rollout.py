@@ -31,20 +31,17 @@ def rollout(
 ) -> Trajectory:  # fmt: skip
     """Run `svkc.simulate` for every lane of `states` and return one batched trajectory.
 
-    Lanes are the elements of a batch: the leading axis of `states` and of the result, in equal
-    order. Each device runs its lanes without waiting for other devices. Under `jax.distributed`,
-    each process runs a share of the chunks, and every process returns the complete trajectory.
+    Lanes are the elements of the batch. Each device runs its lanes without waiting for others.
+    Under `jax.distributed` each process runs a share of the chunks, and all return all lanes.
 
-    states: a State with a leading axis of lanes.
-    t1: end time (s).
+    states: a State with a leading axis of lanes. t1: end time (s).
     data: pytree with a leading axis of lanes: the data in which lanes differ.
     lane: function (chain, data of one lane) that returns a dict of arguments of `simulate`, such as
-        events, args, control, t1, or `chain` with other floats. Lambdas written in the call share a
-        compiled program if their code and the data that they read are equal, as in `simulate`.
-    cost: expected duration of each lane, in any unit [lanes]. Lanes of similar cost share a chunk,
-        so that short runs do not wait for long ones.
-    chunk: lanes that one device runs at once. Default: 64 on a CPU, else 4096, and at most the
-        number of lanes. The memory of a chunk grows with its lanes.
+        events, args, control, t1, or `chain` with other floats. Compared as in `simulate`, so that
+        a lambda in the call is not compiled again.
+    cost: expected duration of each lane, in any unit [lanes]. Lanes of similar cost share a chunk.
+    chunk: lanes that one device runs at once; memory grows with them. Default: 64 on a CPU, else
+        4096.
     out: folder for finished chunks (chunk_00000.npz and so on, readable by `svkc.load_trajectory`).
         A call with equal arguments continues an interrupted rollout from this folder.
     devices: devices to use. Default: all of this process. For several CPU devices call
@@ -53,9 +50,8 @@ def rollout(
     options: further arguments of `simulate`, for all lanes. `throw` is False by default: the result
         codes of failed lanes are in `result`.
 
-    Raises ValueError if leading axes differ, if an option is invalid, or if `out` holds another
-    rollout. Raises RuntimeError if a chunk does not fit into memory or if another process ended
-    early; finished chunks stay in `out`.
+    Raises ValueError if leading axes differ, an option is invalid, or `out` holds another rollout.
+    Raises RuntimeError if a chunk does not fit into memory or another process ended early.
     """
     check_chain(chain)
     lanes = _count_lanes(states, data, cost)
@@ -71,16 +67,14 @@ def rollout(
     own_chunks = range(jax.process_index(), len(chunks), jax.process_count())
     done, start = {}, time.perf_counter()
     for count, i in enumerate(own_chunks, 1):
-        inputs_of_chunk = jax.tree.map(lambda x, i=i: x[chunks[i]], (states, data))
-        done[i] = _load_or_run(
-            run, inputs_of_chunk, folder and folder / f"chunk_{i:05d}.npz", chain, chunk
-        )
+        own_lanes = jax.tree.map(lambda x, i=i: x[chunks[i]], (states, data))
+        file = folder and folder / f"chunk_{i:05d}.npz"
+        done[i] = _load_or_run(run, own_lanes, file, chain, chunk)
         if progress:
             _print_progress(count, len(own_chunks), lanes, time.perf_counter() - start)
     inverse_order = np.argsort(order)
-    return jax.tree.map(
-        lambda *x: np.concatenate(x)[inverse_order], *_gather_chunks(done, len(chunks))
-    )
+    all_chunks = _gather_chunks(done, len(chunks))
+    return jax.tree.map(lambda *x: np.concatenate(x)[inverse_order], *all_chunks)
 
 
 def _prepare_devices(devices, chunk: int | None, lanes: int) -> tuple[list[Any], int]:

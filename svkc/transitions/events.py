@@ -138,8 +138,8 @@ def when(
 
     The time of the event is located to round-off and is differentiable if the guard is smooth.
 
-    A guard is armed while its action would change the structure. A guard whose action stops the
-    run or changes nothing is always armed. A guard that is exactly zero at the start has not
+    A guard is armed while its action would change the structure. A guard whose event stops the
+    run, or has no action, is always armed. A guard that is exactly zero at the start has not
     crossed zero, nor has a guard that stays at zero (to eps^(3/4)) after its event. Crossings are
     detected between the ends of steps: two crossings within one step are missed, so bound the step
     size (`stepsize_controller`, `dt`) where that can happen. The event of a discontinuous guard is

@@ -52,18 +52,11 @@ def render(
 
     check_chain(chain)
     check_single_run(traj)
-    frames, fps, path = (
-        integer("frames", frames, 1),
-        positive_scalar("fps", fps),
-        pathlib.Path(os.fspath(path)),
-    )
-    size, trails = (
-        tuple(integer("size", n, 16, 8192) for n in vector("size", size, 2)),
-        names("trails", trails),
-    )
-    lookat = lookat if lookat is None else vector("lookat", lookat, 3)
-    distance = distance if distance is None else positive_scalar("distance", distance)
-    azimuth, elevation = scalar("azimuth", azimuth), scalar("elevation", elevation)
+    frames, fps = integer("frames", frames, 1), positive_scalar("fps", fps)
+    path = pathlib.Path(os.fspath(path))
+    size = tuple(integer("size", n, 16, 8192) for n in vector("size", size, 2))
+    trails = names("trails", trails)
+    view = {"camera": camera, **_free_camera(lookat, distance, azimuth, elevation)}
     if path.suffix != ".html":
         _require_packages()
     if path.suffix == ".png":
@@ -73,15 +66,18 @@ def render(
     writer = {".gif": animation.write_gif, ".mp4": animation.write_mp4}.get(path.suffix)
     if writer is None:
         raise ValueError(f"render: {path.name} should end in .png, .gif, .mp4 or .html")
-    view = {
-        "camera": camera,
-        "lookat": lookat,
-        "distance": distance,
-        "azimuth": azimuth,
-        "elevation": elevation,
-    }
     writer(path, animation.frames(chain, traj, fps=fps, size=size, trails=trails, **view), fps)
     return path
+
+
+def _free_camera(lookat, distance, azimuth, elevation) -> dict:
+    """Return the validated placement of the free camera, by argument name."""
+    return {
+        "lookat": lookat if lookat is None else vector("lookat", lookat, 3),
+        "distance": distance if distance is None else positive_scalar("distance", distance),
+        "azimuth": scalar("azimuth", azimuth),
+        "elevation": scalar("elevation", elevation),
+    }
 
 
 def plot(traj: Trajectory, chain: Chain | None = None):

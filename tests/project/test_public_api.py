@@ -25,7 +25,11 @@ def public_objects() -> dict[str, object]:
     out = {name: getattr(svkc, name) for name in svkc.__all__ if name not in NAMESPACES}
     for space in NAMESPACES:
         module = getattr(svkc, space)
-        out |= {f"{space}.{name}": x for name, x in vars(module).items() if name[0] != "_"}
+        out |= {
+            f"{space}.{name}": x
+            for name, x in vars(module).items()
+            if name[0] != "_" and not inspect.ismodule(x)
+        }
     for cls in CLASSES:
         for name, x in vars(cls).items():
             if name[0] != "_" and (inspect.isfunction(x) or isinstance(x, property)):

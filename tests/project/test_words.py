@@ -55,7 +55,7 @@ def test_no_identifier_holds_a_private_word():
     assert not uses, "\n".join(uses)
 
 
-def test_a_private_word_is_seen_in_every_kind_of_identifier(tmp_path, monkeypatch):
+def test_the_words_are_searched_for_in_every_kind_of_identifier(tmp_path, monkeypatch):
     monkeypatch.setattr("test_words.ROOT", tmp_path)
     file = tmp_path / "module.py"
     file.write_text(
