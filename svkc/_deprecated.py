@@ -32,15 +32,15 @@ SUPERSEDED = {
         "an object of svkc.dynamics: ArticulatedBodies(), CompositeBodies(hold=...), UnitVectors()",
     ),
     "by_bodies": (
-        "loops.constrained_dynamics.by_bodies",
+        "loops.constrained_dynamics.articulated_bodies",
         "svkc.dynamics.ArticulatedBodies()",
     ),
     "inertia_by_composites": (
-        "tree.mass_matrix.inertia_by_composites",
+        "tree.mass_matrix.mass_matrix_crba",
         "svkc.dynamics.CompositeBodies()",
     ),
     "inertia_by_unit_vectors": (
-        "tree.mass_matrix.inertia_by_unit_vectors",
+        "tree.mass_matrix.mass_matrix_unit_vectors",
         "svkc.dynamics.UnitVectors()",
     ),
 }

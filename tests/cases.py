@@ -45,13 +45,13 @@ FIGURE = str(svkc.scenes.FOLDER / "figure16.xml")
 
 @functools.cache
 def high_bar() -> tuple[svkc.Chain, svkc.State]:
-    """Chain and state of the main job, without joint ranges: nothing that takes or gives energy."""
+    """Return chain and state of the main job, without joint limits, so that energy is conserved."""
     return svkc.scenes.high_bar(ignore=("limit",))
 
 
 @functools.cache
 def flight() -> tuple[svkc.Chain, svkc.State]:
-    """The same figure in flight beside the bar, spinning, its hands still where the grips are."""
+    """Return the high bar figure in flight and spinning, with its hands where the grips were."""
     (chain, state), rng = high_bar(), np.random.default_rng(2)
     free = svkc.cut(chain, state, "right_hand_grip", "left_hand_grip")
     v = free.v.at[: chain.nv].set(jnp.asarray(rng.normal(size=chain.nv)))
@@ -178,7 +178,7 @@ CASES = {
 
 
 def params(tag: str) -> list:
-    """Return the names of the cases with a tag, as parameters of a test."""
+    """Return names of the cases with a tag, as parameters of a test."""
     return [
         name if "fast" in case.tags.split() else pytest.param(name, marks=pytest.mark.slow)
         for name, case in CASES.items()

@@ -1,4 +1,5 @@
-"""float64, strict promotion, warnings as errors, every annotation checked."""
+"""Settings of the tests: float64, strict promotion, warnings as errors, every annotation
+checked."""
 
 import gc
 import importlib.metadata
@@ -71,7 +72,7 @@ def pytest_configure(config):
 
 @pytest.fixture(scope="session")
 def high_bar():
-    """Chain and state of the main job, without joint ranges: nothing that takes or gives energy."""
+    """Return chain and state of the main job, without joint limits, so that energy is conserved."""
     return cases.high_bar()
 
 

@@ -21,7 +21,7 @@ ALGEBRA, RUN = 1e-8, DIFFERENCE
 
 
 def algebra(chain, state):
-    """Everything that is not a run, on one state."""
+    """Return a case with every function that is not a run, on one state."""
     rng = np.random.default_rng(3)
     vdot = jnp.asarray(rng.normal(size=chain.dofs))
 
@@ -66,7 +66,7 @@ def spatial_loop():
 
 
 def over_constrained():
-    """Three parallel bars: the third loop is redundant as a whole."""
+    """Return three parallel bars, whose third loop has only redundant rows."""
     chain = models.parallelogram()
     f, x, _ = algebra(chain, chain.state({"leg0": 0.3}, {"leg0": 1.0}))
     # what keeps the redundant rows redundant: no single place may move
@@ -74,8 +74,8 @@ def over_constrained():
 
 
 def every_float():
-    """A tree with hinges, slides, balls, springs, dampers, rotors and offset axes, by all that its
-    model holds."""
+    """Return a tree with hinges, slides, balls, springs, dampers, armature and offset axes, by all
+    floats of its model."""
     chain = svkc.load(models.random_tree(6, seed=4))
     rng = np.random.default_rng(4)
     q = svkc.integrate(chain, chain.q_load, jnp.asarray(rng.normal(size=chain.dofs)))
@@ -88,7 +88,7 @@ def every_float():
 
 
 def at_rest():
-    """Identity rotations, no velocity, no load: a free body with a ball and a hinge."""
+    """Return a free body with a ball and a hinge: identity rotations, zero velocity, zero load."""
     ball = models.bar(
         "arm",
         'type="ball"',
@@ -104,8 +104,8 @@ def at_rest():
 
 
 def assembly():
-    """Newton's method onto the loops, from a configuration that is off them; lengths and grips of
-    the model too."""
+    """Return Newton's method onto the loops from an open configuration, by model lengths and grips
+    too."""
     chain = models.rod_on_balls()
     near = chain.state({"crank": 0.3})
     # as the user gives it: a little off, and a velocity that does not agree
@@ -126,13 +126,13 @@ def assembly():
 
 
 def at_unit(chain, q):
-    """With quaternions of unit length, as the loader asks for."""
+    """Return the coordinates with quaternions of unit length."""
     full = jnp.concatenate([q, chain.q_load[chain.nq :]])
     return svkc.integrate(chain, full, jnp.zeros(chain.dofs))[: chain.nq]
 
 
 def impact():
-    """The velocity after a connect, declared and where it is."""
+    """Return the velocity after a connect, at the declared placement and at the current poses."""
     box = (
         '<body name="{}" pos="{}"><freejoint name="{}"/><geom type="box" size="0.1 0.2 0.3"'
         ' contype="0"/></body>'
@@ -158,8 +158,8 @@ def impact():
 
 
 def pendulum_cut():
-    """Two rods, the second comes off at an angle of the first, and is taken hold of again where it
-    is: both times, the angle and the model count."""
+    """Return two rods: the second is cut at an angle of the first and gripped again at its current
+    pose; by both times, the angle and the model."""
     rods = models.TWO_RODS
     chain = svkc.load(models.MJCF.format(rods), cuttable="lower")
     state = chain.state({"upper": 1.2, "lower": 0.3}, {"upper": 0.1, "lower": 0.2})
@@ -184,7 +184,7 @@ def pendulum_cut():
 
 
 def breaking():
-    """A joint that breaks under its load, and a grip made with a spare slot."""
+    """Return a joint that breaks under its load, and a grip made with a spare slot."""
     rods = models.TWO_RODS
     rods += models.bar("other", models.Y, "0 0 -1", "1 0 0")
     chain = svkc.load(models.MJCF.format(rods), cuttable="lower", spare=1)
@@ -219,7 +219,8 @@ def breaking():
 
 
 def four_bar_turning():
-    """A four-bar driven through more than a turn: the independent coordinates change on the way."""
+    """Return a four-bar driven through more than one turn, so that the independent coordinates
+    change."""
     chain = models.four_bar()
     control = lambda t, s, args: jnp.zeros(chain.dofs).at[0].set(args[0] * jnp.cos(args[1] * t))
 
@@ -247,7 +248,7 @@ def four_bar_turning():
 
 
 def over_constrained_run():
-    """Three parallel bars swing and the middle one lets go, for a while."""
+    """Return three parallel bars that swing; the middle bar is cut and connected again."""
     chain = models.parallelogram()
     state = chain.state({"leg0": 0.3}, {"leg0": 1.0})
 
@@ -262,8 +263,8 @@ def over_constrained_run():
 
 
 def high_bar():
-    """From rest, two hands, one, none, one again: 24, 23, 22, 23 joint freedoms, every release time
-    and the re-catch."""
+    """Return the high bar figure from rest with two hands, one, none, one: 24, 23, 22, 23 joint
+    freedoms; by every release time and the catch time."""
     chain, hanging = svkc.scenes.high_bar(ignore="limit")
 
     def f(x):
@@ -346,8 +347,8 @@ def swing():
 
 
 def brachiation():
-    """Hanging by one hand, the other takes hold of the next bar where it comes near, and the first
-    lets go."""
+    """Return a figure that hangs by one hand, grips the next bar with the other, and releases the
+    first."""
     from svkc.scenes.brachiation import brachiation
 
     chain, state = brachiation(ignore="limit")
@@ -404,7 +405,7 @@ CASES = ALGEBRAIC | RUNS
 
 
 def main(names):
-    """A row for each case: the worst entry in both modes, along a random direction of each
+    """Print one row for each case: the worst entry in both modes, along a random direction of each
     parameter."""
     print(
         "| case | parameters | worst relative error | of | difference good to | forward against"

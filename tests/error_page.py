@@ -1,5 +1,5 @@
-"""docs/errors.md and the messages that the library raises, read from its sources,
-and what a call looks like without the tests' own type checks."""
+"""docs/errors.md, the messages in the library's sources, and calls without the tests' type
+checks."""
 
 import ast
 import contextlib
@@ -14,7 +14,7 @@ FOLDER = pathlib.Path(svkc.__file__).parent
 
 
 def _text(node) -> str:
-    """A message as written, with ... for what it names."""
+    """Return a message as written, with ... for formatted values."""
     if isinstance(node, ast.Constant):
         return str(node.value)
     if isinstance(node, ast.JoinedStr):
@@ -32,7 +32,7 @@ def _nodes(kind):
 
 
 def messages() -> set[str]:
-    """Of every exception that is raised with one, on one line."""
+    """Return the message of every raised exception, on one line."""
     raised = (node.exc for node in _nodes(ast.Raise))
     return {
         " ".join(_text(call.args[0]).split())
@@ -42,7 +42,7 @@ def messages() -> set[str]:
 
 
 def messages_of(function: str, argument: int) -> set[str]:
-    """What calls of a function by this name, such as eqx.error_if, are given to say."""
+    """Return the messages passed to a function by this name, such as eqx.error_if."""
     calls = (
         node
         for node in _nodes(ast.Call)
@@ -55,7 +55,7 @@ PAGE = (pathlib.Path(__file__).parent.parent / "docs" / "errors.md").read_text()
 
 
 def _rows(head: str) -> list[str]:
-    """First cells of the table that begins so."""
+    """Return the first cells of the table with this head."""
     lines = PAGE.split(f"| {head} |\n|---|---|---|\n")[1].split("\n\n")[0].splitlines()
     return [line.removeprefix("| ").split(" | ")[0].replace("&lt;", "<") for line in lines]
 
@@ -66,13 +66,13 @@ OTHERS = _rows("message | from | what to do")
 
 
 def pattern(row: str) -> str:
-    """A regular expression for the messages that a row of the page stands for, on one line."""
+    """Return a regular expression for the messages that a row stands for."""
     return r"[\s\S]*".join(map(re.escape, re.split(r"\.{3,}", row)))
 
 
 @contextlib.contextmanager
 def as_users_see():
-    """Annotations are not checked, as outside of the tests."""
+    """Disable the checks of annotations, as for users."""
     jaxtyping.config.update("jaxtyping_disable", True)
     try:
         yield

@@ -37,7 +37,7 @@ CALLS = {"count": 0, "raised": 0}
 
 
 def examples(share: float):
-    """Of all examples this part, for one test."""
+    """Return a decorator that gives a test this share of all examples."""
     settings = hypothesis.settings(
         max_examples=max(1, round(share * (LONG or 250))),
         deadline=None,
@@ -61,7 +61,8 @@ NOTHING = object()
 
 
 def outcome(call, *others):
-    """What the call gives; NOTHING where it raises what the page, or the list `others`, has."""
+    """Return the result of a call, or NOTHING if the call raises a documented error or one of
+    `others`."""
     CALLS["count"] += 1
     with (
         warnings.catch_warnings(),
@@ -171,12 +172,12 @@ vectors = lambda n: st.lists(
 
 
 def or_anything(good, part: int = 3):
-    """Mostly what is right: a strategy with one wrong value in `part`."""
+    """Draw from `good`, and one time in `part` from `anything`."""
     return st.integers(1, part).flatmap(lambda i: anything if i == 1 else good)
 
 
 def some_of(**strategies):
-    """A few of these arguments."""
+    """Draw a dict with some of these arguments."""
     return st.fixed_dictionaries({}, optional=strategies)
 
 
@@ -195,8 +196,8 @@ TREE = models.MJCF.format(
 
 @functools.cache
 def scenes() -> dict:
-    """Names to (chain, state): a closed loop; a tree that has none, nor slots; a loop and an empty
-    slot."""
+    """Return name -> (chain, state): a closed loop, a tree without loops or slots, a loop with a
+    spare slot."""
     return {
         name: (chain, chain.state())
         for name, chain in (
@@ -209,7 +210,7 @@ def scenes() -> dict:
 
 @pytest.fixture(scope="module", autouse=True)
 def ready():
-    """The scenes are made before anything is drawn, and annotations are not checked."""
+    """Build the scenes before anything is drawn, and disable the checks of annotations."""
     scenes()
     with error_page.as_users_see():
         yield
@@ -225,7 +226,7 @@ TREE_NUMBER_OF = {"four": (3, 3), "tree": (12, 10), "spare": (3, 3)}
 
 
 def broken(state, field: str, value):
-    """The state with something wrong: a NaN, or another thing in its place."""
+    """Return the state with one defect: NaN, or an invalid value as a field."""
     # (of what is free in space an angle, for nothing depends on where it is)
     at = 3 if state.q.shape == (12,) else 0
     if field == "q":

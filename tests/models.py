@@ -1,5 +1,5 @@
-"""How mechanisms of the tests are built, as MJCF and virtual links; which of them laws are tested
-on, and in what state, is the table in `cases.py`."""
+"""Mechanisms of the tests, as MJCF and virtual links. The table in `cases.py` says which laws are
+tested on which."""
 
 import re
 
@@ -12,8 +12,8 @@ BAR = '<geom type="capsule" fromto="0 0 0 {0}" size="0.03" contype="0" conaffini
 
 
 def random_tree(bodies: int, seed: int, kinds=("hinge", "slide", "ball", "free")) -> str:
-    """A random tree: random shapes and frames, several joints on some bodies, one to three
-    trees."""
+    """Return a random tree with random shapes and frames, several joints on some bodies, and one to
+    three roots."""
     rng = np.random.default_rng(seed)
     children: list[list[int]] = [[] for _ in range(bodies + 1)]
     for i in range(1, bodies + 1):
@@ -80,20 +80,20 @@ FOUR_BAR = bar(
 
 
 def pin(**changed) -> svkc.VirtualLink:
-    """The hinge that closes the four-bar, or one that differs from it."""
+    """Return the hinge that closes the four-bar, with some fields changed."""
     at = {"pos": (1.2, 0, 0), "axis": (0, 1, 0), "real_pos": (0.2, 0, -0.6), "connected": True}
     return svkc.VirtualLink("pin", "world", "rocker", "hinge", **at | changed)
 
 
 def four_bar(**options) -> svkc.Chain:
-    """Crank, coupler, rocker on hinges about y; closed by a hinge. In space: 3 of the 6 rows are
+    """Return crank, coupler and rocker on hinges about y, closed by a hinge; 3 of its 6 rows are
     redundant."""
     return svkc.load(MJCF.format(FOUR_BAR), virtual_links=[pin()], **options)
 
 
 def parallelogram(middle: bool = True) -> svkc.Chain:
-    """Two, or three, parallel bars that carry a platform: the third loop is redundant as a
-    whole."""
+    """Return two or three parallel bars that carry a platform; all rows of the third loop are
+    redundant."""
     legs = "".join(
         bar(
             f"leg{i}",
@@ -121,7 +121,8 @@ def parallelogram(middle: bool = True) -> svkc.Chain:
 
 
 def rod_on_balls() -> svkc.Chain:
-    """Spatial R-S-S-R: a coupler with a ball at each end, free to spin about itself."""
+    """Return a spatial R-S-S-R linkage: the coupler has a ball at each end, and spins freely about
+    its axis."""
     crank = bar(
         "crank",
         'type="hinge" axis="1 0 0"',
@@ -142,8 +143,8 @@ def rod_on_balls() -> svkc.Chain:
 
 
 def stewart() -> svkc.Chain:
-    """A platform on six legs, each a universal joint (two hinges), a slide and a ball; the first
-    leg carries the platform."""
+    """Return a platform on six legs, each a universal joint (two hinges), a slide and a ball; the
+    first leg is in the tree."""
     angle = np.deg2rad([0, 60, 120, 180, 240, 300])
     feet = np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
     tops = np.stack([0.5 * np.cos(angle + 0.5), 0.5 * np.sin(angle + 0.5), 0 * angle + 1], 1)
@@ -197,8 +198,8 @@ def stewart() -> svkc.Chain:
 
 
 def five_bar() -> svkc.Chain:
-    """Two arms of two links that meet: mobility 2, motors on both shoulders and one elbow to choose
-    from."""
+    """Return two arms of two links that meet: mobility 2, with motors on both shoulders and one
+    elbow."""
     left = bar("left_arm", Y, "0 0 0.5", "-0.3 0 0", bar("left_fore", Y, "0.3 0 0.5", "0 0 0.5"))
     right = bar("right_arm", Y, "0 0 0.5", "0.3 0 0", bar("right_fore", Y, "-0.3 0 0.5", "0 0 0.5"))
     link = svkc.VirtualLink(
@@ -215,8 +216,8 @@ def five_bar() -> svkc.Chain:
 
 
 def dh_loop(theta, length, twist, axes_named="j") -> svkc.Chain:
-    """A loop of hinges by Denavit and Hartenberg: joint i turns by theta[i] about z, the next is
-    `length[i]` along x, turned by `twist[i]` about x."""
+    """Return a loop of hinges by Denavit-Hartenberg parameters: joint i rotates by theta[i] about
+    z; the next joint is `length[i]` along x, rotated by `twist[i]` about x."""
     turn = lambda angle: np.array([np.cos(angle / 2), np.sin(angle / 2)])
     about_x = lambda angle: (turn(angle)[0], turn(angle)[1], 0, 0)
     xml = ""
@@ -245,7 +246,8 @@ def dh_loop(theta, length, twist, axes_named="j") -> svkc.Chain:
 
 
 def figure40() -> svkc.Chain:
-    """The 40-freedom figure, a ball grip at each hand where it hangs: mobility 40."""
+    """Return the 40-freedom figure with a ball grip at each hand in the hanging pose: mobility
+    40."""
     chain = svkc.load(str(svkc.scenes.FOLDER / "figure40.xml"))
     place = np.asarray(svkc.poses(chain, chain.state())[0])
     grips = [
@@ -263,7 +265,7 @@ def figure40() -> svkc.Chain:
 
 
 def bennett(theta=0.9) -> svkc.Chain:
-    """Four skew hinges that can move only because sin(alpha) / a = sin(beta) / b."""
+    """Return four skew hinges that move only because sin(alpha) / a = sin(beta) / b."""
     alpha, a, b = np.deg2rad(30.0), 0.5, 0.8
     beta = np.arcsin(np.sin(alpha) * b / a)
     second = 2 * np.arctan(
@@ -273,16 +275,16 @@ def bennett(theta=0.9) -> svkc.Chain:
 
 
 def bricard(theta=np.pi / 3) -> svkc.Chain:
-    """Six hinges, equal links, twists of 90 and -90 degrees in turn: cos t + cos u + cos t cos u =
-    0."""
+    """Return six hinges with equal links and alternating twists of 90 and -90 degrees: cos t + cos
+    u + cos t cos u = 0."""
     other = np.arccos(-np.cos(theta) / (1 + np.cos(theta)))
     quarter = np.pi / 2
     return dh_loop((theta, other) * 3, (0.5,) * 6, (quarter, -quarter) * 3)
 
 
 def sarrus() -> svkc.Chain:
-    """Two legs of three parallel hinges at right angles to each other: the platform goes straight
-    up and down."""
+    """Return two legs of three parallel hinges at right angles: the platform moves straight up and
+    down."""
     X = 'type="hinge" axis="1 0 0"'
     leg_x = bar(
         "a1",
@@ -313,13 +315,13 @@ TWO_BOXES = MJCF.format(
 
 
 def two_boxes(joint: str) -> svkc.Chain:
-    """Two free boxes, a joint between them that is not connected."""
+    """Return two free boxes with a disconnected virtual joint between them."""
     where = {"pos": (0.4, 0.1, 0), "real_pos": (-0.6, 0.1, 0), "axis": (0.2, 0.5, 1)}
     return svkc.load(TWO_BOXES, virtual_links=[svkc.VirtualLink("grip", "a", "b", joint, **where)])
 
 
 def box_with_a_limb() -> svkc.Chain:
-    """Two free boxes, one with a limb that may come off, a weld between them, and a spare slot; no
+    """Return two free boxes, one with a cuttable limb, a weld between them, and a spare slot; no
     gravity."""
     limb = bar("limb", Y, "0.4 0 0", "0.1 0 0") + '</body><body name="b"'
     text = TWO_BOXES.replace("0.3 -0.2 -9.81", "0 0 0").replace('</body><body name="b"', limb)
@@ -328,7 +330,7 @@ def box_with_a_limb() -> svkc.Chain:
 
 
 def free_tree() -> svkc.Chain:
-    """Eight bodies on a free one; no gravity."""
+    """Return eight bodies on a free one; no gravity."""
     text = random_tree(8, seed=4, kinds=("free", "ball", "hinge"))
     first = re.compile(r'<body name="b1"([^>]*)>(<joint[^>]*/>)*')
     text = first.sub(r'<body name="b1"\1><freejoint/>', text, count=1)

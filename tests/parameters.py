@@ -1,5 +1,5 @@
-"""What derivatives are taken by, floats of a chain and of a state by name; of what, a run as
-numbers; and how far they are from differences."""
+"""Parameters of derivatives (floats of a chain and of a state, by name), a run as numbers, and the
+error of derivatives against differences."""
 
 import diffrax
 import equinox as eqx
@@ -15,7 +15,7 @@ FLOATS = "mass com inertia pos quat axis anchor gravity armature damping stiffne
 
 
 def model(chain, *names):
-    """Floats of the model by name, "grip": where its virtual links take hold of their real
+    """Return floats of the model by name; "grip" is the virtual links' placement in their real
     links."""
     return {
         name: chain.structure.real_pos if name == "grip" else getattr(chain, name) for name in names
@@ -23,7 +23,7 @@ def model(chain, *names):
 
 
 def changed(chain, x):
-    """The chain with the floats in x that are its own."""
+    """Return the chain with its floats replaced by those in x."""
     for name in FLOATS:
         if name in x:
             chain = eqx.tree_at(lambda c, name=name: getattr(c, name), chain, x[name])
@@ -35,11 +35,12 @@ def changed(chain, x):
 
 
 def heavier(chain):
-    """Factors of mass and inertia, body by body."""
+    """Return the parameter that scales mass and inertia, body by body."""
     return {"heavier": jnp.ones(len(chain.mass))}
 
 
 def start(state, x):
+    """Return the state with its floats replaced by those in x."""
     s = state.structure
     if "grip" in x:
         s = eqx.tree_at(lambda s: s.real_pos, s, x["grip"])
@@ -47,7 +48,7 @@ def start(state, x):
 
 
 def motion(traj):
-    """What is looked at of a run; rows that no event has filled hold no numbers."""
+    """Return the numbers of a run; rows without an event are zero."""
     e, p = traj.events, traj.phases
     flat = lambda *parts: jnp.concatenate([jnp.ravel(part) for part in parts])
     times = flat(e.time, p.start, p.stop, traj.t_final)

@@ -1,4 +1,4 @@
-"""Python in processes of their own, and the pictures that they draw."""
+"""Python in separate processes, and checks of the pictures that they draw."""
 
 import os
 import pathlib
@@ -14,7 +14,7 @@ CACHE = tempfile.TemporaryDirectory()
 
 
 def run(*args, cwd=ROOT, optimized=True, settings=None):
-    """Runs Python with these arguments."""
+    """Run Python with these arguments."""
     env = dict(os.environ)
     if optimized:
         env["XLA_FLAGS"] = env.get("XLA_FLAGS", "").replace(
@@ -40,7 +40,7 @@ def run(*args, cwd=ROOT, optimized=True, settings=None):
 
 
 def looks_drawn(path):
-    """A picture of more than a few colours."""
+    """Assert that a picture has more than a few colours."""
     from PIL import Image
 
     with Image.open(path) as image:

@@ -218,7 +218,7 @@ def poses(chain: Chain, state: State) -> tuple[Float[Array, "bodies 3"], Float[A
     """
     rows = np.array(chain.topology.body_row)
     kin = kinematics(chain, state.q)
-    return (kin.root + kin.r)[rows], kin.quat[rows]
+    return (kin.root_position + kin.r)[rows], kin.quat[rows]
 
 
 @checked_jit

@@ -1,5 +1,5 @@
-"""Factors and solves in a batch: what they give, and that devices of one process do not wait for
-each other for ever."""
+"""Batched Cholesky and triangular solves: equality with single solves, and no deadlock of several
+CPU devices in one process."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""The cache of compiled programs: where it is, who may write to it, what XLA says of it."""
+"""The persistent compilation cache: its folder, permissions, atomic writes, and XLA's warnings."""
 
 import os
 import pathlib
@@ -16,7 +16,7 @@ SETTINGS = "jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_s
 
 @pytest.fixture(autouse=True)
 def unset(monkeypatch, tmp_path):
-    """No cache, and a home of its own; the suite's cache afterwards."""
+    """Disable the cache and use a temporary home directory; restore the settings afterwards."""
     before = {name: getattr(jax.config, name) for name in SETTINGS}
     kept = compilation_cache.get_executable_and_time, lru_cache.LRUCache.put
     jax.config.update("jax_compilation_cache_dir", None)
@@ -108,8 +108,8 @@ def test_processor_id_depends_on_model_and_features(tmp_path):
 
 
 def test_entries_are_written_atomically(tmp_path):
-    """Over one that was cut short too; nothing else is left, and where nothing can be written
-    nothing is said."""
+    """A truncated entry is replaced, no temporary file is left, and a read-only folder raises no
+    error."""
     entries = lru_cache.LRUCache(str(tmp_path), max_size=-1)
     (tmp_path / "program-cache").write_bytes(b"ha")
     cache._write_entry(entries, "program", b"half and half")
@@ -136,7 +136,7 @@ def test_the_least_recently_used_entries_are_removed(tmp_path, monkeypatch):
 
 
 def test_false_warnings_are_dropped_from_stderr(monkeypatch, capfd):
-    """What else XLA says stays, an instruction that the processor lacks above all."""
+    """Other messages of XLA stay, such as a missing instruction of the processor."""
     line = (
         "E1 cpu_aot_loader.cc:195] Loading XLA:CPU AOT result. Target machine feature +{} is not "
         " supported on the host machine. [+prefer-no-gather]\n"

@@ -1,5 +1,5 @@
-"""Public functions that are compiled for compile time where they are called eagerly: the same under
-every transformation, and within one another."""
+"""Public functions that are compiled for short compile time when called eagerly: equal results
+under every transformation."""
 
 import jax
 import jax.numpy as jnp
@@ -16,15 +16,14 @@ XS = jnp.array([0.1, 0.2])
 
 @pytest.fixture(scope="module")
 def linkage():
-    """A four-bar, and a run of it without steps of note."""
+    """Return a four-bar and a run of one step."""
     chain = models.four_bar()
     traj = svkc.simulate(chain, chain.state(v={"crank": 2.0}), 1e-3, dt=1e-3, throw=False)
     return chain, traj
 
 
 def all_results(chain, traj, x):
-    """What each of the functions says of the linkage at a crank angle, each given what another
-    made."""
+    """Return results of all eagerly compiled functions at a crank angle."""
     state = chain.state({"crank": x}, {"crank": 2.0 + x})
     tau = jnp.zeros(chain.dofs).at[0].set(x)
     co = svkc.coordinates(chain, state)
@@ -129,8 +128,8 @@ def test_options_are_passed_at_the_outermost_jit_only():
 @pytest.mark.slow
 @pytest.mark.parametrize("make", [models.sarrus, models.bennett])
 def test_the_derivative_of_a_state_closed_from_afar(make):
-    """Open, the loops of an over-constrained linkage have a higher rank than closed: what is
-    differentiated is the way that Newton's method went."""
+    """The open loops of an over-constrained linkage have a higher rank than the closed ones;
+    derivatives follow the iterates of Newton's method."""
     chain = make()
     rng = np.random.default_rng(0)
     start, along = (

@@ -1,5 +1,5 @@
-"""Functions made anew by a loop: programs are shared where the functions can be compared, and
-results are those of each function."""
+"""Function objects created in a loop: functions with equal content share a program, and each call
+uses the arrays of its own function."""
 
 import enum
 import functools
@@ -32,7 +32,7 @@ def arm():
 
 @pytest.fixture
 def programs(monkeypatch):
-    """One item for each program of `simulate` that is made."""
+    """Return a list with one item for each program of `simulate` that is traced."""
     conversions, module = [], sys.modules["svkc.simulation.simulate"]
     original = module._closure_convert
     monkeypatch.setattr(
@@ -52,12 +52,12 @@ def fixed_torque(t, state, args):
 
 @pytest.fixture(scope="module")
 def expected(arm):
-    """What constant torques give."""
+    """Return results for constant torques passed by `args`."""
     return [end(arm, fixed_torque, args=jnp.asarray(gain)) for gain in (1.0, 2.0)]
 
 
 def static(function):
-    """What a function is compared by; None: by identity."""
+    """Return the static part of a function; None if it is compared by identity."""
     try:
         return jax.tree.flatten(eqx.filter(comparable(function), eqx.is_array, inverse=True))
     except Exception:
@@ -65,7 +65,7 @@ def static(function):
 
 
 def same(one, other) -> bool:
-    """Whether both are one program."""
+    """Return whether two functions share a program."""
     return isinstance(comparable(one), FunctionPytree) and static(one) == static(other)
 
 
@@ -108,7 +108,8 @@ class Pair(eqx.Module):
 
 
 def test_equal_content_compares_equal():
-    """By type and value, arrays of floats not at all, those of whole numbers by content."""
+    """Static values compare by type and value, integer arrays by content, and floating-point arrays
+    are data."""
     small, large, key = np.ones(2), 3 * np.ones(2), jax.random.key(0)
     makers = {
         torque: [
@@ -189,7 +190,7 @@ def test_equal_content_compares_equal():
 
 
 def test_functions_compared_by_identity():
-    """The whole function is compared by identity."""
+    """One incomparable value makes the function incomparable."""
 
     def writes():
         nonlocal assigned
@@ -252,8 +253,8 @@ def test_functions_compared_by_identity():
 
 
 def test_globals_of_libraries_are_static():
-    """Of the module those that the code names, also through other functions; a function object
-    keeps what it was."""
+    """Globals count that the code names, also through other functions; a function object keeps its
+    first static part."""
     global GAIN, LIST
     read = lambda: [static(f) for f in (lambda: GAIN * 2, lambda: helper(), lambda: LIST[0] + 1)]
     first, kept = read(), lambda: GAIN + 1
@@ -281,7 +282,7 @@ def test_globals_of_libraries_are_static():
 
 
 def test_a_loop_compiles_once(arm, expected, programs):
-    """Whatever holds the arrays; each run is that of its own ones."""
+    """Arrays may be in any container; each run uses the arrays of its own function."""
     module = lambda pair: lambda t, state, args: pair.torque(t, state, args)
     holds = [
         nested,
@@ -297,7 +298,7 @@ def test_a_loop_compiles_once(arm, expected, programs):
 
 
 def test_a_global_that_changes(arm, expected, programs):
-    """A number: another program; an array: the same one."""
+    """A changed number is another program, a changed array is not."""
     global GAIN
     ends = []
     for gain in (1.0, 2.0, np.asarray([1.0]), np.asarray([2.0])):
@@ -309,7 +310,7 @@ def test_a_global_that_changes(arm, expected, programs):
 
 
 def test_a_list_that_counts(arm, expected, programs):
-    """It is the list itself that is written to, and the function stays one program."""
+    """The function writes to the original list, and stays one program."""
     traces = []
     control = lambda t, state, args: (traces.append(0), jnp.ones_like(state.v))[1]
     assert [end(arm, control), end(arm, control)] == expected[:1] * 2
@@ -317,8 +318,8 @@ def test_a_list_that_counts(arm, expected, programs):
 
 
 def test_arrays_whose_values_python_reads_are_static(arm, expected, programs):
-    """Each value has its own program, the right one, and the next goes there at once; other errors
-    are told as they are."""
+    """Each value has its own program, and later calls find the program; other errors are raised
+    unchanged."""
     conditional = lambda gain: (
         lambda t, s, a: float(np.linalg.norm(gain)) * jnp.ones_like(s.v) if gain[0] > 0 else None
     )
@@ -356,7 +357,7 @@ def test_guards(arm, programs):
 
 @pytest.mark.slow
 def test_rollout(arm, programs):
-    """A lambda in the call itself."""
+    """A lambda in the call shares a program."""
     chain, state = arm
     starts = jax.tree.map(lambda x: jnp.stack([x] * 3), state)
 
@@ -385,7 +386,7 @@ def test_rollout(arm, programs):
 
 @pytest.mark.slow
 def test_incomparable_functions_warn_when_compiled_again(arm):
-    """A warning after the second compilation, once, and by the argument's name."""
+    """One warning after the second compilation, with the name of the argument."""
 
     def run(**kw):
         thing = Opaque()
@@ -407,7 +408,8 @@ def test_incomparable_functions_warn_when_compiled_again(arm):
 
 @pytest.mark.slow
 def test_derivatives_and_lanes(arm):
-    """By what is closed over, in lanes, as differences of a run by `args` give them."""
+    """Derivatives by closed-over arrays, and batches, equal differences of runs that pass the
+    arrays by `args`."""
     chain, state = arm
     closed = lambda gain: svkc.simulate(
         chain, state, 0.1, control=lambda t, s, a: gain**2 * jnp.ones_like(s.v), **DT

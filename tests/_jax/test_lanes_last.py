@@ -1,5 +1,5 @@
-"""A `vmap` with the lanes last against jax's own: every operation that has a rule, those that have
-none, and `svkc.step` in all transformations."""
+"""`vmap` with the lanes last against `jax.vmap`: primitives with a rule, primitives without one,
+and `svkc.step` in all transformations."""
 
 import jax
 import jax.numpy as jnp
@@ -15,8 +15,8 @@ KEY = jax.random.key(3)
 
 
 def example(x, y, which):
-    """Calls, gathers by numbers that all lanes share and that each has, products of all kinds,
-    loops, solves, choices."""
+    """Use calls, gathers by shared and by batched indices, products of all kinds, loops, solves and
+    selects."""
     rows = x[np.array([2, 0, 1])] + x[which][None] + jnp.eye(3)[which][None]
     left = (
         jnp.einsum("ij,kj->ik", x, y)
@@ -80,7 +80,7 @@ def test_every_rule(count):
 
 
 def test_zero_lanes_and_integers():
-    """Sums and products of whole numbers stay what they are; of no lanes there is nothing."""
+    """Integer sums and products keep their dtype; a batch of zero lanes gives empty arrays."""
     counted = lambda x: (jnp.sum(x, dtype=jnp.int32), x @ x, jnp.stack([x, x]))
     one = rules.with_lanes_last(counted)
     for count in (0, 4):
@@ -109,7 +109,7 @@ def test_every_primitive_of_a_step_has_a_rule(monkeypatch):
 
 @pytest.mark.slow
 def test_a_step_in_every_transformation():
-    """Lanes of lanes, and derivatives of lanes and by them, are those of one at a time."""
+    """Nested batches, derivatives of batches and batches of derivatives equal single calls."""
     chain = models.four_bar()
     state = chain.state()
     tau = jax.random.normal(KEY, (2, 3, chain.nv))
@@ -135,8 +135,8 @@ def test_a_step_in_every_transformation():
 
 @pytest.mark.slow
 def test_runs_by_articulated_bodies():
-    """A batch of runs in which every lane differs, its accelerations and its way back onto the
-    loops lanes last: its single runs."""
+    """A batch of different runs, with accelerations and projection evaluated lanes last, equals the
+    single runs."""
     chain = models.four_bar()
     start = chain.state(v={"crank": 4.0})
 

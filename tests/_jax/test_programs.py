@@ -1,5 +1,5 @@
-"""What the programs are made of: no calls back to Python, float32 throughout where that is asked,
-no LAPACK in steps by articulated bodies."""
+"""Contents of compiled programs: no callbacks to Python, float32 throughout in float32, no LAPACK
+in steps by articulated bodies."""
 
 import re
 
@@ -20,8 +20,7 @@ def lowered(function, *args) -> str:
 
 
 def calls(text: str) -> set[str]:
-    """Names of what is called that is no operation of XLA's own; those that only mark or arrange
-    are left out."""
+    """Return names of custom calls, without those that only annotate sharding."""
     return set(re.findall(r"custom_call @(\w+)", text)) - {"Sharding", "annotate_device_placement"}
 
 

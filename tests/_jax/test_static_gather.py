@@ -1,4 +1,4 @@
-"""Rows by a known index: jax's own indexing, and the same derivatives without a scatter."""
+"""Gather by a static index: equality with JAX's indexing, and derivatives without a scatter."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""States and scenes to and from MuJoCo, and quaternions with the scalar last."""
+"""Conversion of states and chains to and from MuJoCo, and quaternions with the scalar last."""
 
 import os
 import pathlib
@@ -32,8 +32,8 @@ XML = """<mujoco><worldbody><body name="a" pos="0 0 1"><joint name="a" axis="0 1
 
 @pytest.mark.parametrize("cuttable", [(), pytest.param("c", marks=pytest.mark.slow)])
 def test_states_survive_conversion_to_mujoco_and_back(cuttable):
-    """MuJoCo puts the bodies where svkc has them and moves them so; with a joint that may be cut as
-    well; <equality> as they hold."""
+    """MuJoCo's poses and velocities equal svkc's, also with a cuttable joint; <equality> elements
+    keep whether they are active."""
     chain, rng = svkc.load(XML, cuttable=cuttable), np.random.default_rng(0)
     quat = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_quat(scalar_first=True)
     state = chain.state(
@@ -80,7 +80,7 @@ def test_quaternions_scalar_last():
 
 
 def test_an_equality_without_a_name():
-    """It is a virtual link all the same, and holds in MuJoCo as it does in svkc."""
+    """An <equality> without a name is a virtual link with a generated name."""
     chain = svkc.load(XML.replace('name="w" ', ""))
     assert chain.link_names == ("equality_0",)
     data = mujoco.MjData(chain.model.model)
@@ -146,7 +146,7 @@ SCENES = {
 
 
 def residual(chain, state):
-    """The largest of MuJoCo's own equality residuals at a state."""
+    """Return the largest of MuJoCo's equality residuals at a state."""
     data = mujoco.MjData(chain.model.model)
     svkc.interop.to_mujoco(chain, state, data)
     mujoco.mj_forward(chain.model.model, data)
@@ -158,8 +158,8 @@ def residual(chain, state):
 @pytest.mark.slow
 @pytest.mark.parametrize("scene", SCENES)
 def test_a_scene_as_mjcf_and_back(scene):
-    """The same bodies, joints, links, masses to the last digit; the same loops and motion; MuJoCo
-    finds the loops closed."""
+    """Bodies, joints, links and masses are equal to the last digit, the motion is equal, and
+    MuJoCo's equality residuals are zero."""
     chain, options = SCENES[scene]()
     again = svkc.load(chain.to_mjcf(), **options)
     assert (again.body_names, again.joint_names) == (chain.body_names, chain.joint_names)
@@ -210,8 +210,8 @@ def test_a_scene_as_mjcf_and_back(scene):
 
 
 def test_a_comment_names_links_without_an_mjcf_form():
-    """Other joints, motors on virtual joints, slots and what may be cut: a comment, from which the
-    links can be declared; connected is the chain's."""
+    """A comment lists other joints, motors on virtual joints, spare slots and cuttable joints, as
+    calls that declare them."""
     screw = svkc.VirtualLink(
         "rail--1",
         "world",
@@ -246,7 +246,7 @@ def test_a_comment_names_links_without_an_mjcf_form():
 
 
 def test_new_sites_get_unused_names():
-    """Sites and second connects keep out of the way of the scene's own."""
+    """Names of new sites and equalities differ from the scene's names."""
     hinges = [
         svkc.VirtualLink(name, "a", "b", "hinge", connected=True) for name in ("pin", "pin_axis")
     ]
@@ -262,7 +262,7 @@ VIEWER = pathlib.Path(__file__).parents[2] / "examples" / "08_mujoco_viewer.py"
 
 @pytest.mark.slow
 def test_the_viewer_without_a_display():
-    """Says so, and is no failure."""
+    """The example prints that there is no display, and exits without an error."""
     if not sys.platform.startswith("linux"):
         pytest.skip("other systems have a display")
     env = {
@@ -278,8 +278,7 @@ def test_the_viewer_without_a_display():
 
 @pytest.mark.slow
 def test_the_viewer_is_shown_every_state(monkeypatch, capsys):
-    """The example as it stands, but for the window: what a window would draw is where svkc has the
-    bodies, at each saved time."""
+    """The example with a fake window: at each saved time the bodies have svkc's poses."""
     glfw, shown = pytest.importorskip("glfw"), []
 
     class Window:

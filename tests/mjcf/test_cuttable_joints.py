@@ -1,5 +1,5 @@
-"""Joints of the tree that may be cut (Fig. 15): before the cut the plain tree, after it two free
-systems; joints that break; slots bound in a run."""
+"""Cuttable joints (Fig. 15): equal to the plain tree before the cut, two free systems after the
+cut; joints that break; slots bound in a run."""
 
 import cases
 import equinox as eqx
@@ -23,8 +23,8 @@ def state_of(chain, q):
 
 @pytest.fixture(params=cases.params("cuttable"), scope="module")
 def case(request):
-    """The plain tree and the one with a joint that may be cut, in the same state, springs, ranges
-    and motors included."""
+    """Return the plain tree and the tree with a cuttable joint in equal states, with springs,
+    limits and motors."""
     case = cases.CASES[request.param]
     plain, chain = case.build(), case.build(cuttable=case.cuttable)
     return plain, chain, case.cuttable[0], state_of(plain, case.pose), state_of(chain, case.pose)
@@ -32,7 +32,7 @@ def case(request):
 
 @pytest.mark.slow
 def test_before_the_cut_it_is_the_plain_tree(case):
-    """Poses, velocities, energy, mobility, acceleration and 0.3 s of motion, to 1e-9."""
+    """Poses, velocities, energy, mobility, acceleration and 0.3 s of motion agree to 1e-9."""
     plain, chain, _, a, b = case
     for x, y in zip(
         svkc.poses(plain, a) + svkc.velocities(plain, a),
@@ -63,8 +63,8 @@ def test_before_the_cut_it_is_the_plain_tree(case):
 
 @pytest.mark.slow
 def test_after_it_there_are_two_systems(case):
-    """Nothing jumps at the cut; without gravity the momentum of everything that hangs on nothing is
-    kept to 1e-12."""
+    """The state is continuous at the cut; without gravity the momentum of the free part is
+    conserved to 1e-12."""
     _, chain, cut, _, state = case
     free = svkc.cut(chain, state, cut)
     assert bool(jnp.all(free.q == state.q))
@@ -104,8 +104,8 @@ def bodies_beyond_cut(chain):
 
 
 def part_momentum(chain, state, part):
-    """Linear and angular momentum of some bodies, from poses, velocities and the model's own
-    inertias, in numpy."""
+    """Return linear and angular momentum of some bodies, from poses, velocities and the model's
+    inertias, in NumPy."""
     model = chain.model.model
     pos, quat = (np.asarray(x) for x in svkc.poses(chain, state))
     lin, ang = (np.asarray(x) for x in svkc.velocities(chain, state))
@@ -126,8 +126,8 @@ def part_momentum(chain, state, part):
 
 @pytest.mark.slow
 def test_a_link_in_the_middle_of_a_loop():
-    """A four-bar whose coupler joint is cut: the loop at the rocker still holds, the crank swings
-    alone; then the joint is made again."""
+    """Cut the coupler joint of a four-bar: the loop at the rocker stays closed and the crank swings
+    freely. Then connect the joint again."""
     chain = models.four_bar(cuttable="coupler")
     state = chain.state(v={"crank": 2.0})
     plain = models.four_bar()
@@ -157,8 +157,8 @@ def test_a_link_in_the_middle_of_a_loop():
 
 @pytest.mark.slow
 def test_springs_ranges_and_motors_go_with_the_joint():
-    """A hinge with all of them, with ref, beside one with armature: the same motion while it holds,
-    nothing of them acts when it is cut."""
+    """A hinge with springs, limits, motors and ref: equal motion while connected, and no force of
+    them once cut."""
     xml = """<mujoco><compiler angle="radian"/><worldbody><body name="a"><joint name="a"
       axis="0 1 0" armature="0.05"/><geom type="capsule" fromto="0 0 0 0 0 -1" size="0.05"/>
       <body name="b" pos="0 0 -1" euler="0.2 0 0.1"><joint name="b" axis="0.3 1 0" pos="0.02 0 0"
@@ -203,8 +203,8 @@ def test_springs_ranges_and_motors_go_with_the_joint():
 
 @pytest.mark.slow
 def test_a_joint_that_breaks():
-    """The pivot of a pendulum breaks where it carries 50 N: the load at that moment by the
-    pendulum's own law, then free fall."""
+    """The pivot of a pendulum breaks at 50 N: the load equals the closed form, then the pendulum
+    falls freely."""
     xml = models.ARM.replace('gravity="0.3 -0.2 -9.81"', 'gravity="0 0 -10"')
     chain = svkc.load(xml, cuttable="arm")
     limit = 50.0
@@ -243,7 +243,7 @@ ROTORS = models.MJCF.format(
 
 
 def test_armature_is_left_out_joint_by_joint():
-    """The inertia is MuJoCo's, less the armature of the joints named; a joint that may be cut has
+    """The mass matrix is MuJoCo's without the armature of the named joints; a cuttable joint has
     none."""
     model = mujoco.MjModel.from_xml_string(ROTORS)
     data, M = mujoco.MjData(model), np.zeros((2, 2))
@@ -273,8 +273,8 @@ SPARE = models.MJCF.format(
 
 @pytest.fixture(scope="module")
 def gripped():
-    """A chain with one slot, a state, and the run of six grips and givings up of it at these times,
-    past the end of the run never."""
+    """Return a chain with one spare slot, a state, and a run with six binds and unbinds at given
+    times; times after the end do not happen."""
     chain = svkc.load(SPARE, spare=1)
     state = chain.state({"arm": -0.9})
 
@@ -303,8 +303,8 @@ def gripped():
 
 @pytest.mark.slow
 def test_grips_bound_during_a_run(gripped):
-    """One slot, three grips one after another between bodies that the model does not join, unbound
-    in between; one program."""
+    """One spare slot, three consecutive grips between bodies that the model does not join, in one
+    program."""
     chain, state, run = gripped
     traj = run((0.1, 0.2, 0.3, 0.35, 0.4, 0.5))
     # what is gripped already stays as it is: no change at 0.35
@@ -332,8 +332,7 @@ def test_grips_bound_during_a_run(gripped):
 
 @pytest.mark.slow
 def test_no_slot_left(gripped):
-    """Capacity exceeded: a code, the state of that moment, and the grip that was there still
-    holds."""
+    """Without a free slot the run ends with `no_slot`, and the existing grip stays connected."""
     _, _, run = gripped
     times = (0.1, 9.0, 0.2, 9.0, 9.0, 9.0)
     traj = run(times, throw=False)

@@ -1,4 +1,4 @@
-"""Models in: everything read, everything else named."""
+"""Loading of models: supported elements are read, unsupported ones are named in an error."""
 
 import pathlib
 import re
@@ -37,13 +37,13 @@ def test_all_kinds_of_sources(tmp_path):
 
 
 def kept_as_is():
-    """A jitted function of a chain that gives it back, and the list of its traces."""
+    """Return a jitted identity function of a chain, and the list of its traces."""
     traces = []
     return jax.jit(lambda chain: (traces.append(0), chain)[1]), traces
 
 
 def test_two_loads_of_one_model_are_one_program(tmp_path):
-    """However the model and the arguments come: equal, of equal hash, traced once."""
+    """Chains from all kinds of sources are equal, have equal hashes, and share one trace."""
     path = tmp_path / "model.xml"
     path.write_text(PENDULUM)
     hinge = {"name": "l", "parent": "world", "real": "arm", "connected": True}
@@ -77,8 +77,8 @@ def test_two_loads_of_one_model_are_one_program(tmp_path):
 
 
 def test_chains_of_other_models_keep_their_own():
-    """Equal in shape, but not in a number, a text or an argument: each comes back from jit with the
-    model that it was loaded from."""
+    """Chains that differ in a number, the text or an argument do not share a trace, and return from
+    jit with their own model."""
     link = lambda **where: svkc.VirtualLink("l", "world", "arm", "hinge", **where)
     chains = [
         svkc.load(PENDULUM),
@@ -120,8 +120,8 @@ def test_pointers():
 
 
 def test_ends_of_virtual_links_by_sites():
-    """The same links by bodies and by sites, turned ones too; a site without a placement is the
-    placement."""
+    """Links declared by bodies equal links declared by sites, also rotated ones; a site without a
+    placement is the placement."""
     sites = (
         '<site name="tip" pos="0.1 0.2 -0.3" quat="0.6 0.8 0 0"/>',
         '<site name="foot" pos="0 0.1 0" quat="0.8 0 0.6 0"/>',
@@ -206,7 +206,7 @@ def test_one_error_names_all_unsupported_elements():
 
 
 def test_limits_and_springs_are_the_models():
-    """A spring as MuJoCo has it; a range that holds a pendulum up against gravity."""
+    """A spring equals MuJoCo's; a joint limit holds a pendulum against gravity."""
     xml = PENDULUM.replace('damping="0"', 'damping="2" range="-0.5 0.5" limited="true"').replace(
         "<mujoco>", '<mujoco><compiler angle="radian"/>'
     )
@@ -248,8 +248,8 @@ INERTIA[np.diag_indices(3)] = (
 
 @pytest.mark.slow
 def test_mesh_include_and_defaults(tmp_path):
-    """A scene of two files: classes of defaults, a mesh in a folder of its own, a weld; and the
-    text made of it, which is read anywhere."""
+    """A scene of two files with default classes, a mesh and a weld; its MJCF text loads from any
+    folder."""
     (tmp_path / "parts" / "shapes").mkdir(parents=True)
     (tmp_path / "parts" / "shapes" / "wedge.obj").write_text(OFF_TETRAHEDRON)
     (tmp_path / "parts" / "arm.xml").write_text(
@@ -294,8 +294,8 @@ def test_mesh_include_and_defaults(tmp_path):
     ],
 )
 def test_urdf_with_a_mesh(tmp_path, written, stands):
-    """By path: the mesh is found, of a ROS package too; the link that is fixed is kept for a grip;
-    and the text made of it."""
+    """A URDF by path: meshes resolve, also package:// ones; links behind fixed joints stay bodies;
+    its MJCF text loads."""
     for file in (tmp_path / stands, tmp_path / "arm" / "urdf" / "arm.urdf"):
         file.parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / stands).write_text(OFF_TETRAHEDRON)
@@ -326,8 +326,8 @@ def test_urdf_with_a_mesh(tmp_path, written, stands):
 
 @pytest.mark.slow
 def test_a_scene_written_in_python():
-    """A five-bar as mujoco.MjSpec, part of it attached from another, its loop a virtual link; the
-    spec stays the caller's own."""
+    """A five-bar as a mujoco.MjSpec with an attached spec and a virtual link; loading does not
+    modify the spec."""
 
     def arm(side):
         spec = mujoco.MjSpec()
@@ -385,8 +385,8 @@ def test_the_example_of_the_gallery_runs():
 
 @pytest.mark.slow
 def test_a_robot_from_a_public_collection():
-    """Minitaur's URDF, loops as virtual links: balls find its axes parallel to five digits only,
-    balls that slide along them leave each leg its two motors."""
+    """Minitaur's URDF with loops as virtual links: its axes are parallel to five digits only, so
+    that balls that slide along them leave each leg two freedoms."""
     feet = {}
     for slide in (False, True):
         feet[slide] = [

@@ -1,5 +1,4 @@
-"""docs/errors.md: every message of the library is on the page, and every one of them is provoked,
-here or where the page's list says."""
+"""docs/errors.md lists every message of the library, and a test raises each message."""
 
 import pathlib
 import re
@@ -31,7 +30,7 @@ def setting(tmp_path_factory):
 
 
 def _row(opening: str) -> str:
-    """The one row that begins so, and with no longer opening of another case."""
+    """Return the one row that begins with `opening` and with no longer opening of another case."""
     rows = [
         row
         for row in ROWS
@@ -79,7 +78,7 @@ def test_other_ways_to_them(setting, words, call):
 
 @pytest.mark.slow
 def test_inside_compiled_programs(setting):
-    """What cannot be known while tracing is raised by the program."""
+    """Errors that depend on traced values are raised by the compiled program."""
     assert sorted(error_page.COMPILED) == sorted(error_page.messages_of("error_if", 2))
     apart = setting.load(virtual_links=[wrong_calls.link(pos=(5, 0, 0), real_pos=(0, 0, 0))])
     beyond = wrong_calls.far(setting)

@@ -1,5 +1,5 @@
-"""Chains and states are plain pytrees: optimisers, root finders, files and training states of
-others take them as they are."""
+"""Chains and states are plain pytrees: optimisers, root finders and serialisation of other
+libraries accept them."""
 
 import equinox as eqx
 import jax
@@ -17,7 +17,7 @@ ROD = models.bar("rod", models.Y, "0 0 -1")
 
 
 def assert_equal_leaves(one, two):
-    """Bit for bit, and of one kind."""
+    """Assert that two pytrees have equal structure and bit-identical leaves."""
     assert jax.tree.structure(one) == jax.tree.structure(two)
     for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True):
         assert (a.dtype, a.shape) == (b.dtype, b.shape)
@@ -25,7 +25,7 @@ def assert_equal_leaves(one, two):
 
 
 def differentiable_part(thing, where):
-    """The chosen leaf alone, and the rest."""
+    """Partition a pytree into one leaf and the rest."""
     return eqx.partition(thing, eqx.tree_at(where, jax.tree.map(lambda _: False, thing), True))
 
 
@@ -36,8 +36,7 @@ def four_bar():
 
 
 def test_optax_optimises_a_leaf_of_a_chain(four_bar):
-    """The floats of a chain are an optimiser's parameters: centres of mass that give the energy
-    asked for; the rest stays bit for bit."""
+    """An optimiser fits centres of mass to a given energy; all other leaves stay bit-identical."""
     chain, _, state = four_bar
     free, rest = differentiable_part(chain, lambda c: c.com)
     loss = lambda free: (svkc.potential_energy(eqx.combine(free, rest), state) - 1.0) ** 2
@@ -61,7 +60,7 @@ def test_optax_optimises_a_leaf_of_a_chain(four_bar):
 
 
 def test_optax_optimises_a_state(four_bar):
-    """A whole state as parameters, whole numbers and masks aside."""
+    """All floating-point leaves of a state are parameters."""
     chain, _, state = four_bar
     free, rest = eqx.partition(state, eqx.is_inexact_array)
     loss = lambda free: svkc.kinetic_energy(chain, eqx.combine(free, rest)) - 0.1 * jnp.sum(free.v)
@@ -74,8 +73,8 @@ def test_optax_optimises_a_state(four_bar):
 
 @pytest.mark.slow
 def test_optimistix_finds_a_launch_velocity():
-    """A root through a whole run, over a State: the rate with which a hanging rod must begin to be
-    level at 0.4 s."""
+    """Root finding through a run, over a State: the velocity with which a hanging rod is level at
+    0.4 s."""
     chain = svkc.load(models.MJCF.format(ROD))
     free, rest = differentiable_part(
         eqx.tree_at(lambda s: s.v, chain.state(), jnp.array([6.0])), lambda s: s.v
@@ -92,7 +91,7 @@ def test_optimistix_finds_a_launch_velocity():
 
 @pytest.mark.slow
 def test_optimistix_finds_the_equilibrium():
-    """The least of the potential energy over a State; there nothing accelerates."""
+    """The minimum of the potential energy over a State is an equilibrium."""
     chain = svkc.load(
         models.MJCF.format(
             models.bar(
@@ -113,7 +112,7 @@ def test_optimistix_finds_the_equilibrium():
 
 @pytest.mark.slow
 def test_optimistix_finds_masses(four_bar):
-    """Least squares over a Chain: masses that explain the torques measured."""
+    """Least squares over a Chain: masses that explain measured torques."""
     chain, _, state = four_bar
     torques = lambda chain: svkc.inverse_dynamics(chain, state, jnp.arange(1.0, 1.0 + chain.nv))
     measured = torques(eqx.tree_at(lambda c: c.mass, chain, 1.3 * chain.mass))
@@ -137,8 +136,7 @@ def test_equinox_writes_and_reads_bit_for_bit(four_bar, tmp_path):
 
 
 def test_leaves_rebuild_an_equal_object(four_bar):
-    """As libraries do that know nothing of svkc: flattened, moved through jit and scan, and put
-    together."""
+    """Flatten, pass through jit and scan, and unflatten."""
     chain, rest, state = four_bar
     for thing in (chain, state):
         leaves, tree = jax.tree.flatten(thing)

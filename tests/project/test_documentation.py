@@ -1,5 +1,4 @@
-"""README, pages and changelog: their size, their links, and the paths and versions that they
-name."""
+"""README, pages and changelog: size, links, and the paths and versions in them."""
 
 import importlib.metadata
 import pathlib

@@ -1,4 +1,4 @@
-"""README's example and those of the folder run, by public names alone."""
+"""README's example and those of the folder run, with public names only."""
 
 import ast
 import re

@@ -1,4 +1,4 @@
-"""Random states, and random calls of the functions on them."""
+"""Random states, and random calls of public functions on them."""
 
 import math
 

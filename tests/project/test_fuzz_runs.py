@@ -1,4 +1,4 @@
-"""Random runs, rollouts and files: looked at and traced, and some of them computed."""
+"""Random runs, rollouts and files: validated and traced, some of them computed."""
 
 import functools
 import math
@@ -38,7 +38,7 @@ class RunStarted(Exception):
 
 @pytest.fixture
 def only_traced(monkeypatch):
-    """Runs are traced for their shapes, and not compiled."""
+    """Trace runs for their shapes instead of compiling them."""
     trace = functools.partial(
         eqx.filter_eval_shape, sys.modules["svkc.simulation.simulate"]._run.__wrapped__
     )

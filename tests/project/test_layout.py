@@ -36,7 +36,7 @@ FILES = sorted(
 
 @functools.cache
 def imports(file: str) -> list[tuple[str, str | None]]:
-    """What a file imports, late imports too: the full name, and the function about it."""
+    """Return (full name, enclosing function or None) of each import in a file."""
     result = []
 
     def visit(node, function):
@@ -54,7 +54,7 @@ def imports(file: str) -> list[tuple[str, str | None]]:
 
 
 def targets(file: str) -> set[tuple[str, str | None]]:
-    """The files of svkc that a file imports from."""
+    """Return the files of svkc that a file imports from."""
     result = set()
     for name, function in imports(file):
         parts = name.split(".")[1:] if name.startswith("svkc.") else []

@@ -1,5 +1,5 @@
-"""The tour: every cell runs headless, and prints what is stored with it. `python
-tests/project/test_notebook.py` stores what it prints and draws anew."""
+"""The tour: every cell runs headless and prints its stored output. `python
+tests/project/test_notebook.py` stores new output."""
 
 import base64
 import io

@@ -1,4 +1,5 @@
-"""The two tiers: what the marker `slow` leaves to the fast one, read from the tests' sources."""
+"""The two tiers: the fast tier, without tests marked `slow`, covers every public function. Read
+from the sources of the tests."""
 
 import ast
 import functools
