@@ -107,7 +107,7 @@ def _partition(x):
 
 
 def _finite_outputs(outputs) -> dict[str, np.ndarray]:
-    """Return the leaves as numpy arrays. Raise ValueError if there are none or one is not finite."""
+    """Return the leaves as numpy arrays. Raise ValueError if there are none or not finite."""
     base = {name: np.asarray(leaf) for name, leaf in outputs.items()}
     for name, leaf in base.items():
         if not np.isfinite(leaf).all():

@@ -50,7 +50,9 @@ def only_traced(monkeypatch):
     monkeypatch.setattr(sys.modules["svkc.simulation.simulate"], "_run", run)
     rollout = sys.modules["svkc.tools.rollout"]
     monkeypatch.setattr(
-        rollout, "_piece", functools.partial(eqx.filter_eval_shape, rollout._piece.__wrapped__)
+        rollout,
+        "_run_chunk",
+        functools.partial(eqx.filter_eval_shape, rollout._run_chunk.__wrapped__),
     )
 
 

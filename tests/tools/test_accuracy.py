@@ -329,7 +329,7 @@ def test_a_non_finite_event_keeps_the_state_before_it():
 
 
 def test_tune(capsys):
-    """`tune` returns the fastest candidate that reaches the target, and None if no candidate does."""
+    """`tune` returns the fastest candidate that reaches the target, or None."""
     chain = models.four_bar()
     state = chain.state(v={"crank": 4.0})
     candidates = [

@@ -77,7 +77,7 @@ def run_rollout(chain, states, data, **options):
 
 
 def main(rank, count, port, out, dies=""):
-    """Run one process of several. dies: rank of the process that is killed after its first chunk."""
+    """Run one process of several; the one of rank `dies` is killed after its first chunk."""
     if rank == dies:
         save = svkc.Trajectory.save
         svkc.Trajectory.save = lambda *args: (save(*args), os.kill(os.getpid(), signal.SIGKILL))

@@ -22,7 +22,7 @@ def release(high_bar):
 
 @pytest.fixture(scope="module")
 def stopped():
-    """A four-bar that is cut and connected again; the second event stops the run before t1."""
+    """A four-bar that is cut and connected again; the second event stops the run."""
     chain = models.four_bar()
     events = [svkc.at(0.023, cut="pin"), svkc.at(0.035, connect="pin", here=True, stop=True)]
     return chain, svkc.simulate(
@@ -37,7 +37,7 @@ def stopped():
 
 @pytest.fixture(scope="module")
 def pendulum():
-    """A chain without virtual links, and with a body name that would end a script if not escaped."""
+    """A chain without virtual links, whose body name would end a script if not escaped."""
     body = (
         f'<body name="{html.escape(NAME)}"><joint name="j" axis="0 1'
         f' 0"/>{models.BAR.format("0 0 -1")}</body>'

@@ -11,7 +11,7 @@ import svkc
 
 @pytest.mark.slow
 def test_a_long_floor_does_not_shrink_the_figure(tmp_path):
-    """Ground shapes are shown at most a metre beyond the bodies: the floor's length has no effect."""
+    """Ground shapes end at most a metre beyond the bodies: a floor's length has no effect."""
 
     def drawn(half: float):
         floor = (
