@@ -3,6 +3,9 @@
 Importing svkc does not change a user's settings: only `use_cache` does.
 """
 
+# jax.config's settings have no annotations, and a method of JAX's cache is replaced
+# pyright: reportAttributeAccessIssue=false
+
 import contextlib
 import hashlib
 import importlib.metadata

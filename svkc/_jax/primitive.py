@@ -7,6 +7,7 @@ from typing import Any
 import equinox as eqx
 import equinox.internal as eqxi
 import jax
+from jax import core
 from jax.interpreters import ad
 
 
@@ -25,10 +26,10 @@ def custom_primitive(
 
     def abstract_eval(*args):
         to_struct = lambda x: (
-            jax.ShapeDtypeStruct(x.shape, x.dtype) if isinstance(x, jax.core.ShapedArray) else x
+            jax.ShapeDtypeStruct(x.shape, x.dtype) if isinstance(x, core.ShapedArray) else x
         )
         to_aval = lambda x: (
-            jax.core.ShapedArray(x.shape, x.dtype) if isinstance(x, jax.ShapeDtypeStruct) else x
+            core.ShapedArray(x.shape, x.dtype) if isinstance(x, jax.ShapeDtypeStruct) else x
         )
         out = eqx.filter_eval_shape(function, *jax.tree.map(to_struct, args))
         return jax.tree.map(to_aval, out)
@@ -72,7 +73,7 @@ class ClosureConverted(eqx.Module):
         return cls(closed_jaxpr.consts, closed_jaxpr.jaxpr, (jax.tree.structure(out), static))
 
     def __call__(self, *args):
-        out = jax.core.eval_jaxpr(
+        out = core.eval_jaxpr(
             self.jaxpr, self.consts, *jax.tree.leaves(eqx.filter(args, eqx.is_array))
         )
         return eqx.combine(jax.tree.unflatten(self.out[0], out), self.out[1])

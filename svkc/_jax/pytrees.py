@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 
 
 def stop_gradient_tree(tree):
@@ -27,4 +28,4 @@ def tree_where(condition, new, old):
 
 def is_concrete(*values) -> bool:
     """Return whether no leaf of the values is a tracer, so that Python can read the numbers."""
-    return not any(isinstance(x, jax.core.Tracer) for v in values for x in jax.tree.leaves(v))
+    return not any(isinstance(x, Tracer) for v in values for x in jax.tree.leaves(v))

@@ -136,6 +136,7 @@ def project_state(
     stabilization = field.stabilization
     if not needs_projection(stabilization, field_args):
         return eqx.tree_at(lambda y: y.q, y, normalize(chain, y.q)), None
+    assert isinstance(stabilization, Projection)
     if field.projects_by_loop_forces:
         q, v, info = project_by_loop_forces(
             chain,

@@ -74,7 +74,7 @@ def actuation(
     if vdot_G.shape != (chain.dofs,):
         independent = (
             np.asarray(_coordinates_and_twists(chain, state)[0].independent)
-            if not isinstance(state.q, jax.core.Tracer)
+            if is_concrete(state.q)
             else None
         )
         if independent is None or vdot_G.shape != (independent.sum(),):

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from svkc._jax.pytrees import is_concrete
 from svkc.loops.constraint import loop_kinematics
 from svkc.loops.coordinates import coordinates
 from svkc.loops.pivoting import count_rank, pivot_ratio, pivoted_qr
@@ -34,7 +35,7 @@ class Mobility(eqx.Module):
     dof_names: tuple[str, ...] = eqx.field(static=True)
 
     def __str__(self) -> str:
-        if isinstance(self.rank, jax.core.Tracer) or self.rank.ndim:
+        if not is_concrete(self.rank) or self.rank.ndim:
             return repr(self)
         independent = ", ".join(
             n for n, on in zip(self.dof_names, self.independent, strict=True) if on

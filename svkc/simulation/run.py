@@ -64,7 +64,8 @@ def _rearm_guards(chain: Chain, run: RunState, plan: Plan, options: Options, arg
     if not plan.guards or not reevaluated_guards(plan).any():
         return run
     field_args = FieldArgs(chain, run.state.structure, args)
-    assert run.stale is not None and run.guard_values is not None
+    assert run.stale is not None
+    assert run.guard_values is not None
     values = stop_gradient_tree(GuardValues(plan, options.field))(
         *stop_gradient_tree((run.t, ODEState(run.state.q, run.state.v), field_args))
     )

@@ -16,6 +16,7 @@ import numpy as np
 from svkc._jax.eager import eager_jit
 from svkc._jax.functions import call_with_comparable
 from svkc._jax.primitive import ClosureConverted
+from svkc._jax.pytrees import is_concrete
 from svkc.model.chain import Chain, State
 from svkc.simulation.certificate import certificate, evaluations_per_step
 from svkc.simulation.options import Options, prepare_options
@@ -77,7 +78,7 @@ def simulate(
 def _raise_on_failure(chain: Chain, traj: Trajectory) -> Trajectory:
     """Return the trajectory. Raises RuntimeError (a runtime error under jit) if the run failed."""
     result, success = traj.result, (RESULTS.successful, RESULTS.stopped)
-    if isinstance(result._value, jax.core.Tracer):
+    if not is_concrete(result._value):
         return result.error_if(traj, (result != success[0]) & (result != success[1]))
     if np.all(np.isin(np.asarray(result._value), [code._value for code in success])):
         return traj

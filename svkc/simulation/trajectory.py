@@ -5,11 +5,11 @@ import functools
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.eager import eager_jit
+from svkc._jax.pytrees import is_concrete
 from svkc.model.chain import State
 from svkc.model.validation import scalar
 from svkc.simulation.records import RESULTS, Events, Phases
@@ -169,7 +169,7 @@ class Report(eqx.Module):
     halved: Any = None
 
     def __str__(self) -> str:
-        if isinstance(self.gap, jax.core.Tracer) or self.gap.ndim:
+        if not is_concrete(self.gap) or self.gap.ndim:
             return repr(self)
         balance = (
             f"{float(self.momentum_drift):.2e} N s, {float(self.angular_momentum_drift):.2e} N m s"

@@ -6,7 +6,6 @@ import functools
 import warnings
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -104,7 +103,7 @@ def _check_quaternions(chain: Chain, q):
     Smaller deviations are round-off, which normalising removes.
     """
     first, _ = chain.topology.quaternion_starts
-    if isinstance(q, jax.core.Tracer) or not len(first):
+    if not is_concrete(q) or not len(first):
         return
     norms = np.linalg.norm(np.asarray(q)[first[:, None] + np.arange(4)], axis=1)
     if np.any(np.abs(norms - 1) > 1e-3):

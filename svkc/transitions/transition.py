@@ -7,12 +7,12 @@ and unbinding leave q and v unchanged.
 import functools
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from svkc._jax.eager import eager_jit
+from svkc._jax.pytrees import is_concrete
 from svkc.model.chain import Chain, State, Structure
 from svkc.model.checked_jit import check_state
 from svkc.model.names import connection_mask, joint_slice, link_index, spare_slot
@@ -203,7 +203,7 @@ def _check_connected(chain: Chain, change: StructureChange) -> State:
     Raises ValueError (a runtime error under jit) if bodies were too far from the declared placement
     or a loop is still open.
     """
-    if isinstance(change.initial_gap, jax.core.Tracer):
+    if not is_concrete(change.initial_gap):
         return eqx.error_if(
             change.state,
             change.initial_gap > CONNECT_TOLERANCE,

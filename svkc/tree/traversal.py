@@ -6,7 +6,7 @@ levels and loops over stacked levels is made in one place.
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -44,8 +44,10 @@ def accumulate_to_root(top: Topology, x: Float[Array, "rows *n"]) -> Float[Array
         for _, below in _doubling_tables(top):
             x = x + jnp.sum(static_take(x, below), 1)
         return x
+    levels = level_tables(top)
+    assert isinstance(levels, list)
     sums, below = [], None
-    for level, (first, last) in reversed(list(zip(level_tables(top), top.levels[1:], strict=True))):
+    for level, (first, last) in reversed(list(zip(levels, top.levels[1:], strict=True))):
         own = x[first:last]
         below = own if below is None else own + sum_children(level.children, below)
         sums.append(below)
@@ -177,7 +179,7 @@ def _pad(top: Topology, levels: list[Level]) -> Level:
     )
 
 
-def scan_levels(step: Callable, start, over, reverse: bool = False):
+def scan_levels(step: Callable, start, over, reverse: bool = False) -> Any:
     """Return the outputs of `carry, output = step(carry, level)` over all levels.
 
     The recursion is unrolled over a list of levels, and a `lax.scan` over stacked levels.
