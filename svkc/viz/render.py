@@ -2,6 +2,7 @@
 
 import os
 import pathlib
+from typing import Any
 
 from svkc.model.chain import Chain
 from svkc.model.checked_jit import check_chain
@@ -80,7 +81,7 @@ def _free_camera(lookat, distance, azimuth, elevation) -> dict:
     }
 
 
-def plot(traj: Trajectory, chain: Chain | None = None):
+def plot(traj: Trajectory, chain: Chain | None = None) -> Any:
     """Return a matplotlib figure of coordinates, energy, loop gaps and mobility over time.
 
     Events are numbered lines.

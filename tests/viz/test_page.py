@@ -66,7 +66,7 @@ def test_the_page_is_self_contained(release, tmp_path):
     # both ends of a connected link coincide
     (parent, at), (real, there) = run["phases"][0]["links"][0]["ends"]
     assert (chain.body_names[parent], chain.body_names[real]) == ("world", "right_hand")
-    x, R = poses[0, real, :3], svkc.mjcf.bodies.matrix(poses[0, real, 3:].astype(float))
+    x, R = poses[0, real, :3], svkc.mjcf.bodies.rotation_matrix(poses[0, real, 3:].astype(float))
     np.testing.assert_allclose(x + R @ there, at, atol=1e-6)
 
 
