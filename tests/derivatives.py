@@ -1,7 +1,7 @@
-"""What derivatives are checked on: a function of parameters for each case, its parameters, and the
-relative error it is held to.
+"""Cases of the derivative tests: a function of parameters, the parameters, and the allowed
+relative error.
 
-`python tests/derivatives.py` prints the table of docs/derivatives.md, or the rows of the cases named.
+`python tests/derivatives.py` prints the table of docs/derivatives.md, or the rows of some cases.
 """
 
 import sys

@@ -1,13 +1,11 @@
-"""What tests/project/test_fuzz_*.py share: how random calls are made and judged, what they are
-given, and the scenes that they are made on.
+"""Shared parts of tests/project/test_fuzz_*.py: random arguments, scenes, verdicts on calls.
 
-What comes out of a call is a good value, a message of docs/errors.md, or a NaN that can be seen.
-The suite makes a few hundred calls, the same every time; `SVKC_FUZZ=10000 python -m pytest
-tests/project/test_fuzz_*.py -m slow -n 0` makes that many, others each time.
-What counts is what users see: annotations are not checked while these tests call
-(`error_page.as_users_see`), and jax promotes types as it does by default.
-Programs are compiled for a handful of fixed scenes alone; where a call would compile another
-(`simulate`, `rollout`, `tune`), it is only traced.
+A call must return a valid value, raise an error of docs/errors.md, or return visible NaN.
+The suite makes a few hundred calls with fixed seeds; `SVKC_FUZZ=10000 python -m pytest
+tests/project/test_fuzz_*.py -m slow -n 0` makes that many, with new seeds each time.
+Annotations are not checked during the calls (`error_page.as_users_see`), and JAX promotes types by
+its default, as for users. Programs are compiled for a few fixed scenes only; calls that would
+compile others (`simulate`, `rollout`, `tune`) are only traced.
 """
 
 import functools

@@ -117,12 +117,12 @@ def _unsupported_in_bodies(model) -> dict[str, tuple]:
 
 def _unsupported_elements(model) -> list[tuple[str, str]]:
     """Return (kind, description) of every element that changes the motion and is not simulated."""
-    found = (
+    elements = (
         _unsupported_in_actuators(model)
         | _unsupported_in_joints(model)
         | _unsupported_in_bodies(model)
     )
-    return [(kind, found[kind][1]) for kind in UNSUPPORTED_KINDS if found[kind][0]]
+    return [(kind, elements[kind][1]) for kind in UNSUPPORTED_KINDS if elements[kind][0]]
 
 
 def left_out_elements(model, ignore) -> tuple[str, ...]:

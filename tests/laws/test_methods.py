@@ -46,7 +46,7 @@ def test_articulated_bodies_transmit_torques_at_virtual_joints(name):
             for method in (svkc.dynamics.CompositeBodies(), svkc.dynamics.ArticulatedBodies())
         ]
 
-    for reference, bodies in (both_methods(0.0), jax.jvp(both, (0.0,), (1.0,))[1]):
+    for reference, bodies in (both_methods(0.0), jax.jvp(both_methods, (0.0,), (1.0,))[1]):
         assert np.abs(bodies - reference).max() < REFERENCE * np.abs(reference).max()
     back = [
         jax.grad(lambda x, i=i: jnp.sum(both_methods(x)[i] * jnp.linspace(-1.0, 2.0, chain.dofs)))(

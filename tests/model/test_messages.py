@@ -16,11 +16,12 @@ import svkc
 
 TESTS = pathlib.Path(__file__).parents[1]
 
-# provoked in tests that need more than a call
+# beginning of a message -> (file of the test that raises it, text in that file)
 ELSEWHERE = {
     "rollout: another process": ("tools/test_rollout.py", "another process"),
     "out: ... holds another": ("tools/test_rollout.py", "holds another rollout"),
     "expected NAME@TIME": ("project/test_commands.py", "expected NAME@TIME"),
+    "module ... has no": ("project/test_public_api.py", "has no attribute"),
 }
 
 
@@ -81,7 +82,7 @@ def test_inside_compiled_programs(setting):
     """Errors that depend on traced values are raised by the compiled program."""
     assert sorted(error_page.COMPILED) == sorted(error_page.messages_of("error_if", 2))
     apart = setting.load(virtual_links=[wrong_calls.link(pos=(5, 0, 0), real_pos=(0, 0, 0))])
-    beyond = wrong_calls.far(setting)
+    beyond = wrong_calls.unclosable_loop(setting)
     calls = {
         "connect: the bodies": lambda: jax.jit(lambda s: svkc.connect(apart, s, "x"))(
             apart.state()
@@ -98,16 +99,18 @@ def test_inside_compiled_programs(setting):
             call()
 
 
-def test_warnings_and_what_others_raise(setting, tmp_path):
-    warned, again, missing, unlike = error_page.OTHERS
-    assert error_page.messages_of("warn", 0) == {warned, again}
-    # it takes two compilations: tests/_jax/test_functions.py
+def test_warnings_and_errors_of_other_libraries(setting, tmp_path):
+    in_float64, again, deprecated, missing, unlike = error_page.OTHERS
+    assert error_page.messages_of("warn", 0) == {in_float64, again, deprecated}
+    # raised after two compilations, tested in tests/_jax/test_functions.py
     assert "a new function object" in again
     assert "a new function object" in (TESTS / "_jax/test_functions.py").read_text()
     with jax.enable_x64(False):
         chain = models.four_bar()
-        with pytest.warns(UserWarning, match=error_page.pattern(warned)):
+        with pytest.warns(UserWarning, match=error_page.pattern(in_float64)):
             chain.state(v=np.array([1.0, 0.0, 0.0]))
+    with pytest.warns(DeprecationWarning, match=error_page.pattern(deprecated)):
+        assert svkc.prefer is svkc.with_independent
     for read in (svkc.load_trajectory, svkc.load_chain):
         with pytest.raises(FileNotFoundError, match=error_page.pattern(missing)):
             read(tmp_path / "none.npz")

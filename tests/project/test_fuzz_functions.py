@@ -2,7 +2,6 @@
 
 import math
 
-import hypothesis
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -23,7 +22,7 @@ from fuzzing import (
     vectors,
     wrongs,
 )
-from hypothesis import strategies as st
+from hypothesis import given as over_examples, strategies as st
 
 import svkc
 
@@ -50,7 +49,7 @@ def coordinate_arguments(draw, which: int, name: str):
 
 
 @examples(0.06)
-@hypothesis.given(st.data())
+@over_examples(st.data())
 def test_states(data):
     name = data.draw(scene)
     chain, _ = scenes()[name]
@@ -141,7 +140,7 @@ def arguments(draw, name: str):
 
 
 @examples(0.14)
-@hypothesis.given(st.data())
+@over_examples(st.data())
 def test_verbs(data):
     name, function, wrong, value = (
         data.draw(st.sampled_from(["tree", "spare"])),
@@ -171,7 +170,7 @@ def test_verbs(data):
 
 
 @examples(0.03)
-@hypothesis.given(st.data())
+@over_examples(st.data())
 def test_changes_of_structure(data):
     chain, state = scenes()["spare"]
     wrong, value = data.draw(wrongs), data.draw(anything)

@@ -1,6 +1,5 @@
 """Random models, files and virtual links."""
 
-import hypothesis
 import jax
 import models
 import numpy as np
@@ -15,7 +14,7 @@ from fuzzing import (
     some_of,
     vectors,
 )
-from hypothesis import strategies as st
+from hypothesis import given as over_examples, strategies as st
 
 import svkc
 
@@ -213,7 +212,7 @@ def use_chain(chain):
 
 
 @examples(0.5)
-@hypothesis.given(st.one_of(texts(), texts(), texts(), texts(), anything), load_options(links))
+@over_examples(st.one_of(texts(), texts(), texts(), texts(), anything), load_options(links))
 def test_models(source, options):
     chain = outcome(lambda: svkc.load(source, **options))
     if chain is not NOTHING:
@@ -221,7 +220,7 @@ def test_models(source, options):
 
 
 @examples(0.02)
-@hypothesis.given(st.binary(max_size=60), st.booleans())
+@over_examples(st.binary(max_size=60), st.booleans())
 def test_files_that_are_no_models(tmp_path_factory, data, folder):
     path = tmp_path_factory.mktemp("models") / "model.xml"
     path.mkdir() if folder else path.write_bytes(data)
@@ -229,7 +228,7 @@ def test_files_that_are_no_models(tmp_path_factory, data, folder):
 
 
 @examples(0.1)
-@hypothesis.given(st.lists(links, max_size=2), load_options(links))
+@over_examples(st.lists(links, max_size=2), load_options(links))
 def test_links(declared, options):
     chain = outcome(
         lambda: svkc.load(

@@ -6,7 +6,6 @@ import sys
 
 import diffrax
 import equinox as eqx
-import hypothesis
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,7 +24,7 @@ from fuzzing import (
     vectors,
     wrongs,
 )
-from hypothesis import strategies as st
+from hypothesis import given as over_examples, strategies as st
 
 import svkc
 
@@ -197,7 +196,7 @@ def few(draw, strategies: dict, most: int = 3):
 
 
 @examples(0.04)
-@hypothesis.given(t1=or_anything(times, 8), options=few(simulations), wrong=wrongs, value=anything)
+@over_examples(t1=or_anything(times, 8), options=few(simulations), wrong=wrongs, value=anything)
 def test_requests(only_traced, t1, options, wrong, value):
     chain, state = scenes()["spare"]
     broken_state = broken(state, wrong, value)
@@ -231,7 +230,7 @@ rollouts = dict(
 
 
 @examples(0.02)
-@hypothesis.given(
+@over_examples(
     t1=or_anything(times, 6), options=few(rollouts), states=or_anything(st.just("lanes"), 4)
 )
 def test_rollouts_and_tuning(only_traced, t1, options, states):
@@ -266,7 +265,7 @@ calls = st.sampled_from(
 
 
 @examples(0.045)
-@hypothesis.given(call=calls, value=anything, other=anything)
+@over_examples(call=calls, value=anything, other=anything)
 def test_other_calls(only_traced, place, call, value, other):
     chain, state = scenes()["spare"]
     zero, path = np.zeros(chain.dofs), place.with_name("seen.gif")
@@ -323,7 +322,7 @@ def place(kept):
 
 
 @examples(0.015)
-@hypothesis.given(
+@over_examples(
     q=st.floats(-0.3, 0.3),
     v=st.floats(-3, 3),
     pull=st.sampled_from([0.0, 1.0, -3.0, 1e3, 1e8, 1e300, math.nan, math.inf, 5e-324]),
@@ -362,7 +361,7 @@ def test_runs(q, v, pull, t1, dt, at, lossy):
 
 
 @examples(0.035)
-@hypothesis.given(data=st.data())
+@over_examples(data=st.data())
 def test_files(kept, data):
     """A file that was cut short, written over, or made of other arrays."""
     original, path = kept
