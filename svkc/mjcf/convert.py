@@ -101,17 +101,7 @@ def _add_equality(chain: Chain, spec, link: int, name: str) -> list[str]:
             freedoms[:3], float
         )
     for label, point in points.items():
-        sites = []
-        for body, side, pos, quat in zip(
-            bodies, ("parent", "real"), frames[::2], frames[1::2], strict=True
-        ):
-            sites.append(_unique_name(f"{label}_{side}", [site.name for site in spec.sites]))
-            spec.bodies[body].add_site(
-                name=sites[-1],
-                pos=np.array(pos) + rotation_matrix(quat) @ point,
-                quat=quat,
-                group=3,
-            )
+        sites = _add_sites(spec, bodies, frames, label=label, point=point)
         spec.add_equality(
             name=label,
             type=kind,
@@ -125,6 +115,23 @@ def _add_equality(chain: Chain, spec, link: int, name: str) -> list[str]:
         if top.link_actuated[link]
         else []
     )
+
+
+def _add_sites(spec, bodies, frames, *, label: str, point) -> list[str]:
+    """Add a site at `point` of the frame in the parent, and one in the real link; return their
+    names."""
+    sites = []
+    for body, side, pos, quat in zip(
+        bodies, ("parent", "real"), frames[::2], frames[1::2], strict=True
+    ):
+        sites.append(_unique_name(f"{label}_{side}", [site.name for site in spec.sites]))
+        spec.bodies[body].add_site(
+            name=sites[-1],
+            pos=np.array(pos) + rotation_matrix(quat) @ point,
+            quat=quat,
+            group=3,
+        )
+    return sites
 
 
 def _unique_name(name: str, existing) -> str:

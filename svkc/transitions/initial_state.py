@@ -17,7 +17,8 @@ from svkc.model.chain import Chain, State, Structure, active_dofs
 from svkc.model.names import connection_mask, joint_slice
 from svkc.model.topology import Q_SIZE, V_SIZE
 from svkc.model.validation import finite_array
-from svkc.transitions.newton import (
+from svkc.transitions.newton import solve_structure
+from svkc.transitions.newton_state import (
     CLOSE,
     CLOSE_HELD,
     PROJECT_VELOCITY,
@@ -26,7 +27,6 @@ from svkc.transitions.newton import (
     READ_COORDINATES,
     HeldCoordinates,
     Schedule,
-    solve_structure,
 )
 from svkc.tree.configuration import normalize
 

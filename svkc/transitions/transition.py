@@ -20,14 +20,13 @@ from svkc.model.topology import V_SIZE
 from svkc.model.validation import boolean
 from svkc.transitions.impact import StructureChange, lock_projection
 from svkc.transitions.initial_state import check_closed
-from svkc.transitions.newton import (
+from svkc.transitions.newton import decide_rank, solve_structure
+from svkc.transitions.newton_state import (
     CONNECTION,
     RANK_SEARCH,
     HeldCoordinates,
     NewtonState,
     Schedule,
-    decide_rank,
-    solve_structure,
 )
 from svkc.transitions.placement import joint_coordinates, place_at_current_pose, with_coordinates
 from svkc.transitions.spare_links import cleared
