@@ -33,10 +33,9 @@ def apply_events(
 ):
     """Apply the events that fired at the end of a phase, all in one change of structure.
 
-    end_state: the state at the end of the phase.
-    fired: which events of the plan fired.
-
     Returns the state after the change, the records of events, and the result of the run so far.
+
+    end_state: the state at the end of the phase. fired: which events of the plan fired.
     """
     any_fired, any_no_slot, to_clear = jnp.any(fired), jnp.zeros((), bool), None
     masks = _new_masks(chain, end_state.structure, fired, plan)
@@ -68,9 +67,8 @@ def apply_events(
     events, overflow = _write_events(run.events, outcome.t, fired, connects, change)
     stops = jnp.any(fired & np.array([a.stop for a in plan.actions], bool))
     result = RESULTS.where(stops, RESULTS.stopped, outcome.result)
-    result = RESULTS.where(
-        any_fired & (change.initial_gap > CONNECT_TOLERANCE), RESULTS.not_in_place, result
-    )
+    misplaced = any_fired & (change.initial_gap > CONNECT_TOLERANCE)
+    result = RESULTS.where(misplaced, RESULTS.not_in_place, result)
     result = RESULTS.where(finite, result, RESULTS.non_finite)
     result = RESULTS.where(any_no_slot, RESULTS.no_slot, result)
     result = RESULTS.where(overflow, RESULTS.max_events, result)

@@ -128,6 +128,25 @@ def solve_phase(
     )
 
 
+def _stepper_options(options: Options, armed: ArmedGuards | None) -> StepperOptions:
+    """Return the options of the stepping loop, which is never differentiated."""
+    adjoint = options.adjoint
+    replays = isinstance(adjoint, Replay)
+    solver, armed_guards, (controller, first_step) = stop_gradient_tree(
+        (with_scan_kind(options.solver, "lax"), armed, options.step_size_control())
+    )
+    return StepperOptions(
+        solver=solver,
+        armed_guards=armed_guards,
+        controller=controller,
+        first_step=first_step,
+        progress_meter=options.progress_meter if replays else diffrax.NoProgressMeter(),
+        gap_tolerance=options.gap_tolerance,
+        max_steps=options.max_steps,
+        checkpoint_interval=min(adjoint.every, options.max_steps) if replays else options.max_steps,
+    )
+
+
 def _integrate(
     y0: ODEState,
     times,
@@ -144,22 +163,8 @@ def _integrate(
     times: start and latest end of the phase, and the save times.
     guards: the guards, or the vector field where there are no guards.
     """
-    adjoint = options.adjoint
-    replays = isinstance(adjoint, Replay)
-    solver, armed_guards, (controller, first_step) = stop_gradient_tree(
-        (with_scan_kind(options.solver, "lax"), armed, options.step_size_control())
-    )
-    stepper_options = StepperOptions(
-        solver=solver,
-        armed_guards=armed_guards,
-        controller=controller,
-        first_step=first_step,
-        progress_meter=options.progress_meter if replays else diffrax.NoProgressMeter(),
-        gap_tolerance=options.gap_tolerance,
-        max_steps=options.max_steps,
-        checkpoint_interval=min(adjoint.every, options.max_steps) if replays else options.max_steps,
-    )
-    if replays:
+    adjoint, stepper_options = options.adjoint, _stepper_options(options, armed)
+    if isinstance(adjoint, Replay):
         solution, t, y = integrate_with_replay(y0, times, problem, stepper_options, guards)
         return solution, stop_gradient_tree(solution.event), t, y
     t0, stop, ts = times

@@ -62,7 +62,7 @@ class Trajectory(eqx.Module):
 
         save(self, path, chain, options)
 
-    def plot(self, chain=None):
+    def plot(self, chain=None) -> Any:
         """Return a matplotlib figure of joint coordinates, loop gaps, energy and mobility over
         time, with events as vertical lines.
 

@@ -119,6 +119,12 @@ def test_the_page_of_a_stopped_run_ends_at_its_stop(stopped, tmp_path):
     assert run["gaps"][1] == [None, None]
 
 
+def test_show_returns_the_page_for_a_notebook(pendulum):
+    page = svkc.show(pendulum, static_run(pendulum), title="at rest", height=300)
+    assert "<iframe" in page._repr_html_()
+    assert "at rest" in page._repr_html_()
+
+
 @pytest.mark.slow
 def test_a_run_of_zero_duration(pendulum, tmp_path):
     run = page_data(svkc.render(pendulum, static_run(pendulum), tmp_path / "still.html"))
