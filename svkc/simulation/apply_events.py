@@ -48,11 +48,7 @@ def apply_events(
         masks["at_current_pose"] = masks["at_current_pose"] | to_connect
 
     def apply():
-        change = _change_structure(chain, end_state, masks, plan)
-        if to_clear is None:
-            return change
-        structure = cleared(change.state.structure, to_clear)
-        return eqx.tree_at(lambda c: c.state.structure, change, structure)
+        return _change_structure(chain, end_state, masks, to_clear, plan)
 
     def skip():
         return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), eqx.filter_eval_shape(apply))
@@ -95,11 +91,21 @@ def _new_masks(
     }
 
 
-def _change_structure(chain: Chain, end_state: State, masks: dict, plan: Plan) -> StructureChange:
-    """Change the structure; the impact is compiled only if an event of the plan needs one."""
+def _change_structure(
+    chain: Chain, end_state: State, masks: dict, to_clear, plan: Plan
+) -> StructureChange:
+    """Change the structure; the impact is compiled only if an event of the plan needs one.
+
+    to_clear: mask of spare slots to clear; None: no event of the plan clears slots.
+    """
     if plan.needs_impact(chain):
-        return change_structure(chain, end_state, **masks)
-    return release_constraints(chain, end_state, masks["connected"], masks["locked"])
+        change = change_structure(chain, end_state, **masks)
+    else:
+        change = release_constraints(chain, end_state, masks["connected"], masks["locked"])
+    if to_clear is None:
+        return change
+    structure = cleared(change.state.structure, to_clear)
+    return eqx.tree_at(lambda c: c.state.structure, change, structure)
 
 
 def _write_events(
