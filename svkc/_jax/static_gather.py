@@ -11,8 +11,8 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Float, Int
 
-# the transpose gathers from a padded table [rows, most uses of one row]; if that table has more
-# than this many times the entries that are needed, the transpose is a scatter
+# the transpose gathers by a padded index table [rows, most uses of one row]; if that table has
+# more than this many times the entries that are needed, the transpose is a scatter
 MAX_TABLE_RATIO = 8
 
 

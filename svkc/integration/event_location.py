@@ -106,7 +106,7 @@ class EventInfo(eqx.Module):
     fired: guards that crossed zero at the event.
     values: values of the guards for the next phase, 0 for those that fired.
     first: index of the guard whose root was located.
-    occurred: whether an event ended the phase. The other fields are valid only then.
+    occurred: whether an event ended the phase. `first` is valid only then.
     jumps: whether guard `first` is discontinuous there.
     grazing: whether guard `first` touches zero without crossing it.
     """
@@ -148,7 +148,7 @@ class EventSearch(eqx.Module):
     """The search for the first root of the guards in the step that starts at the loop's t.
 
     step_size: size of that step.
-    sides: sign of each guard that crossed zero after its crossing, 0 for all others.
+    sides: for each guard that crossed zero, its sign after the crossing; 0 for all others.
     magnitudes: larger of the absolute values of each guard at the two ends of the step.
     bracket: interval that holds the first root of the guards that crossed.
     y, values: state and guards at `bracket.b`.

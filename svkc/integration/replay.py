@@ -1,4 +1,4 @@
-"""Integrate one phase with derivatives in both modes, for any solver and step-size control.
+"""Integrate one phase with derivatives in both modes, for fixed or adaptive steps.
 
 The stepping loop is never differentiated. Its steps are replayed at fixed times, to find what a
 change of the start and of the parameters does to each step: forwards for a tangent, backwards for a
@@ -134,7 +134,7 @@ def _at_fixed_start(
 ) -> tuple[ODEState, ODEState]:
     """Return the start state and its tangent as if the time of the start were fixed.
 
-    A later start leaves less time to move: the tangent loses rate dt0.
+    A later start leaves less time to move: `rate * d_t0` is subtracted from the tangent.
 
     rate: derivative of the state by time at the start.
     time, problem: pairs of primal and tangent.

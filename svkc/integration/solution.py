@@ -40,7 +40,7 @@ class StepperOptions(eqx.Module):
     controller: step-size controller of diffrax.
     first_step: size of the first step (s). None: the controller chooses.
     gap_tolerance: steps that leave a larger loop gap are rejected (rad, units of `chain.length`).
-    max_steps: the most attempted steps of a phase.
+    max_steps: the most steps of a phase, accepted and rejected; event location is not counted.
     checkpoint_interval: one state in so many steps is stored.
     """
 

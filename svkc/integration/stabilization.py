@@ -12,7 +12,7 @@ class AbstractStabilization(eqx.Module):
 
 
 class Projection(AbstractStabilization):
-    """Project q and v onto the closed loops after every step (coordinate projection).
+    """Project q and v onto the constraint manifold after every step (coordinate projection).
 
     The projection is the change of least norm in the metric of the mass matrix M: that of an
     impulse of the loops, paper (29). Projecting a velocity in this metric changes its kinetic
@@ -62,7 +62,7 @@ class Baumgarte(AbstractStabilization):
 
 
 class NoStabilization(AbstractStabilization):
-    """Leave the loops to drift: integrate the constrained accelerations and correct nothing."""
+    """Let loops drift. A run whose gap exceeds the tolerance ends with the result `loop_open`."""
 
 
 def needs_projection(stabilization: AbstractStabilization, field_args: FieldArgs) -> bool:

@@ -29,7 +29,7 @@ class Actuation(eqx.Module):
     Bases are padded with zero columns.
 
     tau: torques (N m, N) of least weighted norm.
-    residual: generalized force on theta_G that no torques produce; zero if the acceleration is
+    residual: generalized force on theta_G that tau does not produce; zero if the acceleration is
     reached.
     null_space: columns are torques that do not change the motion, one for each redundant actuator.
     null_force, null_torque: change of the links' wrenches by each column of `null_space`, on `real`
@@ -37,7 +37,7 @@ class Actuation(eqx.Module):
     stress_force, stress_torque: self-stresses, wrenches of redundant loops that need no torques,
     one for each redundant row.
     undriven: columns are joint velocities on which no actuator does work.
-    rank: rank of S. redundancy: number of actuators beyond the rank.
+    rank: rank of S. redundancy: number of actuators that the loops let move, less the rank.
     deficiency: number of freedoms beyond the rank.
     """
 
@@ -62,7 +62,7 @@ def actuation(
     The forces of the joints' springs and dampers are subtracted. (Paper, section III-A.)
 
     vdot_G: accelerations (rad/s^2, m/s^2) over every coordinate, of which those of theta_G
-    (`coordinates(chain, state).independent`) are used, or those of theta_G alone, in order.
+    (`coordinates(chain, state).independent`) are used; outside jit also those of theta_G alone.
     weight: positive weights, a scalar or [dofs]; sum(weight tau^2) is minimised (None: ones).
     actuated: mask of the actuated coordinates (None: `chain.actuated`).
     bounds: (lower, upper) torques, each a scalar or [dofs] (None: unbounded). If no torques within

@@ -32,7 +32,7 @@ def reduced_mass_matrix(
 
 
 class AbstractDynamics(eqx.Module):
-    """A method to compute accelerations. All methods give the same ones, at different cost.
+    """A method to compute accelerations: the same away from singularities, at different cost.
 
     uses_pivots: whether the method chooses dependent coordinates. If not,
     `svkc.stabilization.Projection` works without pivots too.
@@ -60,7 +60,7 @@ class AbstractDynamics(eqx.Module):
     ) -> Callable:
         """Return solve: (force [dofs], bias [rows]) -> x on a chain with virtual links.
 
-        x solves M x = force + J_C^T lambda and J_C x + bias = 0 (paper, section III-B).
+        x solves M x = force + J_C^T lambda and J_C x + bias = 0 (III-B); bias has scaled rows.
 
         loops: kinematics of the tree and of its loops.
         selection: the pivoted QR of `loops.J`; not used if `uses_pivots` is False.
@@ -83,7 +83,7 @@ class ArticulatedBodies(AbstractDynamics):
     J_C near singular configurations. With `svkc.stabilization.Projection` the report knows the
     margin at the ends of phases only, and counts no changes of pivots.
 
-    hold: for stabilizations that choose pivots whatever the method; see `CompositeBodies`.
+    hold: for stabilizations that choose pivots whatever the method; see `AbstractDynamics`.
     """
 
     uses_pivots: ClassVar[bool] = False
@@ -168,11 +168,11 @@ DEPRECATED_SPELLINGS = (
 
 
 class Dynamics(eqx.Module):
-    """Deprecated: choose one of the classes in `svkc.dynamics` by a function.
+    """Deprecated: use a class of `svkc.dynamics`; this one selects among them by a function.
 
     inertia: `svkc.by_bodies`, `svkc.inertia_by_composites`, `svkc.inertia_by_unit_vectors`, or None
     (default) for `default_dynamics`.
-    hold: as in `svkc.dynamics.CompositeBodies`.
+    hold: as in `AbstractDynamics`.
     Raises ValueError if inertia is anything else.
     """
 
@@ -211,7 +211,7 @@ def _implicit_solve(
 ) -> Callable:
     """Return (force, bias) -> x by `factor_solve`, differentiated as an implicit function.
 
-    The derivatives are those of the equations M x = force + J^T mu, J x + bias = 0, with M x by
+    The derivatives are those of the equations M x + J^T mu = force, J x + bias = 0, with M x by
     Newton-Euler. Each costs one more solve with the same factors; neither the recursions for M nor
     the search for pivots is differentiated.
 

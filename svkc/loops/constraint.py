@@ -1,7 +1,7 @@
 """The loop constraints: loop Jacobian J_C, its bias Jdot_C v, gaps and their rates.
 
 Each loop has six rows (paper (9)-(11)), three angular, then three linear: the motion of the virtual
-link relative to its real link, in world axes, at the real link's end of the joint.
+link relative to its real link, in world axes, each link at its own end of the joint.
 """
 
 import equinox as eqx
@@ -192,7 +192,7 @@ def largest_gaps(chain: Chain, state: State) -> tuple[Float[Array, "2"], Float[A
 
 @checked_jit(eager=True)
 def loop_gaps(chain: Chain, state: State) -> Float[Array, "links 6"]:
-    """Return each loop's gap: rotation vector (rad), then distance (m), in world axes.
+    """Return each loop's gap: rotation vector (rad), then displacement (m), in world axes.
 
     The gap is that of the virtual link from its real link, and zero where not connected.
     """

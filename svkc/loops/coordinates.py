@@ -55,7 +55,7 @@ class Coordinates(eqx.Module):
 def dependent_velocities(
     chain: Chain, qr: PivotedQR, J: Float[Array, "rows dofs"], v: Float[Array, " dofs"]
 ) -> Float[Array, " dofs"]:
-    """Return W v_G (16): v with its dependent velocities computed from the independent ones."""
+    """Return W v_G (16): v with new dependent velocities. v must be zero where inactive."""
     _, column = jacobian_scales(chain)
     Jm, JS = pivot_blocks(qr, J)
     return v - column * (qr.P.T @ solve_pivot_block(JS, Jm @ (v / column)))
@@ -68,7 +68,7 @@ def partition_coordinates(
     J: Float[Array, "rows dofs"],
     bias: Float[Array, " rows"],
 ) -> Coordinates:
-    """Return W and Hdot v from the scaled J_C, its pivoted QR and Jdot_C v (paper (14)-(21))."""
+    """Return W and Hdot v from scaled J_C, its pivoted QR and row-scaled Jdot_C v ((14)-(21))."""
     _, column = jacobian_scales(chain)
     Jm, JS = pivot_blocks(qr, J)
     dependent = jnp.any(qr.P > 0, 0)

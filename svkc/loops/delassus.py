@@ -76,7 +76,7 @@ class VirtualJoints(eqx.Module):
 class DelassusRows(NamedTuple):
     """The rows of J that are in D: first six of each `full_links`, then three of each free ball.
 
-    full_links: links with all six rows in D. rows: their indices in J.
+    full_links: links with all six rows in D. rows: index in J of each row of D.
     position: of each row of J its index in D (not in D: the size of D).
     """
 

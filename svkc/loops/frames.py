@@ -112,7 +112,7 @@ def loop_frames(
 
 
 def frame_gaps(structure: Structure, frames: LoopFrames) -> Float[Array, "links 6"]:
-    """Return the rotation vector (rad) and the distance (m) from real to virtual frame.
+    """Return the rotation vector (rad) and the displacement (m) from real to virtual frame.
 
     Both are in world axes, and zero for links that are not connected.
     """

@@ -18,7 +18,7 @@ class Mobility(eqx.Module):
     """Mobility of a structure. `str` gives a table with the names of links and coordinates.
 
     freedoms: mobility N_F = N_J - m (paper (13)). joint_freedoms: N_J. rank: m of the phase.
-    redundant: number of rows of each loop that depend on those of the loops before it.
+    redundant: number of rows of each loop that depend, at q, on its others and on earlier loops.
     independent: mask of theta_G.
     margin: |R_mm| / |R_11| of the pivoted QR of J_C, the distance from a lower rank.
     connected: which virtual links are connected.

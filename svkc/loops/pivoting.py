@@ -22,7 +22,7 @@ class PivotedQR(eqx.Module):
 
     Q: orthonormal rows, zero for inert steps.
     P: one-hot rows that pick the pivot columns, zero for inert steps. It has no derivative.
-    diag_R: |R_kk|, in decreasing order.
+    diag_R: |R_kk|, decreasing unless columns were weighted (`independent`) or pivots given.
     active: the steps that count; they are as many as the rank.
     Q and diag_R have derivatives by which Q's rows span the pivot columns' range (`frozen_qr`).
     """
@@ -173,7 +173,7 @@ def count_rank(diag_R: Float[Array, " steps"]) -> Int[Array, ""]:
 
 
 def pivot_ratio(qr: PivotedQR) -> Float[Array, ""]:
-    """Return |R_mm| / |R_11| of the m active steps, and 1 if no step is active."""
+    """Return the least |R_kk| of the active steps over the largest, and 1 if no step is active."""
     diag_R, active = qr.diag_R, qr.active
     return jnp.min(jnp.where(active, diag_R, jnp.inf), initial=1, where=active) / jnp.where(
         jnp.any(active), jnp.max(diag_R), 1

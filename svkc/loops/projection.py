@@ -30,7 +30,7 @@ from svkc.tree.configuration import integrate, normalize
 def least_norm_change(
     chain: Chain, qr: PivotedQR, J, x: Float[Array, "rows n"]
 ) -> Float[Array, "dofs n"]:
-    """Return the y (m, rad, or their rates) with J y = x of least norm in scaled coordinates."""
+    """Return the y (m, rad, or rates) with J (y / column) = x, of least norm of y / column."""
     Jm, _ = pivot_blocks(qr, J)
     gram = Jm @ Jm.T + jnp.diag(jnp.where(qr.active, 0, 1).astype(J.dtype))
     return jacobian_scales(chain)[1][:, None] * (Jm.T @ solve_positive(gram, qr.Q @ x))
@@ -39,7 +39,7 @@ def least_norm_change(
 def dependent_change(
     chain: Chain, qr: PivotedQR, J, x: Float[Array, "rows n"]
 ) -> Float[Array, "dofs n"]:
-    """Return the y (m, rad, or their rates) with J y = x that is zero for independent coordinates.
+    """Return the y (m, rad, or rates) with J (y / column) = x, zero where independent.
 
     (Paper (16).)
     """
@@ -54,7 +54,7 @@ def inertia_metric_change(
     qr: PivotedQR,
     x: Float[Array, "rows n"],
 ) -> Float[Array, "dofs n"]:
-    """Return the y (m, rad, or their rates) with J y = x and least y^T M y.
+    """Return the y (m, rad, or rates) with J (y / column) = x and least y^T M y.
 
     Velocities change so under an impulse of the loops (paper (29)).
     """
@@ -125,8 +125,8 @@ def project(
 
     dependent_only: whether only dependent coordinates change; otherwise the change is the least in
     the metric of the mass matrix.
-    pivots: pivots in use so far (None: none). They are replaced if their |R_mm| / |R_11| is below
-    `hold` times that of new ones.
+    pivots: pivots to return in the info (None: new ones); the steps themselves use new ones. They
+    are replaced if their |R_mm| / |R_11| is below `hold` times that of new ones.
     """
 
     @functools.partial(jax.checkpoint, prevent_cse=False)

@@ -180,14 +180,14 @@ def joint_armature(model, ignored, without: tuple[str, ...]) -> np.ndarray:
 
 
 def scatter_to_dofs(topology, values) -> np.ndarray:
-    """Return values of the model's velocities [nv] as [dofs], zero for other virtual joints."""
+    """Return values per dof of the model [model.nv] as [dofs], zero for other virtual joints."""
     out = np.zeros(topology.dofs)
     out[np.array(topology.model_v, int)] = np.ravel(values)
     return out
 
 
 def actuator_arrays(model, ignored, topology):
-    """Return gear [motors dofs], control_range and force_range [motors 2]; see `Chain`."""
+    """Return gear, control_range, force_range; see `Chain`. Ignoring one actuator drops all."""
     count = 0 if {"actuator", "all"} & ignored and not is_torque_motor(model).all() else model.nu
     model_v = np.array(topology.model_v, int)
     gear, control, force = (

@@ -65,8 +65,8 @@ def load(source, *, virtual_links=(), cuttable=(), spare=0, ignore=(), ignore_ar
     cuttable: names of joints of the tree that can be cut. Each becomes a virtual link of that name,
         connected in the load pose (paper, Fig. 15).
     spare: number of spare slots, virtual links that `bind` makes at run time.
-    ignore: kinds of elements to leave out, by the names in the error message, or "all". "equality"
-        means those that are neither connect nor weld, "limit" means joint ranges.
+    ignore: kinds to leave out: names in the error message, "all" (every kind in that message), or
+        "limit" (joint ranges), "spring", "damping", "armature". "equality" keeps connect and weld.
     ignore_armature: names of joints whose armature (rotor inertia) is left out. A cuttable joint
         cannot have armature.
 

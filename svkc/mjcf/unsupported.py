@@ -126,7 +126,7 @@ def _unsupported_elements(model) -> list[tuple[str, str]]:
 
 
 def left_out_elements(model, ignore) -> tuple[str, ...]:
-    """Return one line for each kind of element that the chain leaves out.
+    """Return one line for each kind of element of the model that svkc cannot simulate.
 
     Raises ValueError, which lists every kind that is neither simulated nor ignored.
     """

@@ -50,8 +50,8 @@ class State(eqx.Module):
 
     Every field may have leading batch axes.
 
-    q: coordinates (m, rad, wxyz): MuJoCo's qpos for the tree, then the virtual joints' coordinates.
-    v: joint velocities (m/s, rad/s): MuJoCo's qvel for the tree, then the virtual joints'.
+    q: the tree's coordinates (m, rad, wxyz; qpos if none is cuttable), then the virtual joints'.
+    v: the tree's velocities (m/s, rad/s; qvel if none is cuttable), then the virtual joints'.
     structure: how the bodies are joined.
     """
 
@@ -75,11 +75,11 @@ class Chain(eqx.Module):
     com: centre of mass in the row's frame (m).
     inertia: rotational inertia about the centre of mass, in the axes of the row's frame (kg m^2).
     gravity: gravitational acceleration in the world frame (m/s^2).
-    q_load: coordinates of the load pose.
+    q_load: coordinates of the load pose (MuJoCo's qpos0).
     length: characteristic length (m) by which translations and rotations are compared.
-    gear: joint torques (N m, N) for a unit control of each actuator.
+    gear: joint torques (N m, N) for a unit control of each actuator: MuJoCo's gear times gain.
     control_range: lower and upper bound of each control; infinite if there is none.
-    force_range: lower and upper bound of each control by the actuator's force range.
+    force_range: bounds of each control that MuJoCo's forcerange implies: forcerange / gain.
     structure: the structure of the load pose.
     anchor: the joint's anchor in the row's frame (m); None: at the origin of every row.
     armature: rotor inertia, added to the diagonal of the mass matrix (kg m^2, kg).
@@ -88,8 +88,8 @@ class Chain(eqx.Module):
     q_spring: coordinates at which the joint springs are at rest.
     limit: lower and upper end of the joint range (rad, m); infinite if there is none.
     limit_spring: stiffness and damping outside of the joint range.
-    model: the `svkc.mjcf.load.Source` that the chain was loaded from.
-    left_out: one line for each kind of element of the model that is not simulated.
+    model: the `svkc.mjcf.load.Source` of the chain; the mujoco.MjModel is `model.model`.
+    left_out: one line for each kind of element of the model that svkc cannot simulate.
     """
 
     topology: Topology = eqx.field(static=True)
@@ -141,12 +141,12 @@ class Chain(eqx.Module):
 
     @property
     def nq(self) -> int:
-        """Number of the tree's coordinates q, MuJoCo's nq (four for a ball joint)."""
+        """Number of the tree's coordinates q: MuJoCo's nq if no joint is cuttable."""
         return self.topology.nq
 
     @property
     def nv(self) -> int:
-        """Number of the tree's velocities v, MuJoCo's nv."""
+        """Number of the tree's velocities v: MuJoCo's nv if no joint is cuttable."""
         return self.topology.nv
 
     @property
@@ -171,7 +171,7 @@ class Chain(eqx.Module):
 
     @property
     def brother(self) -> np.ndarray:
-        """Next child of the parent of each body and virtual link, indexed as `parent`; -1: none."""
+        """Next sibling of each body and virtual link, indexed as `parent`; -1: none."""
         return _pointers(self)[2]
 
     @property
@@ -247,7 +247,7 @@ class Chain(eqx.Module):
         soft constraints. A comment at the top lists everything without a form in MJCF: other
         virtual joints, motors on virtual joints, spare slots, cuttable joints. Mesh files have
         absolute paths, except files in memory (`MjSpec.assets`) and those of attached specs. Of the
-        chain's arrays only the placements of virtual links are written.
+        chain's arrays only `connected` and the placements of virtual links are written.
 
         Raises ValueError if the chain was loaded from a MjModel, or if MuJoCo cannot read the
         text of the MjSpec.

@@ -64,7 +64,7 @@ def _validated(arguments: dict) -> dict:
 
 
 def float_vector(chain: Chain, name: str, value, size: int | None = None):
-    """Return a value as a floating-point array; integers take the chain's float type.
+    """Return a value as a floating-point array, of the chain's dtype unless a floating JAX array.
 
     name: the argument's name, for messages.
     size: the expected length; None: any shape.

@@ -31,7 +31,7 @@ class Topology:
     joint_row: row of each joint of the tree.
     link_freedoms: six Booleans for each virtual link: rotations, then translations.
     link_spare: whether each virtual link is a spare slot.
-    link_child: row of the child that each virtual link holds if it is a cuttable joint, else -1.
+    link_child: row of the child body of each virtual link that is a cuttable joint, else -1.
     cut_joints: (name, virtual link, first freedom) of each cuttable joint.
     model_q: index in q of each entry of the model's qpos.
     model_v: index in v of each entry of the model's qvel.
@@ -75,7 +75,7 @@ class Topology:
 
     @functools.cached_property
     def root(self) -> np.ndarray:
-        """The ancestor of each row whose parent is the world; 0 for the world."""
+        """For each row, itself or its ancestor that is a child of the world; 0 for the world."""
         root = np.arange(len(self.parent))
         for i in range(1, len(root)):
             root[i] = i if self.parent[i] == 0 else root[self.parent[i]]

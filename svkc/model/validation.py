@@ -12,7 +12,7 @@ from svkc._jax.pytrees import is_concrete
 
 
 def as_array(value):
-    """Return a value as an array, of dtype object if NumPy cannot convert the value."""
+    """Return a value as an array; an array of None if NumPy cannot convert the value."""
     try:
         return (
             value

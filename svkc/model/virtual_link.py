@@ -53,12 +53,12 @@ class VirtualLink:
     joint: the joint between `parent` and the virtual link: weld, hinge, slide, cylinder, universal,
         planar, ball, free, or six Booleans (three rotations, three translations).
     pos: [3] origin of the joint's frame in the parent's frame, or in the site's frame (m).
-    quat: [4] orientation of the joint's frame in the parent's frame (wxyz).
+    quat: [4] orientation of the frame of `axis`, in the parent's or the site's frame (wxyz).
     real_pos: [3] origin of the joint's frame in the real link's frame, or in the site's frame (m).
         None: from the load pose, or at the site.
-    real_quat: [4] orientation of the joint's frame in the real link's frame (wxyz). None: from the
-        load pose.
-    axis: [3] direction of the joint's axis in the frame that `pos` and `quat` make in the parent.
+    real_quat: [4] orientation of the frame of `axis` in the real link's or the site's frame (wxyz).
+        None: from the load pose.
+    axis: [3] the joint's axis in the frame of `quat`; z of the joint's frame points along it.
     connected: whether the link is connected in the load pose.
     actuated: whether a motor drives the joint's coordinates (paper, Fig. 6).
 

@@ -38,7 +38,7 @@ class Options(eqx.Module):
     dt: fixed step size (s); None: `controller` sets the step size.
     first_step: size of the first step with a controller (s).
     has_work: whether to integrate the work of control, joint limits and dampers.
-    gap_tolerance: largest gap of a loop that counts as closed (rad, m).
+    gap_tolerance: largest loop gap that does not fail a run (rad, m).
     """
 
     control: Callable | None

@@ -38,7 +38,7 @@ class RunState(eqx.Module):
 
     work: done so far by control, joint limits and dampers (J).
     guard_values: at the end of the last phase.
-    stale: which guard values belong to the structure before the last change.
+    stale: which guard values are re-evaluated at the start of the next phase.
     pending: which timed events have not happened yet.
     count: number of phases so far.
     saved: states at the save times.

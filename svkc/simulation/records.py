@@ -37,8 +37,8 @@ class Events(eqx.Module):
 
     time: of the event (s).
     which: index of the event in the list that `simulate` was given.
-    impulse, angular_impulse: of each virtual link that the event connected on its real link from
-        the parent, at the joint, in world axes (N s, N m s).
+    impulse, angular_impulse: what the parent exerts on the real link of each virtual link that the
+        event connected, at the joint, in world axes (N s, N m s).
     energy_lost: kinetic energy lost in the impact (J). Events at one instant make one impact, whose
         loss is in the row of the first of them.
     count: number of events. Rows past `count` are empty: their time is inf, their index -1.
@@ -165,14 +165,14 @@ class Phases(eqx.Module):
     joint_freedoms: number N_J of joint freedoms, those of connected virtual links included.
     energy: mechanical energy at the start and at the end (J).
     work: done by control, joint limits and dampers (J).
-    margin: least |R_mm| / |R_11|, which measures how far the loops are from losing rank. With
-        projected steps over all steps, otherwise over the two ends of the phase.
+    margin: least |R_mm| / |R_11|, the distance from losing rank. Over all steps if they are
+        projected by pivots in svkc's own loop, otherwise over the two ends of the phase.
     accepted, rejected: numbers of steps.
-    evaluations: of the vector field in steps, event location not included.
+    evaluations: of the vector field in all attempts; with `Replay` event location is included.
     swaps: how often the choice of dependent coordinates changed between steps (-1: not recorded).
     loop: index of the loop that could not be closed (-1: none).
     error: sum of the estimated errors of the steps, root mean square over q and v (inf: the solver
-        has no error estimate).
+        has no error estimate, or the adjoint is one of diffrax).
     gap: largest loop gaps at the ends of steps (rad, m); with a diffrax adjoint at the two ends of
         the phase.
     gap_rate: largest rates of the loop gaps at the two ends of the phase, before the event (rad/s,

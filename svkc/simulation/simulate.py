@@ -114,7 +114,7 @@ def _with_certificate(
 ) -> Trajectory:
     """Return the trajectory of a run with its certificate.
 
-    gap_tolerance: largest gap of a closed loop (rad, m).
+    gap_tolerance: largest loop gap that does not fail a run (rad, m).
     stages: evaluations of the vector field in one attempted step.
     """
     incomplete = (run.t < t1) & (run.result == RESULTS.successful)

@@ -134,7 +134,7 @@ class Report(eqx.Module):
         largest change of linear momentum that gravity does not explain (N s), and of angular
         momentum about the centre of mass (N m s).
     free: whether there is such a phase.
-    error: sum of the estimated errors of all steps (inf: the solver has no error estimate).
+    error: sum of the estimated errors of all steps (inf: none from this solver or adjoint).
     margin: least rank margin |R_mm| / |R_11|.
     swaps: how often the choice of dependent coordinates changed (-1: not recorded).
     accepted, rejected: numbers of steps.
@@ -143,7 +143,7 @@ class Report(eqx.Module):
     phases: number of phases.
     t_final: end of the run (s).
     result, derivative: of the trajectory.
-    halved: the error that a finer run showed, if `Trajectory.report` was given it.
+    halved: result of `svkc.accuracy.estimate_error` (a finer run), if `report` was given it.
     """
 
     gap: Float[Array, ""]

@@ -179,12 +179,12 @@ def tune(
 
     t1: end time (s).
     target: allowed error (rad, m; root mean square over coordinates, largest over save times).
-    options: the candidates. None: `default_candidates`.
+    options: sequence of `Candidate` to measure. None: `default_candidates`.
     repeats: timed runs of each candidate, after one that compiles. The shortest run counts. A
         candidate that takes ten times as long as the best so far is not repeated.
     show: whether to print progress and the final table.
-    common: keyword arguments of `simulate` that all runs share, such as `ts`, `events`, `control`,
-        `args`.
+    common: keyword arguments of `simulate` that all runs share, such as `events`, `control`,
+        `args`, or `ts` (default: 11 equally spaced times).
 
     Raises ValueError if `target` is not positive or if the reference run fails.
     """

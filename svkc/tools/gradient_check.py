@@ -18,11 +18,11 @@ class GradientCheck(eqx.Module):
         one.
     output: path of the output leaf (and entry), such as "f(x)['a'][3]".
     input: path of the input leaf, such as "x.q".
-    derivative: directional derivative by automatic differentiation.
+    derivative: by forward mode along the direction; in "reverse" of a weighted sum of the leaf.
     difference: directional derivative by central differences.
     uncertainty: estimated error of the difference, relative to the same number as `error`.
-    modes: largest difference between forward and reverse mode, over all entries, relative to the
-        size of the output leaf's derivative. Zero unless `mode` is "both".
+    modes: largest difference between forward and reverse mode, of a random weighted sum of each
+        output leaf, relative to the norms of both factors. Zero unless `mode` is "both".
     mode: the mode that was checked: "forward", "reverse" or "both".
     """
 
@@ -50,7 +50,7 @@ def check_grad(
     """Compare the derivative of f at x with central differences and return the worst entry.
 
     For every floating-point leaf of x, the derivative is taken along random directions. A direction
-    is as long as the leaf (of length one if the leaf is zero). Differences are extrapolated to step
+    has the leaf's 2-norm (1 if the leaf is zero). Differences are extrapolated to step
     zero by Ridders' method. Use float64: in float32 the differences have few correct digits.
 
     f: function of one argument.

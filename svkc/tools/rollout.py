@@ -29,7 +29,7 @@ def rollout(
     chain: Chain, states, t1, *, data: Any = None, lane: Callable | None = None, cost=None,
     chunk: int | None = None, out=None, devices=None, progress: bool = True, **options,
 ) -> Trajectory:  # fmt: skip
-    """Run `svkc.simulate` for every lane of `states` and return one batched trajectory.
+    """Run `svkc.simulate` for every lane of `states`; return one batch of numpy arrays (no grad).
 
     Lanes are the elements of the batch. Each device runs its lanes without waiting for others.
     Under `jax.distributed` each process runs a share of the chunks, and all return all lanes.
@@ -39,11 +39,12 @@ def rollout(
     lane: function (chain, data of one lane) that returns a dict of arguments of `simulate`, such as
         events, args, control, t1, or `chain` with other floats. Compared as in `simulate`, so that
         a lambda in the call is not compiled again.
-    cost: expected duration of each lane, in any unit [lanes]. Lanes of similar cost share a chunk.
+    cost: expected run time of each lane [lanes], not an objective. Lanes of similar cost share a
+        chunk.
     chunk: lanes that one device runs at once; memory grows with them. Default: 64 on a CPU, else
         4096.
     out: folder for finished chunks (chunk_00000.npz and so on, readable by `svkc.load_trajectory`).
-        A call with equal arguments continues an interrupted rollout from this folder.
+        An equal call continues from it. Not compared: `lane`, function bodies, static options.
     devices: devices to use. Default: all of this process. For several CPU devices call
         `jax.config.update("jax_num_cpu_devices", n)` before the first use of jax.
     progress: whether to print progress.
@@ -180,7 +181,7 @@ def _prepare_folder(folder: pathlib.Path, inputs, size: int) -> pathlib.Path:
     digest = hashlib.sha256()
     for path, leaf in jax.tree_util.tree_leaves_with_path(inputs):
         digest.update(jax.tree_util.keystr(path).encode())
-        # functions and solvers are hashed by name: a changed body is not noticed
+        # leaves only: another `lane`, function body or option without leaves is not noticed
         digest.update(
             np.ascontiguousarray(leaf).tobytes()
             if eqx.is_array_like(leaf)

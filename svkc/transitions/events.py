@@ -45,7 +45,7 @@ class At(eqx.Module):
 class When(eqx.Module):
     """An event at the time at which guard(t, state, args) crosses zero.
 
-    direction: True for rising guards only, False for falling guards only, None for either.
+    direction: True for rising crossings only, False for falling ones only, None for either.
     """
 
     guard: Callable
@@ -147,7 +147,7 @@ def when(
 
     guard: function (t, state, args) -> real number, or a guard such as `svkc.touch` returns.
     connect, cut, lock, unlock, here, stop, bind, unbind: as for `svkc.at`.
-    direction: True for rising guards only, False for falling guards only, None for either.
+    direction: True for rising crossings only, False for falling ones only, None for either.
 
     Raises ValueError if the guard is not callable, the direction is not True, False or None, or an
     argument is one that `svkc.at` refuses.

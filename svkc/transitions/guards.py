@@ -184,7 +184,7 @@ def touch(chain: Chain, link: str, distance=0.01, axes: str | None = None) -> To
 
 
 def leaves(chain: Chain, link: str, axis=(0.0, 0.0, 1.0)) -> Leaves:
-    """Return a guard that falls through zero when a virtual link would have to pull.
+    """Return a lift-off guard: falls through zero when a virtual link would have to pull.
 
     The guard's value (N) is the force of the link's parent on its real link along `axis`. With
     direction=False and cut=link the link is a support that can push but not pull.

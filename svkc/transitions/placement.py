@@ -71,7 +71,7 @@ def with_coordinates(
 def _euler_angles(
     rotation: Float[Array, "links 4"], freedoms: Bool[Array, "links 6"]
 ) -> Float[Array, "links 3"]:
-    """Return the Euler angles about x, y, z in sequence; the angle of a locked axis is zero."""
+    """Return the Euler angles about x, y, z in sequence; zero for an axis that is no freedom."""
     R = quat_matrix(rotation)
     fx, fy, fz = freedoms[:, 0], freedoms[:, 1], freedoms[:, 2]
 

@@ -80,7 +80,7 @@ def as_placement(name: str, value, dtype):
 def set_links(
     structure: Structure, links: Bool[Array, " links"], *, rows, freedoms, quat, pos, real_pos
 ) -> Structure:
-    """Return the structure with new bodies, joint and placement of the links in the mask `links`.
+    """Return the structure with new bodies, joint and placement, except `real_quat`, of `links`.
 
     rows: rows of the parent and of the real link among the bodies.
     quat, pos: orientation and position of the joint in the parent (wxyz, m).
@@ -170,7 +170,7 @@ def bind(
     pos=(0.0, 0.0, 0.0),
     real_pos=(0.0, 0.0, 0.0),
 ) -> State:
-    """Return the state with a spare slot bound to two bodies, but not connected.
+    """Return the state with a spare slot, which must not be connected, bound to two bodies.
 
     The slot is run-time data: binding does not retrace. `svkc.connect` then connects the slot, at
     the placement given here or, with here=True, at the current poses of the bodies. During a run

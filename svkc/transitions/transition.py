@@ -137,7 +137,7 @@ def release_constraints(
     """Return the state after cutting links and unlocking joints: q and v stay unchanged and the
     rank is decided again.
 
-    `change_structure` gives the same result; this function compiles no impact.
+    `change_structure` gives the same state; this function compiles no impact, and gives no gaps.
     """
     structure, _, _ = _with_masks(chain, state.structure, connected, locked)
     no_impulse = jnp.zeros((len(chain.link_names), 3), state.v.dtype)
@@ -160,8 +160,8 @@ def transition(chain: Chain, state: State, connected) -> State:
 
     connected: names of virtual links, or a Boolean mask over `chain.link_names`.
 
-    Raises ValueError for unknown names, and if bodies are too far from the declared placement or a
-    loop cannot be closed (a runtime error under jit).
+    Raises ValueError for unknown names, if bodies are too far from the placement (a runtime error
+    under jit), or if a loop cannot be closed (not checked under jit).
     """
     check_state(chain, state)
     mask = jnp.asarray(connection_mask(chain, connected))
@@ -176,11 +176,11 @@ def connect(chain: Chain, state: State, *names: str, here: bool = False) -> Stat
     already connected stay unchanged.
 
     names: virtual links to connect.
-    here: False makes each joint at its declared placement, where the bodies must already be; True
-        makes it at the current poses of the bodies.
+    here: False makes each joint at its placement (declared, or set by the last here=True), where
+        the bodies must already be; True makes it at the current poses of the bodies.
 
-    Raises ValueError for unknown names, and if bodies are too far from the declared placement or a
-    loop cannot be closed (a runtime error under jit).
+    Raises ValueError for unknown names, if bodies are too far from the placement (a runtime error
+    under jit), or if a loop cannot be closed (not checked under jit).
     """
     check_state(chain, state)
     named = _link_mask(chain, names)

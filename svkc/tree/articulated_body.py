@@ -1,4 +1,4 @@
-"""Articulated bodies (Featherstone chapter 7): M^-1 f on the tree without M, level by level.
+"""The articulated-body algorithm (Featherstone chapter 7): M^-1 f without M, level by level.
 
 Articulated inertias are given in world axes about the root's origin, so that those of children
 add up without a change of coordinates. All rows of a level are one array. Joints with fewer
@@ -42,7 +42,7 @@ class ArticulatedLevel(NamedTuple):
 def articulated_inertias(
     chain: Chain, kin: Kinematics, free: Bool[Array, " nv"] | None = None
 ) -> list[ArticulatedLevel] | ArticulatedLevel:
-    """Return the factors of the mass matrix, from articulated inertias summed towards the roots.
+    """Return S, U and D^-1 of each level, from articulated inertias summed towards the roots.
 
     free: coordinates that are not locked (None: all).
     """
@@ -102,8 +102,8 @@ def _inward_pass(top: Topology, bodies, f: Float[Array, "nv *k"]):
 def delassus_matrix(top: Topology, bodies, J: Float[Array, "rows nv"]) -> Float[Array, "rows rows"]:
     """Return J M^-1 J^T.
 
-    M^-1 = L^-T D^-1 L^-1 with a block of D for each joint (Featherstone section 6.5), so that the
-    inward pass, L^-1 J^T, is enough.
+    M = L^T D L with a block of D for each joint (Featherstone section 6.5), so that the inward
+    pass, L^-T J^T, is enough.
     """
     parts = _inward_pass(top, bodies, J.T)
     parts = parts if isinstance(parts, list) else [parts]

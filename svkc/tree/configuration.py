@@ -1,6 +1,6 @@
 """The configuration manifold: retraction, difference, derivative, unit quaternions.
 
-The only module that knows which entries of q are quaternions and which of v turn them.
+`Topology.quaternion_starts` says which entries of q are quaternions and which of v turn them.
 """
 
 import jax
@@ -45,7 +45,7 @@ def integrate(chain: Chain, q: Float[Array, " q"], dv: Float[Array, " dofs"]) ->
 
     Rotations follow Rodrigues' formula (paper (39)); quaternions of q are normalized first.
 
-    q: configuration (m, rad, unit quaternions wxyz), [nq] for the tree or for every coordinate.
+    q: configuration (m, rad, unit quaternions wxyz) over every coordinate, as `State.q`.
     dv: displacement in the coordinates of v (m, rad; body axes for rotations).
     """
     quat_q, quat_v = chain.topology.quaternion_starts

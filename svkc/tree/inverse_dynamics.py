@@ -98,8 +98,8 @@ def limit_forces(
 ) -> Float[Array, " dofs"]:
     """Return the torques of stiff springs and dampers outside the joints' ranges.
 
-    With x the distance outside the range (paper, section VII-B) and a = 0.02 rad or m, the torque
-    is -(k x + c v) exp(-a / x); inside it is zero. All its derivatives are continuous at the end
+    Outside by x, negative below (paper, section VII-B), and with a = 0.02 rad or m, the torque
+    is -(k x + c v) exp(-a / |x|); inside it is zero. All its derivatives are continuous at the end
     of the range: a kink would cost adaptive steps of high order more than the motion itself.
     """
     tau = jnp.zeros_like(v)

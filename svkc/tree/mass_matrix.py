@@ -1,4 +1,4 @@
-"""The mass matrix of the tree: by composite rigid bodies, by unit vectors."""
+"""The mass matrix of the tree: by the composite-rigid-body algorithm, by unit vectors."""
 
 import jax
 import jax.numpy as jnp

@@ -18,8 +18,8 @@ for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
 HAMILTON[1:, 1:, 1:] = SKEW
 for i in range(4):
     HAMILTON[0, i, i], HAMILTON[i, i, 0], HAMILTON[i, 0, i] = 1, 1, -1 if i else 1
-# the table of x -> x q*
 CONJUGATE = np.array([1.0, -1, -1, -1])
+# the table of x -> x q*
 RIGHT_CONJUGATE = CONJUGATE[:, None, None] * HAMILTON.transpose(2, 1, 0)
 
 
@@ -163,7 +163,7 @@ def quat_log(q: Float[Array, "*n 4"]) -> Float[Array, "*n 3"]:
     small = square < 1e-8
     s = jnp.sqrt(jnp.where(small, 1, square))
     w = q[..., :1]
-    # where `small`: atan(x) / x at x = s / w, to second order, with w = 1 - square / 2
+    # where `small`: 2 atan(x) / s with x = s / w, by atan(x) / x = 1 - x^2 / 3
     factor = jnp.where(
         small,
         2 / jnp.where(small, w, 1) * (1 - square / (3 * jnp.where(small, w * w, 1))),
