@@ -110,7 +110,7 @@ def measure_eager(model: str) -> dict:
     import jax
 
     rows = {}
-    for name, call in compile_cases.called_eagerly(model).items():
+    for name, call in compile_cases.eager_calls(model).items():
         before = clocks()
         jax.block_until_ready(call())
         cpu, wall = (b - a for a, b in zip(before, clocks(), strict=True))

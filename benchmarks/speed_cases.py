@@ -65,7 +65,7 @@ def model_path(name: str) -> str:
 def mujoco_case(name: str, chain, state) -> tuple[mujoco.MjModel, np.ndarray, np.ndarray]:
     """Return MuJoCo's model (step DT, no joint ranges, grips as `connect`), qpos and qvel."""
     spec = mujoco.MjSpec.from_file(model_path(name))
-    model = soft_loops.figure(SimpleNamespace(chain=chain, state=state), spec, DT)
+    model = soft_loops.figure_model(SimpleNamespace(chain=chain, state=state), spec, DT)
     model.opt.timestep, model.opt.jacobian = DT, mujoco.mjtJacobian.mjJAC_DENSE
     model.opt.disableflags |= (
         mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_LIMIT
