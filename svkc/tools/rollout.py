@@ -39,8 +39,7 @@ def rollout(
     lane: function (chain, data of one lane) that returns a dict of arguments of `simulate`, such as
         events, args, control, t1, or `chain` with other floats. Compared as in `simulate`, so that
         a lambda in the call is not compiled again.
-    cost: expected run time of each lane [lanes], not an objective. Lanes of similar cost share a
-        chunk.
+    cost: expected run time of each lane, no objective [lanes]. Lanes of similar cost share a chunk.
     chunk: lanes that one device runs at once; memory grows with them. Default: 64 on a CPU, else
         4096.
     out: folder for finished chunks (chunk_00000.npz and so on, readable by `svkc.load_trajectory`).
