@@ -216,7 +216,7 @@ def test_the_figure_of_40_freedoms(benchmark):
     links = {name: len(chain.topology.parent) - 1 for name, chain in chains.items()}
     assert (links, len(balls), chains["balls"].nv) == ({"balls": 17, "hinges": 41}, 12, 46)
     assert abs(float(chains["balls"].mass.sum()) - 73) < 0.01
-    states = benchmark.same_motion(chains, balls, np.random.default_rng(2))
+    states = benchmark.matching_states(chains, balls, np.random.default_rng(2))
     ends = [
         svkc.simulate(chain, state, 0.2, rtol=1e-10, atol=1e-12).final
         for chain, state in zip(chains.values(), states, strict=True)
