@@ -49,7 +49,7 @@ def custom_primitive(
     return lambda *args: eqxi.filter_primitive_bind(primitive, *args)
 
 
-def is_cotangent_of(x) -> bool:
+def is_undefined_primal(x) -> bool:
     """Return whether an input of a transpose rule is one whose cotangent the rule returns."""
     return isinstance(x, ad.UndefinedPrimal)
 

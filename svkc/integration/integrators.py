@@ -12,7 +12,7 @@ from svkc._jax.lanes_last import with_lanes_last
 from svkc.loops.constrained_dynamics import ArticulatedBodies
 from svkc.loops.forward_dynamics import velocity_and_acceleration
 from svkc.model.chain import Chain, State, active_dofs
-from svkc.model.checked_jit import checked_jit, joint_torques
+from svkc.model.checked_jit import checked_jit, torques_over_dofs
 from svkc.model.validation import scalar
 from svkc.tree.configuration import integrate
 from svkc.tree.inverse_dynamics import limit_forces
@@ -121,7 +121,7 @@ def step(
     Raises ValueError if `tau` has neither of these sizes, or if `dt` is not one real number.
     """
     return _step(
-        chain, state, joint_torques(chain, tau), jnp.asarray(scalar("dt", dt), state.q.dtype)
+        chain, state, torques_over_dofs(chain, tau), jnp.asarray(scalar("dt", dt), state.q.dtype)
     )
 
 

@@ -21,7 +21,7 @@ from svkc.loops.forward_dynamics import (
 )
 from svkc.loops.projection import ProjectionInfo, project, project_by_loop_forces
 from svkc.model.chain import Chain, State, active_dofs
-from svkc.model.checked_jit import joint_torques
+from svkc.model.checked_jit import torques_over_dofs
 from svkc.model.validation import real_array
 from svkc.tree.configuration import configuration_derivative, normalize
 from svkc.tree.inverse_dynamics import limit_forces
@@ -108,7 +108,7 @@ class VectorField(eqx.Module):
             controlled = eqx.filter_jit(self.control)(
                 t, State(y.q, y.v, field_args.structure), field_args.args
             )
-            tau = tau + joint_torques(chain, real_array("control", controlled, y.v.dtype))
+            tau = tau + torques_over_dofs(chain, real_array("control", controlled, y.v.dtype))
         if chain.limit is not None:
             tau = tau + limit_forces(chain, y.q, y.v)
         if y.work is None:

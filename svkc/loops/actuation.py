@@ -19,7 +19,7 @@ from svkc.loops.pivoting import PivotedQR, pivoted_qr, pivoted_qr_with_rank
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import check_state
 from svkc.model.validation import as_array, real_array
-from svkc.tree.inverse_dynamics import append_virtual_joints, passive_forces, rnea
+from svkc.tree.inverse_dynamics import pad_to_dofs, passive_forces, rnea
 from svkc.tree.kinematics import kinematics, twists
 
 
@@ -165,7 +165,7 @@ def _solve_unbounded(chain: Chain, state: State, vdot_G, weight, actuated: Bool[
     co, kin, V = _coordinates_and_twists(chain, state)
     _, column = jacobian_scales(chain)
     vdot = co.W @ jnp.where(co.independent, vdot_G, 0) + co.bias
-    forces = append_virtual_joints(chain, rnea(chain, kin, V, state.v, vdot[:nv])) - passive_forces(
+    forces = pad_to_dofs(chain, rnea(chain, kin, V, state.v, vdot[:nv])) - passive_forces(
         chain, state.q, state.v
     )
     target_force = co.W.T @ forces

@@ -17,8 +17,8 @@ from svkc.loops.delassus import loop_force_solver
 from svkc.loops.pivoting import PivotedQR, pivot_blocks
 from svkc.model.chain import Chain, Structure, active_dofs
 from svkc.model.validation import scalar
-from svkc.tree.articulated_body import articulated_inertias, solve_mass_matrix
-from svkc.tree.inverse_dynamics import append_virtual_joints, mass_matrix_product
+from svkc.tree.articulated_body import articulated_factors, solve_mass_matrix
+from svkc.tree.inverse_dynamics import mass_matrix_product, pad_to_dofs
 from svkc.tree.kinematics import Kinematics
 from svkc.tree.mass_matrix import mass_matrix_crba, mass_matrix_unit_vectors
 
@@ -104,7 +104,7 @@ class ArticulatedBodies(AbstractDynamics):
 
     def prepare_open(self, chain, structure, kin):
         free = None if structure.locked is None else ~structure.locked
-        bodies = articulated_inertias(*jax.lax.stop_gradient((chain, kin)), free)
+        bodies = articulated_factors(*jax.lax.stop_gradient((chain, kin)), free)
         solve = lambda force: solve_mass_matrix(chain.topology, bodies, force)
         return _implicit_open_solve(chain, structure, kin, solve)
 
@@ -157,7 +157,7 @@ def default_dynamics(chain: Chain) -> AbstractDynamics:
 
 def articulated_bodies(chain: Chain, kin: Kinematics):
     """Stand for `ArticulatedBodies` in `svkc.Dynamics(inertia=svkc.by_bodies)`."""
-    return articulated_inertias(chain, kin)
+    return articulated_factors(chain, kin)
 
 
 DEPRECATED_SPELLINGS = (
@@ -226,10 +226,7 @@ def _implicit_solve(
         x, mu = unknown
         J = select_rows(loops.J) / column[None]
         active_x = jnp.where(active, x, 0)
-        force = (
-            append_virtual_joints(chain, mass_matrix_product(chain, loops.kin, active_x[:nv]))
-            + J.T @ mu
-        )
+        force = pad_to_dofs(chain, mass_matrix_product(chain, loops.kin, active_x[:nv])) + J.T @ mu
         return jnp.where(active, force, x), J @ x + jnp.where(active_rows, 0, mu)
 
     def solve(force: Float[Array, " dofs"], bias: Float[Array, " rows"]) -> Float[Array, " dofs"]:
@@ -252,18 +249,18 @@ def _link_tangents(a: Float[Array, "..."], b: Float[Array, "..."]):
 def _solve_by_partitioning(
     chain: Chain, kin: Kinematics, structure: Structure, qr: PivotedQR, J, mass_matrix: Callable
 ) -> Callable:
-    """Return (force, rate) -> (x, mu) through W and A (paper (16), (23), (24))."""
+    """Return (force, loop_bias) -> (x, mu) through W and A (paper (16), (23), (24))."""
     nv, (_, column) = chain.nv, jacobian_scales(chain)
     co = partition_coordinates(chain, structure, qr, J, jnp.zeros(J.shape[0], J.dtype))
     M, W = mass_matrix(chain, kin), co.W
     A_inverse = cholesky_solver(reduced_mass_matrix(chain, co, M))
     _, JS = pivot_blocks(qr, J)
 
-    def solve(force, rate):
-        x = column * (qr.P.T @ batched_solve_triangular(JS, rate))
-        x = x + W @ A_inverse(W.T @ (force - append_virtual_joints(chain, M @ x[:nv])))
-        rest = column * (force - append_virtual_joints(chain, M @ x[:nv]))
-        return x, jnp.where(qr.active, batched_solve_triangular(JS, qr.P @ rest, trans=True), rate)
+    def solve(force, loop_bias):
+        x = column * (qr.P.T @ batched_solve_triangular(JS, loop_bias))
+        x = x + W @ A_inverse(W.T @ (force - pad_to_dofs(chain, M @ x[:nv])))
+        rest = qr.P @ (column * (force - pad_to_dofs(chain, M @ x[:nv])))
+        return x, jnp.where(qr.active, batched_solve_triangular(JS, rest, trans=True), loop_bias)
 
     return solve
 

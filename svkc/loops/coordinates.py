@@ -52,7 +52,7 @@ class Coordinates(eqx.Module):
         return self.bias
 
 
-def dependent_velocities(
+def with_dependent_velocities(
     chain: Chain, qr: PivotedQR, J: Float[Array, "rows dofs"], v: Float[Array, " dofs"]
 ) -> Float[Array, " dofs"]:
     """Return W v_G (16): v with new dependent velocities. v must be zero where inactive."""

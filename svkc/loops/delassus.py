@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 from svkc._jax.batched_lapack import cholesky_solver
 from svkc._jax.static_gather import static_take
 from svkc.model.chain import Chain
-from svkc.tree.articulated_body import articulated_inertias, delassus_matrix, solve_mass_matrix
+from svkc.tree.articulated_body import articulated_factors, delassus_matrix, solve_mass_matrix
 from svkc.tree.kinematics import Kinematics
 from svkc.tree.spatial import inverse_positive, matvec
 
@@ -43,7 +43,7 @@ class VirtualJoints(eqx.Module):
     dof: np.ndarray
     count: int
 
-    def rates(self, x: Float[Array, "*n rows"]) -> Float[Array, "*n links d"]:
+    def joint_rates(self, x: Float[Array, "*n rows"]) -> Float[Array, "*n links d"]:
         """Return S^+ x, the joint rates that fit the loop rows x best."""
         x = x.reshape(*x.shape[:-1], -1, 6)
         return matvec(
@@ -53,7 +53,7 @@ class VirtualJoints(eqx.Module):
 
     def reject(self, x: Float[Array, "*n rows"]) -> Float[Array, "*n rows"]:
         """Return x - S S^+ x, the part of the loop rows that the joints cannot follow."""
-        rates = self.rates(x)
+        rates = self.joint_rates(x)
         return x - matvec(_align_batch_axes(self.S, rates), rates).reshape(x.shape)
 
     def subset(self, links: np.ndarray) -> "VirtualJoints":
@@ -147,7 +147,7 @@ def _regularized_inverse(D: Float[Array, "delassus delassus"]) -> Callable:
 def loop_force_solver(
     chain: Chain, kin: Kinematics, J: Float[Array, "rows dofs"], free: Bool[Array, " nv"] | None
 ) -> Callable:
-    """Return (force, rate) -> (x, mu) with M x + J^T mu = force and J x = rate.
+    """Return (force, loop_bias) -> (x, mu) with M x + J^T mu = force and J x = loop_bias.
 
     The rows of J may be dependent. D is regularized and factored, and the forces are refined
     against D itself (the proximal form): forces of dependent rows stay finite, and the motion is
@@ -157,7 +157,7 @@ def loop_force_solver(
     """
     top, nv, J_tree = chain.topology, chain.nv, J[:, : chain.nv]
     bodies, joints, in_D = (
-        articulated_inertias(chain, kin, free),
+        articulated_factors(chain, kin, free),
         virtual_joints(chain, J),
         delassus_rows(chain, free is not None),
     )
@@ -167,18 +167,18 @@ def loop_force_solver(
     D = reject(reject(delassus_matrix(top, bodies, static_take(J_tree, in_D.rows))).T)
     solve_regularized = _regularized_inverse(D)
 
-    def solve(force, rate):
+    def solve(force, loop_bias):
         # a force on a virtual joint, which has no inertia, is transmitted by its loop
         transmitted = -matvec(
             joints.S, matvec(joints.gram_inverse, joints.gather(force[nv:]))
         ).ravel()
         unconstrained = solve_mass_matrix(top, bodies, force[:nv] + transmitted @ J_tree)
-        residual = reject(static_take(rate - J_tree @ unconstrained, in_D.rows))
+        residual = reject(static_take(loop_bias - J_tree @ unconstrained, in_D.rows))
         z = solve_regularized(residual)
         for _ in range(REFINEMENTS):
             z = z + solve_regularized(residual - D @ z)
         mu = transmitted + in_D.expand(reject(z))
         x = solve_mass_matrix(top, bodies, force[:nv] + mu @ J_tree)
-        return jnp.concatenate([x, joints.scatter(joints.rates(rate - J_tree @ x))]), -mu
+        return jnp.concatenate([x, joints.scatter(joints.joint_rates(loop_bias - J_tree @ x))]), -mu
 
     return solve

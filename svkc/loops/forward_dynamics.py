@@ -14,7 +14,7 @@ from svkc.loops.constrained_dynamics import (
     default_dynamics,
 )
 from svkc.loops.constraint import constraint_bias, jacobian_scales, loop_kinematics
-from svkc.loops.coordinates import dependent_velocities
+from svkc.loops.coordinates import with_dependent_velocities
 from svkc.loops.pivoting import (
     NEAR_SINGULAR,
     PivotedQR,
@@ -25,8 +25,8 @@ from svkc.loops.pivoting import (
     solve_pivot_block,
 )
 from svkc.model.chain import Chain, State, Structure, active_dofs
-from svkc.model.checked_jit import checked_jit, joint_torques
-from svkc.tree.inverse_dynamics import append_virtual_joints, passive_forces, rnea
+from svkc.model.checked_jit import checked_jit, torques_over_dofs
+from svkc.tree.inverse_dynamics import pad_to_dofs, passive_forces, rnea
 from svkc.tree.kinematics import kinematics, twists
 
 
@@ -66,18 +66,20 @@ def velocity_and_acceleration(
             near = pivot_ratio(qr) < NEAR_SINGULAR * structure.margin
             v = jnp.where(
                 near,
-                dependent_velocities(chain, qr, J, jnp.where(active_dofs(chain, structure), v, 0)),
+                with_dependent_velocities(
+                    chain, qr, J, jnp.where(active_dofs(chain, structure), v, 0)
+                ),
                 v,
             )
     else:
         kin, loops = kinematics(chain, q), None
     V = twists(chain, kin, v)
     bias = rnea(chain, kin, V, v, jnp.zeros(chain.nv, v.dtype))
-    force = tau + passive_forces(chain, q, v) - append_virtual_joints(chain, bias)
+    force = tau + passive_forces(chain, q, v) - pad_to_dofs(chain, bias)
     if loops is None:
         return v, dynamics.prepare_open(chain, structure, kin)(force)
-    rates = constraint_bias(chain, structure, v, loops, V, baumgarte)
-    return v, dynamics.prepare(chain, structure, loops, qr)(force, rates)
+    loop_bias = constraint_bias(chain, structure, v, loops, V, baumgarte)
+    return v, dynamics.prepare(chain, structure, loops, qr)(force, loop_bias)
 
 
 @with_lanes_last
@@ -109,7 +111,7 @@ def forward_dynamics(
     tau: joint torques (N m, N) over every coordinate, or over the tree's.
     Raises ValueError if tau has neither length.
     """
-    tau = joint_torques(chain, tau)
+    tau = torques_over_dofs(chain, tau)
     return acceleration(chain, state.structure, state.q, state.v, tau, default_dynamics(chain))
 
 
@@ -153,7 +155,7 @@ def loop_forces(chain: Chain, state: State, tau: Float[Array, " torques"]) -> Lo
     tau: joint torques (N m, N) over every coordinate, or over the tree's.
     Raises ValueError if tau has neither length.
     """
-    tau = joint_torques(chain, tau)
+    tau = torques_over_dofs(chain, tau)
     if not len(chain.link_names):
         return LoopForces(
             jnp.zeros((0, 3), state.v.dtype), jnp.zeros((0, 3), state.v.dtype), jnp.zeros(0, bool)
@@ -163,7 +165,7 @@ def loop_forces(chain: Chain, state: State, tau: Float[Array, " torques"]) -> Lo
     kin, J = loops.kin, loops.J
     V = twists(chain, kin, v)
     vdot = acceleration(chain, s, q, v, tau, default_dynamics(chain))
-    force = append_virtual_joints(chain, rnea(chain, kin, V, v, vdot[:nv]))
+    force = pad_to_dofs(chain, rnea(chain, kin, V, v, vdot[:nv]))
     qr = select_pivots(s, J)
     wrench = -constraint_forces(chain, qr, J, force - passive_forces(chain, q, v) - tau)
     return LoopForces(wrench[:, 3:], wrench[:, :3], ~self_stressed(s, qr))

@@ -51,7 +51,7 @@ def to_mjcf(chain: Chain) -> str:
         elif not top.link_spare[link] and not (top.link_child and top.link_child[link] >= 0):
             notes += _add_equality(chain, spec, link, name)
     slots = [name for name, spare in zip(chain.link_names, top.link_spare, strict=True) if spare]
-    cuttable = [name for name, _, _ in top.cut_joints]
+    cuttable = [name for name, _, _ in top.cuttable_joints]
     notes += (
         [f"not in this text: {len(slots)} spare slots, svkc.load(..., spare={len(slots)})"]
         if slots

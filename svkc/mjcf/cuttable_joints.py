@@ -106,7 +106,7 @@ def check_armature(model, cuts: list[CuttableJoint], armature: np.ndarray) -> No
 def with_cuttable_joints(
     model, topology: Topology, cuts: list[CuttableJoint], first: int
 ) -> Topology:
-    """Return the topology with link_child, cut_joints, model_q and model_v filled.
+    """Return the topology with link_child, cuttable_joints, model_q and model_v filled.
 
     first: index of the first virtual link that replaces a cuttable joint.
     """
@@ -114,7 +114,7 @@ def with_cuttable_joints(
     link_child = [-1] * len(topology.link_names)
     for body, (slot, _) in slots.items():
         link_child[slot] = topology.body_row[body]
-    model_q, model_v, cut_joints, tree = (
+    model_q, model_v, records, tree = (
         [],
         [],
         [],
@@ -129,7 +129,7 @@ def with_cuttable_joints(
                 next(tree)
                 with_free_joint.add(body)
             own = cut.freedoms if kind == BALL else (cut.freedoms[cut.joints.index(j)],)
-            cut_joints.append((name_of(model, "joint", j), slot, own[0]))
+            records.append((name_of(model, "joint", j), slot, own[0]))
             model_q += (
                 list(table.quat[slot])
                 if kind == BALL
@@ -145,7 +145,7 @@ def with_cuttable_joints(
     return dataclasses.replace(
         topology,
         link_child=as_ints(link_child),
-        cut_joints=tuple(cut_joints),
+        cuttable_joints=tuple(records),
         model_q=as_ints(model_q),
         model_v=as_ints(model_v),
     )

@@ -107,8 +107,8 @@ def _tree_without(model, cuts: list[CuttableJoint]) -> tuple[list[tuple[int, int
     if not topology.joint_names:
         raise ValueError("source: the model has no joints")
     _check_unique("bodies", topology.body_names)
-    cut_joints = [name_of(model, "joint", j) for cut in cuts for j in cut.joints]
-    _check_unique("joints", [*topology.joint_names, *cut_joints])
+    names_of_cut = [name_of(model, "joint", j) for cut in cuts for j in cut.joints]
+    _check_unique("joints", [*topology.joint_names, *names_of_cut])
     return rows, topology
 
 

@@ -155,7 +155,7 @@ class Chain(eqx.Module):
         return self.topology.dofs
 
     @property
-    def rotational(self) -> Float[Array, "rows 3 3"]:
+    def symmetric_inertia(self) -> Float[Array, "rows 3 3"]:
         """Symmetric part of `inertia`, so that each entry of `inertia` can be perturbed alone."""
         return (self.inertia + jnp.swapaxes(self.inertia, -1, -2)) / 2
 

@@ -112,7 +112,7 @@ def checked_jit(fn: Callable | None = None, *, eager: bool = False) -> Callable:
     return call
 
 
-def joint_torques(chain: Chain, tau) -> Float[Array, " dofs"]:
+def torques_over_dofs(chain: Chain, tau) -> Float[Array, " dofs"]:
     """Return torques [dofs] over every coordinate, with zeros for virtual joints if tau is [nv].
 
     Raises ValueError if tau has another length.

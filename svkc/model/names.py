@@ -46,7 +46,7 @@ def joint_slice(chain: Chain, name: str, widths, starts) -> slice:
     starts: first index of each row: `Topology.q_start` or `Topology.v_start`.
     """
     top = chain.topology
-    for joint, link, freedom in top.cut_joints:
+    for joint, link, freedom in top.cuttable_joints:
         if joint == name:
             ball = sum(top.link_freedoms[link][:3]) == 3
             if widths is V_SIZE:

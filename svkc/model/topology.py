@@ -32,7 +32,7 @@ class Topology:
     link_freedoms: six Booleans for each virtual link: rotations, then translations.
     link_spare: whether each virtual link is a spare slot.
     link_child: row of the child body of each virtual link that is a cuttable joint, else -1.
-    cut_joints: (name, virtual link, first freedom) of each cuttable joint.
+    cuttable_joints: (name, virtual link, first freedom) of each cuttable joint.
     model_q: index in q of each entry of the model's qpos.
     model_v: index in v of each entry of the model's qvel.
     link_actuated: whether a motor drives the coordinates of each virtual link.
@@ -52,7 +52,7 @@ class Topology:
     link_freedoms: tuple[tuple[bool, ...], ...]
     link_spare: tuple[bool, ...]
     link_child: tuple[int, ...] = ()
-    cut_joints: tuple[tuple[str, int, int], ...] = ()
+    cuttable_joints: tuple[tuple[str, int, int], ...] = ()
     model_q: tuple[int, ...] = ()
     model_v: tuple[int, ...] = ()
     link_actuated: tuple[bool, ...] = ()
@@ -149,7 +149,7 @@ class Topology:
             ]
             for d, suffix in own:
                 names[d] = name + (suffix if len(own) > 1 else "")
-        for name, link, freedom in self.cut_joints:
+        for name, link, freedom in self.cuttable_joints:
             if sum(self.link_freedoms[link]) < 3:
                 names[self.links.dof[link, freedom]] = name
         return tuple(names)

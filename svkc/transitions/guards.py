@@ -17,7 +17,7 @@ from svkc._jax.primitive import ClosureConverted
 from svkc.loops.forward_dynamics import loop_forces
 from svkc.loops.frames import loop_frames
 from svkc.model.chain import Chain, State
-from svkc.model.checked_jit import check_chain, joint_torques
+from svkc.model.checked_jit import check_chain, torques_over_dofs
 from svkc.model.names import link_index
 from svkc.model.validation import finite_array, positive_scalar, scalar
 from svkc.tree.kinematics import kinematics
@@ -80,7 +80,7 @@ class LinkGuard(AbstractGuard):
 
         tau: joint torques (N m, N) over every coordinate, or the tree's; None: zeros.
         """
-        tau = jnp.zeros_like(state.v) if tau is None else joint_torques(self.chain, tau)
+        tau = jnp.zeros_like(state.v) if tau is None else torques_over_dofs(self.chain, tau)
         return self.value(self.chain, t, state, args, tau)
 
 

@@ -9,7 +9,7 @@ from svkc.loops.constraint import LoopKinematics, jacobian_scales
 from svkc.loops.forward_dynamics import constraint_forces
 from svkc.loops.pivoting import PivotedQR
 from svkc.model.chain import Chain, State, Structure
-from svkc.tree.inverse_dynamics import append_virtual_joints, mass_matrix_product
+from svkc.tree.inverse_dynamics import mass_matrix_product, pad_to_dofs
 from svkc.tree.kinematics import kinematics
 
 
@@ -24,9 +24,7 @@ def velocity_after_impact(
     """
     solve = CompositeBodies().prepare(chain, structure, loops, qr)
     delta_v = solve(jnp.zeros_like(v), loops.J @ (v / jacobian_scales(chain)[1]))
-    impulse = append_virtual_joints(
-        chain, mass_matrix_product(chain, loops.kin, delta_v[: chain.nv])
-    )
+    impulse = pad_to_dofs(chain, mass_matrix_product(chain, loops.kin, delta_v[: chain.nv]))
     # v+ - v- is orthogonal to v+, so the energy lost is a squared norm and cannot be negative
     return v + delta_v, -constraint_forces(chain, qr, loops.J, impulse), delta_v @ impulse / 2
 

@@ -84,7 +84,7 @@ def _full_vector(chain: Chain, quantity: str, value, default):
                 named[at] = True
         return out, named
     value = finite_array(quantity, value, default.dtype)
-    if top.cut_joints and value.shape == (len(model_entries),):
+    if top.cuttable_joints and value.shape == (len(model_entries),):
         # the size in the model itself, in which no joint is cut
         return _set_values(default, np.array(model_entries, int), value), named
     if value.shape == (tree_size,):

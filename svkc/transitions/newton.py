@@ -158,11 +158,11 @@ def _iterate(
     held: HeldCoordinates,
     schedule: Schedule,
     *,
-    steps_before_rank: int,
+    all_row_steps: int,
 ) -> NewtonState:
     """Run the iterations of a schedule.
 
-    steps_before_rank: the number of first iterations that use all rows, whatever the rank.
+    all_row_steps: the number of first iterations that use all rows, whatever the rank.
     """
     kinds, active = schedule.kinds, active_dofs(chain, structure)
     # a fixed direction without symmetry, as q itself may be singular
@@ -176,7 +176,7 @@ def _iterate(
 
     xs = (
         jnp.asarray(np.array(kinds, np.int32)),
-        jnp.asarray(np.arange(len(kinds)) >= steps_before_rank),
+        jnp.asarray(np.arange(len(kinds)) >= all_row_steps),
     )
     return jax.lax.scan(
         scan_body, NewtonState.init(chain, structure, q, jnp.where(active, v, 0)), xs
@@ -187,10 +187,10 @@ def _solve(
     chain: Chain, structure: Structure, q, v, held: HeldCoordinates, schedule: Schedule
 ) -> NewtonState:
     """Run a schedule. All rows are used until the search for the rank has ended."""
-    steps_before_rank = (
-        schedule.steps_before_rank + len(RANK_SEARCH) if DECIDE_RANK in schedule.kinds else 0
+    all_row_steps = (
+        schedule.all_row_steps + len(RANK_SEARCH) if DECIDE_RANK in schedule.kinds else 0
     )
-    return _iterate(chain, structure, q, v, held, schedule, steps_before_rank=steps_before_rank)
+    return _iterate(chain, structure, q, v, held, schedule, all_row_steps=all_row_steps)
 
 
 def _solve_jvp(primals, tangents):
@@ -216,7 +216,7 @@ def _solve_jvp(primals, tangents):
             v,
             held,
             without_rank_search,
-            steps_before_rank=schedule.steps_before_rank,
+            all_row_steps=schedule.all_row_steps,
         )
         return end.q, end.v, end.spatial_impulse, end.energy_lost
 

@@ -35,7 +35,7 @@ class Schedule(eqx.Module):
     kinds: tuple[int, ...] = eqx.field(static=True)
 
     @property
-    def steps_before_rank(self) -> int:
+    def all_row_steps(self) -> int:
         """Return the number of iterations before the search for the rank; they use all rows."""
         return self.kinds.index(PERTURB) if PERTURB in self.kinds else 0
 

@@ -39,7 +39,7 @@ class ArticulatedLevel(NamedTuple):
     D_inverse: Float[Array, "*levels n d d"]
 
 
-def articulated_inertias(
+def articulated_factors(
     chain: Chain, kin: Kinematics, free: Bool[Array, " nv"] | None = None
 ) -> list[ArticulatedLevel] | ArticulatedLevel:
     """Return S, U and D^-1 of each level, from articulated inertias summed towards the roots.

@@ -19,7 +19,7 @@ def _body_motions(chain: Chain, kin: Kinematics, v):
     V = twists(chain, kin, v)
     c = kin.r + matvec(kin.R, chain.com)
     w = V[:, :3]
-    spin = matvec(kin.R, matvec(chain.rotational, matvec(jnp.swapaxes(kin.R, -1, -2), w)))
+    spin = matvec(kin.R, matvec(chain.symmetric_inertia, matvec(jnp.swapaxes(kin.R, -1, -2), w)))
     return c, V[:, 3:] + cross(w, c), w, spin
 
 

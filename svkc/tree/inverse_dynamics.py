@@ -36,7 +36,7 @@ def newton_euler(
     R = kin.R
 
     def angular_momentum(w):
-        return matvec(R, matvec(chain.rotational, matvec(jnp.swapaxes(R, -1, -2), w)))
+        return matvec(R, matvec(chain.symmetric_inertia, matvec(jnp.swapaxes(R, -1, -2), w)))
 
     moment = angular_momentum(alpha)
     if V is not None:
@@ -72,7 +72,7 @@ def mass_matrix_product(
     return tau if chain.armature is None else tau + chain.armature * x
 
 
-def append_virtual_joints(chain: Chain, force: Float[Array, " nv"]) -> Float[Array, " dofs"]:
+def pad_to_dofs(chain: Chain, force: Float[Array, " nv"]) -> Float[Array, " dofs"]:
     """Return the force with a zero appended for each coordinate of a virtual joint."""
     return jnp.concatenate([force, jnp.zeros(chain.dofs - chain.nv, force.dtype)])
 

@@ -30,7 +30,7 @@ def central_inertias(
 
     Both are in world axes.
     """
-    RI = jnp.sum(kin.R[:, :, :, None] * chain.rotational[:, None, :, :], 2)
+    RI = jnp.sum(kin.R[:, :, :, None] * chain.symmetric_inertia[:, None, :, :], 2)
     return kin.r + matvec(kin.R, chain.com), jnp.sum(RI[:, :, None, :] * kin.R[:, None, :, :], -1)
 
 

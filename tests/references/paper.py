@@ -15,7 +15,7 @@ from svkc.loops.coordinates import closed_coordinates
 from svkc.loops.forward_dynamics import acceleration
 from svkc.loops.frames import loop_frames
 from svkc.model.chain import Chain, State
-from svkc.model.checked_jit import joint_torques
+from svkc.model.checked_jit import torques_over_dofs
 from svkc.model.names import link_index
 from svkc.transitions.placement import joint_coordinates, with_coordinates
 from svkc.tree.kinematics import twists
@@ -28,7 +28,7 @@ def forward_dynamics_by_unit_vectors(
 ) -> Float[Array, " dofs"]:
     """Return the accelerations of every coordinate by unit vectors, the paper's (23), (24)."""
     return acceleration(
-        chain, state.structure, state.q, state.v, joint_torques(chain, tau), UnitVectors()
+        chain, state.structure, state.q, state.v, torques_over_dofs(chain, tau), UnitVectors()
     )
 
 
