@@ -238,7 +238,7 @@ CASES = {
     "ignore_armature: no joint": lambda s: s.load(ignore_armature="nobody"),
     "joint: got": lambda s: link(joint="screw"),
     "lane: expected a dict": lambda s: s.rollout(lane=lambda chain, data: 3),
-    "load_trajectory: expected": lambda s: svkc.load_trajectory(3),
+    "...: expected a path": lambda s: svkc.load_trajectory(3),
     "leaves: axis": lambda s: svkc.leaves(s.four, "pin", axis=(0, 0, 0)),
     "mode: got": lambda s: svkc.check_grad(lambda x: x, jnp.asarray(1.0), mode="sideways"),
     "no joint ...": lambda s: s.four.state({"nobody": 1.0}),
@@ -273,7 +273,7 @@ CASES = {
     "state....: got": lambda s: s.simulate(
         state=svkc.State(jnp.zeros(2), s.state.v, s.state.structure)
     ),
-    "state.q is": lambda s: s.simulate(
+    "state.... is": lambda s: s.simulate(
         state=eqx.tree_at(lambda x: (x.q, x.v), s.state, replace_fn=lambda x: x.astype(jnp.float32))
     ),
     "state: expected": lambda s: svkc.poses(s.four, 3),
@@ -375,6 +375,19 @@ ALSO = [
     ("foot", lambda s: s.four.state({"crank": 0.1}, connected="foot")),
     # how far two bars reach
     (r"cannot be closed.*x by \d+\.\d+ m and", lambda s: unclosable_loop(s).state()),
+    (
+        r"state\.v is float32",
+        lambda s: svkc.poses(
+            s.four, eqx.tree_at(lambda x: x.v, s.state, jnp.zeros(4, jnp.float32))
+        ),
+    ),
+    (
+        r"state\.structure\.connected: got shape \(2,\), expected \(1,\)",
+        lambda s: svkc.poses(
+            s.four,
+            eqx.tree_at(lambda x: x.structure.connected, s.state, jnp.zeros(2, bool)),
+        ),
+    ),
     # grips in a run
     ("no body 'nose'", lambda s: s.gripped("crank", "nose")),
     ("no coordinates for 'universal'", lambda s: s.gripped("crank", "rocker", joint="universal")),

@@ -186,23 +186,27 @@ def scatter_to_dofs(topology, values) -> np.ndarray:
     return out
 
 
-def actuator_arrays(model, ignored, topology):
-    """Return gear, control_range, force_range; see `Chain`. Ignoring one actuator drops all."""
-    count = 0 if {"actuator", "all"} & ignored and not is_torque_motor(model).all() else model.nu
-    model_v = np.array(topology.model_v, int)
+def actuator_arrays(model, topology):
+    """Return gear, control_range, force_range; see `Chain`.
+
+    Actuators that svkc cannot simulate have no row. `left_out_elements` has checked that they are
+    ignored.
+    """
+    motors = np.flatnonzero(is_torque_motor(model))
+    count, model_v = len(motors), np.array(topology.model_v, int)
     gear, control, force = (
         np.zeros((count, topology.dofs)),
         np.tile([-np.inf, np.inf], (count, 1)),
         np.tile([-np.inf, np.inf], (count, 1)),
     )
-    for i in range(count):
-        joint = int(model.actuator_trnid[i, 0])
+    for i, motor in enumerate(motors):
+        joint = int(model.actuator_trnid[motor, 0])
         size, start = V_SIZE[JOINT_KINDS[int(model.jnt_type[joint])]], int(model.jnt_dofadr[joint])
         gear[i, model_v[start : start + size]] = (
-            model.actuator_gear[i, :size] * model.actuator_gainprm[i, 0]
+            model.actuator_gear[motor, :size] * model.actuator_gainprm[motor, 0]
         )
-        if model.actuator_ctrllimited[i]:
-            control[i] = model.actuator_ctrlrange[i]
-        if model.actuator_forcelimited[i]:
-            force[i] = np.sort(model.actuator_forcerange[i] / model.actuator_gainprm[i, 0])
+        if model.actuator_ctrllimited[motor]:
+            control[i] = model.actuator_ctrlrange[motor]
+        if model.actuator_forcelimited[motor]:
+            force[i] = np.sort(model.actuator_forcerange[motor] / model.actuator_gainprm[motor, 0])
     return gear, control, force

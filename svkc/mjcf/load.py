@@ -65,8 +65,8 @@ def load(source, *, virtual_links=(), cuttable=(), spare=0, ignore=(), ignore_ar
     cuttable: names of joints of the tree that can be cut. Each becomes a virtual link of that name,
         connected in the load pose (paper, Fig. 15).
     spare: number of spare slots, virtual links that `bind` makes at run time.
-    ignore: kinds to leave out: names in the error message, "all" (every kind in that message), or
-        "limit" (joint ranges), "spring", "damping", "armature". "equality" keeps connect and weld.
+    ignore: kinds to leave out, as in the error message, "all" of these, or "limit" (joint ranges),
+        "spring", "damping", "armature". Connects, welds and motors on joints stay.
     ignore_armature: names of joints whose armature (rotor inertia) is left out. A cuttable joint
         cannot have armature.
 
@@ -277,7 +277,7 @@ def _build_chain(source: Source, topology, rows, structure, armature, left_out) 
     """Return the chain with all arrays of the model."""
     model, ignored = source.model, set(source.arguments["ignore"])
     bodies = body_arrays(model, topology, rows)
-    gear, control, force = actuator_arrays(model, ignored, topology)
+    gear, control, force = actuator_arrays(model, topology)
     q_load = _load_pose(model, topology)
     own = ("pos", "quat", "axis", "mass", "com", "inertia")
     return Chain(

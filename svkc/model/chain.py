@@ -206,14 +206,14 @@ class Chain(eqx.Module):
     def motors(self, u: Any) -> Float[Array, " dofs"]:
         """Return the joint torques (N m, N) of the model's actuators: gear times clipped controls.
 
-        u: one control for each actuator, clipped to its control range and force range.
-
+        u: one control for each motor on a joint, in the model's order, clipped to its control range
+            and force range. Actuators left out by `load(ignore=...)` have no entry.
         Raises ValueError if u has another length.
         """
         u = real_array("u", u, self.gear.dtype)
-        if u.shape != self.gear.shape[:1]:
+        if u.shape != (count := len(self.gear),):
             raise ValueError(
-                f"u: got shape {u.shape}, the model has {self.gear.shape[0]} actuators"
+                f"u: got shape {u.shape}, expected ({count},), a control for each motor on a joint"
             )
         force = jnp.clip(u, self.control_range[:, 0], self.control_range[:, 1])
         force = jnp.clip(force, self.force_range[:, 0], self.force_range[:, 1])

@@ -32,7 +32,7 @@ def check_state(chain, state) -> None:
     expected = (
         ("q", state.q, chain.topology.nq_all),
         ("v", state.v, chain.dofs),
-        ("connected", state.structure.connected, len(chain.link_names)),
+        ("structure.connected", state.structure.connected, len(chain.link_names)),
     )
     for name, value, size in expected:
         shape = getattr(value, "shape", None)
@@ -41,12 +41,12 @@ def check_state(chain, state) -> None:
                 f"state.{name}: got shape {shape}, expected ({size},); use vmap or svkc.rollout"
                 " for a batch"
             )
-    for value in (state.q, state.v):
-        dtype = real_array("state", value).dtype
+    for name, value in (("q", state.q), ("v", state.v)):
+        dtype = real_array(f"state.{name}", value).dtype
         if dtype != chain.q_load.dtype:
             raise ValueError(
-                f"state.q is {dtype}, the chain is {chain.q_load.dtype}; load and state must be"
-                " made with the same precision"
+                f"state.{name} is {dtype}, the chain is {chain.q_load.dtype}; load and state must"
+                " be made with the same precision"
             )
 
 

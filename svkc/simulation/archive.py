@@ -151,7 +151,7 @@ def load_chain(path) -> Chain:
     Raises ValueError if the file was saved without a chain or with a chain loaded from a compiled
     model (MjModel), is incomplete, or has another schema; FileNotFoundError if there is no file.
     """
-    arrays, meta, _ = _read(path)
+    arrays, meta, _ = _read("load_chain", path)
     if not meta.get("model"):
         raise ValueError(
             f"{path} holds no model; save with traj.save(path, chain), the chain loaded from a"
@@ -172,7 +172,7 @@ def load_trajectory(path) -> Trajectory:
     Raises ValueError if the file is not one of svkc, is incomplete, or has another schema;
     FileNotFoundError if there is no file.
     """
-    arrays, _, codes = _read(path)
+    arrays, _, codes = _read("load_trajectory", path)
     arrays = {name: x for name, x in arrays.items() if not name.startswith("chain.")}
     _check_complete(path, arrays, _array_names(Trajectory))
     code = lambda value: eqx.tree_at(lambda item: item._value, RESULTS.successful, value)
@@ -190,11 +190,14 @@ def load_trajectory(path) -> Trajectory:
         ) from error
 
 
-def _read(path) -> tuple[dict[str, np.ndarray], dict, dict[str, np.ndarray]]:
+def _read(caller: str, path) -> tuple[dict[str, np.ndarray], dict, dict[str, np.ndarray]]:
     """Return the arrays, the metadata and the result codes of a file. Raises as
-    `load_trajectory` does."""
+    `load_trajectory` does.
+
+    caller: the function that the user called, for messages.
+    """
     if not isinstance(path, str | bytes | os.PathLike):
-        raise ValueError(f"load_trajectory: expected a path, got {path!r}")
+        raise ValueError(f"{caller}: expected a path, got {path!r}")
     try:
         with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}

@@ -135,8 +135,11 @@ def inverse_dynamics(
 ) -> Float[Array, " nv"]:
     """Return the joint torques (N m, N) of the tree for the accelerations vdot.
 
-    The forces of the joints' springs and dampers are subtracted, so that this is the inverse of
-    `forward_dynamics` on a tree. Computed by recursive Newton-Euler (Featherstone chapter 5).
+    The forces of the joints' springs and dampers are subtracted. If no virtual link is connected
+    and no joint is locked, this is the inverse of `forward_dynamics`. Otherwise the result is tau
+    plus the generalized forces of the links and locks. Neither function has the torques of joint
+    ranges, which `simulate` and `step` add. Computed by recursive Newton-Euler (Featherstone
+    chapter 5).
 
     vdot: accelerations (rad/s^2, m/s^2) of the tree's coordinates, or of every coordinate.
     Raises ValueError if vdot has neither length.

@@ -13,6 +13,7 @@ from tolerances import REFERENCE, ROUND_OFF
 import svkc
 from svkc.loops.forward_dynamics import acceleration as acceleration_by
 from svkc.tree.configuration import configuration_derivative
+from svkc.tree.inverse_dynamics import limit_forces
 
 
 @pytest.fixture(params=cases.params("loops"), scope="module")
@@ -68,6 +69,22 @@ def test_loop_forces_and_torques_explain_the_acceleration(case):
     relative = svkc.loop_gap_rates(chain, tree_motion)
     power = -jnp.sum(relative[:, :3] * torque) - jnp.sum(relative[:, 3:] * force)
     assert abs(float(missing @ v - power)) < 1e-8 * max(1.0, float(jnp.max(jnp.abs(force))))
+
+
+def test_inverse_dynamics_inverts_forward_dynamics_without_joint_limits():
+    """Outside of its range, with a spring and a damper: both leave out the torque of the limit,
+    which `step` adds."""
+    joint = 'type="hinge" axis="0 1 0" range="-20 20" limited="true" stiffness="3" damping="0.5"'
+    chain = svkc.load(models.MJCF.format(models.bar("arm", joint, "0 0 -1")))
+    tau, dt = jnp.array([0.4]), 1e-8
+    state = chain.state([1.0], [0.7])
+    vdot = svkc.forward_dynamics(chain, state, tau)
+    np.testing.assert_allclose(svkc.inverse_dynamics(chain, state, vdot), tau, atol=ROUND_OFF)
+    limit = limit_forces(chain, state.q, state.v)
+    assert abs(float(limit[0])) > 1
+    # round-off of the difference of velocities: 1e-16 / dt
+    vdot = (svkc.step(chain, state, tau, dt).v - state.v) / dt
+    np.testing.assert_allclose(svkc.inverse_dynamics(chain, state, vdot), tau + limit, rtol=1e-5)
 
 
 @pytest.mark.slow

@@ -205,6 +205,18 @@ def test_one_error_names_all_unsupported_elements():
     assert svkc.load(xml, ignore="all").nv == 1
 
 
+def test_ignoring_an_unsupported_actuator_keeps_the_others_in_order():
+    """`motors` takes one control for each motor on a joint, in the model's order."""
+    rods = models.bar("a", models.Y, "0 0 -1") + models.bar("b", models.Y, "0 0 -1", "1 0 0")
+    motors = '<motor joint="b" gear="2"/><position joint="a" kp="3"/><motor joint="a" gear="5"/>'
+    text = models.MJCF.format(rods).replace("</mujoco>", f"<actuator>{motors}</actuator></mujoco>")
+    for ignore in ("actuator", "all"):
+        chain = svkc.load(text, ignore=ignore)
+        np.testing.assert_allclose(chain.motors(jnp.array([1.0, 10.0])), [50.0, 2.0])
+        with pytest.raises(ValueError, match=r"u: got shape \(3,\), expected \(2,\), .*motor"):
+            chain.motors(jnp.zeros(3))
+
+
 def test_limits_and_springs_are_the_models():
     """A spring equals MuJoCo's; a joint limit holds a pendulum against gravity."""
     xml = PENDULUM.replace('damping="0"', 'damping="2" range="-0.5 0.5" limited="true"').replace(

@@ -111,6 +111,12 @@ def test_continue_a_saved_run(run, tmp_path):
     assert "<mujoco" in metadata["model"]
 
 
+@pytest.mark.parametrize("read", [svkc.load_trajectory, svkc.load_chain])
+def test_a_path_that_is_none_names_the_function_called(read):
+    with pytest.raises(ValueError, match=f"^{read.__name__}: expected a path, got 5$"):
+        read(5)
+
+
 def test_a_loaded_chain_does_not_retrace(run, tmp_path):
     """A chain loaded with all arguments of `load` equals the saved chain and is traced once."""
     link = svkc.VirtualLink("hold", "world", "rod", "ball", axis=np.array([0, 1e-3, 1 / 3]))
