@@ -60,8 +60,10 @@ class SymplecticEuler(RodriguesEuler):
     """Symplectic Euler (semi-implicit Euler) of first order with fixed steps.
 
     v(t + dt) = v(t) + vdot(t) dt, then q(t + dt) = q(t) exp(v(t + dt) dt), where exp is the
-    exponential map of the configuration space. The error of the energy of a conservative open
-    chain stays bounded (Hairer, Lubich and Wanner, Geometric Numerical Integration, I.1 and VI.3).
+    exponential map of the configuration space. The step is symplectic where the mass matrix is
+    constant: the energy error of a conservative system then stays bounded (Hairer, Lubich and
+    Wanner, Geometric Numerical Integration). Where the mass matrix depends on q, as for a double
+    pendulum, the energy drifts.
 
     Use as `solver` of `svkc.simulate` together with `dt`: the solver estimates no error and
     handles the states of `svkc.simulate` alone.
@@ -76,7 +78,7 @@ class SimplifiedNewton(diffrax.VeryChord):
 
     The iteration ends when the remaining error, estimated by the last update or by the rate of
     convergence, is below kappa times the tolerance, or when the update is round-off (Hairer and
-    Wanner, Solving Ordinary Differential Equations II, IV.8).
+    Wanner, Solving Ordinary Differential Equations II, section IV.8).
 
     `diffrax.VeryChord` always takes a second update, and reports divergence where both updates are
     round-off. On the high bar that takes five times as many steps.

@@ -17,7 +17,7 @@ class Projection(AbstractStabilization):
     The projection is the change of least norm in the metric of the mass matrix M: that of an
     impulse of the loops, paper (29). Projecting a velocity in this metric changes its kinetic
     energy only in second order. Method: Hairer and Wanner, Solving Ordinary Differential Equations
-    II, VII.2.
+    II, 2nd edition, section VII.2.
 
     iterations: Newton steps on the positions. One Newton step leaves a gap of second order in the
         drift of a step; 0 projects the velocity alone.

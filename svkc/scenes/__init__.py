@@ -1,8 +1,14 @@
 """The scenes that ship with svkc: MJCF files, and functions that load them with virtual links."""
 
+from svkc import _deprecated
 from svkc.scenes.figure import BAR_HEIGHT as BAR_HEIGHT, FOLDER as FOLDER, PALM as PALM
 from svkc.scenes.high_bar import (
     HALF_GRIP_WIDTH as HALF_GRIP_WIDTH,
     hanging_state as hanging_state,
     high_bar as high_bar,
 )
+
+
+def __getattr__(name: str):
+    """Return the object of a deprecated name, with a `DeprecationWarning`."""
+    return _deprecated.resolve(f"scenes.{name}")

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from svkc import _deprecated
 from svkc.mjcf.load import load
 from svkc.model.chain import Chain, State
 from svkc.scenes.figure import ARM_LENGTH, BAR_HEIGHT, add_rod, figure16, hand_on_bar, hanging_pose
@@ -56,3 +57,8 @@ def hanging_state(chain: Chain, angle: float) -> State:
     for side in ("right", "left"):
         q |= {f"{side}_hip_flexion": 0.1, f"{side}_knee": 0.3, f"{side}_ankle": -0.5}
     return chain.state(q)
+
+
+def __getattr__(name: str):
+    """Return the object of a deprecated name, with a `DeprecationWarning`."""
+    return _deprecated.resolve(f"scenes.brachiation.{name}")

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
+from svkc import _deprecated
 from svkc.mjcf.load import load
 from svkc.model.chain import Chain, State
 from svkc.model.virtual_link import VirtualLink
@@ -132,3 +133,8 @@ def _sitting(chain: Chain, angle: float) -> State:
                 ]
             ] = q[f"{side}_{name}"]
     return chain.state(full)
+
+
+def __getattr__(name: str):
+    """Return the object of a deprecated name, with a `DeprecationWarning`."""
+    return _deprecated.resolve(f"scenes.swing.{name}")

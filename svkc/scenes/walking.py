@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import mujoco
 
+from svkc import _deprecated
 from svkc.mjcf.load import load
 from svkc.model.chain import Chain, State
 from svkc.model.virtual_link import VirtualLink
@@ -73,3 +74,8 @@ def leg_angles(forward, down) -> dict:
         SHANK_LENGTH * jnp.sin(knee), THIGH_LENGTH + SHANK_LENGTH * cosine
     )
     return {"hip_flexion": hip, "knee": knee, "ankle": knee - hip}
+
+
+def __getattr__(name: str):
+    """Return the object of a deprecated name, with a `DeprecationWarning`."""
+    return _deprecated.resolve(f"scenes.walking.{name}")

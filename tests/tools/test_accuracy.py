@@ -71,10 +71,10 @@ def exact(arm):
 
 
 @pytest.mark.slow
-def test_symplectic_euler_keeps_energy():
+def test_symplectic_euler_bounds_the_energy_error_of_a_pendulum():
     """The energy error of symplectic Euler does not grow; that of Rodrigues-Euler does.
 
-    A pendulum swings 100 times, with 60 steps each.
+    A pendulum, whose mass matrix is constant, swings 100 times, with 60 steps each.
     """
     chain = svkc.load(
         models.MJCF.format(models.bar("rod", models.Y, "0 0 -1")).replace("0.3 -0.2", "0 0")
