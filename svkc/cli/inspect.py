@@ -1,4 +1,4 @@
-"""Commands that inspect a model or a saved run."""
+"""The commands `info`, of a model, and `view`, of a saved run."""
 
 import pathlib
 import webbrowser
@@ -7,7 +7,10 @@ from svkc.cli.run import print_report
 
 
 def info(path: str) -> int:
-    """Print what svkc reads from a model; return the exit status."""
+    """Print what svkc reads from a model file, and return the exit status.
+
+    path: MJCF or URDF file. If it has unsupported elements, they are named and left out.
+    """
     import svkc
     from svkc._jax.compilation_cache import use_cache
 
@@ -40,9 +43,9 @@ def info(path: str) -> int:
 
 
 def _load_state(chain):
-    """Return the state at the load pose.
+    """Return the state nearest to the load pose.
 
-    If the loops cannot be closed, print the reason and return None.
+    If the loops cannot be closed, print the error and return None.
     """
     try:
         return chain.state()
@@ -52,36 +55,37 @@ def _load_state(chain):
 
 
 def _print_suggestions(chain):
-    """Print which joints can be cut, and which bodies at the ends of the tree could be held."""
+    """Print which joints can be cut, and which leaf bodies of the tree could be held."""
     from svkc.mjcf.cuttable_joints import cuttable_joints
 
-    def cut(name):
+    def can_be_cut(name):
         try:
             return bool(cuttable_joints(chain.model.model, [name]))
         except ValueError:
             return False
 
     parents = {int(p) for p in chain.model.model.body_parentid[1:]}
-    ends = [name for i, name in enumerate(chain.body_names) if i and i not in parents]
+    leaf_bodies = [name for i, name in enumerate(chain.body_names) if i and i not in parents]
     print(
         "joints that can be cut, load(..., cuttable=[...]):"
-        f" {', '.join(filter(cut, chain.joint_names)) or 'none'}"
+        f" {', '.join(filter(can_be_cut, chain.joint_names)) or 'none'}"
     )
     print(
         "ends of the tree, which could be held: "
-        + ", ".join(ends[:12])
-        + ", ..." * (len(ends) > 12)
+        + ", ".join(leaf_bodies[:12])
+        + ", ..." * (len(leaf_bodies) > 12)
     )
-    if ends:
+    if leaf_bodies:
         print(
-            f'  svkc.VirtualLink("grip", "world", "{ends[0]}", joint="ball"), or load(..., spare=1)'
-            " and svkc.bind while it moves"
+            f'  svkc.VirtualLink("grip", "world", "{leaf_bodies[0]}", joint="ball"), or'
+            " load(..., spare=1) and svkc.bind while it moves"
         )
 
 
 def view(path: pathlib.Path, show: bool) -> int:
-    """Print and draw a run that was saved with its chain; return the exit status.
+    """Print the report of a saved run, draw its page and curves, and return the exit status.
 
+    path: a file written by `traj.save(path, chain)`. The pictures are written beside it.
     show: whether to open the page in a browser.
     """
     import jax
@@ -98,7 +102,7 @@ def view(path: pathlib.Path, show: bool) -> int:
         print(error)
         return 1
     print_report(chain, traj)
-    written, missing = [], []
+    written, failures = [], []
     for target, write in (
         (path.with_suffix(".html"), lambda p: svkc.render(chain, traj, p)),
         (path.with_name(f"{path.stem}_curves.png"), lambda p: traj.plot(chain).savefig(p)),
@@ -107,8 +111,8 @@ def view(path: pathlib.Path, show: bool) -> int:
             write(target)
             written.append(target)
         except ImportError as error:
-            missing.append(f"{target.name} not drawn: {error}")
-    print("\n".join(missing) + "\n" * bool(missing) + "wrote " + ", ".join(map(str, written)))
+            failures.append(f"{target.name} not drawn: {error}")
+    print("\n".join(failures) + "\n" * bool(failures) + "wrote " + ", ".join(map(str, written)))
     if show:
         webbrowser.open(written[0].resolve().as_uri())
     return 0

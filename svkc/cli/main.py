@@ -1,4 +1,4 @@
-"""The command line's arguments. `svkc` alone, or `python -m svkc`, runs the high bar."""
+"""The command line. `svkc` or `python -m svkc` without arguments runs the high bar."""
 
 import argparse
 import math
@@ -9,9 +9,12 @@ from svkc.cli import inspect, run
 
 
 def _event_parser(kind: str):
-    """Return a function that parses NAME@TIME to (kind, link, seconds)."""
+    """Return a parser of NAME@TIME, for argparse, that returns (kind, link, seconds).
 
-    def read(text: str):
+    kind: "release" or "catch".
+    """
+
+    def parse(text: str):
         link, _, time = text.rpartition("@")
         try:
             seconds = float(time)
@@ -23,7 +26,7 @@ def _event_parser(kind: str):
             )
         return kind, link, seconds
 
-    return read
+    return parse
 
 
 def _argument_parser() -> argparse.ArgumentParser:
@@ -36,13 +39,18 @@ def _argument_parser() -> argparse.ArgumentParser:
     )
     add = parser.add_subparsers(dest="command", metavar="COMMAND", required=True).add_parser
     _add_run_options(
-        add("run", help="a scene, or a model from where it was loaded: table, npz, pictures, page")
+        add(
+            "run",
+            help="simulate a scene, or a model from its load pose: table, npz, pictures, page",
+        )
     )
-    add("info", help="what a model is to svkc").add_argument("model", help="MJCF or URDF file")
-    view = add("view", help="table, curves and page of a run that was saved")
-    view.add_argument("file", type=pathlib.Path, help="an .npz of traj.save(path, chain)")
+    add("info", help="print what svkc reads from a model").add_argument(
+        "model", help="MJCF or URDF file"
+    )
+    view = add("view", help="table, curves and page of a saved run")
+    view.add_argument("file", type=pathlib.Path, help="an .npz written by traj.save(path, chain)")
     view.add_argument("--no-open", action="store_true", help="write the page and do not open it")
-    add("scenes", help="the scenes that ship")
+    add("scenes", help="list the scenes that ship with svkc")
     return parser
 
 
@@ -56,10 +64,10 @@ def _add_run_options(parser: argparse.ArgumentParser):
         metavar="SCENE|MODEL",
         help="a name that `svkc scenes` lists (default: high_bar), or an MJCF or URDF file",
     )
-    add("--t1", type=float, help="until when, s")
-    for kind, what in (
-        ("release", "let a virtual link go"),
-        ("catch", "connect one where its bodies are then"),
+    add("--t1", type=float, help="end time, s")
+    for kind, purpose in (
+        ("release", "cut a virtual link"),
+        ("catch", "connect a virtual link at the poses of its bodies"),
     ):
         add(
             f"--{kind}",
@@ -68,14 +76,14 @@ def _add_run_options(parser: argparse.ArgumentParser):
             default=[],
             type=_event_parser(kind),
             metavar="NAME@TIME",
-            help=f"{what} at a time, s; again for more, instead of the scene's own events",
+            help=f"{purpose} at a time, s; may be repeated; replaces the scene's own events",
         )
-    leave_out = "kinds of elements of a model to leave out, or all"
-    add("--ignore", nargs="*", default=[], metavar="KIND", help=leave_out)
+    ignore_help = "kinds of model elements to leave out, or all"
+    add("--ignore", nargs="*", default=[], metavar="KIND", help=ignore_help)
     folder = pathlib.Path("out")
     add("--out", type=pathlib.Path, default=folder, help="folder for results (default: out)")
-    add("--mp4", action="store_true", help="an mp4 too (needs the extra svkc[video])")
-    add("--quiet", action="store_true", help="no progress")
+    add("--mp4", action="store_true", help="write an mp4 as well (needs the extra svkc[video])")
+    add("--quiet", action="store_true", help="no progress bar")
 
 
 def main(argv=None) -> int:

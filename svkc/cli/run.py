@@ -1,6 +1,6 @@
-"""Commands that run a scene or a model.
+"""The commands `run`, of a scene or a model, and `scenes`.
 
-jax is imported where it is used, so that `--help` is fast.
+Functions import jax when called, so that `--help` is fast.
 """
 
 import gc
@@ -13,6 +13,7 @@ TOLERANCES = {"rtol": 1e-8, "atol": 1e-10}
 
 
 def _high_bar():
+    """Return chain, state and events of the main job: one hand releases the bar, then the other."""
     import svkc
     from svkc.scenes import high_bar
 
@@ -23,6 +24,7 @@ def _high_bar():
 
 
 def _swing():
+    """Return chain, state and events of the swing."""
     from svkc.scenes.swing import seat_events, swing
 
     chain, state = swing()
@@ -30,12 +32,14 @@ def _swing():
 
 
 def _brachiation():
+    """Return chain, state and no events of the figure under three bars."""
     from svkc.scenes.brachiation import brachiation
 
     return *brachiation(), ()
 
 
 def _walking():
+    """Return chain, state and no events of the standing figure."""
     from svkc.scenes.walking import walking
 
     return *walking(), ()
@@ -48,24 +52,24 @@ SCENES = {
     "brachiation": (
         _brachiation,
         1.0,
-        "hangs from the first of three bars; nobody drives it (examples/03_brachiation.py does)",
+        "hangs from the first of three bars, without control (examples/03_brachiation.py has one)",
     ),
     "walking": (
         _walking,
         0.6,
         (
-            "stands on two feet and falls, only its feet held by the ground; nobody drives it"
-            " (examples/04_walk.py does)"
+            "stands on two feet and falls, its feet held by the ground, without control"
+            " (examples/04_walk.py has one)"
         ),
     ),
 }
 
 
 def scenes() -> int:
-    """Print the scenes that ship; return the exit status."""
+    """Print name, duration and description of each scene, and return the exit status."""
     width = max(map(len, SCENES))
-    for name, (_, end, what) in SCENES.items():
-        print(f"{name:<{width}}  {end:.1f} s  {what}")
+    for name, (_, end, description) in SCENES.items():
+        print(f"{name:<{width}}  {end:.1f} s  {description}")
     print("run one:  svkc run NAME")
     return 0
 
@@ -73,50 +77,60 @@ def scenes() -> int:
 def run(
     name: str, *, t1: float | None, events, ignore, out: pathlib.Path, video: bool, quiet: bool
 ) -> int:
-    """Run one scene or model, print its report, write its pictures; return the exit status.
+    """Run a scene or a model, print its report, write its files, and return the exit status.
 
-    events: (kind, link, time), which replace the scene's own.
+    name: name of a scene, or path of a model.
+    t1: end time (s). None: that of the scene.
+    events: (kind, link, time (s)) of each `--release` and `--catch`. If there are any, they replace
+        the scene's own events.
+    ignore: kinds of model elements to leave out.
+    out: folder for the files.
+    video: whether to write an mp4.
+    quiet: whether to show no progress bar.
     """
     cache_folder = _configure_process()
     import svkc
 
-    times = [time.perf_counter()]
+    clock = [time.perf_counter()]
     progress = _progress_bar(quiet)
     try:
         chain, state, events, end = _prepare_run(name, t1, events, ignore)
         out.mkdir(parents=True, exist_ok=True)
-        times.append(time.perf_counter())
+        clock.append(time.perf_counter())
         _next_stage(progress, "compiling, and the first run")
         _simulate(chain, state, events, end, progress.disable)
     except (ValueError, OSError) as error:
         progress.close()
         print(error)
         return 1
-    times.append(time.perf_counter())
+    clock.append(time.perf_counter())
     _next_stage(progress, "a run")
     traj = _simulate(chain, state, events, end, progress.disable)
-    times.append(time.perf_counter())
+    clock.append(time.perf_counter())
     _next_stage(progress, "pictures")
     options = {**TOLERANCES, "t1": end, "what": name}
-    written, missing = _write_results(chain, traj, out, pathlib.Path(name).stem, video, options)
+    written, failures = _write_results(chain, traj, out, pathlib.Path(name).stem, video, options)
     _next_stage(progress, "done")
     progress.close()
     print_report(chain, traj)
-    _print_times(times, cache_folder)
-    _print_files(written, missing)
+    _print_times(clock, cache_folder)
+    _print_files(written, failures)
     # a run that ended early is written as well; the exit status tells the shell
     return 0 if traj.result in (svkc.RESULTS.successful, svkc.RESULTS.stopped) else 1
 
 
 def _configure_process() -> pathlib.Path | None:
-    """Configure jax and the garbage collector; return the folder of compiled programs."""
+    """Enable x64 and the compilation cache, and return the folder of the cache.
+
+    Garbage collection is made less frequent.
+    """
     import jax
 
     jax.config.update("jax_enable_x64", True)
     from svkc._jax.compilation_cache import use_cache
 
     cache_folder = use_cache()
-    # tracing makes very many small objects that stay, which the collector would scan repeatedly
+    # the collector would repeatedly scan the many small objects that tracing leaves
     gc.freeze()
     gc.set_threshold(100_000, 20, 50)
     return cache_folder
@@ -135,12 +149,12 @@ def _progress_bar(quiet: bool):
     )
 
 
-def _print_times(times: list[float], cache_folder: pathlib.Path | None):
+def _print_times(clock: list[float], cache_folder: pathlib.Path | None):
     """Print the seconds of loading, of the first run and of a second run, and the cache folder.
 
-    times: four clock readings.
+    clock: the times (s) at which loading starts and each of the three ends.
     """
-    load, first, second = (b - a for a, b in itertools.pairwise(times))
+    load, first, second = (b - a for a, b in itertools.pairwise(clock))
     print(
         f"load and close the loops {load:.1f} s, first run with compilation"
         f" {first:.1f} s, a run {second:.3f} s"
@@ -149,9 +163,9 @@ def _print_times(times: list[float], cache_folder: pathlib.Path | None):
         print(f"compiled programs are kept in {cache_folder}")
 
 
-def _print_files(written: list[pathlib.Path], missing: list[str]):
-    """Print which pictures failed, which files were written, and how to open them."""
-    print("\n".join(missing) + "\n" * bool(missing) + "wrote " + ", ".join(map(str, written)))
+def _print_files(written: list[pathlib.Path], failures: list[str]):
+    """Print the failures, the files that were written, and how to open them."""
+    print("\n".join(failures) + "\n" * bool(failures) + "wrote " + ", ".join(map(str, written)))
     print(
         f"look: open {written[-1]}"
         + f", or  svkc view {written[0]}" * (written[-1].suffix == ".html")
@@ -159,7 +173,7 @@ def _print_files(written: list[pathlib.Path], missing: list[str]):
 
 
 def _simulate(chain, state, events, end: float, quiet: bool):
-    """Run the scene and wait for the result. Runs longer than 10 s show their progress."""
+    """Return the trajectory up to `end` (s). Runs of more than 10 s show their progress."""
     import diffrax
     import jax
     import jax.numpy as jnp
@@ -176,13 +190,13 @@ def _simulate(chain, state, events, end: float, quiet: bool):
 
 
 def _next_stage(progress, description: str):
-    """Advance the progress bar to the next stage."""
+    """Advance the progress bar by one stage and show the description of the next one."""
     progress.update()
     progress.set_description(description)
 
 
 def _prepare_run(name: str, t1: float | None, events, ignore):
-    """Return chain, state, events and end time for the arguments of the command."""
+    """Return chain, state, events and end time (s) for the arguments of the command."""
     from svkc.model.validation import positive_scalar
 
     chain, state, scene_events, end = _load_scene(name, ignore)
@@ -192,15 +206,15 @@ def _prepare_run(name: str, t1: float | None, events, ignore):
 
 
 def _load_scene(name: str, ignore):
-    """Return chain, state, events and end time of a scene or of a model file.
+    """Return chain, state, events and end time (s) of a scene or of a model file.
 
-    A model file starts at its load pose and runs for two seconds.
+    A model starts at its load pose and runs for two seconds.
     """
     import svkc
 
     if name in SCENES:
-        make, end, _ = SCENES[name]
-        return *make(), end
+        build, end, _ = SCENES[name]
+        return *build(), end
     if not pathlib.Path(name).is_file():
         raise ValueError(f"run: no scene and no file {name!r}; scenes: {', '.join(SCENES)}")
     chain = svkc.load(name, ignore=ignore)
@@ -208,7 +222,7 @@ def _load_scene(name: str, ignore):
 
 
 def _requested_events(chain, events):
-    """Return the events of `--release` and `--catch`."""
+    """Return the events that `--release` and `--catch` describe."""
     import svkc
 
     for _, link, _ in events:
@@ -226,13 +240,14 @@ def _requested_events(chain, events):
 def _write_results(
     chain, traj, out: pathlib.Path, stem: str, video: bool, options: dict
 ) -> tuple[list, list[str]]:
-    """Save the run and draw its pictures.
+    """Save the run and draw its pictures. Return the files written, and a message per failure.
 
-    Return the files written, and a message for each failure.
+    stem: name of each file, without its suffix.
+    options: the run's options, which are saved with it.
     """
     import svkc
 
-    written, missing = [out / f"{stem}.npz"], []
+    written, failures = [out / f"{stem}.npz"], []
     traj.save(written[0], chain, **options)
     curves = lambda path: traj.plot(chain).savefig(path, dpi=110)
     draw = lambda path: svkc.render(chain, traj, path, azimuth=90)
@@ -250,12 +265,15 @@ def _write_results(
             write(out / file)
             written.append(out / file)
         except (RuntimeError, ImportError) as error:
-            missing.append(f"{file} not drawn: {error}")
-    return written, missing
+            failures.append(f"{file} not drawn: {error}")
+    return written, failures
 
 
 def print_report(chain, traj):
-    """Print a table of the phases, the event times, and the run's report."""
+    """Print a table of the phases, the times of the events (s), and the run's report.
+
+    Phases of zero duration after the first one are left out.
+    """
     p, report = traj.phases, traj.report()
     names = {
         i: (

@@ -1,4 +1,4 @@
-"""The scenes that ship with svkc: MJCF files, and functions that load them with virtual links."""
+"""The scenes that ship with svkc: functions that return a chain and its initial state."""
 
 from svkc import _deprecated
 from svkc.scenes.figure import BAR_HEIGHT as BAR_HEIGHT, FOLDER as FOLDER, PALM as PALM

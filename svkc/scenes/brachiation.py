@@ -5,22 +5,28 @@ import numpy as np
 from svkc import _deprecated
 from svkc.mjcf.load import load
 from svkc.model.chain import Chain, State
-from svkc.scenes.figure import ARM_LENGTH, BAR_HEIGHT, add_rod, figure16, hand_on_bar, hanging_pose
+from svkc.scenes.figure import (
+    ARM_LENGTH,
+    BAR_HEIGHT,
+    HALF_SHOULDER_WIDTH,
+    add_rod,
+    figure16,
+    hand_on_bar,
+    hanging_pose,
+)
 
 BAR_RADIUS = 0.02  # m: bars, and the rails that carry them
 BAR_SPACING = 0.5  # m: distance between bars
-HAND_Y = 0.18  # m: y of each hand, half the shoulders' width
 
 
 def brachiation(**options) -> tuple[Chain, State]:
-    """Return the 16-joint figure under three bars, and a state at rest.
+    """Return the chain of the 16-joint figure under three bars, and its initial state.
 
-    The figure hangs from the first bar.
-
-    The right hand holds the first bar; the figure is swung back by 0.9 rad. Bars lie along y under
-    two rails, `BAR_SPACING` apart along x, `BAR_HEIGHT` above the ground. The virtual links
-    "right_hand_bar1" (connected), "left_hand_bar2" and "right_hand_bar3" are hinges about the bars.
-    Mobility is 17 with one hand on a bar, 12 with two.
+    The bars lie along y, `BAR_SPACING` apart along x, `BAR_HEIGHT` above the ground. Two rails
+    carry them. The virtual links "right_hand_bar1", "left_hand_bar2" and "right_hand_bar3" are
+    hinges about the bars. Mobility is 17 with one hand on a bar, 12 with two. In the initial state
+    the right hand holds the first bar, and the figure is at rest, rotated backwards by 0.9 rad
+    about this bar.
 
     options: keyword arguments of `svkc.load`.
     """
@@ -34,18 +40,25 @@ def brachiation(**options) -> tuple[Chain, State]:
         add_rod(spec, (-BAR_SPACING / 2, y, rail), (2.5 * BAR_SPACING, y, rail), radius=BAR_RADIUS)
     hands = [
         hand_on_bar(f"{side}_hand_bar{bar + 1}", side, x=bar * BAR_SPACING, y=y, connected=bar == 0)
-        for bar, (side, y) in enumerate((("right", -HAND_Y), ("left", HAND_Y), ("right", -HAND_Y)))
+        for bar, (side, y) in enumerate(
+            (
+                ("right", -HALF_SHOULDER_WIDTH),
+                ("left", HALF_SHOULDER_WIDTH),
+                ("right", -HALF_SHOULDER_WIDTH),
+            )
+        )
     ]
     chain = load(spec, virtual_links=hands, **options)
     return chain, hanging_state(chain, angle=0.9)
 
 
 def hanging_state(chain: Chain, angle: float) -> State:
-    """Return the state at rest in which the right hand holds the first bar.
+    """Return a state at rest in which the right hand holds the first bar.
 
     The left arm is half raised.
 
-    angle: rotation of the figure about the bar, backwards (rad).
+    chain: the chain of `brachiation`.
+    angle: rotation of the figure about the bar (rad). Positive angles move the hips backwards.
     """
     q = {
         "base": hanging_pose(ARM_LENGTH, angle),

@@ -1,4 +1,4 @@
-"""Parts that several scenes share: the 16-joint figure, bars, hands on bars, the hanging pose."""
+"""Parts that several scenes use: the 16-joint figure, rods, hands on bars, the hanging pose."""
 
 import pathlib
 
@@ -8,6 +8,7 @@ from svkc.model.virtual_link import VirtualLink
 
 FOLDER = pathlib.Path(__file__).parent
 BAR_HEIGHT = 2.6  # m: bars above the ground
+HALF_SHOULDER_WIDTH = 0.18  # m: half the distance between the shoulders
 SHOULDER_ABOVE_HIPS = 0.5155  # m: the shoulders above the hips
 ARM_LENGTH = 0.2817 + 0.2689  # m: from the shoulder to the wrist
 PALM = 0.0681  # m: from the wrist to the palm's center
@@ -21,7 +22,10 @@ def figure16():
 
 
 def add_rod(spec, start, end, radius: float, name: str = ""):
-    """Add a steel rod between two points of the ground frame (m), without collisions."""
+    """Add a rod between two points of the ground frame (m) to a `mujoco.MjSpec`.
+
+    radius: m.
+    """
     import mujoco
 
     spec.worldbody.add_geom(
@@ -36,9 +40,12 @@ def add_rod(spec, start, end, radius: float, name: str = ""):
 
 
 def hand_on_bar(name: str, side: str, *, x: float, y: float, connected: bool) -> VirtualLink:
-    """Return a virtual link that holds a palm on a bar along y: a hinge about the bar.
+    """Return a virtual link by which a palm holds a bar along y: a hinge about the bar.
 
-    x, y: position of the hand on the bar (m).
+    name: name of the virtual link.
+    side: "right" or "left".
+    x, y: position of the palm (m). Its height is `BAR_HEIGHT`.
+    connected: whether the link is connected in the initial state.
     """
     return VirtualLink(
         name,
@@ -54,12 +61,12 @@ def hand_on_bar(name: str, side: str, *, x: float, y: float, connected: bool) ->
 
 
 def hanging_pose(arm: float, angle: float) -> list[float]:
-    """Return the base's position (m) and quaternion for a figure that hangs from a bar.
+    """Return position (m) and quaternion of the base for a figure that hangs from a bar.
 
-    The bar is above the origin.
+    The bar is along y, at `BAR_HEIGHT` above the origin.
 
     arm: vertical distance from wrists to shoulders at angle zero (m).
-    angle: rotation of the figure about the bar, backwards (rad).
+    angle: rotation of the figure about the bar (rad). Positive angles move the hips backwards.
     """
     distance = arm + PALM + SHOULDER_ABOVE_HIPS
     quaternion = [np.cos(angle / 2), 0.0, np.sin(angle / 2), 0.0]

@@ -4,17 +4,26 @@ import numpy as np
 
 from svkc.mjcf.load import load
 from svkc.model.chain import Chain, State
-from svkc.scenes.figure import ARM_LENGTH, BAR_HEIGHT, add_rod, figure16, hand_on_bar, hanging_pose
+from svkc.scenes.figure import (
+    ARM_LENGTH,
+    BAR_HEIGHT,
+    HALF_SHOULDER_WIDTH,
+    add_rod,
+    figure16,
+    hand_on_bar,
+    hanging_pose,
+)
 
 HALF_GRIP_WIDTH = 0.30  # m: half the distance between the hands
 
 
 def high_bar(**options) -> tuple[Chain, State]:
-    """Return the high bar of the paper's Fig. 20, and a state at rest, swung back by 1.7 rad.
+    """Return the chain of the high bar of the paper's Fig. 20, and its initial state.
 
-    The 16-joint figure holds the bar with both hands, each by a hinge about the bar (virtual links
-    "right_hand_grip", "left_hand_grip"). There are 24 joint freedoms with both hands on the bar, 23
-    with one, 22 in flight.
+    The 16-joint figure holds the bar with both hands. Each hand has a hinge about the bar (virtual
+    links "right_hand_grip", "left_hand_grip"). There are 24 joint freedoms with both hands on the
+    bar, 23 with one, 22 in flight. The initial state is at rest, rotated backwards by 1.7 rad about
+    the bar.
 
     options: keyword arguments of `svkc.load`.
     """
@@ -31,17 +40,18 @@ def high_bar(**options) -> tuple[Chain, State]:
 
 
 def hanging_state(chain: Chain, angle: float) -> State:
-    """Return the state at rest in which both hands hold the bar.
+    """Return a state at rest in which both hands hold the bar.
 
-    angle: rotation of the figure about the bar, backwards (rad).
+    chain: the chain of `high_bar`.
+    angle: rotation of the figure about the bar (rad). Positive angles move the hips backwards.
     """
-    spread = np.arcsin((HALF_GRIP_WIDTH - 0.18) / ARM_LENGTH)
-    q = {"base": hanging_pose(ARM_LENGTH * np.cos(spread), angle)}
+    abduction = np.arcsin((HALF_GRIP_WIDTH - HALF_SHOULDER_WIDTH) / ARM_LENGTH)
+    q = {"base": hanging_pose(ARM_LENGTH * np.cos(abduction), angle)}
     for side in ("right", "left"):
         q |= {
             f"{side}_shoulder_flexion": np.pi - 0.1,
-            f"{side}_shoulder_abduction": spread,
-            f"{side}_wrist": -spread,
+            f"{side}_shoulder_abduction": abduction,
+            f"{side}_wrist": -abduction,
             f"{side}_elbow": 0.1,
             f"{side}_knee": 0.1,
             f"{side}_hip_flexion": 0.1,

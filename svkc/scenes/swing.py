@@ -20,32 +20,36 @@ THIGH_ABOVE_PLATE = 0.07  # m: axis of a thigh above the plate
 
 
 def swing(angle: float = 0.6, **options) -> tuple[Chain, State]:
-    """Return the 16-joint figure on a swing, at rest.
+    """Return the chain of the 16-joint figure on a swing, and its initial state, at rest.
 
-    Each hand holds a rod by a ball joint; each thigh slides along the plate by a slide. There are
-    30 joint freedoms and the swing's own one. Where a slide is cut, the seat gives way: two joint
-    freedoms fewer after both slides are cut.
+    Each hand holds a rod by a ball joint. Each thigh is on the plate by a slide. There are 31 joint
+    freedoms: 22 of the figure, 6 of the hands, 2 of the slides, and the swing's pivot. The seat is
+    lost as the slides are cut, which leaves 29.
 
     angle: rotation of the swing about its pivot (rad).
     options: keyword arguments of `svkc.load`.
     """
     spec, links = model_and_links()
     chain = load(spec, virtual_links=links, **options)
-    return chain, _sitting(chain, angle)
+    return chain, _sitting_state(chain, angle)
 
 
 def model_and_links():
-    """Return the model, a `mujoco.MjSpec`, and its virtual links."""
+    """Return the swing and the figure as a `mujoco.MjSpec`, and the virtual links between them."""
     import mujoco
 
     spec = figure16()
-    look = {"contype": 0, "conaffinity": 0, "rgba": [0.55, 0.4, 0.3, 1]}
+    appearance = {"contype": 0, "conaffinity": 0, "rgba": [0.55, 0.4, 0.3, 1]}
     capsule, box = mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOX
     body = spec.worldbody.add_body(name="swing", pos=[0, 0, PIVOT_HEIGHT])
     body.add_joint(name="pivot", axis=[0, 1, 0])
     for y in (-HALF_WIDTH, HALF_WIDTH):
         body.add_geom(
-            type=capsule, fromto=[0, y, 0, 0, y, -ROD_LENGTH], size=[0.012, 0, 0], mass=2.0, **look
+            type=capsule,
+            fromto=[0, y, 0, 0, y, -ROD_LENGTH],
+            size=[0.012, 0, 0],
+            mass=2.0,
+            **appearance,
         )
     body.add_geom(
         name="plate",
@@ -53,20 +57,20 @@ def model_and_links():
         pos=[0, 0, -ROD_LENGTH - 0.01],
         size=[PLATE_EDGE, HALF_WIDTH, 0.01],
         mass=3.0,
-        **look,
+        **appearance,
     )
     spec.worldbody.add_geom(
         type=capsule,
         fromto=[0, -0.6, PIVOT_HEIGHT, 0, 0.6, PIVOT_HEIGHT],
         size=[0.03, 0, 0],
-        **look,
+        **appearance,
     )
     return spec, _links()
 
 
 def _links() -> list[VirtualLink]:
     """Return the virtual links of hands and thighs."""
-    quarter = np.sqrt(0.5)
+    cos_45 = np.sqrt(0.5)
     links = []
     for side, y in (("right", -1), ("left", 1)):
         hand = VirtualLink(
@@ -78,7 +82,7 @@ def _links() -> list[VirtualLink]:
             real_pos=(0, 0, -PALM),
             connected=True,
         )
-        # sitting, the thigh points forward: its own x axis is up
+        # the thigh of the sitting figure points forward, so that its x axis points up
         thigh = VirtualLink(
             f"{side}_thigh_plate",
             "swing",
@@ -87,7 +91,7 @@ def _links() -> list[VirtualLink]:
             axis=(1, 0, 0),
             pos=(0, y * 0.085, -ROD_LENGTH),
             real_pos=(-THIGH_ABOVE_PLATE, 0, -0.2),
-            real_quat=(quarter, 0, quarter, 0),
+            real_quat=(cos_45, 0, cos_45, 0),
             connected=True,
         )
         links += [hand, thigh]
@@ -95,24 +99,27 @@ def _links() -> list[VirtualLink]:
 
 
 def seat_events(chain: Chain) -> list[When]:
-    """Return events that cut each thigh's slide as the thigh passes an edge of the plate."""
+    """Return events that cut each thigh's slide as the thigh passes an edge of the plate.
 
-    def beyond(link):
-        along = touch(chain, link, 0.0, axes="z")  # z is the axis of the slide
-        return lambda t, state, args: jnp.abs(along(t, state)) - PLATE_EDGE
+    chain: the chain of `swing`.
+    """
+
+    def distance_beyond_edge(link):
+        slide_position = touch(chain, link, 0.0, axes="z")  # z is the axis of the slide
+        return lambda t, state, args: jnp.abs(slide_position(t, state)) - PLATE_EDGE
 
     return [
-        when(beyond(link), cut=link, direction=True)
+        when(distance_beyond_edge(link), cut=link, direction=True)
         for link in ("right_thigh_plate", "left_thigh_plate")
     ]
 
 
-def _sitting(chain: Chain, angle: float) -> State:
+def _sitting_state(chain: Chain, angle: float) -> State:
     """Return the state with thighs along the plate, trunk upright, hands on the rods."""
     c, s = np.cos(angle), np.sin(angle)
     hips = np.array([-0.17, THIGH_ABOVE_PLATE - ROD_LENGTH])
-    place = [c * hips[0] + s * hips[1], 0, PIVOT_HEIGHT - s * hips[0] + c * hips[1]]
-    q = {"pivot": angle, "base": [*place, np.cos(angle / 2), 0, np.sin(angle / 2), 0]}
+    position = [c * hips[0] + s * hips[1], 0, PIVOT_HEIGHT - s * hips[0] + c * hips[1]]
+    q = {"pivot": angle, "base": [*position, np.cos(angle / 2), 0, np.sin(angle / 2), 0]}
     for side in ("right", "left"):
         q |= {
             f"{side}_hip_flexion": np.pi / 2,
@@ -120,7 +127,7 @@ def _sitting(chain: Chain, angle: float) -> State:
             f"{side}_shoulder_flexion": 0.7,
         }
         q |= {f"{side}_shoulder_abduction": 0.4, f"{side}_elbow": 1.0}
-    # named coordinates are binding, an array is a guess: the hands' loops have to move the arms
+    # named coordinates are kept, an array is a guess: closing the hands' loops moves the arms
     seated = chain.state(
         {k: x for k, x in q.items() if "shoulder" not in k and "elbow" not in k}, connected=()
     )

@@ -14,11 +14,12 @@ _MJCF = f"""<mujoco model="two_links"><option gravity="{{}}"/><worldbody><body n
 
 
 def two_links(gravity=(0.0, -9.81, 0.0), connected: bool = True) -> tuple[Chain, State]:
-    """Return a free-flying chain of two links and its state at rest, as drawn in the paper.
+    """Return a free-flying chain of two links, and its state at rest in the pose of Fig. 14.
 
     Link 1 is on a hinge about z, one metre along y from the free base. Virtual Link 1v, one metre
     further along y, is a hinge about z to the ground. theta_1..6 are the base's coordinates,
-    theta_7 is that of Link 1, theta_8 that of Link 1v, counted about -z as in the paper's J_C (45).
+    theta_7 is that of Link 1, and theta_8 that of Link 1v, positive about -z as in the paper's J_C
+    (45).
 
     gravity: acceleration of gravity (m/s^2).
     connected: whether Link 1v is connected.

@@ -18,11 +18,13 @@ THIGH_LENGTH, SHANK_LENGTH = 0.4222, 0.434  # m
 
 
 def walking(**options) -> tuple[Chain, State]:
-    """Return the 16-joint figure standing at rest, the right foot a stride behind the left one.
+    """Return the chain of the 16-joint figure on flat ground, and its initial state.
 
-    A weld holds the sole of each foot to the ground. There are 22 joint freedoms; mobility is 11
-    with both feet on the ground (legs in parallel planes make one row redundant), 16 with one, 22
-    with none. A weld also carries moments and friction: feet neither slide nor tilt in this scene.
+    The figure stands at rest, the right foot `STRIDE` behind the left one. A weld holds the sole of
+    each foot to the ground ("right_foot_ground", "left_foot_ground"). There are 22 joint freedoms.
+    Mobility is 11 with both feet on the ground (one row is redundant because the legs move in
+    parallel planes), 16 with one foot, 22 with none. A weld carries forces and moments in every
+    direction, so that feet neither slide nor tilt.
 
     options: keyword arguments of `svkc.load`.
     """
@@ -45,33 +47,33 @@ def walking(**options) -> tuple[Chain, State]:
         for side, x, y in (("left", 0, HALF_HIP_WIDTH), ("right", -STRIDE, -HALF_HIP_WIDTH))
     ]
     chain = load(spec, virtual_links=feet, **options)
-    hips = -0.55 * STRIDE - SOLE_OFFSET
-    q = {"base": [hips, 0, HIP_HEIGHT, 1, 0, 0, 0]}
-    for link, arm in zip(feet, (-0.3, 0.3), strict=True):
+    hips_x = -0.55 * STRIDE - SOLE_OFFSET
+    q = {"base": [hips_x, 0, HIP_HEIGHT, 1, 0, 0, 0]}
+    for link, shoulder_flexion in zip(feet, (-0.3, 0.3), strict=True):
         side = link.name.removesuffix("_foot_ground")
-        q |= {f"{side}_shoulder_flexion": arm, f"{side}_elbow": 0.35}
+        q |= {f"{side}_shoulder_flexion": shoulder_flexion, f"{side}_elbow": 0.35}
         for joint, angle in leg_angles(
-            link.pos[0] - SOLE_OFFSET - hips, HIP_HEIGHT - ANKLE_HEIGHT
+            link.pos[0] - SOLE_OFFSET - hips_x, HIP_HEIGHT - ANKLE_HEIGHT
         ).items():
             q[f"{side}_{joint}"] = float(angle)
     return chain, chain.state(q)
 
 
 def leg_angles(forward, down) -> dict:
-    """Return the angles (rad) of a leg by inverse kinematics, for an upright trunk and a flat foot.
+    """Return a leg's joint angles (rad) by name, for an upright trunk and a level foot.
 
-    forward, down: position of the ankle relative to the hip (m). Out of reach, the leg is
-        stretched.
+    forward, down: position of the ankle relative to the hip (m). The leg is stretched towards a
+        position out of reach.
     """
-    reach = forward * forward + down * down
-    cosine = jnp.clip(
-        (reach - THIGH_LENGTH**2 - SHANK_LENGTH**2) / (2 * THIGH_LENGTH * SHANK_LENGTH),
+    squared_distance = forward * forward + down * down
+    cos_knee = jnp.clip(
+        (squared_distance - THIGH_LENGTH**2 - SHANK_LENGTH**2) / (2 * THIGH_LENGTH * SHANK_LENGTH),
         -0.9999,
         0.9999,
     )
-    knee = jnp.arccos(cosine)
+    knee = jnp.arccos(cos_knee)
     hip = jnp.arctan2(forward, down) + jnp.arctan2(
-        SHANK_LENGTH * jnp.sin(knee), THIGH_LENGTH + SHANK_LENGTH * cosine
+        SHANK_LENGTH * jnp.sin(knee), THIGH_LENGTH + SHANK_LENGTH * cos_knee
     )
     return {"hip_flexion": hip, "knee": knee, "ankle": knee - hip}
 

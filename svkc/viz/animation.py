@@ -79,13 +79,16 @@ def write_mp4(path: pathlib.Path, images: Iterator, fps: float):
         writer.close()
 
 
-def frames(chain: Chain, traj: Trajectory, *, fps: float, size, trails, **view) -> Iterator:
-    """Yield PIL images `1/fps` s apart, each showing the saved state nearest in time.
+def frames(
+    chain: Chain, traj: Trajectory, *, fps: float, size, trails, **camera_options
+) -> Iterator:
+    """Yield PIL images `1/fps` s apart, each of the saved state nearest in time.
 
-    Connected links are drawn as spheres. A strip below the image holds time, links and events.
+    Connected virtual links are drawn as spheres. A strip below the image shows the time, the
+    connected links, the last event and a time line.
 
-    size: (width, height) in pixels.
-    trails: names of bodies whose paths are drawn.
+    size: (width, height) of the image without its strip (pixels).
+    trails: names of bodies whose paths up to the image's time are drawn.
     view: arguments of `_choose_camera`.
 
     Raises ValueError if a body or camera does not exist, RuntimeError if no GL library is
@@ -98,14 +101,14 @@ def frames(chain: Chain, traj: Trajectory, *, fps: float, size, trails, **view) 
     unknown = [name for name in trails if name not in chain.body_names]
     if unknown:
         raise ValueError(f"trails: no body {unknown[0]!r}; bodies: {', '.join(chain.body_names)}")
-    _set_buffer(model, size)
+    _configure_offscreen(model, size)
     data = mujoco.MjData(model)
     ts, (positions, R) = np.asarray(traj.ts), positions_and_rotations(chain, traj.states)
     link_positions, events = (
         connected_link_positions(chain, traj.states, positions, R),
         event_descriptions(traj, chain),
     )
-    camera = _choose_camera(model, positions, **view)
+    camera = _choose_camera(model, positions, **camera_options)
     _use_offscreen_context()
     mujoco.mj_forward(model, data)
     with mujoco.Renderer(model, height=size[1], width=size[0]) as renderer:
@@ -113,7 +116,7 @@ def frames(chain: Chain, traj: Trajectory, *, fps: float, size, trails, **view) 
             i = int(np.argmin(np.abs(ts - t)))
             _set_poses(model, data, positions[i], R[i])
             renderer.update_scene(data, camera)
-            just_changed = any(0 <= t - when < FLASH_DURATION for when, _ in events)
+            just_changed = any(0 <= t - time < FLASH_DURATION for time, _ in events)
             _draw_links(renderer.scene, link_positions[i], large=just_changed)
             for k, name in enumerate(trails):
                 trail = positions[: i + 1, chain.body_names.index(name)]
@@ -123,17 +126,17 @@ def frames(chain: Chain, traj: Trajectory, *, fps: float, size, trails, **view) 
             yield _add_caption(image, ts[i], ts[0], ts[-1], links, events)
 
 
-def _set_buffer(model, size):
-    """Make the offscreen buffer at least `size`, without shadows and multisampling."""
+def _configure_offscreen(model, size):
+    """Make MuJoCo's offscreen buffer at least `size` pixels; disable shadows and multisampling."""
     model.vis.quality.shadowsize = model.vis.quality.offsamples = 0
     buffer = model.vis.global_
     buffer.offwidth, buffer.offheight = np.maximum(size, (buffer.offwidth, buffer.offheight))
 
 
 def _set_poses(model, data, positions: np.ndarray, R: np.ndarray):
-    """Set poses of geoms and cameras from svkc's body poses.
+    """Write the poses of geoms and cameras into MuJoCo's data, from svkc's body poses.
 
-    MuJoCo's own kinematics cannot be used: its tree is another one where joints can be cut.
+    `mj_kinematics` would be wrong for cuttable joints: MuJoCo's tree holds them together.
     """
     geoms = model.geom_bodyid, model.geom_pos, model.geom_quat, data.geom_xpos, data.geom_xmat
     cameras = model.cam_bodyid, model.cam_pos, model.cam_quat, data.cam_xpos, data.cam_xmat
@@ -144,7 +147,10 @@ def _set_poses(model, data, positions: np.ndarray, R: np.ndarray):
 
 
 def _choose_camera(model, positions, *, camera, lookat, distance, azimuth, elevation):
-    """Return the model's camera of that name, or a free camera that sees all body positions."""
+    """Return the name of the model's camera, or a free camera that sees all body positions.
+
+    Raises ValueError if the model has no camera of that name.
+    """
     import mujoco
 
     if camera is not None:
@@ -164,7 +170,7 @@ def _choose_camera(model, positions, *, camera, lookat, distance, azimuth, eleva
 
 
 def _rgba(hexadecimal: str, alpha: float):
-    """Return a color #rrggbb and an opacity as four floats in 0 to 1."""
+    """Return red, green, blue and opacity in [0, 1] for a color #rrggbb."""
     return np.array(
         [int(hexadecimal[k : k + 2], 16) / 255 for k in (1, 3, 5)] + [alpha], np.float32
     )
@@ -221,11 +227,11 @@ def _add_caption(image, t: float, start: float, end: float, links: list[str], ev
     draw.text(
         (margin, y + 6), f"{t:6.3f} s   held by {', '.join(links) or 'nothing'}", "#222222", font
     )
-    past = [f"{when:.3f} s: {what}" for when, what in events if when <= t]
+    past = [f"{time:.3f} s: {description}" for time, description in events if time <= t]
     draw.text((margin, y + 25), past[-1] if past else "", "#b03030", font)
     pixel = lambda s: margin + (width - 2 * margin) * (s - start) / max(end - start, 1e-12)
     draw.rectangle((margin, y + 49, width - margin, y + 51), "#c8c8c4")
     draw.rectangle((margin, y + 49, pixel(t), y + 51), "#1f5fa8")
-    for when, _ in events:
-        draw.rectangle((pixel(when) - 1, y + 45, pixel(when) + 1, y + 55), "#b03030")
+    for time, _ in events:
+        draw.rectangle((pixel(time) - 1, y + 45, pixel(time) + 1, y + 55), "#b03030")
     return out

@@ -1,6 +1,6 @@
 """A run as one self-contained HTML page: bodies in three dimensions, a time line, numbers.
 
-The page reads nothing from a network. The browser's part is in `web/`.
+The page loads nothing from a network. Its JavaScript is in `web/`.
 """
 
 import base64
@@ -25,7 +25,7 @@ FOLDER = pathlib.Path(__file__).parent / "web"
 
 @dataclasses.dataclass(frozen=True)
 class Page:
-    """The page of a run. Jupyter shows it in a frame.
+    """The HTML page of a run. Jupyter displays the page in a frame.
 
     text: the HTML file.
     height: height of the frame (pixels).
@@ -43,9 +43,9 @@ class Page:
 
 
 def show(chain: Chain, traj: Trajectory, *, title: str = "svkc", height: int = 480) -> Page:
-    """Return the page of a run, which a notebook displays.
+    """Return the HTML page of a run.
 
-    As the last line of a notebook cell the page is displayed below the cell. `svkc.render(chain,
+    A notebook displays the page below a cell whose last line is this call. `svkc.render(chain,
     traj, "run.html")` writes the page to a file. Between save times the page interpolates positions
     linearly and orientations at constant angular velocity: save about 40 states a second.
 
@@ -57,19 +57,19 @@ def show(chain: Chain, traj: Trajectory, *, title: str = "svkc", height: int = 4
     """
     text = _read_web_file("page.html")
     # the run is inserted last, so that no placeholder is replaced inside its strings
-    parts = {
+    placeholders = {
         "three": _read_web_file("three.min.js"),
         "page": _read_web_file("page.js"),
         "title": html.escape(title),
         "run": _script_json(_run_data(chain, traj)),
     }
-    for place, value in parts.items():
-        text = text.replace("{{" + place + "}}", value)
+    for name, value in placeholders.items():
+        text = text.replace("{{" + name + "}}", value)
     return Page(text, height)
 
 
 def write_page(chain: Chain, traj: Trajectory, path: pathlib.Path) -> pathlib.Path:
-    """Write the page to a file, with the file's stem as its title, and return the path."""
+    """Write the page of a run to a file, with the file's stem as title, and return the path."""
     path.write_text(show(chain, traj, title=path.stem).text, encoding="utf-8")
     return path
 
@@ -80,7 +80,7 @@ def _read_web_file(name: str) -> str:
 
 
 def _script_json(data) -> str:
-    """Return JSON that is safe inside a <script>: no string in it can end the script."""
+    """Return JSON for a <script> element. `<` is escaped, so no string can end the element."""
     return json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
 
 
@@ -100,7 +100,7 @@ def _base64(x, dtype) -> str:
 
 
 def _run_data(chain: Chain, traj: Trajectory) -> dict:
-    """Return the data of a run that the page's script reads."""
+    """Return what the page's script reads of a run, as JSON data."""
     check_single_run(traj)
     ts, states, gaps = _saved_frames(chain, traj)
     positions, quats, energies = jax.jit(jax.vmap(lambda s: (*poses(chain, s), energy(chain, s))))(
@@ -123,9 +123,9 @@ def _run_data(chain: Chain, traj: Trajectory) -> dict:
 
 
 def _saved_frames(chain: Chain, traj: Trajectory) -> tuple[np.ndarray, State, np.ndarray]:
-    """Return save times, states and gaps up to the end of the run.
+    """Return save times (s), states and largest gaps (rad, m) up to the end of the run.
 
-    The run may end before the last save time. Its end is the last frame.
+    A run may end before the last save time. The final state is appended if no save time is the end.
     """
     ts, end = np.asarray(traj.ts, float), float(traj.t_final)
     keep = np.flatnonzero(ts <= end)
@@ -145,9 +145,9 @@ def _saved_frames(chain: Chain, traj: Trajectory) -> tuple[np.ndarray, State, np
 
 
 def _phase_rows(chain: Chain, traj: Trajectory, ts: np.ndarray, states: State) -> list[dict]:
-    """Return start (s), mobility and connected links of each phase.
+    """Return times (s), mobility, energy (J), gaps (rad, m) and connected links of each phase.
 
-    The structure that an event at the end of the run leaves is added as a phase.
+    If an event ends the run, the structure after this event is one more phase, of zero duration.
     """
     p, final = traj.phases, traj.final.structure
     rows = [
@@ -182,7 +182,7 @@ def _phase_rows(chain: Chain, traj: Trajectory, ts: np.ndarray, states: State) -
     for row, connected, start, stop in zip(
         rows, connected_rows, bounds[:-1], bounds[1:], strict=True
     ):
-        # placements of links are known only at save times
+        # link placements are recorded at save times alone
         saved = np.flatnonzero((ts >= start) & (ts < stop))
         s = (
             jax.tree.map(lambda x, k=saved: np.asarray(x[k[0]]), states.structure)
@@ -196,16 +196,19 @@ def _phase_rows(chain: Chain, traj: Trajectory, ts: np.ndarray, states: State) -
     return rows
 
 
-def _link_ends(s: Structure, link: int, body: dict) -> list:
-    """Return [body, position in its frame] of a virtual link's parent end and real end."""
+def _link_ends(structure: Structure, link: int, body_of_row: dict) -> list:
+    """Return [body, position in the body's frame (m)] for a link's parent and its real link."""
     return [
-        [body[int(row[link])], _json_numbers(pos[link])]
-        for row, pos in ((s.parent, s.pos), (s.real, s.real_pos))
+        [body_of_row[int(row[link])], _json_numbers(pos[link])]
+        for row, pos in ((structure.parent, structure.pos), (structure.real, structure.real_pos))
     ]
 
 
-def _event_rows(chain: Chain, traj: Trajectory, begin: float) -> list[dict]:
-    """Return time (s), description and lost energy (J) of each instant with events."""
+def _event_rows(chain: Chain, traj: Trajectory, start: float) -> list[dict]:
+    """Return time (s), description and lost energy (J) of each instant with events.
+
+    start: first save time (s). Earlier events are left out.
+    """
     e = traj.events
     times, lost = (np.asarray(x[: int(e.count)], float) for x in (e.time, e.energy_lost))
     # a cut loses no energy: a loss within round-off is shown as zero
@@ -213,7 +216,7 @@ def _event_rows(chain: Chain, traj: Trajectory, begin: float) -> list[dict]:
     instants = [
         (time, text, float(lost[times == time].sum()))
         for time, text in event_descriptions(traj, chain)
-        if time >= begin
+        if time >= start
     ]
     return [
         {"time": time, "text": text, "lost": loss if abs(loss) > rounding else 0.0}
@@ -222,14 +225,14 @@ def _event_rows(chain: Chain, traj: Trajectory, begin: float) -> list[dict]:
 
 
 def _geoms(model) -> tuple[list[dict], list[dict]]:
-    """Return the visible geoms, and the meshes that they use, each mesh once."""
+    """Return the visible geoms, and each mesh or height field among them once."""
     import mujoco
 
-    kinds = mujoco.mjtGeom
-    geoms, meshes, known = [], [], {}
+    geom_types = mujoco.mjtGeom
+    geoms, meshes, mesh_numbers = [], [], {}
     for g in range(model.ngeom):
         kind, data, material = (
-            kinds(int(model.geom_type[g])),
+            geom_types(int(model.geom_type[g])),
             int(model.geom_dataid[g]),
             int(model.geom_matid[g]),
         )
@@ -239,36 +242,38 @@ def _geoms(model) -> tuple[list[dict], list[dict]]:
             rgba = model.mat_rgba[material]
         if model.geom_group[g] > 2 or rgba[3] == 0:
             continue
-        shape = {
+        geom = {
             "body": int(model.geom_bodyid[g]),
             "kind": kind.name.removeprefix("mjGEOM_").lower(),
             "rgba": _json_numbers(rgba.round(4)),
         }
-        shape |= {
+        geom |= {
             "size": _json_numbers(model.geom_size[g]),
             "pos": _json_numbers(model.geom_pos[g]),
             "quat": _json_numbers(model.geom_quat[g]),
         }
         if data >= 0:
-            source = (kind == kinds.mjGEOM_HFIELD, data)
-            if source not in known:
-                known[source] = len(meshes)
+            source = (kind == geom_types.mjGEOM_HFIELD, data)
+            if source not in mesh_numbers:
+                mesh_numbers[source] = len(meshes)
                 vertices, faces = _heightfield(model, data) if source[0] else _mesh(model, data)
                 meshes.append(
                     {"vertices": _base64(vertices, np.float32), "faces": _base64(faces, np.uint32)}
                 )
-            shape |= {"kind": "mesh", "mesh": known[source]}
-        geoms.append(shape)
+            geom |= {"kind": "mesh", "mesh": mesh_numbers[source]}
+        geoms.append(geom)
     return geoms, meshes
 
 
 def _mesh(model, i: int) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices and faces of a mesh."""
-    first, count, face, faces = (
+    first_vertex, vertices, first_face, faces = (
         int(x[i])
         for x in (model.mesh_vertadr, model.mesh_vertnum, model.mesh_faceadr, model.mesh_facenum)
     )
-    return model.mesh_vert[first : first + count], model.mesh_face[face : face + faces]
+    return model.mesh_vert[first_vertex : first_vertex + vertices], model.mesh_face[
+        first_face : first_face + faces
+    ]
 
 
 def _heightfield(model, i: int) -> tuple[np.ndarray, np.ndarray]:
@@ -276,14 +281,16 @@ def _heightfield(model, i: int) -> tuple[np.ndarray, np.ndarray]:
     rows, columns, first = (
         int(x[i]) for x in (model.hfield_nrow, model.hfield_ncol, model.hfield_adr)
     )
-    wide, deep, high, _ = model.hfield_size[i]
-    x, y = np.meshgrid(np.linspace(-wide, wide, columns), np.linspace(-deep, deep, rows))
-    corner = np.arange(rows * columns).reshape(rows, columns)
+    half_width, half_depth, height, _ = model.hfield_size[i]
+    x, y = np.meshgrid(
+        np.linspace(-half_width, half_width, columns), np.linspace(-half_depth, half_depth, rows)
+    )
+    vertex = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = (
         part.ravel()
-        for part in (corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1])
+        for part in (vertex[:-1, :-1], vertex[:-1, 1:], vertex[1:, 1:], vertex[1:, :-1])
     )
-    z = high * model.hfield_data[first : first + rows * columns]
+    z = height * model.hfield_data[first : first + rows * columns]
     return np.stack([x.ravel(), y.ravel(), z], -1), np.concatenate(
         [np.stack([a, b, c], -1), np.stack([a, c, d], -1)]
     )

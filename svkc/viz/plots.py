@@ -19,15 +19,17 @@ from svkc.viz.shapes import (
 
 
 def strobe(chain: Chain, traj: Trajectory, path: pathlib.Path, frames: int) -> pathlib.Path:
-    """Draw several poses in the x-z plane, save the picture, and return its path.
+    """Draw several poses of a run in the x-z plane, save the picture, and return its path.
 
-    Each structure has a color. Connected links are rings.
+    Each structure has a color. Connected virtual links are rings. Later poses are more opaque.
     """
     from matplotlib.figure import Figure
 
     ts = np.asarray(traj.ts)
-    picked = np.unique(np.searchsorted(ts, np.linspace(ts[0], ts[-1], frames)).clip(0, len(ts) - 1))
-    states = jax.tree.map(lambda x: x[picked], traj.states)
+    frame_indices = np.unique(
+        np.searchsorted(ts, np.linspace(ts[0], ts[-1], frames)).clip(0, len(ts) - 1)
+    )
+    states = jax.tree.map(lambda x: x[frame_indices], traj.states)
     positions, R = positions_and_rotations(chain, states)
     link_positions = connected_link_positions(chain, states, positions, R)
     starts, structures = _structures(traj)
@@ -42,23 +44,25 @@ def strobe(chain: Chain, traj: Trajectory, path: pathlib.Path, frames: int) -> p
     scale = 72 * min(9 / (high[0] - low[0]), 6.7 / (high[1] - low[1]))
     draw = functools.partial(_draw_shapes, axes, scale=scale)
     draw(ground_shapes, positions[0], R[0], color="#9a9aa2", alpha=0.8)
-    for frame, i in enumerate(picked):
+    for frame, i in enumerate(frame_indices):
         structure = structures[max(int(np.sum(starts <= ts[i])) - 1, 0)]
-        shade = 0.2 + 0.7 * (frame + 1) / len(picked)
+        shade = 0.2 + 0.7 * (frame + 1) / len(frame_indices)
         draw(body_shapes, positions[frame], R[frame], color=colors[structure], alpha=shade)
         rings = np.array([place[[0, 2]] for place in link_positions[frame].values()]).reshape(-1, 2)
         axes.plot(*rings.T, "o", color="#202020", alpha=shade, markersize=7, fillstyle="none")
     _add_legend(axes, chain, starts, structures, colors)
     axes.grid(alpha=0.2)
-    axes.set_title(f"{len(picked)} poses, {ts[picked[0]]:.2f} s to {ts[picked[-1]]:.2f} s")
+    axes.set_title(
+        f"{len(frame_indices)} poses, {ts[frame_indices[0]]:.2f} s to {ts[frame_indices[-1]]:.2f} s"
+    )
     figure.savefig(path, dpi=110, bbox_inches="tight")
     return path
 
 
 def _structures(traj: Trajectory) -> tuple[np.ndarray, list[tuple[int, ...]]]:
-    """Return each phase's start (s) and connected links.
+    """Return the start (s) and the connected links of each phase.
 
-    Phases of zero duration, between events at one instant, are left out.
+    Phases of zero duration, which lie between events at one instant, are left out.
     """
     p = traj.phases
     phases = [i for i in range(int(p.count)) if p.stop[i] > p.start[i]] or [0]
@@ -67,10 +71,10 @@ def _structures(traj: Trajectory) -> tuple[np.ndarray, list[tuple[int, ...]]]:
 
 
 def _axis_limits(ground_shapes, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest and the highest visible x and z (m).
+    """Return the lower and the upper limits of x and z (m).
 
-    Shapes on the ground are shown at most a metre beyond the bodies: a long floor would make the
-    bodies small.
+    Shapes on the ground count up to a metre beyond the bodies: a long floor would make the bodies
+    small.
     """
     points = positions[:, 1:, [0, 2]].reshape(-1, 2)
     ends = np.array([end for _, *ends, _ in ground_shapes for end in ends]).reshape(-1, 3)[
@@ -81,7 +85,10 @@ def _axis_limits(ground_shapes, positions: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _draw_shapes(axes, shapes, positions, R, *, scale: float, color: str, alpha: float):
-    """Draw shapes as thick lines at the poses of their bodies. scale: points per metre."""
+    """Draw shapes as thick lines at the poses of their bodies.
+
+    scale: printer's points per metre.
+    """
     for body, a, b, radius in shapes:
         ends = np.array([positions[body] + R[body] @ x for x in (a, b)])
         if np.hypot(*(ends[1] - ends[0])[[0, 2]]) * scale < 1:
@@ -103,8 +110,10 @@ def _add_legend(axes, chain: Chain, starts, structures, colors: dict):
     from matplotlib.transforms import ScaledTranslation
 
     for structure, structure_color in colors.items():
-        begins = [f"{t:.2f}" for t, s in zip(starts, structures, strict=True) if s == structure]
-        times = ", ".join(begins[:6]) + ", ..." * (len(begins) > 6)
+        start_times = [
+            f"{t:.2f}" for t, s in zip(starts, structures, strict=True) if s == structure
+        ]
+        times = ", ".join(start_times[:6]) + ", ..." * (len(start_times) > 6)
         links = ", ".join(chain.link_names[k] for k in structure) or "nothing"
         axes.plot([], [], color=structure_color, linewidth=5, label=f"{links} from {times} s")
     # below the picture: inside, the legend would hide limbs
@@ -122,10 +131,10 @@ def _add_legend(axes, chain: Chain, starts, structures, colors: dict):
 def curves(traj: Trajectory, chain: Chain | None = None):
     """Return a matplotlib figure of coordinates, energy, loop gaps and mobility over time.
 
-    Events are numbered lines.
+    Events are numbered vertical lines.
 
-    chain: adds joint names, and kinetic and potential energy at the save times. Without a chain,
-        the energy is shown at the ends of phases alone.
+    chain: the chain of the run, which adds joint names, and kinetic and potential energy at the
+        save times. Without a chain, the energy is shown at the ends of phases alone.
     """
     from matplotlib.figure import Figure
 
@@ -147,9 +156,9 @@ def curves(traj: Trajectory, chain: Chain | None = None):
 
 
 def _plot_coordinates(axes, ts, traj: Trajectory, chain: Chain | None):
-    """Plot all coordinates.
+    """Plot all coordinates over time.
 
-    A legend names them if the tree has at most eight, one for each joint.
+    A legend names the tree's coordinates if there are at most eight, one for each joint.
     """
     axes.plot(ts, np.asarray(traj.states.q), linewidth=0.8)
     axes.set_ylabel("q (m, rad)")
@@ -175,7 +184,7 @@ def _plot_energies(axes, ts, traj: Trajectory, chain: Chain | None):
 
 
 def _mark_events(figure, panels, events: list[tuple[float, str]]):
-    """Draw a numbered line at each event in every panel, and name the events below."""
+    """Draw a numbered vertical line at each event in every panel, and list the events below."""
     for number, (t, _) in enumerate(events, 1):
         for panel in panels:
             panel.axvline(t, color="0.6", linewidth=0.8, linestyle="--")

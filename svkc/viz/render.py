@@ -1,4 +1,4 @@
-"""Pictures of a run. matplotlib, Pillow and mujoco's renderer are imported where they are used."""
+"""Public functions that draw a run. Drawing packages are imported when a function needs them."""
 
 import os
 import pathlib
@@ -30,13 +30,13 @@ def render(
 ) -> pathlib.Path:  # fmt: skip
     """Write a picture of a run in the format of the path's suffix, and return the path.
 
-    .png: a strobe of several poses in the x-z plane. .gif, .mp4: an animation, with a strip below
-    that shows time, connected links and events. .html: an interactive page, as by `svkc.show`.
+    .png: several poses in the x-z plane, in one picture. .gif, .mp4: an animation, above a strip
+    with time, connected links and events. .html: an interactive page, that of `svkc.show`.
 
     traj: one run, not a batch.
     path: file to write; its suffix is .png, .gif, .mp4 or .html.
     fps: frames per second of an animation.
-    frames: number of poses of a strobe.
+    frames: number of poses in a .png picture.
     size: (width, height) of an animation (pixels).
     trails: names of bodies whose paths are drawn in an animation.
     camera: name of a camera of the model, for an animation. None: a free camera, as follows.
@@ -57,7 +57,7 @@ def render(
     path = pathlib.Path(os.fspath(path))
     size = tuple(integer("size", n, 16, 8192) for n in vector("size", size, 2))
     trails = names("trails", trails)
-    view = {"camera": camera, **_free_camera(lookat, distance, azimuth, elevation)}
+    camera_options = {"camera": camera, **_free_camera(lookat, distance, azimuth, elevation)}
     if path.suffix != ".html":
         _require_packages()
     if path.suffix == ".png":
@@ -67,12 +67,16 @@ def render(
     writer = {".gif": animation.write_gif, ".mp4": animation.write_mp4}.get(path.suffix)
     if writer is None:
         raise ValueError(f"render: {path.name} should end in .png, .gif, .mp4 or .html")
-    writer(path, animation.frames(chain, traj, fps=fps, size=size, trails=trails, **view), fps)
+    writer(
+        path,
+        animation.frames(chain, traj, fps=fps, size=size, trails=trails, **camera_options),
+        fps,
+    )
     return path
 
 
 def _free_camera(lookat, distance, azimuth, elevation) -> dict:
-    """Return the validated placement of the free camera, by argument name."""
+    """Validate the placement of the free camera and return it by argument name."""
     return {
         "lookat": lookat if lookat is None else vector("lookat", lookat, 3),
         "distance": distance if distance is None else positive_scalar("distance", distance),
@@ -84,10 +88,11 @@ def _free_camera(lookat, distance, azimuth, elevation) -> dict:
 def plot(traj: Trajectory, chain: Chain | None = None) -> Any:
     """Return a matplotlib figure of coordinates, energy, loop gaps and mobility over time.
 
-    Events are numbered lines.
+    Events are numbered vertical lines.
 
     traj: one run, not a batch.
-    chain: adds joint names, and kinetic and potential energy at every save time.
+    chain: the chain of the run, which adds joint names, and kinetic and potential energy (J) at
+        every save time.
 
     Raises ValueError if `traj` is a batch, RuntimeError if matplotlib is not installed.
     """

@@ -1,4 +1,4 @@
-"""Geometry and labels that all pictures of a run share: body poses, shapes, links, events."""
+"""Poses, shapes, link positions and descriptions of events, which all pictures of a run use."""
 
 import jax
 import numpy as np
@@ -13,7 +13,7 @@ COLORS = ("#1f5fa8", "#d9822b", "#2f8f4e", "#8e3b8e", "#b03030")
 
 
 def check_single_run(traj) -> None:
-    """Raise ValueError if the argument is not a trajectory, or a batch of trajectories."""
+    """Raise ValueError if the argument is no trajectory or is a batch of trajectories."""
     if not isinstance(traj, Trajectory):
         raise ValueError(f"traj: expected one run of svkc.simulate, got {type(traj).__name__}")
     if np.ndim(traj.ts) != 1:
@@ -24,40 +24,40 @@ def check_single_run(traj) -> None:
 
 
 def color(i: int) -> str:
-    """Return color number i of a repeating palette, as #rrggbb."""
+    """Return color i of a cyclic palette, as #rrggbb."""
     return COLORS[i % len(COLORS)]
 
 
 def segments(chain: Chain) -> list[tuple[int, np.ndarray, np.ndarray, float]]:
-    """Return (body, end, other end, radius) for each geom that can be drawn as a thick line.
+    """Return (body, end, other end, radius) for each geom, drawn as a thick line.
 
-    Ends are in the body's frame (m). Planes and height fields are left out.
+    Ends and radius are in m, in the body's frame. Planes and height fields are left out.
     """
     import mujoco
 
     model, lines = chain.model.model, []
     for g in range(model.ngeom):
-        kind, size = mujoco.mjtGeom(int(model.geom_type[g])), model.geom_size[g]
+        geom_type, size = mujoco.mjtGeom(int(model.geom_type[g])), model.geom_size[g]
         R = rotation_matrix(model.geom_quat[g])
         axis = R[:, 2]
-        if kind in (mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER):
-            half, radius = axis * size[1], size[0]
-        elif kind in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_ELLIPSOID):
-            half, radius = (
+        if geom_type in (mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER):
+            half_axis, radius = axis * size[1], size[0]
+        elif geom_type in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_ELLIPSOID):
+            half_axis, radius = (
                 axis * 1e-3,
-                float(np.mean(size)) if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID else size[0],
+                float(np.mean(size)) if geom_type == mujoco.mjtGeom.mjGEOM_ELLIPSOID else size[0],
             )
-        elif kind in (mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_MESH):
+        elif geom_type in (mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_MESH):
             # along the longest side, as thick as the shortest; `size` of a mesh is half its box
             longest = int(np.argmax(size))
-            half, radius = R[:, longest] * size[longest], float(np.min(size))
+            half_axis, radius = R[:, longest] * size[longest], float(np.min(size))
         else:
             continue
         lines.append(
             (
                 int(model.geom_bodyid[g]),
-                model.geom_pos[g] - half,
-                model.geom_pos[g] + half,
+                model.geom_pos[g] - half_axis,
+                model.geom_pos[g] + half_axis,
                 float(radius),
             )
         )
@@ -65,9 +65,9 @@ def segments(chain: Chain) -> list[tuple[int, np.ndarray, np.ndarray, float]]:
 
 
 def positions_and_rotations(chain: Chain, states: State) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions (m) and rotation matrices of the body frames.
+    """Return positions (m) and rotation matrices of the body frames in the ground frame.
 
-    Shapes are [times bodies 3] and [times bodies 3 3]; both are relative to the ground.
+    Shapes are [times bodies 3] and [times bodies 3 3].
     """
     positions, quats = jax.jit(jax.vmap(lambda s: poses(chain, s)))(states)
     w, x, y, z = np.moveaxis(np.asarray(quats, float), -1, 0)
@@ -84,29 +84,38 @@ def positions_and_rotations(chain: Chain, states: State) -> tuple[np.ndarray, np
 def connected_link_positions(
     chain: Chain, states: State, positions, R
 ) -> list[dict[int, np.ndarray]]:
-    """Return, for each state, the positions of the connected links: {link: position}.
+    """Return {link: position (m)} of the connected virtual links, for each state.
 
-    Positions are in the ground frame (m).
+    A link's position is its point on the real link, in the ground frame.
 
     positions, R: result of `positions_and_rotations`.
     """
-    rows, s = {row: body for body, row in enumerate(chain.topology.body_row)}, states.structure
+    body_of_row, structure = (
+        {row: body for body, row in enumerate(chain.topology.body_row)},
+        states.structure,
+    )
     connected, real, real_pos = (
-        np.asarray(s.connected),
-        np.asarray(s.real),
-        np.asarray(s.real_pos, float),
+        np.asarray(structure.connected),
+        np.asarray(structure.real),
+        np.asarray(structure.real_pos, float),
     )
     position_of = lambda i, link, body: positions[i, body] + R[i, body] @ real_pos[i, link]
     return [
-        {int(k): position_of(i, k, rows[int(real[i, k])]) for k in np.flatnonzero(connected[i])}
+        {
+            int(k): position_of(i, k, body_of_row[int(real[i, k])])
+            for k in np.flatnonzero(connected[i])
+        }
         for i in range(len(positions))
     ]
 
 
 def event_descriptions(traj: Trajectory, chain: Chain | None = None) -> list[tuple[float, str]]:
-    """Return (time in s, description) for each instant with events.
+    """Return (time (s), description) for each instant with events.
 
-    A description lists what was connected and cut, by link name, or by link number without a chain.
+    A description lists the virtual links that were connected and cut. If none was, the description
+    is the numbers of the events.
+
+    chain: the chain of the run, for link names. None: links are numbered.
     """
     p, e, descriptions = traj.phases, traj.events, []
     starts, connected = np.asarray(p.start)[: int(p.count)], np.asarray(p.connected)[: int(p.count)]

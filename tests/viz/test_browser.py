@@ -173,7 +173,9 @@ def test_event_marks(release, open_page, tmp_path):
         marks.nth(i).click()
         assert read_number(page, "time") == t
         assert page.locator("#events .past").count() == i + 1
-    drawn = "[...svkc.holds.values()].filter(([ball]) => ball.visible).map(([ball]) => ball.name)"
+    drawn = (
+        "[...svkc.linkMarkers.values()].filter(([ball]) => ball.visible).map(([ball]) => ball.name)"
+    )
     red = lambda: int(np.sum(np.all(np.abs(screenshot(page) - [224, 32, 32]) < 50, -1)))
     page.evaluate("svkc.seek(0.1)")
     assert page.evaluate(drawn) == ["right_hand_grip", "left_hand_grip"]
@@ -201,7 +203,9 @@ def test_energy_jumps_where_a_link_is_connected(stopped, open_page, tmp_path):
     assert energy(0.0229) == pytest.approx(float(traj.phases.energy[0, 1]), rel=1e-5)
     # no state was saved since the cut: placements are unknown and no link is drawn
     assert energy(0.0231) == pytest.approx(float(traj.phases.energy[1, 0]), rel=1e-5)
-    assert page.evaluate("[...svkc.holds.values()].filter(([ball]) => ball.visible).length") == 0
+    assert (
+        page.evaluate("[...svkc.linkMarkers.values()].filter(([ball]) => ball.visible).length") == 0
+    )
 
 
 @pytest.mark.slow

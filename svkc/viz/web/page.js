@@ -4,14 +4,14 @@ const $ = id => document.getElementById(id);
 const COLORS = ["#e02020", "#f08c00", "#2f9e44", "#9c36b5", "#1971c2", "#0c8599"];
 const color = link => COLORS[link.link % COLORS.length];
 
-// numbers ------------------------------------------------------------------------------------------------------------------------------------------------
+// data ------------------------------------------------------------------------------------------------------------------------------------------------
 
-function unpacked(text, Kind) {
+function decodeArray(text, Kind) {
   return new Kind(Uint8Array.from(atob(text), c => c.charCodeAt(0)).buffer);
 }
 
-// how many of the sorted values are at most x
-function upTo(count, value, x) {
+// the number of sorted values that are at most x
+function countUpTo(count, value, x) {
   let low = 0, high = count;
   while (low < high) {
     const middle = (low + high) >> 1;
@@ -21,25 +21,25 @@ function upTo(count, value, x) {
 }
 
 const times = run.times, begin = times[0], end = times[times.length - 1];
-const poses = unpacked(run.poses, Float32Array), row = 7 * run.bodies.length;
-const phaseAt = t => Math.max(0, upTo(run.phases.length, i => run.phases[i].start, t) - 1);
-const written = (x, unit, digits) => x === null ? "–" : (digits ? x.toPrecision(digits) : x === 0 ? "0" : x.toExponential(1)) + " " + unit;
+const poses = decodeArray(run.poses, Float32Array), row = 7 * run.bodies.length;
+const phaseAt = t => Math.max(0, countUpTo(run.phases.length, i => run.phases[i].start, t) - 1);
+const formatQuantity = (x, unit, digits) => x === null ? "–" : (digits ? x.toPrecision(digits) : x === 0 ? "0" : x.toExponential(1)) + " " + unit;
 
-// everything that is shown at a time: bodies between two saved states, numbers that never mix two phases
-function moment(t) {
-  const a = Math.max(0, upTo(times.length, i => times[i], t) - 1), b = Math.min(a + 1, times.length - 1);
+// what the page shows at time t: poses interpolated between saved states a and b, numbers of one phase
+function momentAt(t) {
+  const a = Math.max(0, countUpTo(times.length, i => times[i], t) - 1), b = Math.min(a + 1, times.length - 1);
   const index = phaseAt(t), phase = run.phases[index];
-  const mine = k => phaseAt(times[k]) === index;
-  const [t0, e0] = mine(a) ? [times[a], run.energy[a]] : [phase.start, phase.energy[0]];
-  const [t1, e1] = mine(b) ? [times[b], run.energy[b]] : [phase.stop, phase.energy[1]];
+  const inPhase = k => phaseAt(times[k]) === index;
+  const [t0, e0] = inPhase(a) ? [times[a], run.energy[a]] : [phase.start, phase.energy[0]];
+  const [t1, e1] = inPhase(b) ? [times[b], run.energy[b]] : [phase.stop, phase.energy[1]];
   const part = (from, to) => to > from ? (t - from) / (to - from) : 0;
   const energy = e0 === null || e1 === null ? null : e0 + (e1 - e0) * part(t0, t1);
-  return { a, b, part: part(times[a], times[b]), phase, energy, gap: mine(a) ? run.gaps[a] : mine(b) ? run.gaps[b] : phase.gap };
+  return { a, b, part: part(times[a], times[b]), phase, energy, gap: inPhase(a) ? run.gaps[a] : inPhase(b) ? run.gaps[b] : phase.gap };
 }
 
 // scene --------------------------------------------------------------------------------------------------------------------------------------------------
 
-const scene = new THREE.Scene(), figure = new THREE.Group(), holds = new Map();
+const scene = new THREE.Scene(), figure = new THREE.Group(), linkMarkers = new Map();
 const bodies = run.bodies.map(name => Object.assign(new THREE.Group(), { name }));
 figure.add(...bodies);
 scene.add(figure);
@@ -54,9 +54,9 @@ const SHAPES = {
 };
 const meshes = run.meshes.map(({ vertices, faces }) => {
   const geometry = new THREE.BufferGeometry();
-  geometry.setAttribute("position", new THREE.BufferAttribute(unpacked(vertices, Float32Array), 3));
-  geometry.setIndex(new THREE.BufferAttribute(unpacked(faces, Uint32Array), 1));
-  // faces meet at sharp edges
+  geometry.setAttribute("position", new THREE.BufferAttribute(decodeArray(vertices, Float32Array), 3));
+  geometry.setIndex(new THREE.BufferAttribute(decodeArray(faces, Uint32Array), 1));
+  // separate vertices for each face give sharp edges
   const flat = geometry.toNonIndexed();
   flat.computeVertexNormals();
   return flat;
@@ -67,7 +67,7 @@ function addGeom({ body, kind, size, pos, quat: [w, x, y, z], rgba: [r, g, b, al
   const material = new THREE.MeshStandardMaterial({
     color: new THREE.Color().setRGB(r, g, b, THREE.SRGBColorSpace), roughness: 0.7, opacity: alpha, transparent: alpha < 1,
   });
-  // what has no inside is seen from both sides
+  // meshes may be open surfaces, planes are: draw both sides
   if (mesh !== undefined || kind === "plane") material.side = THREE.DoubleSide;
   const thing = new THREE.Mesh(mesh === undefined ? SHAPES[kind](...size) : meshes[mesh], material);
   thing.position.set(...pos);
@@ -91,24 +91,24 @@ function place({ a, b, part }) {
   figure.updateMatrixWorld(true);
 }
 
-// a virtual link that holds: a ball on its real link, and a rod to where its parent has the joint, which is elsewhere where the joint slides
-function holdOf(link) {
-  if (!holds.has(link.link)) {
+// markers of a connected virtual link: a ball at the joint's point on the real link, and a rod from it to the joint's point on the parent
+function linkMarker(link) {
+  if (!linkMarkers.has(link.link)) {
     const material = new THREE.MeshBasicMaterial({ color: color(link), transparent: true, opacity: 0.85, depthTest: false });
     const ball = new THREE.Mesh(new THREE.SphereGeometry(0.13 * run.size, 24, 16), material);
     const rod = new THREE.Mesh(new THREE.CylinderGeometry(0.04 * run.size, 0.04 * run.size, 1, 12).rotateX(Math.PI / 2), material);
     ball.renderOrder = rod.renderOrder = 1;
     ball.name = link.name;
     scene.add(ball, rod);
-    holds.set(link.link, [ball, rod]);
+    linkMarkers.set(link.link, [ball, rod]);
   }
-  return holds.get(link.link);
+  return linkMarkers.get(link.link);
 }
 
-function placeHolds({ phase }) {
-  holds.forEach(parts => parts.forEach(part => { part.visible = false; }));
+function placeLinkMarkers({ phase }) {
+  linkMarkers.forEach(parts => parts.forEach(part => { part.visible = false; }));
   phase.links.filter(link => link.ends).forEach(link => {
-    const [ball, rod] = holdOf(link), [parent, real] = link.ends.map(([body, pos]) => bodies[body].localToWorld(new THREE.Vector3(...pos)));
+    const [ball, rod] = linkMarker(link), [parent, real] = link.ends.map(([body, pos]) => bodies[body].localToWorld(new THREE.Vector3(...pos)));
     const length = parent.distanceTo(real);
     ball.visible = true;
     ball.position.copy(real);
@@ -119,7 +119,7 @@ function placeHolds({ phase }) {
   });
 }
 
-// the box that holds everything but planes, at all times
+// the bounding box of all geoms but planes, over the whole run
 function extent() {
   const box = new THREE.Box3(), frames = Math.min(times.length, 40);
   for (let i = 0; i < frames; i++) {
@@ -133,24 +133,24 @@ function extent() {
   return box.isEmpty() || box.min.equals(box.max) ? box.expandByScalar(1) : box;
 }
 
-const [flats, solids] = [true, false].map(flat => run.geoms.filter(({ kind }) => (kind === "plane") === flat));
+const [planes, solids] = [true, false].map(flat => run.geoms.filter(({ kind }) => (kind === "plane") === flat));
 solids.forEach(addGeom);
 const box = extent(), center = box.getCenter(new THREE.Vector3()), radius = box.getSize(new THREE.Vector3()).length() / 2;
-const cell = 10 ** Math.floor(Math.log10(radius)), wide = 2 * cell * Math.ceil(3 * radius / cell);
+const gridSpacing = 10 ** Math.floor(Math.log10(radius)), gridWidth = 2 * gridSpacing * Math.ceil(3 * radius / gridSpacing);
 
-// a grid on the plane that has no end, or on the ground where there is no plane; shadows fall on either
+// a grid, on the infinite plane of the scene or, in a scene without planes, on a ground that shows shadows only
 function addGround() {
-  const grid = new THREE.GridHelper(wide, wide / cell, "#9aa5b4", "#9aa5b4").rotateX(Math.PI / 2);
+  const grid = new THREE.GridHelper(gridWidth, gridWidth / gridSpacing, "#9aa5b4", "#9aa5b4").rotateX(Math.PI / 2);
   Object.assign(grid.material, { transparent: true, opacity: 0.5 });
-  const drawn = flats.map(flat => addGeom({ ...flat, size: flat.size.map(x => x || wide / 2) }));
+  const drawn = planes.map(flat => addGeom({ ...flat, size: flat.size.map(x => x || gridWidth / 2) }));
   drawn.forEach(({ material }) => Object.assign(material, { polygonOffset: true, polygonOffsetFactor: 1, polygonOffsetUnits: 1 }));
-  const endless = flats.findIndex(({ size }) => !size[0] && !size[1]);
-  if (endless >= 0) drawn[endless].add(grid);
-  if (flats.length) return;
-  const shade = new THREE.Mesh(new THREE.PlaneGeometry(wide, wide), new THREE.ShadowMaterial({ opacity: 0.25 }));
+  const infinite = planes.findIndex(({ size }) => !size[0] && !size[1]);
+  if (infinite >= 0) drawn[infinite].add(grid);
+  if (planes.length) return;
+  const shade = new THREE.Mesh(new THREE.PlaneGeometry(gridWidth, gridWidth), new THREE.ShadowMaterial({ opacity: 0.25 }));
   shade.receiveShadow = true;
   const ground = new THREE.Group().add(grid, shade);
-  // what hangs from a ceiling is not cut by the ground
+  // the ground is at z = 0, or at the lowest point of bodies that move below it
   ground.position.set(center.x, center.y, box.min.z > -0.05 * radius ? Math.min(0, box.min.z) : box.min.z);
   scene.add(ground);
 }
@@ -168,34 +168,34 @@ function addLights() {
 
 addGround();
 addLights();
-$("note").textContent = `grid ${cell >= 1e-3 && cell <= 1e3 ? cell : cell.toExponential()} m`;
+$("note").textContent = `grid ${gridSpacing >= 1e-3 && gridSpacing <= 1e3 ? gridSpacing : gridSpacing.toExponential()} m`;
 
 // view ---------------------------------------------------------------------------------------------------------------------------------------------------
 
 const camera = new THREE.PerspectiveCamera(35, 1, 0.01 * radius, 60 * radius);
 camera.up.set(0, 0, 1);
-let renderer = null, controls = null, fitted = true, asked = false;
+let renderer = null, controls = null, cameraFitted = true, drawRequested = false;
 
-// as near as the box is seen whole
+// move the camera as near as the whole box is in view
 function fit() {
-  const back = new THREE.Vector3(0.5, -1, 0.25).normalize(), right = new THREE.Vector3().crossVectors(camera.up, back).normalize();
-  const over = new THREE.Vector3().crossVectors(back, right), slope = Math.tan(camera.fov * Math.PI / 360);
+  const viewAxis = new THREE.Vector3(0.5, -1, 0.25).normalize(), right = new THREE.Vector3().crossVectors(camera.up, viewAxis).normalize();
+  const over = new THREE.Vector3().crossVectors(viewAxis, right), slope = Math.tan(camera.fov * Math.PI / 360);
   let distance = 0;
   for (let corner = 0; corner < 8; corner++) {
     const [x, y, z] = ["x", "y", "z"].map((axis, k) => (corner >> k & 1 ? box.max : box.min)[axis] - center[axis]), d = new THREE.Vector3(x, y, z);
-    distance = Math.max(distance, d.dot(back) + 1.06 * Math.max(Math.abs(d.dot(over)), Math.abs(d.dot(right)) / camera.aspect) / slope);
+    distance = Math.max(distance, d.dot(viewAxis) + 1.06 * Math.max(Math.abs(d.dot(over)), Math.abs(d.dot(right)) / camera.aspect) / slope);
   }
-  camera.position.copy(center).addScaledVector(back, distance);
+  camera.position.copy(center).addScaledVector(viewAxis, distance);
   controls.target.copy(center);
   controls.update();
-  fitted = true;
+  cameraFitted = true;
 }
 
 function draw() {
-  if (asked || !renderer) return;
-  asked = true;
+  if (drawRequested || !renderer) return;
+  drawRequested = true;
   requestAnimationFrame(() => {
-    asked = false;
+    drawRequested = false;
     renderer.render(scene, camera);
   });
 }
@@ -207,7 +207,7 @@ function resize() {
   renderer.setSize(width, height, false);
   camera.aspect = width / height;
   camera.updateProjectionMatrix();
-  if (fitted) fit();
+  if (cameraFitted) fit();
   draw();
 }
 
@@ -216,7 +216,7 @@ try {
   renderer.shadowMap.enabled = true;
   $("view").prepend(renderer.domElement);
   controls = new THREE.OrbitControls(camera, renderer.domElement);
-  controls.addEventListener("start", () => { fitted = false; });
+  controls.addEventListener("start", () => { cameraFitted = false; });
   controls.addEventListener("change", draw);
   new ResizeObserver(resize).observe($("view"));
 } catch (error) {
@@ -226,15 +226,15 @@ try {
 // time ---------------------------------------------------------------------------------------------------------------------------------------------------
 
 const element = (kind, parts, ...inside) => {
-  const made = Object.assign(document.createElement(kind), parts);
-  made.append(...inside);
-  return made;
+  const node = Object.assign(document.createElement(kind), parts);
+  node.append(...inside);
+  return node;
 };
 const percent = t => `${end > begin ? 100 * (t - begin) / (end - begin) : 0}%`;
 const now = element("div", { id: "now" }), track = $("track");
 let time = begin, playing = false, last = 0;
 
-// a band for each phase, a mark and a line in the list for each event
+// a band of the time line for each phase; a mark on it, and a line of the list, for each event
 run.phases.forEach((phase, i) => {
   const stop = i + 1 < run.phases.length ? run.phases[i + 1].start : end, start = Math.max(phase.start, begin);
   const band = element("div", { className: "phase" }, element("b", {}, element("span", { textContent: "mobility " }), phase.mobility));
@@ -256,15 +256,15 @@ Object.entries({ min: begin, max: end }).forEach(([name, t]) => track.setAttribu
 
 function seek(t) {
   time = Math.min(Math.max(t, begin), end);
-  const shown = moment(time);
+  const shown = momentAt(time);
   place(shown);
-  placeHolds(shown);
+  placeLinkMarkers(shown);
   now.style.left = percent(time);
   track.setAttribute("aria-valuenow", time.toFixed(3));
   $("time").textContent = `${time.toFixed(3)} s`;
   $("mobility").textContent = shown.phase.mobility;
-  $("energy").textContent = written(shown.energy, "J", 8);
-  $("gap").textContent = `${written(shown.gap[1], "m")}\n${written(shown.gap[0], "rad")}`;
+  $("energy").textContent = formatQuantity(shown.energy, "J", 8);
+  $("gap").textContent = `${formatQuantity(shown.gap[1], "m")}\n${formatQuantity(shown.gap[0], "rad")}`;
   const held = shown.phase.links.map(link => {
     const dot = element("i");
     dot.style.background = color(link);
@@ -300,23 +300,23 @@ function drag(event) {
 
 $("play").onclick = () => play(!playing);
 track.onpointerdown = event => {
-  // a mark is clicked, not dragged
+  // a press on a mark is a click, not a drag
   if (event.target.className.startsWith("mark")) return;
   track.setPointerCapture(event.pointerId);
   drag(event);
 };
 track.onpointermove = event => { if (track.hasPointerCapture(event.pointerId)) drag(event); };
-const frameBy = step => times[Math.min(Math.max(upTo(times.length, i => times[i], time) - 1 + step, 0), times.length - 1)];
+const frameBy = step => times[Math.min(Math.max(countUpTo(times.length, i => times[i], time) - 1 + step, 0), times.length - 1)];
 const KEYS = {
   " ": () => play(!playing), Home: () => seek(begin), End: () => seek(end), ArrowRight: () => seek(frameBy(1)), ArrowLeft: () => seek(frameBy(-1)),
 };
 addEventListener("keydown", event => {
-  // a button has its own use for the space bar, a menu for every key
+  // leave the space bar to buttons, and every key to menus
   if (!KEYS[event.key] || event.ctrlKey || event.altKey || event.metaKey || event.target.closest?.(event.key === " " ? "button, select" : "select")) return;
   event.preventDefault();
   KEYS[event.key]();
 });
 
 seek(begin);
-// for the console
-globalThis.svkc = { run, bodies, holds, camera, seek, play, get time() { return time; } };
+// for the browser's console and the tests
+globalThis.svkc = { run, bodies, linkMarkers, camera, seek, play, get time() { return time; } };
