@@ -5,15 +5,7 @@ import numpy as np
 from svkc import _deprecated
 from svkc.mjcf.load import load
 from svkc.model.chain import Chain, State
-from svkc.scenes.figure import (
-    ARM_LENGTH,
-    BAR_HEIGHT,
-    HALF_SHOULDER_WIDTH,
-    add_rod,
-    figure16,
-    hand_on_bar,
-    hanging_pose,
-)
+from svkc.scenes import figure
 
 BAR_RADIUS = 0.02  # m: bars, and the rails that carry them
 BAR_SPACING = 0.5  # m: distance between bars
@@ -22,7 +14,7 @@ BAR_SPACING = 0.5  # m: distance between bars
 def brachiation(**options) -> tuple[Chain, State]:
     """Return the chain of the 16-joint figure under three bars, and its initial state.
 
-    The bars lie along y, `BAR_SPACING` apart along x, `BAR_HEIGHT` above the ground. Two rails
+    The bars lie along y, `BAR_SPACING` apart along x, `figure.BAR_HEIGHT` above the ground. Two rails
     carry them. The virtual links "right_hand_bar1", "left_hand_bar2" and "right_hand_bar3" are
     hinges about the bars. Mobility is 17 with one hand on a bar, 12 with two. In the initial state
     the right hand holds the first bar, and the figure is at rest, rotated backwards by 0.9 rad
@@ -30,23 +22,25 @@ def brachiation(**options) -> tuple[Chain, State]:
 
     options: keyword arguments of `svkc.load`.
     """
-    spec = figure16()
+    spec = figure.figure16()
     for bar in range(3):
         x = bar * BAR_SPACING
-        ends = (x, -0.6, BAR_HEIGHT), (x, 0.6, BAR_HEIGHT)
-        add_rod(spec, *ends, radius=BAR_RADIUS, name=f"bar{bar + 1}")
-    rail = BAR_HEIGHT + 2 * BAR_RADIUS
+        ends = (x, -0.6, figure.BAR_HEIGHT), (x, 0.6, figure.BAR_HEIGHT)
+        figure.add_rod(spec, *ends, radius=BAR_RADIUS, name=f"bar{bar + 1}")
+    rail = figure.BAR_HEIGHT + 2 * BAR_RADIUS
     for y in (-0.6, 0.6):
-        add_rod(spec, (-BAR_SPACING / 2, y, rail), (2.5 * BAR_SPACING, y, rail), radius=BAR_RADIUS)
-    hands = [
-        hand_on_bar(f"{side}_hand_bar{bar + 1}", side, x=bar * BAR_SPACING, y=y, connected=bar == 0)
-        for bar, (side, y) in enumerate(
-            (
-                ("right", -HALF_SHOULDER_WIDTH),
-                ("left", HALF_SHOULDER_WIDTH),
-                ("right", -HALF_SHOULDER_WIDTH),
-            )
+        figure.add_rod(
+            spec, (-BAR_SPACING / 2, y, rail), (2.5 * BAR_SPACING, y, rail), radius=BAR_RADIUS
         )
+    hands = [
+        figure.hand_on_bar(
+            f"{side}_hand_bar{bar + 1}",
+            side,
+            x=bar * BAR_SPACING,
+            y=sign * figure.HALF_SHOULDER_WIDTH,
+            connected=bar == 0,
+        )
+        for bar, (side, sign) in enumerate((("right", -1), ("left", 1), ("right", -1)))
     ]
     chain = load(spec, virtual_links=hands, **options)
     return chain, hanging_state(chain, angle=0.9)
@@ -61,7 +55,7 @@ def hanging_state(chain: Chain, angle: float) -> State:
     angle: rotation of the figure about the bar (rad). Positive angles move the hips backwards.
     """
     q = {
-        "base": hanging_pose(ARM_LENGTH, angle),
+        "base": figure.hanging_pose(figure.ARM_LENGTH, angle),
         "right_shoulder_flexion": np.pi - 0.1,
         "right_elbow": 0.1,
         "left_shoulder_flexion": 1.2,
