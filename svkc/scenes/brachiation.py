@@ -14,11 +14,11 @@ BAR_SPACING = 0.5  # m: distance between bars
 def brachiation(**options) -> tuple[Chain, State]:
     """Return the chain of the 16-joint figure under three bars, and its initial state.
 
-    The bars lie along y, `BAR_SPACING` apart along x, `figure.BAR_HEIGHT` above the ground. Two rails
-    carry them. The virtual links "right_hand_bar1", "left_hand_bar2" and "right_hand_bar3" are
-    hinges about the bars. Mobility is 17 with one hand on a bar, 12 with two. In the initial state
-    the right hand holds the first bar, and the figure is at rest, rotated backwards by 0.9 rad
-    about this bar.
+    The bars lie along y, `BAR_SPACING` apart along x, at `figure.BAR_HEIGHT` above the ground.
+    Two rails carry them. The virtual links "right_hand_bar1", "left_hand_bar2" and
+    "right_hand_bar3" are hinges about the bars. Mobility is 17 with one hand on a bar, 12 with two.
+    In the initial state the right hand holds the first bar, and the figure is at rest, rotated
+    backwards by 0.9 rad about this bar.
 
     options: keyword arguments of `svkc.load`.
     """
