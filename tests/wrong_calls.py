@@ -1,5 +1,6 @@
 """Calls that raise, by the message that each raises."""
 
+import threading
 from unittest import mock
 
 import diffrax
@@ -105,6 +106,11 @@ def simulate_without_x64(s):
 def rollout_with_nine_processes(s):
     with mock.patch("jax.process_count", return_value=9):
         s.rollout()
+
+
+def rollout_with_a_lock(s):
+    lock = threading.Lock()
+    s.rollout(out=s.folder / "chunks", control=lambda t, state, args: state.v * lock.locked())
 
 
 def rollout_out_of_memory(s):
@@ -245,6 +251,7 @@ CASES = {
     "no joint coordinate": lambda s: svkc.with_independent(s.four, s.state, "nobody"),
     "source: no such file": lambda s: s.load("nowhere.xml"),
     "no virtual link": lambda s: svkc.cut(s.four, s.state, "nobody"),
+    "out: ... cannot": rollout_with_a_lock,
     "overload: give": lambda s: svkc.overload(s.four, "pin"),
     "q: the quaternion": (
         lambda s: s.load(models.MJCF.format(models.bar("b", 'type="ball"', "0 0 1"))).state(

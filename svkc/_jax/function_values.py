@@ -109,7 +109,7 @@ _dict = lambda keys, *values: dict(zip(keys, values))
 _tree = lambda shape, *parts: jax.tree.unflatten(shape, parts)
 
 
-def _is_library_module(space) -> bool:
+def is_library_module(space) -> bool:
     """Return whether these are the globals of a module of Python, a package, or svkc."""
     return str(space.get("__file__")).startswith(LIBRARY_FOLDERS) or getattr(
         space.get("__spec__"), "origin", None
@@ -122,9 +122,9 @@ def defined_by_library(x) -> bool:
     Also true for jit-wrapped functions of any module, which JAX compares by identity.
     """
     if isinstance(x, types.ModuleType):
-        return _is_library_module(vars(x))
+        return is_library_module(vars(x))
     scope = sys.modules.get(str(getattr(x, "__module__", None)))
-    if scope is None or not (_is_library_module(vars(scope)) or isinstance(x, JIT_FUNCTION_TYPE)):
+    if scope is None or not (is_library_module(vars(scope)) or isinstance(x, JIT_FUNCTION_TYPE)):
         return False
     for name in str(getattr(x, "__qualname__", None) or getattr(x, "__name__", None)).split("."):
         scope = getattr(scope, name, None)
@@ -165,7 +165,7 @@ def _decompose_function(f: types.FunctionType):
             "a variable outside that it assigns" if written else "a function with attributes"
         )
     # the globals of a library are assumed constant
-    space, own = f.__globals__, not _is_library_module(f.__globals__)
+    space, own = f.__globals__, not is_library_module(f.__globals__)
     names, imports = (
         tuple(sorted(used)) if own else () for used in (names & space.keys(), imports)
     )

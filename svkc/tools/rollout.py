@@ -1,6 +1,5 @@
 """Batches of runs: lanes are distributed over chunks, and chunks over devices and processes."""
 
-import hashlib
 import json
 import os
 import pathlib
@@ -15,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
+from svkc._jax.content_digest import content_digest
 from svkc._jax.functions import call_with_comparable
 from svkc.integration.replay import Replay
 from svkc.model.chain import Chain, State
@@ -43,14 +43,15 @@ def rollout(
     chunk: lanes that one device runs at once; memory grows with them. Default: 64 on a CPU, else
         4096.
     out: folder for finished chunks (chunk_00000.npz and so on, readable by `svkc.load_trajectory`).
-        An equal call continues from it. Not compared: `lane`, function bodies, static options.
+        An equal call continues from it. All arguments are compared by content: functions by code
+        and by the values that they read, functions of installed packages by name.
     devices: devices to use. Default: all of this process. For several CPU devices call
         `jax.config.update("jax_num_cpu_devices", n)` before the first use of jax.
     progress: whether to print progress.
     options: further arguments of `simulate`, for all lanes. `throw` is False by default: the result
         codes of failed lanes are in `result`.
 
-    Raises ValueError if leading axes differ, an option is invalid, or `out` holds another rollout.
+    Raises ValueError if leading axes differ, an option is invalid, `out` holds another rollout.
     Raises RuntimeError if a chunk does not fit into memory or another process ended early.
     """
     check_chain(chain)
@@ -62,8 +63,8 @@ def rollout(
     order = np.arange(lanes) if cost is None else np.argsort(np.asarray(cost), kind="stable")
     chunks = _assign_chunks(order, size)
     run = _chunk_runner(chain, jnp.asarray(t1, states.q.dtype), lane, options, devices)
-    inputs = (chain, states, t1, data, order, options)
-    folder = None if out is None else _prepare_folder(pathlib.Path(out), inputs, size)
+    inputs = {"chain": chain, "states": states, "t1": t1, "data": data, "lane": lane, **options}
+    folder = _prepare_folder(out, inputs | {"cost": order, "chunk": size})
     own_chunks = range(jax.process_index(), len(chunks), jax.process_count())
     done, start = {}, time.perf_counter()
     for count, i in enumerate(own_chunks, 1):
@@ -72,9 +73,8 @@ def rollout(
         done[i] = _load_or_run(run, own_lanes, file, chain, chunk)
         if progress:
             _print_progress(count, len(own_chunks), lanes, time.perf_counter() - start)
-    inverse_order = np.argsort(order)
     all_chunks = _gather_chunks(done, len(chunks))
-    return jax.tree.map(lambda *x: np.concatenate(x)[inverse_order], *all_chunks)
+    return jax.tree.map(lambda *x: np.concatenate(x)[np.argsort(order)], *all_chunks)
 
 
 def _prepare_devices(devices, chunk: int | None, lanes: int) -> tuple[list[Any], int]:
@@ -172,32 +172,45 @@ def _run_chunk(common, lanes, mesh: Mesh) -> Trajectory:
     return parts(arrays, *lanes)
 
 
-def _prepare_folder(folder: pathlib.Path, inputs, size: int) -> pathlib.Path:
-    """Create the folder and label it with a hash of the rollout's arguments.
+def _prepare_folder(out, inputs: dict[str, Any]) -> pathlib.Path | None:
+    """Create the folder and label it with a digest of each input of the rollout, by name.
 
-    Raises ValueError if the folder is labelled with another hash.
+    Return the folder, or None if `out` is None.
+
+    Raises ValueError if an input has no digest, or if the folder is labelled with other digests.
     """
-    digest = hashlib.sha256()
-    for path, leaf in jax.tree_util.tree_leaves_with_path(inputs):
-        digest.update(jax.tree_util.keystr(path).encode())
-        # leaves only: another `lane`, function body or option without leaves is not noticed
-        digest.update(
-            np.ascontiguousarray(leaf).tobytes()
-            if eqx.is_array_like(leaf)
-            else repr(getattr(leaf, "__qualname__", leaf)).encode()
-        )
-    description = {"rollout": digest.hexdigest(), "lanes in a chunk": size}
+    if out is None:
+        return None
+    folder = pathlib.Path(out)
+    # a progress meter changes no number
+    compared = {name: x for name, x in inputs.items() if x is not None and name != "progress_meter"}
+    description = {"inputs": {name: _digest(name, compared[name]) for name in sorted(compared)}}
     folder.mkdir(parents=True, exist_ok=True)
     label_path = folder / "rollout.json"
-    if label_path.exists() and json.loads(label_path.read_text()) != description:
-        raise ValueError(
-            f"out: {folder} holds another rollout (other states, options or chunks); give another"
-            " folder, or empty it"
-        )
+    if label_path.exists():
+        new, old = description["inputs"], json.loads(label_path.read_text()).get("inputs", {})
+        other = sorted(name for name in new | old if new.get(name) != old.get(name))
+        if other:
+            raise ValueError(
+                f"out: {folder} holds another rollout, with other {', '.join(other)}; give another"
+                " folder, or empty it"
+            )
     temporary = folder / f"rollout.{os.getpid()}.part"
     temporary.write_text(json.dumps(description))
     temporary.replace(label_path)
     return folder
+
+
+def _digest(name: str, value) -> str:
+    """Return the digest of an input. Raises ValueError if its content cannot be compared."""
+    try:
+        return content_digest(value)
+    # an object of the user may raise any error when it is read
+    except Exception as error:
+        raise ValueError(
+            f"out: {name} cannot be compared with that of a later call ({error}); let it hold"
+            " numbers, arrays, containers and functions only"
+        ) from error
 
 
 def _load_or_run(

@@ -188,6 +188,52 @@ def test_an_interrupted_rollout_resumes(case, single_runs, tmp_path, monkeypatch
         )
 
 
+def scaled(gain):
+    return lambda t, state, args: gain * args * state.v
+
+
+def test_a_folder_continues_the_same_rollout_only(tmp_path):
+    """Another value in `control` or `lane`, another body of either, and other options are refused
+    by name; equal functions that are new objects are not."""
+    chain = svkc.load(models.ARM)
+    state = chain.state({"arm": 0.3})
+    own = lambda end, options=None: lambda chain, data: {"t1": end, **(options or {})}
+
+    def run(**other):
+        options = {"control": scaled(2.0), "lane": own(0.02), "args": 1.0, "dt": 0.01} | other
+        chains = options.pop("chain", chain)
+        states = jax.tree.map(lambda x: x[None], options.pop("states", state))
+        return svkc.rollout(chains, states, 0.02, out=tmp_path, progress=False, **options)
+
+    first = run()
+    label = tmp_path / "rollout.json"
+    stamp = (tmp_path / "chunk_00000.npz").stat().st_mtime_ns
+    assert run().final.q.tolist() == first.final.q.tolist()
+    assert (tmp_path / "chunk_00000.npz").stat().st_mtime_ns == stamp
+    others = {
+        "control": {"control": scaled(3.0)},
+        "lane": {"lane": own(0.01)},
+        "args": {"args": 2.0},
+        "solver": {"solver": svkc.integrators.SymplecticEuler()},
+        "dt": {"dt": 0.005},
+        "events": {"events": [svkc.when(lambda t, state, args: state.q[0] - 1)]},
+        "chain": {"chain": eqx.tree_at(lambda c: c.mass, chain, chain.mass * 2)},
+        "states": {"states": chain.state({"arm": 0.4})},
+        "data": {"data": jnp.zeros(1)},
+        "control, lane": {
+            "control": lambda t, state, args: 2.0 * args + state.v,
+            "lane": lambda chain, data: {},
+        },
+    }
+    for name, other in others.items():
+        with pytest.raises(ValueError, match=f"holds another rollout, with other {name}; give"):
+            run(**other)
+    # of an older version, which did not compare functions
+    label.write_text('{"rollout": "0123", "lanes in a chunk": 1}')
+    with pytest.raises(ValueError, match="holds another rollout, with other args, chain, chunk"):
+        run()
+
+
 def start_processes(count, out, dies=""):
     with socket.socket() as s:
         s.bind(("localhost", 0))
