@@ -19,7 +19,7 @@ from svkc.model.chain import Chain as Chain, State as State, Structure as Struct
 from svkc.model.virtual_link import VirtualLink as VirtualLink
 from svkc.transitions.spare_links import Grip as Grip
 from svkc.simulation.trajectory import Trajectory as Trajectory
-from svkc.simulation.records import RESULTS as RESULTS
+from svkc.simulation.codes import RESULTS as RESULTS
 
 # files
 from svkc.mjcf.load import load as load

@@ -10,6 +10,10 @@ RENAMED = {
     "Drift": "stabilization.NoStabilization",
     "Exact": "stabilization.CoordinatePartitioning",
     "Projection": "stabilization.Projection",
+    "RESULTS.grazing": "types.DERIVATIVE.grazing",
+    "RESULTS.jump": "types.DERIVATIVE.jump",
+    "RESULTS.rank_lost": "types.DERIVATIVE.rank_lost",
+    "RESULTS.together": "types.DERIVATIVE.together",
     "Replay": "integrators.Replay",
     "RodriguesEuler": "integrators.RodriguesEuler",
     "SemiImplicitEuler": "integrators.SymplecticEuler",
@@ -56,6 +60,26 @@ SUPERSEDED = {
 }
 
 
+def _warn(name: str, use: str, stacklevel: int) -> None:
+    """Warn that a name below `svkc.` is deprecated."""
+    warnings.warn(
+        f"svkc.{name} is deprecated and leaves with the next release; use {use}",
+        DeprecationWarning,
+        stacklevel=stacklevel,
+    )
+
+
+def warn_of_results(name: str, stacklevel: int) -> None:
+    """Warn that a code of derivatives was read from `svkc.RESULTS`.
+
+    name: of the code; "": `svkc.RESULTS` was compared with, or indexed by, such a code.
+    """
+    if name:
+        _warn(f"RESULTS.{name}", f"svkc.{RENAMED[f'RESULTS.{name}']}", stacklevel + 1)
+    else:
+        _warn("RESULTS for traj.derivative", "svkc.types.DERIVATIVE", stacklevel + 1)
+
+
 def resolve(name: str):
     """Return the object of a deprecated name `svkc.<name>`, with a `DeprecationWarning`.
 
@@ -70,10 +94,6 @@ def resolve(name: str):
     else:
         module, _, attribute = f"svkc.{name}".rpartition(".")
         raise AttributeError(f"module {module!r} has no attribute {attribute!r}")
-    warnings.warn(
-        f"svkc.{name} is deprecated and leaves with the next release; use {use}",
-        DeprecationWarning,
-        stacklevel=3,
-    )
+    _warn(name, use, stacklevel=4)
     module, _, attribute = f"svkc.{path}".rpartition(".")
     return getattr(importlib.import_module(module), attribute)

@@ -1,10 +1,11 @@
-"""Types of results, for annotations and for `isinstance`."""
+"""Types of results, for annotations and for `isinstance`, and the codes in `traj.derivative`."""
 
 from svkc.loops.actuation import Actuation as Actuation
 from svkc.loops.constrained_dynamics import AbstractDynamics as AbstractDynamics
 from svkc.loops.coordinates import Coordinates as Coordinates
 from svkc.loops.forward_dynamics import LoopForces as LoopForces
 from svkc.loops.mobility import Mobility as Mobility
+from svkc.simulation.codes import DERIVATIVE as DERIVATIVE
 from svkc.simulation.records import Events as Events, Phases as Phases
 from svkc.simulation.trajectory import Report as Report
 from svkc.tools.gradient_check import GradientCheck as GradientCheck

@@ -60,6 +60,12 @@ def _rows(head: str) -> list[str]:
     return [line.removeprefix("| ").split(" | ")[0].replace("&lt;", "<") for line in lines]
 
 
+def codes(enumeration: str) -> list[str]:
+    """Return the codes of the table below the heading that names an enumeration."""
+    table = PAGE.split(f"{enumeration}`\n")[1].split("\n## ")[0]
+    return re.findall(r"^\| `(\w+)` \|", table, re.M)
+
+
 ROWS = _rows("message | raised by | what to do")
 COMPILED = _rows("message inside compiled programs | raised by | what to do")
 OTHERS = _rows("message | from | what to do")

@@ -9,8 +9,9 @@ from jaxtyping import Array, Bool
 from svkc._jax.control_flow import unvmap_any
 from svkc.integration.ode import ODEState, is_finite
 from svkc.model.chain import Chain, State, Structure
+from svkc.simulation.codes import RESULTS
 from svkc.simulation.phase import PhaseOutcome, RunState
-from svkc.simulation.records import RESULTS, Events
+from svkc.simulation.records import Events
 from svkc.transitions.impact import StructureChange
 from svkc.transitions.plan import Plan
 from svkc.transitions.spare_links import bind_grip, cleared

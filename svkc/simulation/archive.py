@@ -11,22 +11,28 @@ import pathlib
 import threading
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from svkc._jax.enumerations import member_names, with_value
 from svkc.mjcf.load import load
 from svkc.model.chain import Chain, State, Structure
 from svkc.model.checked_jit import check_chain
 from svkc.model.virtual_link import VirtualLink
-from svkc.simulation.records import RESULTS, Events, Phases
+from svkc.simulation.codes import CODES
+from svkc.simulation.records import Events, Phases
 from svkc.simulation.trajectory import Trajectory
 
 # Increase the schema whenever a stored array is added, renamed or changes its meaning: files of
-# every other schema are refused.
-SCHEMA = 4
-_RESULT_CODES = ("result", "derivative")
+# schemas that are not readable are refused.
+SCHEMA = 5
+# Schema 4 differs from schema 5 in its result codes only: integers, the indices of these names.
+READABLE = (4, SCHEMA)
+_CODES_OF_SCHEMA_4 = (
+    "successful", "stopped", "max_events", "max_steps", "step_too_small", "not_in_place",
+    "loop_open", "non_finite", "grazing", "jump", "together", "rank_lost", "no_slot",
+)  # fmt: skip
 _NESTED = {
     "states": State,
     "final": State,
@@ -43,7 +49,7 @@ def _flatten(node, prefix: str = "") -> dict[str, np.ndarray]:
         value, name = getattr(node, field.name), prefix + field.name
         if field.name in _NESTED:
             out |= _flatten(value, name + ".")
-        elif field.name not in _RESULT_CODES and value is not None:
+        elif field.name not in CODES and value is not None:
             out[name] = np.asarray(value)
     return out
 
@@ -79,7 +85,9 @@ def save(traj: Trajectory, path, chain=None, options=None) -> None:
         "jax": jax.__version__,
         "units": "SI, rad, wxyz",
     }
-    meta |= {name: np.asarray(getattr(traj, name)._value).tolist() for name in _RESULT_CODES}
+    for field, enumeration in CODES.items():
+        values = np.asarray(getattr(traj, field)._value)
+        meta[field] = np.array(member_names(enumeration))[values].tolist()
     certify = Trajectory.report
     for _ in range(np.ndim(traj.ts) - 1):
         # a batch of runs
@@ -88,7 +96,7 @@ def save(traj: Trajectory, path, chain=None, options=None) -> None:
     meta["certificate"] = {
         f.name: np.asarray(getattr(report, f.name)).tolist()
         for f in dataclasses.fields(report)
-        if f.name not in _RESULT_CODES
+        if f.name not in CODES
     }
     meta["options"] = options or {}
     arrays: dict[str, Any] = _flatten(traj)
@@ -114,7 +122,7 @@ def _array_names(cls, prefix: str = "") -> set[str]:
     for field in dataclasses.fields(cls):
         if field.name in _NESTED:
             out |= _array_names(_NESTED[field.name], prefix + field.name + ".")
-        elif field.name not in (*_RESULT_CODES, "locked", "independent"):
+        elif field.name not in (*CODES, "locked", "independent"):
             out.add(prefix + field.name)
     return out
 
@@ -173,25 +181,39 @@ def load_trajectory(path) -> Trajectory:
     FileNotFoundError if there is no file.
     """
     arrays, _, codes = _read("load_trajectory", path)
+    codes = _as_codes(path, codes)
     arrays = {name: x for name, x in arrays.items() if not name.startswith("chain.")}
     _check_complete(path, arrays, _array_names(Trajectory))
-    code = lambda value: eqx.tree_at(lambda item: item._value, RESULTS.successful, value)
-    build = lambda arrays, codes: _build(
-        Trajectory, arrays, **{name: code(value) for name, value in codes.items()}
-    )
+    build = lambda arrays, codes: _build(Trajectory, arrays, **codes)
     for _ in range(arrays["ts"].ndim - 1):
         # a batch of runs
         build = jax.vmap(build)
     try:
-        return build(arrays, {name: jnp.asarray(code) for name, code in codes.items()})
+        return build(arrays, codes)
     except (TypeError, ValueError) as error:
         raise ValueError(
             f"{path} is not a complete trajectory file written by svkc: {error}"
         ) from error
 
 
+def _as_codes(path, codes: dict[str, np.ndarray]) -> dict[str, Any]:
+    """Return the codes as members of their enumerations. Raises ValueError for unknown names."""
+    members = {}
+    for field, names in codes.items():
+        known = member_names(CODES[field])
+        unknown = sorted(set(names.ravel().tolist()) - set(known))
+        if unknown:
+            raise ValueError(
+                f"{path} has the {field} {', '.join(unknown)}, which this version of svkc does not"
+                " know; load it with the version of svkc that wrote it"
+            )
+        values = np.vectorize(known.index, otypes=[np.int32])(names)
+        members[field] = with_value(CODES[field].successful, jnp.asarray(values))
+    return members
+
+
 def _read(caller: str, path) -> tuple[dict[str, np.ndarray], dict, dict[str, np.ndarray]]:
-    """Return the arrays, the metadata and the result codes of a file. Raises as
+    """Return the arrays, the metadata and the names of the codes of a file. Raises as
     `load_trajectory` does.
 
     caller: the function that the user called, for messages.
@@ -203,11 +225,8 @@ def _read(caller: str, path) -> tuple[dict[str, np.ndarray], dict, dict[str, np.
             arrays = {name: file[name] for name in file.files}
         meta = json.loads(str(arrays.pop("metadata")))
         schema = int(meta["schema"])
-        codes = (
-            {name: np.asarray(meta[name], np.int32) for name in _RESULT_CODES}
-            if schema == SCHEMA
-            else {}
-        )
+        as_names = (lambda code: np.take(_CODES_OF_SCHEMA_4, code)) if schema == 4 else np.asarray
+        codes = {name: np.asarray(as_names(meta[name])) for name in CODES if schema in READABLE}
     except FileNotFoundError:
         raise
     # the readers of zip, npy and JSON raise exceptions of many types for a damaged file
@@ -215,9 +234,9 @@ def _read(caller: str, path) -> tuple[dict[str, np.ndarray], dict, dict[str, np.
         raise ValueError(
             f"{path} is not a complete trajectory file written by svkc: {error}"
         ) from error
-    if schema != SCHEMA:
+    if schema not in READABLE:
         raise ValueError(
-            f"{path} has schema {schema}, this version reads schema {SCHEMA}; load it with the"
-            " version of svkc that wrote it"
+            f"{path} has schema {schema}, this version reads schemas {READABLE[0]} to {SCHEMA};"
+            " load it with the version of svkc that wrote it"
         )
     return arrays, meta, codes

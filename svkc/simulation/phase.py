@@ -28,8 +28,9 @@ from svkc.integration.solution import (
 )
 from svkc.integration.vector_field import VectorField
 from svkc.model.chain import State
+from svkc.simulation.codes import DERIVATIVE, RESULTS
 from svkc.simulation.options import Options
-from svkc.simulation.records import RESULTS, Events, PhaseRecords
+from svkc.simulation.records import Events, PhaseRecords
 from svkc.transitions.plan import Plan
 
 
@@ -57,7 +58,7 @@ class RunState(eqx.Module):
     count: Int[Array, ""]
     saved: State
     result: RESULTS
-    derivative: RESULTS
+    derivative: DERIVATIVE
     invalid_from: Int[Array, ""]
 
 
@@ -79,7 +80,7 @@ class PhaseOutcome(eqx.Module):
     ys: ODEState
     solution: PhaseSolution
     result: RESULTS
-    derivative: RESULTS
+    derivative: DERIVATIVE
 
 
 def solve_phase(
@@ -116,13 +117,13 @@ def solve_phase(
         ys=solution.ys,
         solution=stop_gradient_tree(solution),
         result=_as_result(solution.result, solution.y),
-        derivative=RESULTS.successful,
+        derivative=DERIVATIVE.successful,
     )
     if event is None:
         return outcome
-    code = RESULTS.where(event.jumps, RESULTS.jump, RESULTS.successful)
-    code = RESULTS.where(jnp.sum(event.fired) > 1, RESULTS.together, code)
-    code = RESULTS.where(event.grazing, RESULTS.grazing, code)
+    code = DERIVATIVE.where(event.jumps, DERIVATIVE.jump, DERIVATIVE.successful)
+    code = DERIVATIVE.where(jnp.sum(event.fired) > 1, DERIVATIVE.together, code)
+    code = DERIVATIVE.where(event.grazing, DERIVATIVE.grazing, code)
     return dataclasses.replace(
         outcome, fired=event.fired, guard_values=event.values, derivative=code
     )

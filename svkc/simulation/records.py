@@ -1,5 +1,4 @@
-"""The outcomes of a run, and the records that a run writes: one row for each phase and one for each
-event."""
+"""The records that a run writes: one row for each phase and one for each event."""
 
 import equinox as eqx
 import jax
@@ -113,47 +112,6 @@ def write_phase_row(
         row.reshape(-1, *(1,) * jnp.ndim(new)), jnp.asarray(new)[None], old
     )
     return jax.tree.map(write, records, new)
-
-
-class RESULTS(eqx.Enumeration):
-    """How a run ended, for each element of a batch, and why a run has no derivative."""
-
-    successful = ""
-    stopped = "An event stopped the run."
-    max_events = (
-        "More events than max_events: the final state is that after the last recorded event. Raise"
-        " max_events, or look for chattering."
-    )
-    max_steps = "More steps than max_steps in one phase. Raise max_steps, or loosen rtol and atol."
-    step_too_small = (
-        "The step size fell to its lower bound: the problem is too stiff, or singular, for this"
-        " solver and tolerance."
-    )
-    not_in_place = (
-        "An event connects a link at its declared placement, but the bodies were elsewhere. Use"
-        " here=True, or a guard that waits until they are there."
-    )
-    loop_open = (
-        "A loop is open by more than the tolerance. Use smaller steps, or projection; check the"
-        " mobility and its margin there."
-    )
-    non_finite = "A non-finite number appeared."
-    grazing = (
-        "A guard touched zero without crossing it: the time of its event has no derivative;"
-        " derivatives are NaN."
-    )
-    jump = "A guard jumped over zero: derivatives treat the time of its event as constant."
-    together = (
-        "Events happened at one instant: derivatives hold for this order of events, and do not"
-        " exist if their times can separate."
-    )
-    rank_lost = (
-        "The loops lose rank at an end of a phase: derivatives across that end are unreliable."
-    )
-    no_slot = (
-        "An event makes a grip, but every spare slot was bound: the grip was skipped, all other"
-        " changes were made. Load with more spare slots, or unbind."
-    )
 
 
 class Phases(eqx.Module):

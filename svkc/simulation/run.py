@@ -16,9 +16,10 @@ from svkc.integration.event_location import GuardValues, event_tolerance
 from svkc.integration.ode import FieldArgs, ODEState
 from svkc.model.chain import Chain, State
 from svkc.simulation.apply_events import apply_events, reevaluated_guards
+from svkc.simulation.codes import DERIVATIVE, RESULTS
 from svkc.simulation.options import Options
 from svkc.simulation.phase import PhaseOutcome, RunState, solve_phase
-from svkc.simulation.records import RESULTS, empty_events, empty_phase_records, write_phase_row
+from svkc.simulation.records import empty_events, empty_phase_records, write_phase_row
 from svkc.transitions.plan import Plan
 
 
@@ -54,7 +55,7 @@ def initial_run_state(chain: Chain, state: State, t0, ts, plan: Plan, options: O
         count=jnp.asarray(0, jnp.int32),
         saved=jax.tree.map(lambda x: jnp.broadcast_to(x[None], (ts.shape[0], *x.shape)), state),
         result=RESULTS.successful,
-        derivative=RESULTS.successful,
+        derivative=DERIVATIVE.successful,
         invalid_from=jnp.asarray(rows + 1, jnp.int32),
     )  # fmt: skip
 
@@ -144,18 +145,18 @@ def _fired_events(run: RunState, outcome: PhaseOutcome, active, plan: Plan):
 
 def _check_derivative(
     run: RunState, outcome: PhaseOutcome, active, timed: Bool[Array, " timed"], index
-) -> tuple[RESULTS, Int[Array, ""]]:
+) -> tuple[DERIVATIVE, Int[Array, ""]]:
     """Return the first reason why the run has no derivative, and the index of its phase. The
     certificate checks ranks after the run.
 
     active: whether the run had not ended before this phase.
     timed: which timed events happened.
     """
-    code = RESULTS.where(
-        jnp.sum(outcome.fired) + jnp.sum(timed) > 1, RESULTS.together, outcome.derivative
+    code = DERIVATIVE.where(
+        jnp.sum(outcome.fired) + jnp.sum(timed) > 1, DERIVATIVE.together, outcome.derivative
     )
-    first = (run.derivative == RESULTS.successful) & active & (code != RESULTS.successful)
-    return RESULTS.where(first, code, run.derivative), jnp.where(
+    first = (run.derivative == DERIVATIVE.successful) & active & (code != DERIVATIVE.successful)
+    return DERIVATIVE.where(first, code, run.derivative), jnp.where(
         first, index.astype(jnp.int32), run.invalid_from
     )
 

@@ -19,9 +19,9 @@ from svkc._jax.primitive import ClosureConverted
 from svkc._jax.pytrees import is_concrete
 from svkc.model.chain import Chain, State
 from svkc.simulation.certificate import certificate, evaluations_per_step
+from svkc.simulation.codes import DERIVATIVE, RESULTS
 from svkc.simulation.options import Options, prepare_options
 from svkc.simulation.phase import RunState
-from svkc.simulation.records import RESULTS
 from svkc.simulation.run import initial_run_state, run_phase, with_lock_mask
 from svkc.simulation.trajectory import Trajectory
 from svkc.transitions.plan import Plan
@@ -124,9 +124,9 @@ def _with_certificate(
     result = RESULTS.where(
         (result == RESULTS.successful) & (largest_gap > gap_tolerance), RESULTS.loop_open, result
     )
-    derivative = RESULTS.where(
+    derivative = DERIVATIVE.where(
         (rank_lost_at < phases.start.shape[0]) & (rank_lost_at <= run.invalid_from),
-        RESULTS.rank_lost,
+        DERIVATIVE.rank_lost,
         run.derivative,
     )
     return Trajectory(

@@ -12,7 +12,8 @@ from svkc._jax.eager import eager_jit
 from svkc._jax.pytrees import is_concrete
 from svkc.model.chain import State
 from svkc.model.validation import scalar
-from svkc.simulation.records import RESULTS, Events, Phases
+from svkc.simulation.codes import DERIVATIVE, RESULTS
+from svkc.simulation.records import Events, Phases
 
 
 class Trajectory(eqx.Module):
@@ -25,8 +26,8 @@ class Trajectory(eqx.Module):
     phases: records of the phases.
     final, t_final: state and time at the end of the run.
     result: how the run ended.
-    derivative: `RESULTS.successful` if the run has derivatives; otherwise why not: a guard that
-        grazed zero or jumped, simultaneous events, or a loss of rank.
+    derivative: `svkc.types.DERIVATIVE.successful` if the run has derivatives; otherwise why not: a
+        guard that grazed zero or jumped, simultaneous events, or a loss of rank.
     """
 
     ts: Float[Array, " times"]
@@ -38,7 +39,7 @@ class Trajectory(eqx.Module):
     final: State
     t_final: Float[Array, ""]
     result: RESULTS
-    derivative: RESULTS
+    derivative: DERIVATIVE
 
     @property
     def connected(self) -> Bool[Array, "... times links"]:
@@ -165,7 +166,7 @@ class Report(eqx.Module):
     phases: Int[Array, ""]
     t_final: Float[Array, ""]
     result: RESULTS
-    derivative: RESULTS
+    derivative: DERIVATIVE
     halved: Any = None
 
     def __str__(self) -> str:
@@ -212,6 +213,6 @@ class Report(eqx.Module):
         ]
         if self.loop >= 0:
             lines.append(f"could not be closed     loop {int(self.loop)}, counted from 0")
-        if self.derivative != RESULTS.successful:
-            lines.append(f"derivatives             {RESULTS[self.derivative]}")
+        if self.derivative != DERIVATIVE.successful:
+            lines.append(f"derivatives             {DERIVATIVE[self.derivative]}")
         return "\n".join(lines)

@@ -20,8 +20,8 @@ from svkc.loops.constrained_dynamics import ArticulatedBodies
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import check_state
 from svkc.model.validation import integer, positive_scalar, scalar
+from svkc.simulation.codes import RESULTS
 from svkc.simulation.options import resolve_tolerances
-from svkc.simulation.records import RESULTS
 from svkc.simulation.simulate import simulate
 from svkc.simulation.trajectory import Trajectory
 from svkc.tree.configuration import difference

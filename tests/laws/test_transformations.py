@@ -208,8 +208,8 @@ def test_where_there_is_no_derivative(pendulum):
 
     # at 0.4 s its rate is not zero; 3e-8 s before 0.5 s it nearly is
     slopes, codes = jax.jit(jax.vmap(jax.grad(grazed, has_aux=True)))(jnp.array([0.01, 1e-15]))
-    assert (codes == svkc.RESULTS.successful).tolist() == [True, False]
-    assert (codes == svkc.RESULTS.grazing).tolist() == [False, True]
+    assert (codes == svkc.types.DERIVATIVE.successful).tolist() == [True, False]
+    assert (codes == svkc.types.DERIVATIVE.grazing).tolist() == [False, True]
     np.testing.assert_allclose(slopes[0], -5.0, rtol=REFERENCE)
     assert np.isnan(slopes[1])
 
@@ -241,14 +241,14 @@ def test_where_there_is_no_derivative(pendulum):
         jnp.array([0, 0, 1.0, 0]),
         jnp.array([0, 0, 0, 1.0]),
     )
-    assert code(jump, rest, never, never) == svkc.RESULTS.jump
-    assert code(turned, 2 * turned, never, never) == svkc.RESULTS.together
-    assert code(rest, rest, 0.5, 0.5) == svkc.RESULTS.together
-    assert code(clock, rest, 0.5, never) == svkc.RESULTS.together
+    assert code(jump, rest, never, never) == svkc.types.DERIVATIVE.jump
+    assert code(turned, 2 * turned, never, never) == svkc.types.DERIVATIVE.together
+    assert code(rest, rest, 0.5, 0.5) == svkc.types.DERIVATIVE.together
+    assert code(clock, rest, 0.5, never) == svkc.types.DERIVATIVE.together
     # a single guard that crosses zero at a finite rate has a derivative
-    assert code(clock, rest, never, never) == svkc.RESULTS.successful
+    assert code(clock, rest, never, never) == svkc.types.DERIVATIVE.successful
     # a flat parallelogram, with its bars in line, is singular
     flat = models.parallelogram(middle=False)
     lost = svkc.simulate(flat, flat.state({"leg0": np.pi / 2}, {"leg0": 1.0}), 1e-3, throw=False)
-    assert lost.derivative == svkc.RESULTS.rank_lost
+    assert lost.derivative == svkc.types.DERIVATIVE.rank_lost
     assert float(lost.phases.margin[0]) < np.sqrt(np.finfo(float).eps)

@@ -66,7 +66,7 @@ def test_a_wrong_rank_is_reported():
             svkc.simulate(chain, with_rank(2), 1.0, **kw)
     high = svkc.simulate(chain, with_rank(4), 0.1, throw=False, dt=1e-3)
     assert float(high.report().margin) < ROUND_OFF
-    assert high.derivative == svkc.RESULTS.rank_lost
+    assert high.derivative == svkc.types.DERIVATIVE.rank_lost
 
 
 @pytest.mark.slow

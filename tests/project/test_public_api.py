@@ -3,6 +3,7 @@
 import importlib
 import inspect
 import pathlib
+import pkgutil
 import re
 import typing
 
@@ -93,15 +94,23 @@ def test_the_readme_lists_the_public_names():
 
 @pytest.mark.parametrize("name", [*deprecated.RENAMED, *deprecated.SUPERSEDED])
 def test_every_old_name_warns_and_works(name):
-    module, _, attribute = f"svkc.{name}".rpartition(".")
     use = f"svkc.{deprecated.RENAMED[name]}" if name in deprecated.RENAMED else "svkc.dynamics"
     with pytest.warns(DeprecationWarning, match=rf"svkc.{name} is deprecated.*{re.escape(use)}"):
-        old = getattr(importlib.import_module(module), attribute)
+        old = pkgutil.resolve_name(f"svkc.{name}")
     if name in deprecated.RENAMED:
-        module, _, attribute = use.rpartition(".")
-        assert old is getattr(importlib.import_module(module), attribute)
+        assert old is pkgutil.resolve_name(use)
     else:
         assert callable(old)
+
+
+def test_warnings_point_at_the_line_that_uses_an_old_name():
+    """In a process of its own: the tests' type checks add frames to the stack."""
+    uses = ("svkc.prefer", "svkc.page.show", "svkc.RESULTS.jump", "svkc.RESULTS[d]",
+            "d == svkc.RESULTS.successful", "svkc.RESULTS.successful != d")  # fmt: skip
+    code = "\n".join(["import svkc; d = svkc.types.DERIVATIVE.jump", *uses])
+    done = run("-W", "always::DeprecationWarning", "-c", code)
+    lines = re.findall(r"^<string>:(\d+): DeprecationWarning: svkc", done.stderr, re.M)
+    assert lines == [str(2 + i) for i in range(len(uses))], done.stderr
 
 
 def test_unknown_names_are_attribute_errors():

@@ -1,6 +1,7 @@
-"""Trajectory files: a stored file of the current schema, rejected schemas, and round trips.
+"""Trajectory files: stored files of the readable schemas, rejected schemas, and round trips.
 
-saved/schema_4.npz was written by `traj.save(path, chain)` with schema 4.
+saved/schema_4.npz and saved/schema_5.npz were written by `traj.save(path, chain)` with these
+schemas.
 """
 
 import json
@@ -16,7 +17,8 @@ from tolerances import REFERENCE, ROUND_OFF
 
 import svkc
 
-FILE = pathlib.Path(__file__).parent / "saved" / "schema_4.npz"
+FILES = [pathlib.Path(__file__).parent / "saved" / f"schema_{i}.npz" for i in (4, 5)]
+FILE = FILES[-1]
 ROD = """<mujoco><worldbody>
   <body name="rod"><joint name="pivot" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -1"
     size="0.03"/></body>
@@ -37,14 +39,16 @@ def run():
     return chain, simulate(chain, chain.state({"pivot": 1.2}))
 
 
-def test_load_file_of_current_schema():
-    traj = svkc.load_trajectory(FILE)
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_load_file_of_every_readable_schema(file):
+    traj = svkc.load_trajectory(file)
     np.testing.assert_allclose(traj.ts, [0, 0.1, 0.2, 0.3])
     np.testing.assert_allclose(traj.states.q[0, 0], 1.2)
     np.testing.assert_allclose(traj.events.time[:1], [0.2])
     assert traj.connected[:, 0].tolist() == [False, False, False, True]
     assert traj.result == svkc.RESULTS.successful
-    assert svkc.load_chain(FILE).link_names == ("hook",)
+    assert traj.derivative == svkc.types.DERIVATIVE.successful
+    assert svkc.load_chain(file).link_names == ("hook",)
 
 
 @pytest.mark.slow
@@ -63,15 +67,62 @@ def test_stored_file_equals_a_new_run(run, tmp_path):
         np.testing.assert_allclose(a, b, rtol=ROUND_OFF)
 
 
-@pytest.mark.parametrize("schema", [1, 3, 5])
-def test_other_schemas_are_rejected(schema, tmp_path):
-    with np.load(FILE) as file:
-        arrays = dict(file)
-    metadata = json.loads(str(arrays["metadata"])) | {"schema": schema}
-    path = tmp_path / "other.npz"
+def rewritten(file, path, **metadata):
+    """Write a copy of a trajectory file with other metadata."""
+    with np.load(file) as stored:
+        arrays = dict(stored)
+    metadata = json.loads(str(arrays["metadata"])) | metadata
     np.savez(path, **arrays | {"metadata": np.array(json.dumps(metadata))})
+    return path
+
+
+# name and integer of each code, as schema 4 stored them
+OF_SCHEMA_4 = [
+    ("result", name, value)
+    for name, value in {
+        "successful": 0, "stopped": 1, "max_events": 2, "max_steps": 3, "step_too_small": 4,
+        "not_in_place": 5, "loop_open": 6, "non_finite": 7, "no_slot": 12,
+    }.items()
+] + [
+    ("derivative", name, value)
+    for name, value in
+    {"successful": 0, "grazing": 8, "jump": 9, "together": 10, "rank_lost": 11}.items()
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("field", "name", "value"), OF_SCHEMA_4)
+def test_integer_codes_of_schema_4_are_read_by_their_meaning(field, name, value, tmp_path):
+    traj = svkc.load_trajectory(rewritten(FILES[0], tmp_path / "x.npz", **{field: value}))
+    enumeration = {"result": svkc.RESULTS, "derivative": svkc.types.DERIVATIVE}[field]
+    assert getattr(traj, field) == getattr(enumeration, name)
+
+
+def test_files_hold_the_names_of_codes(run, tmp_path):
+    """Of a batch as well; an unknown name is an error that says so, and leaves the chain."""
+    chain, traj = run
+    names = {"result": ["successful", "stopped"], "derivative": ["grazing", "successful"]}
+    batch = jax.tree.map(lambda x: jnp.stack([x, x]), traj)
+    codes = svkc.RESULTS.stopped._value, svkc.types.DERIVATIVE.grazing._value
+    values = jnp.array([0, codes[0]]), jnp.array([codes[1], 0])
+    batch = eqx.tree_at(lambda t: (t.result._value, t.derivative._value), batch, values)
+    batch.save(tmp_path / "batch.npz", chain)
+    with np.load(tmp_path / "batch.npz") as file:
+        metadata = json.loads(str(file["metadata"]))
+    assert {field: metadata[field] for field in names} == names
+    assert bool(eqx.tree_equal(svkc.load_trajectory(tmp_path / "batch.npz"), batch))
+    newer = rewritten(FILE, tmp_path / "newer.npz", result="exploded")
+    with pytest.raises(ValueError, match="has the result exploded, which this version"):
+        svkc.load_trajectory(newer)
+    assert svkc.load_chain(newer).link_names == ("hook",)
+
+
+@pytest.mark.parametrize("schema", [1, 3, 6])
+def test_other_schemas_are_rejected(schema, tmp_path):
+    path = rewritten(FILE, tmp_path / "other.npz", schema=schema)
     for load in (svkc.load_trajectory, svkc.load_chain):
-        with pytest.raises(ValueError, match=f"has schema {schema}, .* reads schema 4; load it"):
+        with pytest.raises(
+            ValueError, match=f"has schema {schema}, .* reads schemas 4 to 5; load it"
+        ):
             load(path)
 
 

@@ -1,0 +1,64 @@
+"""How a run ended (`RESULTS`), and whether the run has derivatives (`DERIVATIVE`).
+
+Files hold the names of the codes, so that codes may be added in any order.
+"""
+
+from typing import Any
+
+import equinox as eqx
+
+from svkc import _deprecated
+from svkc._jax.enumerations import FormerMeta, MovedMeta, connect_enumerations
+
+
+class RESULTS(eqx.Enumeration, metaclass=FormerMeta):  # pyright: ignore
+    """How a run ended, for each element of a batch."""
+
+    successful = ""
+    stopped = "An event stopped the run."
+    max_events = (
+        "More events than max_events: the final state is that after the last recorded event. Raise"
+        " max_events, or look for chattering."
+    )
+    max_steps = "More steps than max_steps in one phase. Raise max_steps, or loosen rtol and atol."
+    step_too_small = (
+        "The step size fell to its lower bound: the problem is too stiff, or singular, for this"
+        " solver and tolerance."
+    )
+    not_in_place = (
+        "An event connects a link at its declared placement, but the bodies were elsewhere. Use"
+        " here=True, or a guard that waits until they are there."
+    )
+    loop_open = (
+        "A loop is open by more than the tolerance. Use smaller steps, or projection; check the"
+        " mobility and its margin there."
+    )
+    non_finite = "A non-finite number appeared."
+    no_slot = (
+        "An event makes a grip, but every spare slot was bound: the grip was skipped, all other"
+        " changes were made. Load with more spare slots, or unbind."
+    )
+
+
+class DERIVATIVE(eqx.Enumeration, metaclass=MovedMeta):  # pyright: ignore
+    """Whether a run has derivatives, for each element of a batch, and why not."""
+
+    successful = ""
+    grazing = (
+        "A guard touched zero without crossing it: the time of its event has no derivative;"
+        " derivatives are NaN."
+    )
+    jump = "A guard jumped over zero: derivatives treat the time of its event as constant."
+    together = (
+        "Events happened at one instant: derivatives hold for this order of events, and do not"
+        " exist if their times can separate."
+    )
+    rank_lost = (
+        "The loops lose rank at an end of a phase: derivatives across that end are unreliable."
+    )
+
+
+connect_enumerations(RESULTS, DERIVATIVE, _deprecated.warn_of_results)
+
+# fields of `Trajectory` and `Report` that hold a code, and their enumerations
+CODES: dict[str, Any] = {"result": RESULTS, "derivative": DERIVATIVE}
