@@ -14,7 +14,7 @@ from svkc.simulation.phase import PhaseOutcome, RunState
 from svkc.simulation.records import Events
 from svkc.transitions.impact import StructureChange
 from svkc.transitions.plan import Plan
-from svkc.transitions.spare_links import bind_grip, cleared
+from svkc.transitions.spare_links import bind_grip, cleared, unbound_slots
 from svkc.transitions.transition import CONNECT_TOLERANCE, change_structure, release_constraints
 
 
@@ -31,45 +31,91 @@ def apply_events(
     outcome: PhaseOutcome,
     fired: Bool[Array, " events"],
     plan: Plan,
+    *,
+    gap_tolerance: float,
 ):
     """Apply the events that fired at the end of a phase, all in one change of structure.
 
-    Returns the state after the change, the records of events, and the result of the run so far.
+    Returns the state after the change, the records of events, and the result of the run so far. A
+    change that fails is neither applied nor recorded: the run keeps the state before the events.
 
     end_state: the state at the end of the phase. fired: which events of the plan fired.
+    gap_tolerance: largest loop gap that does not fail the change (rad, or in `chain.length`s).
     """
-    any_fired, any_no_slot, to_clear = jnp.any(fired), jnp.zeros((), bool), None
-    masks = _new_masks(chain, end_state.structure, fired, plan)
-    if plan.has_binds:
-        structure, to_connect, any_no_slot, to_clear = _bind_slots(
-            chain, end_state.structure, fired, plan
-        )
-        end_state = State(end_state.q, end_state.v, structure)
-        masks["connected"] = (masks["connected"] | to_connect) & ~to_clear
-        masks["at_current_pose"] = masks["at_current_pose"] | to_connect
+    any_fired = jnp.any(fired)
+    start, masks, any_no_slot = _prepare_change(chain, end_state, fired, plan)
 
     def apply():
-        return _change_structure(chain, end_state, masks, to_clear, plan)
+        return _change_structure(chain, start, masks, plan)
 
     def skip():
         return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), eqx.filter_eval_shape(apply))
 
     change = jax.lax.cond(unvmap_any(any_fired), apply, skip)
-    # a change that is not finite is discarded, so that the run keeps its last finite state
-    finite = is_finite(ODEState(change.state.q, change.state.v)) & ~jnp.isnan(change.initial_gap)
-    after = jax.tree.map(
-        lambda new, old: jnp.where(any_fired & finite, new, old), change.state, end_state
-    )
     connects = plan.action_mask(chain, "connect") | plan.grip_mask(chain)
-    events, overflow = _write_events(run.events, outcome.t, fired, connects, change)
+    failure = _failure(chain, start.structure, masks["connected"], change, plan, gap_tolerance)
+    overflow = run.events.count + jnp.sum(fired, dtype=jnp.int32) > run.events.time.shape[0]
+    failure = RESULTS.where(overflow, RESULTS.max_events, failure)
+    applied = any_fired & (failure == RESULTS.successful)
+    after = jax.tree.map(lambda new, old: jnp.where(applied, new, old), change.state, end_state)
+    events = _write_events(run.events, outcome.t, fired & applied, connects, change)
     stops = jnp.any(fired & np.array([a.stop for a in plan.actions], bool))
     result = RESULTS.where(stops, RESULTS.stopped, outcome.result)
-    misplaced = any_fired & (change.initial_gap > CONNECT_TOLERANCE)
-    result = RESULTS.where(misplaced, RESULTS.not_in_place, result)
-    result = RESULTS.where(finite, result, RESULTS.non_finite)
     result = RESULTS.where(any_no_slot, RESULTS.no_slot, result)
-    result = RESULTS.where(overflow, RESULTS.max_events, result)
+    result = RESULTS.where(any_fired & ~applied, failure, result)
     return after, events, result
+
+
+def _failure(
+    chain: Chain,
+    structure: Structure,
+    connected: Bool[Array, " links"],
+    change: StructureChange,
+    plan: Plan,
+    gap_tolerance: float,
+) -> RESULTS:
+    """Return why a change of structure cannot be made, or `RESULTS.successful`.
+
+    structure: before the change. connected: the links that the change leaves connected.
+    """
+    new = connected & ~structure.connected
+    misplaced = change.initial_gap > CONNECT_TOLERANCE
+    result = RESULTS.where(misplaced, RESULTS.not_in_place, RESULTS.successful)
+    if plan.needs_impact(chain):
+        open_loop = ~(jnp.max(change.residual_gaps, initial=0) <= gap_tolerance)
+        result = RESULTS.where(
+            jnp.any(new) & ~misplaced & open_loop, RESULTS.loop_open, result
+        )
+    finite = is_finite(ODEState(change.state.q, change.state.v)) & ~jnp.isnan(change.initial_gap)
+    result = RESULTS.where(finite, result, RESULTS.non_finite)
+    if (plan.action_mask(chain, "connect") & np.array(chain.topology.link_spare, bool)).any():
+        unbound = jnp.any(new & unbound_slots(chain, structure))
+        result = RESULTS.where(unbound, RESULTS.not_bound, result)
+    return result
+
+
+def _prepare_change(
+    chain: Chain, end_state: State, fired: Bool[Array, " events"], plan: Plan
+) -> tuple[State, dict, Bool[Array, ""]]:
+    """Return the state with the spare slots of these events cleared and bound, the arguments of
+    `change_structure`, and whether a grip had no free slot.
+
+    Links are cut and slots are cleared before grips are made, so that a grip may take a slot that
+    an event of the same instant cuts or clears.
+    """
+    masks, structure = _new_masks(chain, end_state.structure, fired, plan), end_state.structure
+    if not plan.has_binds:
+        return end_state, masks, jnp.zeros((), bool)
+    to_clear = jnp.any(fired[:, None] & plan.slots_to_unbind(chain, structure), 0)
+    masks["connected"] = masks["connected"] & ~to_clear
+    # a slot that is cut and bound again is a new link
+    structure = eqx.tree_at(
+        lambda s: s.connected, cleared(structure, to_clear), structure.connected & masks["connected"]
+    )
+    structure, to_connect, any_no_slot = _bind_slots(chain, structure, fired, plan)
+    masks["connected"] = masks["connected"] | to_connect
+    masks["at_current_pose"] = masks["at_current_pose"] | to_connect
+    return State(end_state.q, end_state.v, structure), masks, any_no_slot
 
 
 def _new_masks(
@@ -93,20 +139,12 @@ def _new_masks(
 
 
 def _change_structure(
-    chain: Chain, end_state: State, masks: dict, to_clear, plan: Plan
+    chain: Chain, end_state: State, masks: dict, plan: Plan
 ) -> StructureChange:
-    """Change the structure; the impact is compiled only if an event of the plan needs one.
-
-    to_clear: mask of spare slots to clear; None: no event of the plan clears slots.
-    """
+    """Change the structure; the impact is compiled only if an event of the plan needs one."""
     if plan.needs_impact(chain):
-        change = change_structure(chain, end_state, **masks)
-    else:
-        change = release_constraints(chain, end_state, masks["connected"], masks["locked"])
-    if to_clear is None:
-        return change
-    structure = cleared(change.state.structure, to_clear)
-    return eqx.tree_at(lambda c: c.state.structure, change, structure)
+        return change_structure(chain, end_state, **masks)
+    return release_constraints(chain, end_state, masks["connected"], masks["locked"])
 
 
 def _write_events(
@@ -115,14 +153,14 @@ def _write_events(
     fired: Bool[Array, " events"],
     connects: Bool[np.ndarray, "events links"],
     change: StructureChange,
-) -> tuple[Events, Bool[Array, ""]]:
-    """Return the records with a row for each event that fired, and whether rows were lacking.
+) -> Events:
+    """Return the records with a row for each event that fired.
 
     connects: the links that each event connects, whose impulses are written in the event's row.
     """
-    r, count, capacity = events, jnp.sum(fired, dtype=jnp.int32), events.time.shape[0]
+    r = events
     row = r.count + jnp.cumsum(fired, dtype=jnp.int32) - 1
-    rows = jnp.arange(capacity, dtype=jnp.int32)
+    rows = jnp.arange(events.time.shape[0], dtype=jnp.int32)
     # [rows, events]
     row_of_event = (rows[:, None] == row[None]) & fired[None]
     written = jnp.any(row_of_event, 1)
@@ -136,14 +174,15 @@ def _write_events(
             connected_by_row, change.angular_impulse[None], r.angular_impulse
         ),
         energy_lost=jnp.where(first, change.energy_lost, r.energy_lost),
-        count=jnp.minimum(r.count + count, capacity),
-    ), r.count + count > capacity
+        count=r.count + jnp.sum(fired, dtype=jnp.int32),
+    )
 
 
-def _bind_slots(chain: Chain, structure: Structure, fired: Bool[Array, " events"], plan: Plan):
+def _bind_slots(
+    chain: Chain, structure: Structure, fired: Bool[Array, " events"], plan: Plan
+) -> tuple[Structure, Bool[Array, " links"], Bool[Array, ""]]:
     """Return the structure with the spare slots bound by the events that fired, the mask of slots
-    to connect, whether a grip had no free slot, and the mask of slots to clear."""
-    to_clear = jnp.any(fired[:, None] & plan.slots_to_unbind(chain, structure), 0)
+    to connect, and whether a grip had no free slot."""
     to_connect, any_no_slot = jnp.zeros(len(chain.link_names), bool), jnp.zeros((), bool)
     for event, grips in enumerate(plan.grips):
         for grip in grips:
@@ -158,4 +197,4 @@ def _bind_slots(chain: Chain, structure: Structure, fired: Bool[Array, " events"
             )
             to_connect = to_connect | (slot & fired[event])
             any_no_slot = any_no_slot | (no_slot & fired[event])
-    return structure, to_connect, any_no_slot, to_clear
+    return structure, to_connect, any_no_slot

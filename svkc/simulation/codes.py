@@ -17,8 +17,8 @@ class RESULTS(eqx.Enumeration, metaclass=FormerMeta):  # pyright: ignore
     successful = ""
     stopped = "An event stopped the run."
     max_events = (
-        "More events than max_events: the final state is that after the last recorded event. Raise"
-        " max_events, or look for chattering."
+        "More events than max_events: the run ended at the first event that has no row in the"
+        " records, in the state before this event. Raise max_events, or look for chattering."
     )
     max_steps = "More steps than max_steps in one phase. Raise max_steps, or loosen rtol and atol."
     step_too_small = (
@@ -35,8 +35,13 @@ class RESULTS(eqx.Enumeration, metaclass=FormerMeta):  # pyright: ignore
     )
     non_finite = "A non-finite number appeared."
     no_slot = (
-        "An event makes a grip, but every spare slot was bound: the grip was skipped, all other"
-        " changes were made. Load with more spare slots, or unbind."
+        "An event makes a grip, but every spare slot was bound, or the slot that the grip names was"
+        " connected: the grip was skipped, all other changes were made. Load with more spare slots,"
+        " or unbind."
+    )
+    not_bound = (
+        "An event connects a spare slot that is bound to no bodies. Bind the slot before, with"
+        " svkc.bind, or in the event, with bind=svkc.Grip(..., slot=...)."
     )
 
 

@@ -111,7 +111,9 @@ def run_phase(
     derivative, invalid_from = _check_derivative(run, outcome, active, timed, index)
     after, events, result = end_state, run.events, outcome.result
     if plan.actions:
-        after, events, result = apply_events(chain, run, end_state, outcome, fired, plan)
+        after, events, result = apply_events(
+            chain, run, end_state, outcome, fired, plan, gap_tolerance=options.gap_tolerance
+        )
     result = RESULTS.where(run.result == RESULTS.successful, result, run.result)
     stale = None
     if plan.guards:

@@ -80,6 +80,9 @@ def _make_action(*, connect, cut, lock, unlock, here, stop, bind, unbind) -> Act
     if not set(here) <= set(connect):
         raise ValueError(f"here: {here} must be among the links to connect, {connect}")
     cut, lock, unlock = names("cut", cut), names("lock", lock), names("unlock", unlock)
+    _check_no_contradiction(connect=connect, cut=cut)
+    _check_no_contradiction(connect=connect, unbind=unbind)
+    _check_no_contradiction(lock=lock, unlock=unlock)
     return Action(
         connect=connect,
         cut=cut,
@@ -92,12 +95,23 @@ def _make_action(*, connect, cut, lock, unlock, here, stop, bind, unbind) -> Act
     )
 
 
+def _check_no_contradiction(**arguments) -> None:
+    """Raise ValueError if two arguments of one event, by keyword, have a name in common."""
+    (first, of_first), (second, of_second) = arguments.items()
+    for name in of_first:
+        if name in of_second:
+            raise ValueError(f"{first} and {second} both name {name!r}; an event does one of the two")
+
+
 def at(
     time, connect=(), cut=(), *, lock=(), unlock=(), here=False, stop=False, bind=(), unbind=()
 ) -> At:
     """Return an event that changes the structure at a given time.
 
-    A link that events of one instant both connect and cut is cut.
+    All events of one instant make one change: links are cut and slots cleared first, then grips
+    are made and links connected. The order of the events does not matter: a link that one event
+    connects and another one cuts is cut, and a joint that one locks and another unlocks is free.
+    A grip may take a slot that the same instant cuts or clears.
 
     time: when the event happens (s). The time is differentiable.
     connect, cut: name or names of virtual links.
@@ -106,12 +120,15 @@ def at(
         placements: True for all links of `connect`, or names of some of them.
     stop: end the run at this event.
     bind: `svkc.Grip` or several, made with spare slots at the current poses of the bodies. The run
-        ends with the result `no_slot` if no spare slot is free.
+        ends with the result `no_slot` if no spare slot is free, or if the slot that a grip names
+        stays connected.
     unbind: spare slots to cut and clear: names of slots, or pairs (parent, real) of body names for
         all slots between two bodies.
 
-    Raises ValueError if an argument has another type or if `here` names a link that `connect` does
-    not name. Names are checked against the chain by `simulate`.
+    Raises ValueError if an argument has another type, if `here` names a link that `connect` does
+    not name, or if `connect` and `cut`, `connect` and `unbind`, or `lock` and `unlock` have a name
+    in common. Names are checked against the chain by `simulate`. The run ends with the result
+    `not_bound` if `connect` names a spare slot that is bound to no bodies.
     """
     real_array("time", time)
     action = _make_action(

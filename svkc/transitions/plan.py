@@ -67,7 +67,7 @@ class Plan(eqx.Module):
         """Return whether any event connects a link or locks a joint. If none does, no impact is
         compiled."""
         return bool(
-            self.has_binds
+            any(self.grips)
             or self.action_mask(chain, "connect").any()
             or self.action_mask(chain, "lock").any()
         )

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
+from svkc._jax.pytrees import is_concrete
 from svkc.model.chain import Chain, State, Structure
 from svkc.model.checked_jit import check_state
 from svkc.model.names import body_rows, spare_slot
@@ -27,8 +28,9 @@ class Grip(eqx.Module):
     """A joint that an event makes between two bodies with a spare slot (`bind=` of `svkc.at` and
     `svkc.when`).
 
-    The joint is made at the current poses of the bodies. The chain needs spare slots
-    (`svkc.load(..., spare=n)`). `simulate` raises ValueError for unknown names and invalid values.
+    The joint is made at the current poses of the bodies. A grip of two bodies that a connected slot
+    joins already changes nothing. The chain needs spare slots (`svkc.load(..., spare=n)`).
+    `simulate` raises ValueError for unknown names and invalid values.
 
     parent, real: names of the two bodies.
     joint: name of the joint, or six Booleans for its freedoms, as for `svkc.VirtualLink`; joints
@@ -102,6 +104,41 @@ def set_links(
     )
 
 
+def unbound_slots(chain: Chain, structure: Structure) -> Bool[Array, " links"]:
+    """Return the mask of the spare slots that are bound to no bodies."""
+    spare = np.array(chain.topology.link_spare, bool)
+    return spare & (structure.parent == 0) & (structure.real == 0)
+
+
+def check_bound(chain: Chain, state: State, to_connect) -> State:
+    """Return the state.
+
+    to_connect: mask of the links to connect.
+
+    Raises ValueError (a runtime error under jit) if one of them is a spare slot that is bound to no
+    bodies.
+    """
+    spare = np.array(chain.topology.link_spare, bool)
+    if is_concrete(to_connect) and not np.any(np.asarray(to_connect) & spare):
+        return state
+    structure = state.structure
+    if not is_concrete(to_connect, structure.parent, structure.real):
+        return eqx.error_if(
+            state,
+            jnp.any(to_connect & unbound_slots(chain, structure)),
+            "connect: a spare slot is not bound to two bodies; bind it first",
+        )
+    is_unbound = (np.asarray(structure.parent) == 0) & (np.asarray(structure.real) == 0)
+    missing = np.flatnonzero(np.asarray(to_connect) & spare & is_unbound)
+    if len(missing):
+        names = ", ".join(chain.link_names[i] for i in missing)
+        raise ValueError(
+            f"connect: spare slots that are not bound to two bodies: {names}; bind them first, as"
+            f" in svkc.bind(chain, state, {chain.link_names[missing[0]]!r}, parent, real)"
+        )
+    return state
+
+
 def bound_between(
     chain: Chain, structure: Structure, parent: str, real: str
 ) -> Bool[Array, " links"]:
@@ -126,7 +163,7 @@ def bind_grip(
     spare = jnp.asarray(np.array(chain.topology.link_spare, bool))
     rows = body_rows(chain, grip.parent, grip.real)
     if grip.slot is None:
-        free = spare & ~structure.connected & (structure.parent == 0) & (structure.real == 0)
+        free = unbound_slots(chain, structure) & ~structure.connected
         slot = free & (jnp.cumsum(free, dtype=jnp.int32) == 1)
     else:
         slot = (jnp.arange(spare.shape[0]) == spare_slot(chain, grip.slot)) & ~structure.connected

@@ -29,7 +29,7 @@ from svkc.transitions.newton_state import (
     Schedule,
 )
 from svkc.transitions.placement import joint_coordinates, place_at_current_pose, with_coordinates
-from svkc.transitions.spare_links import cleared
+from svkc.transitions.spare_links import check_bound, cleared
 from svkc.tree.kinematics import kinematics
 
 
@@ -160,12 +160,13 @@ def transition(chain: Chain, state: State, connected) -> State:
 
     connected: names of virtual links, or a Boolean mask over `chain.link_names`.
 
-    Raises ValueError for unknown names, if bodies are too far from the placement (a runtime error
-    under jit), or if a loop cannot be closed (not checked under jit).
+    Raises ValueError for unknown names; also, as a runtime error under jit, for a spare slot that
+    is not bound, if bodies are too far from the placement, and if a loop cannot be closed.
     """
     check_state(chain, state)
-    mask = jnp.asarray(connection_mask(chain, connected))
-    return _check_connected(chain, change_structure(chain, state, mask))
+    mask = connection_mask(chain, connected)
+    state = check_bound(chain, state, mask)
+    return _check_connected(chain, change_structure(chain, state, jnp.asarray(mask)))
 
 
 def connect(chain: Chain, state: State, *names: str, here: bool = False) -> State:
@@ -179,21 +180,21 @@ def connect(chain: Chain, state: State, *names: str, here: bool = False) -> Stat
     here: False makes each joint at its placement (declared, or set by the last here=True), where
         the bodies must already be; True makes it at the current poses of the bodies.
 
-    Raises ValueError for unknown names, if bodies are too far from the placement (a runtime error
-    under jit), or if a loop cannot be closed (not checked under jit).
+    Raises ValueError for unknown names; also, as a runtime error under jit, for a spare slot that
+    is not bound, if bodies are too far from the placement, and if a loop cannot be closed.
     """
     check_state(chain, state)
     named = _link_mask(chain, names)
+    state = check_bound(chain, state, named)
     connected = state.structure.connected | named
-    at_current_pose = named if boolean("here", here) else None
+    at_current_pose = jnp.asarray(named) if boolean("here", here) else None
     change = change_structure(chain, state, connected, at_current_pose=at_current_pose)
     return _check_connected(chain, change)
 
 
-def _link_mask(chain: Chain, names: tuple[str, ...]) -> Bool[Array, " links"]:
+def _link_mask(chain: Chain, names: tuple[str, ...]) -> np.ndarray:
     """Return the mask of these virtual links. Raises ValueError for unknown names."""
-    named = np.isin(np.arange(len(chain.link_names)), [link_index(chain, n) for n in names])
-    return jnp.asarray(named)
+    return np.isin(np.arange(len(chain.link_names)), [link_index(chain, n) for n in names])
 
 
 def _check_connected(chain: Chain, change: StructureChange) -> State:

@@ -83,6 +83,9 @@ def test_inside_compiled_programs(setting):
     apart = setting.load(virtual_links=[wrong_calls.link(pos=(5, 0, 0), real_pos=(0, 0, 0))])
     beyond = wrong_calls.unclosable_loop(setting)
     calls = {
+        "connect: a spare slot": lambda: jax.jit(
+            lambda s: svkc.connect(setting.spare, s, "spare_0", here=True)
+        )(setting.empty),
         "connect: the bodies": lambda: jax.jit(lambda s: svkc.connect(apart, s, "x"))(
             apart.state()
         ),
