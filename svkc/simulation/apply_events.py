@@ -83,9 +83,7 @@ def _failure(
     result = RESULTS.where(misplaced, RESULTS.not_in_place, RESULTS.successful)
     if plan.needs_impact(chain):
         open_loop = ~(jnp.max(change.residual_gaps, initial=0) <= gap_tolerance)
-        result = RESULTS.where(
-            jnp.any(new) & ~misplaced & open_loop, RESULTS.loop_open, result
-        )
+        result = RESULTS.where(jnp.any(new) & ~misplaced & open_loop, RESULTS.loop_open, result)
     finite = is_finite(ODEState(change.state.q, change.state.v)) & ~jnp.isnan(change.initial_gap)
     result = RESULTS.where(finite, result, RESULTS.non_finite)
     if (plan.action_mask(chain, "connect") & np.array(chain.topology.link_spare, bool)).any():
@@ -110,7 +108,9 @@ def _prepare_change(
     masks["connected"] = masks["connected"] & ~to_clear
     # a slot that is cut and bound again is a new link
     structure = eqx.tree_at(
-        lambda s: s.connected, cleared(structure, to_clear), structure.connected & masks["connected"]
+        lambda s: s.connected,
+        cleared(structure, to_clear),
+        structure.connected & masks["connected"],
     )
     structure, to_connect, any_no_slot = _bind_slots(chain, structure, fired, plan)
     masks["connected"] = masks["connected"] | to_connect
@@ -138,9 +138,7 @@ def _new_masks(
     }
 
 
-def _change_structure(
-    chain: Chain, end_state: State, masks: dict, plan: Plan
-) -> StructureChange:
+def _change_structure(chain: Chain, end_state: State, masks: dict, plan: Plan) -> StructureChange:
     """Change the structure; the impact is compiled only if an event of the plan needs one."""
     if plan.needs_impact(chain):
         return change_structure(chain, end_state, **masks)

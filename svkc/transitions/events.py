@@ -100,7 +100,9 @@ def _check_no_contradiction(**arguments) -> None:
     (first, of_first), (second, of_second) = arguments.items()
     for name in of_first:
         if name in of_second:
-            raise ValueError(f"{first} and {second} both name {name!r}; an event does one of the two")
+            raise ValueError(
+                f"{first} and {second} both name {name!r}; an event does one of the two"
+            )
 
 
 def at(

@@ -106,7 +106,7 @@ def set_links(
 
 def unbound_slots(chain: Chain, structure: Structure) -> Bool[Array, " links"]:
     """Return the mask of the spare slots that are bound to no bodies."""
-    spare = np.array(chain.topology.link_spare, bool)
+    spare = jnp.asarray(np.array(chain.topology.link_spare, bool))
     return spare & (structure.parent == 0) & (structure.real == 0)
 
 

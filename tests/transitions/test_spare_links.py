@@ -78,7 +78,9 @@ def test_a_grip_replaces_the_one_that_its_event_ends(sliders):
     """The old grip ends, the new one is made in the same slot with its impact, in one event that
     unbinds or cuts, and in two events of one instant in either order."""
     chain, state = sliders
-    held = svkc.connect(chain, svkc.bind(chain, state, "spare_0", "world", "a"), "spare_0", here=True)
+    held = svkc.connect(
+        chain, svkc.bind(chain, state, "spare_0", "world", "a"), "spare_0", here=True
+    )
     grip = svkc.Grip("a", "b", slot="spare_0")
     a, b = (svkc.at(0.1, unbind="spare_0"), svkc.at(0.1, bind=grip))
     cases = [
@@ -101,7 +103,9 @@ def test_a_grip_replaces_the_one_that_its_event_ends(sliders):
 
 def test_a_grip_in_a_slot_that_stays_connected_ends_with_no_slot(sliders):
     chain, state = sliders
-    held = svkc.connect(chain, svkc.bind(chain, state, "spare_0", "world", "a"), "spare_0", here=True)
+    held = svkc.connect(
+        chain, svkc.bind(chain, state, "spare_0", "world", "a"), "spare_0", here=True
+    )
     traj = run(chain, held, svkc.at(0.1, bind=svkc.Grip("a", "b", slot="spare_0")))
     assert traj.result == svkc.RESULTS.no_slot
     assert traj.final.structure.connected.tolist() == [True, False]
@@ -117,7 +121,7 @@ def test_a_grip_in_a_slot_that_stays_connected_ends_with_no_slot(sliders):
     ],
 )
 def test_an_event_that_contradicts_itself_is_an_error(changes):
-    with pytest.raises(ValueError, match="both name '(spare_0|a)'"):
+    with pytest.raises(ValueError, match=r"both name '(spare_0|a)'"):
         svkc.at(0.1, **changes)
     with pytest.raises(ValueError, match="both name"):
         svkc.when(lambda t, s, args: t, **changes)
