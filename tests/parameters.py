@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import svkc
-from svkc.tools.gradient_check import _central_differences
+from svkc.tools.central_differences import central_differences
 
 TIGHT = {"rtol": 1e-11, "atol": 1e-13, "solver": diffrax.Dopri8()}
 FLOATS = "mass com inertia pos quat axis anchor gravity armature damping stiffness q_spring".split()
@@ -82,7 +82,7 @@ def worst(program, x, step=0.05) -> float:
             other: along if other == name else jnp.zeros_like(value) for other, value in x.items()
         }
         derivative = named(program(x, along)[1])
-        difference, _ = _central_differences(
+        difference, _ = central_differences(
             lambda x, along=along: named(program(x, along)[0]), x, along, step
         )
         for path, expected in difference.items():

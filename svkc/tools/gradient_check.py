@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -9,21 +10,30 @@ import jax.numpy as jnp
 import numpy as np
 
 from svkc.model.validation import check_function, integer, positive_scalar
+from svkc.tools.central_differences import central_differences
+
+# directions and weights of at most so many numbers are written out, as a line of text holds them
+WRITTEN_OUT = 6
 
 
 class GradientCheck(eqx.Module):
     """The result of `check_grad`: the entry of the derivative with the largest error.
 
+    The derivative is that of f(x + h direction) by h, where the direction is added to one leaf.
+
     error: |derivative - difference|, relative to the largest entry of the output leaf in either
         one.
-    output: path of the output leaf (and entry), such as "f(x)['a'][3]".
+    output: path of the output leaf (and entry), such as "f(x)['a'][3]"; of several entries
+        "sum(w * f(x)['a'])" in "reverse", which has one derivative for all of them.
     input: path of the input leaf, such as "x.q".
-    derivative: by forward mode along the direction; in "reverse" of a weighted sum of the leaf.
-    difference: directional derivative by central differences.
+    derivative: of the output along the direction, by differentiation.
+    difference: of the output along the direction, by central differences.
     uncertainty: estimated error of the difference, relative to the same number as `error`.
     modes: largest difference between forward and reverse mode, of a random weighted sum of each
         output leaf, relative to the norms of both factors. Zero unless `mode` is "both".
+    direction: unit direction in the input leaf [shape of the leaf]; 1 for a single number.
     mode: the mode that was checked: "forward", "reverse" or "both".
+    weights: the unit vector w of the sum [shape of the output leaf]; None: the output is one entry.
     """
 
     error: float
@@ -33,15 +43,29 @@ class GradientCheck(eqx.Module):
     difference: float
     uncertainty: float
     modes: float
+    direction: Any
     mode: str = eqx.field(static=True, default="both")
+    weights: Any = None
 
     def __str__(self) -> str:
+        weights = along = ""
+        if self.weights is not None:
+            weights = f" (w = {_written(self.weights, 'check.weights')})"
+        if np.size(self.direction) > 1:
+            along = f" along the unit direction {_written(self.direction, 'check.direction')}"
         return (
             f"worst relative error {self.error:.2e} (the difference is good to"
-            f" {self.uncertainty:.0e}): d {self.output} / d {self.input} is {self.derivative:.12g}"
-            f" by differentiation, {self.difference:.12g} by differences"
+            f" {self.uncertainty:.0e}): d {self.output}{weights} / d {self.input}{along} is"
+            f" {self.derivative:.12g} by differentiation, {self.difference:.12g} by differences"
             + (f"; forward and reverse differ by {self.modes:.1e}" if self.mode == "both" else "")
         )
+
+
+def _written(numbers: np.ndarray, name: str) -> str:
+    """Return a few numbers as text, with four digits; of many numbers the name."""
+    if numbers.size > WRITTEN_OUT:
+        return name
+    return f"[{', '.join(f'{x:.4g}' for x in np.ravel(numbers))}]"
 
 
 def check_grad(
@@ -49,16 +73,18 @@ def check_grad(
 ) -> GradientCheck:
     """Compare the derivative of f at x with central differences and return the worst entry.
 
-    For every floating-point leaf of x, the derivative is taken along random directions. A direction
-    has the leaf's 2-norm (1 if the leaf is zero). Differences are extrapolated to step
+    For every floating-point leaf of x, the derivative is taken along random unit directions; along
+    1 if the leaf is a single number. In mode "reverse" an output leaf of several entries is
+    replaced by its sum with random weights, a unit vector. Differences are extrapolated to step
     zero by Ridders' method. Use float64: in float32 the differences have few correct digits.
 
     f: function of one argument.
     x: a pytree. Floating-point leaves of x and of f(x) are differentiated, others are ignored.
     mode: "forward", "reverse", or "both", which also compares the two modes with each other.
     directions: number of random directions for each leaf.
-    step: first step of the differences, as a multiple of the direction. It is halved seven times.
-    seed: seed of the random directions.
+    step: first step of the differences, as a multiple of the leaf's 2-norm (of 1 if the leaf is
+        zero). It is halved seven times.
+    seed: seed of the random directions and weights.
 
     Raises ValueError if x or f(x) has no floating-point arrays, if f(x) is not finite, or if an
     option is invalid.
@@ -72,13 +98,13 @@ def check_grad(
     value = lambda free: _outputs(f, free, static)
     base = _finite_outputs(value(differentiable))
     rng, checks = np.random.default_rng(seed), []
-    weights = {name: rng.normal(size=leaf.shape) for name, leaf in base.items()}
+    weights = {name: _unit(rng, leaf.shape) for name, leaf in base.items()}
     gradients = {} if mode == "forward" else _reverse_gradients(f, differentiable, static, weights)
     leaves = jax.tree_util.tree_flatten_with_path(differentiable)[0]
     for index, (path, leaf) in enumerate(leaves):
         for _ in range(directions if leaf.size else 0):
             direction, forward = _direction(differentiable, index, rng), None
-            difference, uncertainty = _central_differences(value, differentiable, direction, step)
+            difference, uncertainty = central_differences(value, differentiable, direction, step)
             if mode != "reverse":
                 forward = _forward_derivative(f, differentiable, static, direction)
             for name, weight in weights.items():
@@ -88,9 +114,28 @@ def check_grad(
                 )
                 paths = f"f(x){name}", f"x{jax.tree_util.keystr(path)}"
                 estimate = difference[name], uncertainty[name]
-                checks.append(_compare_leaf(*derivatives, weight, *estimate, paths))
+                check = _compare_leaf(*derivatives, weight, *estimate, paths)
+                checks.append(_per_unit_length(check, jax.tree.leaves(direction)[index]))
     worst = max(checks, key=lambda c: c.error)
     return dataclasses.replace(worst, modes=max(c.modes for c in checks), mode=mode)
+
+
+def _unit(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    """Return a random array of 2-norm 1; of a single number 1, so that its sign is no riddle."""
+    x = rng.normal(size=shape)
+    return np.ones(shape) if x.size == 1 else x / (np.linalg.norm(x) or 1.0)
+
+
+def _per_unit_length(check: GradientCheck, direction) -> GradientCheck:
+    """Return the check with derivatives along a direction divided by the length of the direction,
+    and with the unit direction."""
+    length = float(np.linalg.norm(direction))
+    return dataclasses.replace(
+        check,
+        derivative=check.derivative / length,
+        difference=check.difference / length,
+        direction=np.asarray(direction) / length,
+    )
 
 
 def _partition(x):
@@ -120,8 +165,8 @@ def _finite_outputs(outputs) -> dict[str, np.ndarray]:
 def _direction(differentiable, index: int, rng: np.random.Generator):
     """Return a random direction in one leaf, as long as this leaf (one if the leaf is zero)."""
     leaves, structure = jax.tree.flatten(differentiable)
-    leaf, along = leaves[index], rng.normal(size=leaves[index].shape)
-    along = along / np.linalg.norm(along) * (np.linalg.norm(leaf) or 1.0)
+    leaf = leaves[index]
+    along = _unit(rng, leaf.shape) * (np.linalg.norm(leaf) or 1.0)
     zeros = [jnp.zeros_like(x) for x in leaves]
     return structure.unflatten(
         [*zeros[:index], jnp.asarray(along, leaf.dtype), *zeros[index + 1 :]]
@@ -146,9 +191,11 @@ def _compare_leaf(
     if forward is None:
         # one pass of reverse mode gives one number for all entries of the leaf
         weighted_sum = lambda x: np.asarray(np.sum(weight * x))
-        return _worst_entry(
-            np.asarray(reverse), weighted_sum(difference), weighted_sum(uncertainty), 0.0, *paths
-        )
+        sums = np.asarray(reverse), weighted_sum(difference), weighted_sum(uncertainty)
+        if weight.size == 1:
+            return _worst_entry(*sums, 0.0, *paths)
+        check = _worst_entry(*sums, 0.0, f"sum(w * {paths[0]})", paths[1])
+        return dataclasses.replace(check, weights=weight)
     scale = np.linalg.norm(weight) * np.linalg.norm(forward)
     mode_difference = 0.0 if reverse is None else abs(reverse - np.sum(weight * forward))
     return _worst_entry(
@@ -196,47 +243,6 @@ def _reverse_gradients(f, differentiable, static, weights):
     }
 
 
-def _central_differences(value, differentiable, direction, step):
-    """Return central differences extrapolated to step zero, and an estimate of their errors.
-
-    Ridders' method: eight halved steps fill a Neville tableau. For every entry, the estimate that
-    changed least between neighbours in the tableau is returned, with that change as its
-    uncertainty.
-    """
-    evaluate = lambda h: value(
-        jax.tree.map(lambda x, d: x + jnp.asarray(h, x.dtype) * d, differentiable, direction)
-    )
-    table, best, uncertainty = [], {}, {}
-    for h in step / 2.0 ** np.arange(8):
-        after, before = evaluate(h), evaluate(-h)
-        if not all(np.isfinite(x).all() for x in (*after.values(), *before.values())):
-            # f is not defined this far from x: restart with smaller steps
-            table, best, uncertainty = [], {}, {}
-            continue
-        row = [
-            {name: (np.asarray(after[name]) - np.asarray(before[name])) / (2 * h) for name in after}
-        ]
-        for k, before in enumerate(table[-1] if table else [], start=1):
-            row.append(
-                {
-                    name: row[-1][name] + (row[-1][name] - before[name]) / (4**k - 1)
-                    for name in before
-                }
-            )
-        for k in range(1, len(row)):
-            for name, new in row[k].items():
-                change = np.maximum(
-                    np.abs(new - row[k - 1][name]), np.abs(new - table[-1][k - 1][name])
-                )
-                better = change < uncertainty.get(name, np.inf)
-                best[name] = np.where(better, new, best.get(name, new))
-                uncertainty[name] = np.where(better, change, uncertainty.get(name, change))
-        table.append(row)
-    # NaN where f was not finite at every step
-    undefined = {name: np.full(np.shape(leaf), np.nan) for name, leaf in after.items()}
-    return undefined | best, undefined | uncertainty
-
-
 def _worst_entry(
     derivative, difference, uncertainty, modes: float, output: str, input: str
 ) -> GradientCheck:
@@ -258,6 +264,7 @@ def _worst_entry(
             difference=0.0,
             uncertainty=0.0,
             modes=modes,
+            direction=None,
         )
     worst = int(np.argmax(errors))
     entry = lambda x: float(np.ravel(x)[worst])
@@ -269,4 +276,5 @@ def _worst_entry(
         difference=entry(difference),
         uncertainty=entry(uncertainty) / float(scale),
         modes=modes,
+        direction=None,
     )

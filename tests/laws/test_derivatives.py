@@ -284,6 +284,39 @@ def test_gradients_in_the_tangent():
     assert abs(float(jnp.linalg.norm(lower)) - 1) < 1e-14
 
 
+@pytest.mark.parametrize("mode", ["forward", "reverse", "both"])
+def test_check_grad_states_the_derivative_along_its_direction(mode):
+    """Of a number by a number the plain derivative; else along a unit direction that it states, in
+    reverse mode of the sum of the outputs times weights that it states."""
+    check = svkc.check_grad(lambda x: 3 * x["a"], {"a": jnp.array(2.0)}, mode, directions=1)
+    assert check.derivative == pytest.approx(3, abs=ROUND_OFF)
+    assert check.difference == pytest.approx(3, abs=DIFFERENCE)
+    assert "d f(x) / d x['a'] is 3 by differentiation, " in str(check)
+
+    matrix = jnp.array([[1.0, 2.0, 3.0], [4.0, 5.0, 7.0]])
+    for f in (lambda x: (matrix @ x)[1], lambda x: matrix @ x):
+        check = svkc.check_grad(f, jnp.array([1.0, -2.0, 4.0]), mode, directions=1)
+        assert np.linalg.norm(check.direction) == pytest.approx(1, abs=ROUND_OFF)
+        change = np.asarray(f(check.direction))
+        if check.weights is not None:
+            assert (mode, np.size(change)) == ("reverse", 2)
+            assert np.linalg.norm(check.weights) == pytest.approx(1, abs=ROUND_OFF)
+            assert "sum(w * f(x)) (w = [" in str(check)
+            change = np.sum(check.weights * change)
+        elif np.size(change) > 1:
+            change = change[int(check.output.split("[")[1][0])]
+        assert check.derivative == pytest.approx(change, abs=REFERENCE)
+        # the direction is written out with four digits
+        written = ", ".join(f"{x:.4g}" for x in check.direction)
+        assert f"/ d x along the unit direction [{written}] is " in str(check)
+
+
+def test_check_grad_states_no_long_directions():
+    check = svkc.check_grad(lambda x: x**2, jnp.arange(1.0, 12.0), "reverse", directions=1)
+    assert "d sum(w * f(x)) (w = check.weights) / d x" in str(check)
+    assert "d x along the unit direction check.direction is" in str(check)
+
+
 def test_check_grad_names_a_wrong_derivative():
     """A wrong derivative is named by the paths of its input and its output."""
 

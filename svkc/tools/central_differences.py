@@ -1,0 +1,50 @@
+"""Central differences of a function of a pytree, extrapolated to step zero."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+def central_differences(value, differentiable, direction, step):
+    """Return central differences extrapolated to step zero, and an estimate of their errors.
+
+    Ridders' method: eight halved steps fill a Neville tableau. For every entry, the estimate that
+    changed least between neighbours in the tableau is returned, with that change as its
+    uncertainty.
+
+    value: function of a pytree like `differentiable` that returns arrays by name.
+    direction: a pytree like `differentiable`.
+    step: first step, as a multiple of the direction.
+    """
+    evaluate = lambda h: value(
+        jax.tree.map(lambda x, d: x + jnp.asarray(h, x.dtype) * d, differentiable, direction)
+    )
+    table, best, uncertainty = [], {}, {}
+    for h in step / 2.0 ** np.arange(8):
+        after, before = evaluate(h), evaluate(-h)
+        if not all(np.isfinite(x).all() for x in (*after.values(), *before.values())):
+            # f is not defined this far from x: restart with smaller steps
+            table, best, uncertainty = [], {}, {}
+            continue
+        row = [
+            {name: (np.asarray(after[name]) - np.asarray(before[name])) / (2 * h) for name in after}
+        ]
+        for k, before in enumerate(table[-1] if table else [], start=1):
+            row.append(
+                {
+                    name: row[-1][name] + (row[-1][name] - before[name]) / (4**k - 1)
+                    for name in before
+                }
+            )
+        for k in range(1, len(row)):
+            for name, new in row[k].items():
+                change = np.maximum(
+                    np.abs(new - row[k - 1][name]), np.abs(new - table[-1][k - 1][name])
+                )
+                better = change < uncertainty.get(name, np.inf)
+                best[name] = np.where(better, new, best.get(name, new))
+                uncertainty[name] = np.where(better, change, uncertainty.get(name, change))
+        table.append(row)
+    # NaN where f was not finite at every step
+    undefined = {name: np.full(np.shape(leaf), np.nan) for name, leaf in after.items()}
+    return undefined | best, undefined | uncertainty
