@@ -134,7 +134,7 @@ def heavy_top():
     data, n = reference.load_reference("heavy_top"), reference.numbers
     model, case = data["model"], data["cases"][-1]
     return _top(
-        reference.ROTATION.format(
+        reference.TOP_MJCF.format(
             n(model["gravity"]), n(model["com_body"]), model["mass"], n(model["inertia_com_body"])
         ),
         case,
@@ -145,7 +145,7 @@ def free_top():
     """Return an asymmetric top without gravity for 10 s, with its closed form."""
     case = reference.load_reference("free_top")["cases"][-1]
     return _top(
-        reference.ROTATION.format("0 0 0", "0 0 0", 1, reference.numbers(case["inertia"])), case
+        reference.TOP_MJCF.format("0 0 0", "0 0 0", 1, reference.numbers(case["inertia"])), case
     )
 
 
@@ -186,7 +186,11 @@ def andrews():
         if force["type"] == "torque"
     }
     return Problem(
-        chain, state, 0.03, torques=torques, control=reference.springs(chain, data["problem"])
+        chain,
+        state,
+        0.03,
+        torques=torques,
+        control=reference.spring_control(chain, data["problem"]),
     )
 
 

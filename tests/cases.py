@@ -1,10 +1,15 @@
-"""The table of mechanisms on which laws and comparisons are tested: how each is built, in what
-state, and what is known of it. `models.py` has what is built here and in other tests.
+"""The table of mechanisms on which laws and comparisons with references are tested.
 
-Tags: "loops", closed by hinges and balls; "forces", of which the loop forces are known to be unique
-or not; "overconstrained", that move although counting says that they cannot; "tree"; "cuttable",
-trees with joints that may be cut; "afloat", joined to the world by virtual links alone; "fast", in
-the fast tier. `params(tag)` gives the names of those with a tag; all but "fast" ones marked slow.
+A case says how a chain is built, in which pose it is tested, and which of its numbers are known.
+`models.py` builds the models. Tags select cases by `params(tag)`:
+
+"loops": loops are closed by hinges and balls.
+"forces": it is known which loop forces are unique.
+"overconstrained": the mechanism moves, although the counting formula gives no freedom.
+"tree": no loops.
+"cuttable": a tree with cuttable joints.
+"floating": no joint but virtual links holds the mechanism to the ground.
+"fast": the case is in the fast tier; tests of the other cases are marked slow.
 """
 
 import dataclasses
@@ -22,7 +27,7 @@ import pytest
 import svkc
 import svkc.scenes
 
-# of gymnasium, which need not be imported for them
+# MJCF files of gymnasium, found without importing the package
 ASSETS = pathlib.Path(importlib.util.find_spec("gymnasium").origin).parent / "envs/mujoco/assets"
 URDF = """<robot name="arm">
 <link name="base"/><link name="upper"><inertial><origin xyz="0 0.02 0.15" rpy="0.1 0.2 0.3"/><mass
@@ -51,7 +56,7 @@ def high_bar() -> tuple[svkc.Chain, svkc.State]:
 
 @functools.cache
 def flight() -> tuple[svkc.Chain, svkc.State]:
-    """Return the high bar figure in flight and spinning, with its hands where the grips were."""
+    """Return the high bar, both grips cut, in the initial pose with random velocities."""
     (chain, state), rng = high_bar(), np.random.default_rng(2)
     free = svkc.cut(chain, state, "right_hand_grip", "left_hand_grip")
     v = free.v.at[: chain.nv].set(jnp.asarray(rng.normal(size=chain.nv)))
@@ -60,25 +65,30 @@ def flight() -> tuple[svkc.Chain, svkc.State]:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Case:
-    """`build(**options)`: the chain, with options of `svkc.load`; `pose`: the tree's coordinates,
-    by joint name or as an array, where they are not those of the model as it is loaded."""
+    """A mechanism of the table.
+
+    build: function of keyword arguments of `svkc.load` that returns the chain.
+    tags: names, separated by spaces.
+    pose: coordinates of the tree, by joint name, or a function that returns them as an array. None:
+        those of the load pose.
+    cuttable: names of joints that may be cut. Tests cut the first.
+    joint_freedoms, rank, freedoms: N_J, m and N_F of the closed chain.
+    counted: N_F by the counting formula of Kutzbach and Gruebler.
+    unique: whether the force of each loop is unique.
+    """
 
     build: Callable[..., svkc.Chain]
     tags: str
     pose: Callable[[], jax.Array] | Mapping | None = None
-    # joints that may be cut, the first of which is
     cuttable: tuple[str, ...] = ()
-    # numbers of the closed chain: N_J, m, N_F, and N_F as Kutzbach and Gruebler count
     joint_freedoms: int | None = None
     rank: int | None = None
     freedoms: int | None = None
     counted: int | None = None
-    # for each loop, whether its force is unique
     unique: tuple[bool, ...] | None = None
 
     def random_motion(self) -> tuple[svkc.Chain, svkc.State, jax.Array]:
-        """Return the chain, a state with velocities at random, projected on what the loops allow,
-        and torques at random."""
+        """Return the chain, a state with random velocities that keep the loops, random torques."""
         chain, rng = self.build(), np.random.default_rng(3)
         pose = self.pose() if callable(self.pose) else self.pose
         state = chain.state(pose, rng.normal(size=chain.nv))
@@ -86,6 +96,7 @@ class Case:
 
 
 def tree(source: str, tags: str = "tree", **known) -> Case:
+    """Return the case of a model that `svkc.load` reads from `source`."""
     return Case(build=functools.partial(svkc.load, source), tags=tags, **known)
 
 
@@ -112,11 +123,11 @@ CASES = {
         build=models.rod_on_balls, tags="loops forces", freedoms=2, unique=(True,)
     ),
     "stewart": Case(build=models.stewart, tags="loops forces", freedoms=6, unique=(True,) * 5),
-    "figure40": Case(build=models.figure40, tags="loops afloat", freedoms=40),
+    "figure40": Case(build=models.figure40, tags="loops floating", freedoms=40),
     "two_hands": Case(
         build=lambda: high_bar()[0],
         pose=lambda: high_bar()[1].q[: high_bar()[0].nq],
-        tags="loops afloat",
+        tags="loops floating",
         freedoms=12,
     ),
     "bennett": Case(
@@ -138,7 +149,7 @@ CASES = {
     "sarrus": Case(
         build=models.sarrus, tags="overconstrained", joint_freedoms=6, rank=5, freedoms=1, counted=0
     ),
-    # trees; of each kind one in the fast tier: figures of others, trees of everything, a URDF
+    # trees, one of each kind in the fast tier: published models, random trees, a URDF
     **{
         name: tree(str(ASSETS / f"{name}.xml"), "tree fast" if name == "hopper" else "tree")
         for name in ("humanoid", "ant", "half_cheetah", "hopper", "walker2d")
@@ -148,9 +159,9 @@ CASES = {
         for n in (2, 7, 25, 60)
     },
     "urdf": tree(URDF, "tree fast"),
-    "free_tree": Case(build=models.free_tree, tags="afloat fast"),
+    "free_tree": Case(build=models.free_tree, tags="floating fast"),
     "figure40_tree": tree(str(svkc.scenes.FOLDER / "figure40.xml")),
-    # trees with joints that may be cut
+    # trees with cuttable joints
     "arm": tree(
         FIGURE,
         "cuttable fast",

@@ -1,5 +1,4 @@
-"""Settings of the tests: float64, strict promotion, warnings as errors, every annotation
-checked."""
+"""Settings of the tests: float64, strict promotion, warnings as errors, checked annotations."""
 
 import gc
 import importlib.metadata
@@ -8,11 +7,11 @@ import pathlib
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("MPLBACKEND", "Agg")
-# most of the suite's time is compilation; the main job, its example and README's run in processes
-# of their own, optimized
+# most of the suite's time is compilation, so XLA does not optimize; the main job, its example and
+# that of the README run in separate processes, with optimization
 flags = "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1"
 if tuple(map(int, importlib.metadata.version("jax").split(".")[:2])) < (0, 11):
-    # half the time; newer XLA has no other emitters
+    # halves the time of compilation; newer XLA lacks this option
     flags += " --xla_cpu_use_fusion_emitters=false"
 os.environ.setdefault("XLA_FLAGS", flags)
 
@@ -34,18 +33,18 @@ hook.uninstall()
 
 import cases
 
-# a second run of the suite, and the other workers, find most programs compiled; jax's key of a
-# program tells the XLA_FLAGS of tests and commands apart
+# a second run of the suite, and other workers, load most programs from this cache; jax's cache key
+# contains XLA_FLAGS, so that tests and commands do not share programs
 svkc._jax.compilation_cache.use_cache()
 
-# tracing makes very many small objects that stay: to look through all of them again and again took
-# a tenth of the suite's time
+# the garbage collector repeatedly scanned the many small objects that tracing leaves, which took a
+# tenth of the suite's time
 gc.freeze()
 gc.set_threshold(100_000, 20, 50)
 
 
-# the longest first, so that no worker is left with one of them in the end
-LONGEST = (
+# these files run first, so that no worker is still running one of them at the end
+LONGEST_FILES = (
     "test_examples",
     "test_commands",
     "test_transformations",
@@ -59,14 +58,18 @@ LONGEST = (
 
 
 def pytest_collection_modifyitems(items):
+    """Move the tests of the longest files to the front."""
     items.sort(
         key=lambda item: (
-            LONGEST.index(item.path.stem) if item.path.stem in LONGEST else len(LONGEST)
+            LONGEST_FILES.index(item.path.stem)
+            if item.path.stem in LONGEST_FILES
+            else len(LONGEST_FILES)
         )
     )
 
 
 def pytest_configure(config):
+    """Turn warnings into errors."""
     config.addinivalue_line("filterwarnings", "error")
 
 
@@ -77,12 +80,11 @@ def high_bar():
 
 
 @pytest.fixture(autouse=True)
-def room_for_programs(request):
-    """Compiled programs are given up before they are too many: XLA maps memory for every kernel,
-    and Linux allows a process 65530 maps.
+def limit_compiled_programs(request):
+    """Clear JAX's caches after a test if the process has more than 30000 memory maps.
 
-    Not after a test of the fixture `compiled`: the next of them counts the traces of the same
-    program.
+    XLA maps memory for every kernel, and Linux allows a process 65530 maps. Caches are kept after a
+    test with the fixture `compiled`, because the next such test counts traces of the same program.
     """
     yield
     maps = pathlib.Path("/proc/self/maps")

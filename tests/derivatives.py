@@ -1,7 +1,6 @@
-"""Cases of the derivative tests: a function of parameters, the parameters, and the allowed
-relative error.
+"""Cases of the derivative tests: (function of parameters, parameters, largest relative error).
 
-`python tests/derivatives.py` prints the table of docs/derivatives.md, or the rows of some cases.
+`python tests/derivatives.py [CASE ...]` prints the table of docs/derivatives.md, or some rows.
 """
 
 import sys
@@ -11,7 +10,15 @@ import jax
 import jax.numpy as jnp
 import models
 import numpy as np
-from parameters import FLOATS, TIGHT, changed, heavier, model, motion, start
+from parameters import (
+    FLOATS,
+    TIGHT,
+    mass_factors,
+    model_floats,
+    run_outputs,
+    with_model_floats,
+    with_state_floats,
+)
 from tolerances import DIFFERENCE
 
 import svkc
@@ -21,13 +28,13 @@ ALGEBRA, RUN = 1e-8, DIFFERENCE
 
 
 def algebra(chain, state):
-    """Return a case with every function that is not a run, on one state."""
+    """Return the case of all public functions that are not runs, on one state."""
     rng = np.random.default_rng(3)
     vdot = jnp.asarray(rng.normal(size=chain.dofs))
 
     def f(x):
-        c = changed(chain, x)
-        s = start(state, x)
+        c = with_model_floats(chain, x)
+        s = with_state_floats(state, x)
         out = {
             "forward": svkc.forward_dynamics(c, s, x["tau"]),
             "inverse": svkc.inverse_dynamics(c, s, vdot),
@@ -47,21 +54,25 @@ def algebra(chain, state):
             }
         return out
 
-    x = {"q": state.q, "v": state.v, "tau": jnp.asarray(rng.normal(size=chain.dofs))} | model(
-        chain, "mass", "com", "inertia", "pos", "gravity"
-    )
+    x = {
+        "q": state.q,
+        "v": state.v,
+        "tau": jnp.asarray(rng.normal(size=chain.dofs)),
+    } | model_floats(chain, "mass", "com", "inertia", "pos", "gravity")
     return f, x | ({"grip": state.structure.real_pos} if len(chain.link_names) else {}), ALGEBRA
 
 
 def four_bar():
+    """Return the four-bar in motion."""
     chain = models.four_bar()
     return algebra(chain, chain.state(v={"crank": 4.0}))
 
 
 def spatial_loop():
+    """Return the spatial R-S-S-R linkage in motion."""
     chain = models.rod_on_balls()
     f, x, _ = algebra(chain, chain.state(v={"crank": 2.0}))
-    # the rod's inertia about itself is too small for differences
+    # differences by the rod's inertia about its axis would be inaccurate: it is too small
     return f, {name: value for name, value in x.items() if name != "inertia"}, ALGEBRA
 
 
@@ -69,20 +80,19 @@ def over_constrained():
     """Return three parallel bars, whose third loop has only redundant rows."""
     chain = models.parallelogram()
     f, x, _ = algebra(chain, chain.state({"leg0": 0.3}, {"leg0": 1.0}))
-    # what keeps the redundant rows redundant: no single place may move
+    # without parameters whose change would make the redundant rows independent
     return f, {k: v for k, v in x.items() if k not in ("q", "v", "pos", "grip")}, ALGEBRA
 
 
 def every_float():
-    """Return a tree with hinges, slides, balls, springs, dampers, armature and offset axes, by all
-    floats of its model."""
+    """Return a tree with all kinds of joints, springs, dampers and armature, by all its floats."""
     chain = svkc.load(models.random_tree(6, seed=4))
     rng = np.random.default_rng(4)
     q = svkc.integrate(chain, chain.q_load, jnp.asarray(rng.normal(size=chain.dofs)))
     f, x, _ = algebra(
         chain, svkc.State(q, jnp.asarray(rng.normal(size=chain.dofs)), chain.structure)
     )
-    floats = model(chain, *FLOATS)
+    floats = model_floats(chain, *FLOATS)
     assert all(leaf is not None for leaf in floats.values())
     return f, x | floats, ALGEBRA
 
@@ -104,15 +114,14 @@ def at_rest():
 
 
 def assembly():
-    """Return Newton's method onto the loops from an open configuration, by model lengths and grips
-    too."""
+    """Return `chain.state` from an open configuration, also by lengths and link placements."""
     chain = models.rod_on_balls()
     near = chain.state({"crank": 0.3})
-    # as the user gives it: a little off, and a velocity that does not agree
+    # coordinates that leave the loop open by a little; the velocity below opens it as well
     q = near.q[: chain.nq] + 0.02 * jnp.sin(jnp.arange(chain.nq, dtype=float))
 
     def f(x):
-        c = changed(chain, x)
+        c = with_model_floats(chain, x)
         c = eqx.tree_at(lambda c: c.structure.real_pos, c, x["grip"])
         state = c.state(x["q"], x["v"])
         return {"q": state.q, "v": state.v}
@@ -146,20 +155,25 @@ def impact():
     state = chain.state(v=rng.normal(size=12), connected=())
 
     def f(x):
-        after = svkc.connect(changed(chain, x), start(state, x), "hold", here=True)
-        return {"q": after.q, "v": after.v, "energy": svkc.kinetic_energy(changed(chain, x), after)}
+        after = svkc.connect(
+            with_model_floats(chain, x), with_state_floats(state, x), "hold", here=True
+        )
+        return {
+            "q": after.q,
+            "v": after.v,
+            "energy": svkc.kinetic_energy(with_model_floats(chain, x), after),
+        }
 
     return (
         f,
         {"q": state.q, "v": state.v, "grip": state.structure.real_pos}
-        | model(chain, "mass", "com", "inertia"),
+        | model_floats(chain, "mass", "com", "inertia"),
         ALGEBRA,
     )
 
 
 def pendulum_cut():
-    """Return two rods: the second is cut at an angle of the first and gripped again at its current
-    pose; by both times, the angle and the model."""
+    """Return two rods, of which the second is cut at an angle of the first and connected again."""
     rods = models.TWO_RODS
     chain = svkc.load(models.MJCF.format(rods), cuttable="lower")
     state = chain.state({"upper": 1.2, "lower": 0.3}, {"upper": 0.1, "lower": 0.2})
@@ -170,9 +184,15 @@ def pendulum_cut():
             svkc.at(x["again"], connect="lower", here=True),
         ]
         ts = jnp.stack([x["seen"], x["t1"]])
-        return motion(
+        return run_outputs(
             svkc.simulate(
-                changed(chain, x), state, x["t1"], ts=ts, events=events, args=x["angle"], **TIGHT
+                with_model_floats(chain, x),
+                state,
+                x["t1"],
+                ts=ts,
+                events=events,
+                args=x["angle"],
+                **TIGHT,
             )
         )
 
@@ -180,11 +200,11 @@ def pendulum_cut():
         name: jnp.asarray(value)
         for name, value in {"angle": 0.4, "again": 0.55, "t1": 0.7, "seen": 0.5}.items()
     }
-    return f, x | model(chain, "com", "gravity") | heavier(chain), RUN
+    return f, x | model_floats(chain, "com", "gravity") | mass_factors(chain), RUN
 
 
 def breaking():
-    """Return a joint that breaks under its load, and a grip made with a spare slot."""
+    """Return a joint that breaks under its load, and a grip by a spare slot."""
     rods = models.TWO_RODS
     rods += models.bar("other", models.Y, "0 0 -1", "1 0 0")
     chain = svkc.load(models.MJCF.format(rods), cuttable="lower", spare=1)
@@ -197,9 +217,9 @@ def breaking():
             svkc.at(x["time"], bind=grip),
         ]
         control = lambda t, s, args: args * jnp.sin(3 * t) * jnp.ones(chain.nv)
-        return motion(
+        return run_outputs(
             svkc.simulate(
-                changed(chain, x),
+                with_model_floats(chain, x),
                 state,
                 0.6,
                 events=events,
@@ -215,17 +235,16 @@ def breaking():
         "torque": jnp.asarray(0.5),
         "place": jnp.array([0.1, 0.0, -0.7]),
     }
-    return f, x | model(chain, "gravity") | heavier(chain), RUN
+    return f, x | model_floats(chain, "gravity") | mass_factors(chain), RUN
 
 
 def four_bar_turning():
-    """Return a four-bar driven through more than one turn, so that the independent coordinates
-    change."""
+    """Return a four-bar driven through more than a turn, which changes independent coordinates."""
     chain = models.four_bar()
     control = lambda t, s, args: jnp.zeros(chain.dofs).at[0].set(args[0] * jnp.cos(args[1] * t))
 
     def run(x):
-        c = changed(chain, x)
+        c = with_model_floats(chain, x)
         # the pin may be elsewhere in the plane; out of it the loop would not close
         pin = chain.structure.real_pos.at[:, ::2].add(x["pin"])
         c = eqx.tree_at(lambda c: c.structure.real_pos, c, pin)
@@ -240,11 +259,11 @@ def four_bar_turning():
         "angle": jnp.asarray(0.1),
         "pin": jnp.zeros((1, 2)),
     }
-    x |= model(chain, "gravity") | heavier(chain)
+    x |= model_floats(chain, "gravity") | mass_factors(chain)
     c, traj = run(x)
     dependent = jax.vmap(lambda s: svkc.coordinates(c, s).dependent)(traj.states)
     assert jnp.any(dependent != dependent[:1]), "no coordinate was swapped"
-    return lambda x: motion(run(x)[1]), x, RUN
+    return lambda x: run_outputs(run(x)[1]), x, RUN
 
 
 def over_constrained_run():
@@ -257,18 +276,22 @@ def over_constrained_run():
             svkc.at(x["time"], cut="pin1"),
             svkc.at(x["time"] + 0.1, connect="pin1", here=True),
         ]
-        return motion(svkc.simulate(changed(chain, x), state, 0.5, events=events, **TIGHT))
+        return run_outputs(
+            svkc.simulate(with_model_floats(chain, x), state, 0.5, events=events, **TIGHT)
+        )
 
-    return f, {"time": jnp.asarray(0.2)} | model(chain, "gravity") | heavier(chain), RUN
+    return f, {"time": jnp.asarray(0.2)} | model_floats(chain, "gravity") | mass_factors(chain), RUN
 
 
 def high_bar():
-    """Return the high bar figure from rest with two hands, one, none, one: 24, 23, 22, 23 joint
-    freedoms; by every release time and the catch time."""
+    """Return the high bar with two hands, one, none, one: 24, 23, 22, 23 joint freedoms.
+
+    The times of releases and of the catch are parameters.
+    """
     chain, hanging = svkc.scenes.high_bar(ignore="limit")
 
     def f(x):
-        c = changed(chain, x)
+        c = with_model_floats(chain, x)
         right, left, again = x["times"]
         events = [
             svkc.at(right, cut="right_hand_grip"),
@@ -278,7 +301,7 @@ def high_bar():
         control = lambda t, s, args: jnp.concatenate(
             [jnp.zeros(6), args * jnp.sin(4 * t), jnp.zeros(chain.dofs - 22)]
         )
-        return motion(
+        return run_outputs(
             svkc.simulate(
                 c,
                 c.state(hanging.q[: c.nq], x["v"]),
@@ -296,14 +319,14 @@ def high_bar():
         "torque": jnp.asarray(5 * rng.normal(size=16)),
         "v": jnp.zeros(chain.nv),
     }
-    return f, x | heavier(chain), RUN
+    return f, x | mass_factors(chain), RUN
 
 
 def swing():
-    """The seat gives way as each thigh slides over an edge of its own: two guards.
+    """Return the swing, whose slides are cut by two guards at two distances.
 
-    Both sides of the body stay alike up to the first: turned on the plate, the pelvis would open
-    the two slides' loops to the second order only.
+    The torques are symmetric. Asymmetric ones would turn the pelvis on the plate, which the loops
+    of the two slides allow to first order only.
     """
     from svkc.scenes.swing import PLATE_EDGE, swing
 
@@ -328,9 +351,9 @@ def swing():
     def f(x):
         arm, leg = jnp.split(x["torque"], 2)
         torque = jnp.concatenate([jnp.zeros(6), arm, arm, leg, leg, jnp.zeros(chain.dofs - 22)])
-        c = changed(chain, {"heavier": x["heavier"][index]})
+        c = with_model_floats(chain, {"mass_factors": x["mass_factors"][index]})
         events = [slid(side, number) for number, side in enumerate(sides)]
-        return motion(
+        return run_outputs(
             svkc.simulate(
                 c,
                 state,
@@ -343,12 +366,11 @@ def swing():
         )
 
     x = {"t1": jnp.asarray(0.15), "torque": jnp.ones(8), "edge": jnp.asarray(PLATE_EDGE)}
-    return f, x | {"heavier": jnp.ones(index.max() + 1)}, RUN
+    return f, x | {"mass_factors": jnp.ones(index.max() + 1)}, RUN
 
 
 def brachiation():
-    """Return a figure that hangs by one hand, grips the next bar with the other, and releases the
-    first."""
+    """Return a figure that hangs by one hand, catches the next bar, and releases the first."""
     from svkc.scenes.brachiation import brachiation
 
     chain, state = brachiation(ignore="limit")
@@ -376,7 +398,7 @@ def brachiation():
             svkc.when(near, connect="left_hand_bar2", here=True, direction=False),
             svkc.at(x["release"], cut="right_hand_bar1"),
         ]
-        return motion(
+        return run_outputs(
             svkc.simulate(
                 chain, state, 0.8, events=events, control=control, args=x["pose"], **TIGHT
             )
@@ -405,8 +427,7 @@ CASES = ALGEBRAIC | RUNS
 
 
 def main(names):
-    """Print one row for each case: the worst entry in both modes, along a random direction of each
-    parameter."""
+    """Print the worst relative error of each case, in both modes, along random directions."""
     print(
         "| case | parameters | worst relative error | of | difference good to | forward against"
         " reverse |\n|---|---|---|---|---|---|"

@@ -1,5 +1,7 @@
-"""Mechanisms of the tests, as MJCF and virtual links. The table in `cases.py` says which laws are
-tested on which."""
+"""Mechanisms of the tests, as MJCF and virtual links.
+
+The table in `cases.py` selects those on which laws are tested.
+"""
 
 import re
 
@@ -12,8 +14,10 @@ BAR = '<geom type="capsule" fromto="0 0 0 {0}" size="0.03" contype="0" conaffini
 
 
 def random_tree(bodies: int, seed: int, kinds=("hinge", "slide", "ball", "free")) -> str:
-    """Return a random tree with random shapes and frames, several joints on some bodies, and one to
-    three roots."""
+    """Return the MJCF of a random tree with random shapes and frames.
+
+    Bodies have one or two joints. Some trees have several roots.
+    """
     rng = np.random.default_rng(seed)
     children: list[list[int]] = [[] for _ in range(bodies + 1)]
     for i in range(1, bodies + 1):
@@ -43,21 +47,27 @@ def random_tree(bodies: int, seed: int, kinds=("hinge", "slide", "ball", "free")
 
     def body(i, root):
         quat = rng.normal(size=4)
-        here = (
+        element = (
             f'<body name="b{i}" pos="{numbers(rng.normal(size=3) / 3)}"'
             f' quat="{numbers(quat / np.linalg.norm(quat))}">{joints(i, root)}'
         )
         size = rng.uniform(0.03, 0.1, 3)
-        here += (
+        element += (
             f'<geom type="box" size="{numbers(size)}" pos="{numbers(rng.normal(size=3) / 10)}"'
             ' contype="0" conaffinity="0"/>'
         )
-        return here + "".join(body(c, False) for c in children[i]) + "</body>"
+        return element + "".join(body(c, False) for c in children[i]) + "</body>"
 
     return MJCF.format("".join(body(i, True) for i in children[0]))
 
 
 def bar(name: str, joint: str, to: str, pos="0 0 0", inside="") -> str:
+    """Return the MJCF of a body with one joint of its name and a capsule from its origin to `to`.
+
+    joint: attributes of the joint.
+    pos: origin of the body in its parent (m).
+    inside: MJCF of child bodies.
+    """
     return (
         f'<body name="{name}" pos="{pos}"><joint name="{name}"'
         f" {joint}/>{BAR.format(to)}{inside}</body>"
@@ -67,7 +77,7 @@ def bar(name: str, joint: str, to: str, pos="0 0 0", inside="") -> str:
 Y = 'type="hinge" axis="0 1 0" damping="0"'
 
 
-# a rod on a hinge; two of them
+# a rod on a hinge, and the bodies of a double pendulum
 ARM = MJCF.format(bar("arm", Y, "0 0 -1"))
 TWO_RODS = bar("upper", Y, "0 0 -1", inside=bar("lower", Y, "0 0 -0.8", "0 0 -1"))
 
@@ -86,14 +96,18 @@ def pin(**changed) -> svkc.VirtualLink:
 
 
 def four_bar(**options) -> svkc.Chain:
-    """Return crank, coupler and rocker on hinges about y, closed by a hinge; 3 of its 6 rows are
-    redundant."""
+    """Return crank, coupler and rocker on hinges about y, closed by a hinge.
+
+    3 of the loop's 6 rows are redundant.
+    """
     return svkc.load(MJCF.format(FOUR_BAR), virtual_links=[pin()], **options)
 
 
 def parallelogram(middle: bool = True) -> svkc.Chain:
-    """Return two or three parallel bars that carry a platform; all rows of the third loop are
-    redundant."""
+    """Return three parallel bars under a plate: two loops, of which one is wholly redundant.
+
+    middle: whether the middle bar is connected.
+    """
     legs = "".join(
         bar(
             f"leg{i}",
@@ -121,8 +135,7 @@ def parallelogram(middle: bool = True) -> svkc.Chain:
 
 
 def rod_on_balls() -> svkc.Chain:
-    """Return a spatial R-S-S-R linkage: the coupler has a ball at each end, and spins freely about
-    its axis."""
+    """Return a spatial R-S-S-R linkage, whose coupler spins freely between two balls."""
     crank = bar(
         "crank",
         'type="hinge" axis="1 0 0"',
@@ -143,8 +156,10 @@ def rod_on_balls() -> svkc.Chain:
 
 
 def stewart() -> svkc.Chain:
-    """Return a platform on six legs, each a universal joint (two hinges), a slide and a ball; the
-    first leg is in the tree."""
+    """Return a Stewart platform: six legs of a universal joint (two hinges), a slide and a ball.
+
+    The ball of the first leg is in the tree; the other balls are virtual links.
+    """
     angle = np.deg2rad([0, 60, 120, 180, 240, 300])
     feet = np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
     tops = np.stack([0.5 * np.cos(angle + 0.5), 0.5 * np.sin(angle + 0.5), 0 * angle + 1], 1)
@@ -175,14 +190,14 @@ def stewart() -> svkc.Chain:
                     connected=True,
                 )
             )
-    # places of the joints in the plate, from the load pose
+    # positions of the balls in the plate's frame, from the load pose
     import mujoco
 
     model = mujoco.MjModel.from_xml_string(MJCF.format(xml))
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     R, p = data.body("plate").xmat.reshape(3, 3), data.body("plate").xpos
-    placed = [
+    placed_links = [
         svkc.VirtualLink(
             k.name,
             k.parent,
@@ -194,12 +209,11 @@ def stewart() -> svkc.Chain:
         )
         for i, k in enumerate(links)
     ]
-    return svkc.load(MJCF.format(xml), virtual_links=placed)
+    return svkc.load(MJCF.format(xml), virtual_links=placed_links)
 
 
 def five_bar() -> svkc.Chain:
-    """Return two arms of two links that meet: mobility 2, with motors on both shoulders and one
-    elbow."""
+    """Return two arms of two links whose ends are joined by a hinge: mobility 2."""
     left = bar("left_arm", Y, "0 0 0.5", "-0.3 0 0", bar("left_fore", Y, "0.3 0 0.5", "0 0 0.5"))
     right = bar("right_arm", Y, "0 0 0.5", "0.3 0 0", bar("right_fore", Y, "-0.3 0 0.5", "0 0 0.5"))
     link = svkc.VirtualLink(
@@ -215,20 +229,25 @@ def five_bar() -> svkc.Chain:
     return svkc.load(MJCF.format(left + right), virtual_links=[link])
 
 
-def dh_loop(theta, length, twist, axes_named="j") -> svkc.Chain:
-    """Return a loop of hinges by Denavit-Hartenberg parameters: joint i rotates by theta[i] about
-    z; the next joint is `length[i]` along x, rotated by `twist[i]` about x."""
-    turn = lambda angle: np.array([np.cos(angle / 2), np.sin(angle / 2)])
-    about_x = lambda angle: (turn(angle)[0], turn(angle)[1], 0, 0)
+def dh_loop(theta, length, twist, joint_prefix="j") -> svkc.Chain:
+    """Return a loop of hinges with Denavit-Hartenberg parameters.
+
+    theta: rotation of each joint about z in the load pose (rad).
+    length: distance along x to the next joint (m).
+    twist: rotation about x to the next joint (rad).
+    joint_prefix: beginning of the names of bodies and joints.
+    """
+    half_angle = lambda angle: np.array([np.cos(angle / 2), np.sin(angle / 2)])
+    about_x = lambda angle: (half_angle(angle)[0], half_angle(angle)[1], 0, 0)
     xml = ""
     for i in reversed(range(len(theta) - 1)):
-        # Rot_x(twist) Rot_z(theta), from the joint before
-        (cx, sx), (cz, sz) = turn(twist[i - 1] if i else 0), turn(theta[i])
+        # Rot_x(twist of the previous link) Rot_z(theta)
+        (cx, sx), (cz, sz) = half_angle(twist[i - 1] if i else 0), half_angle(theta[i])
         quat = f"{cx * cz} {sx * cz} {-sx * sz} {cx * sz}"
         pos = f"{length[i - 1] if i else 0} 0 0"
         hinge = (
-            f'<body name="{axes_named}{i}" pos="{pos}" quat="{quat}"><joint name="{axes_named}{i}"'
-            ' axis="0 0 1"/>'
+            f'<body name="{joint_prefix}{i}" pos="{pos}" quat="{quat}">'
+            f'<joint name="{joint_prefix}{i}" axis="0 0 1"/>'
         )
         xml = (
             hinge
@@ -238,7 +257,7 @@ def dh_loop(theta, length, twist, axes_named="j") -> svkc.Chain:
         )
     last = len(theta) - 2
     end = svkc.VirtualLink(
-        "last", f"{axes_named}{last}", "world", "hinge", pos=(length[last], 0, 0),
+        "last", f"{joint_prefix}{last}", "world", "hinge", pos=(length[last], 0, 0),
         quat=about_x(twist[last]), real_pos=(-length[-1], 0, 0), real_quat=about_x(-twist[-1]),
         connected=True,
     )  # fmt: skip
@@ -246,8 +265,7 @@ def dh_loop(theta, length, twist, axes_named="j") -> svkc.Chain:
 
 
 def figure40() -> svkc.Chain:
-    """Return the 40-freedom figure with a ball grip at each hand in the hanging pose: mobility
-    40."""
+    """Return the 40-freedom figure with both hands held to the ground by balls: mobility 40."""
     chain = svkc.load(str(svkc.scenes.FOLDER / "figure40.xml"))
     place = np.asarray(svkc.poses(chain, chain.state())[0])
     grips = [
@@ -265,26 +283,35 @@ def figure40() -> svkc.Chain:
 
 
 def bennett(theta=0.9) -> svkc.Chain:
-    """Return four skew hinges that move only because sin(alpha) / a = sin(beta) / b."""
+    """Return Bennett's linkage: four skew hinges with sin(alpha) / a = sin(beta) / b.
+
+    theta: rotation of the first joint in the load pose (rad).
+    """
     alpha, a, b = np.deg2rad(30.0), 0.5, 0.8
     beta = np.arcsin(np.sin(alpha) * b / a)
-    second = 2 * np.arctan(
+    theta_2 = 2 * np.arctan(
         np.sin((beta + alpha) / 2) / np.sin((beta - alpha) / 2) / np.tan(theta / 2)
     )
-    return dh_loop((theta, second, -theta, -second), (a, b, a, b), (alpha, beta, alpha, beta))
+    return dh_loop((theta, theta_2, -theta, -theta_2), (a, b, a, b), (alpha, beta, alpha, beta))
 
 
 def bricard(theta=np.pi / 3) -> svkc.Chain:
-    """Return six hinges with equal links and alternating twists of 90 and -90 degrees: cos t + cos
-    u + cos t cos u = 0."""
-    other = np.arccos(-np.cos(theta) / (1 + np.cos(theta)))
-    quarter = np.pi / 2
-    return dh_loop((theta, other) * 3, (0.5,) * 6, (quarter, -quarter) * 3)
+    """Return Bricard's linkage: six hinges, equal links, alternating twists of 90 and -90 degrees.
+
+    Angles t and u of successive joints satisfy cos t + cos u + cos t cos u = 0.
+
+    theta: t in the load pose (rad).
+    """
+    theta_2 = np.arccos(-np.cos(theta) / (1 + np.cos(theta)))
+    quarter_turn = np.pi / 2
+    return dh_loop((theta, theta_2) * 3, (0.5,) * 6, (quarter_turn, -quarter_turn) * 3)
 
 
 def sarrus() -> svkc.Chain:
-    """Return two legs of three parallel hinges at right angles: the platform moves straight up and
-    down."""
+    """Return Sarrus' linkage: two legs of three parallel hinges each, at right angles.
+
+    The plate moves along a vertical line.
+    """
     X = 'type="hinge" axis="1 0 0"'
     leg_x = bar(
         "a1",
@@ -321,8 +348,10 @@ def two_boxes(joint: str) -> svkc.Chain:
 
 
 def box_with_a_limb() -> svkc.Chain:
-    """Return two free boxes, one with a cuttable limb, a weld between them, and a spare slot; no
-    gravity."""
+    """Return two free boxes without gravity, one with a cuttable limb.
+
+    A disconnected weld is between the boxes. There is one spare slot.
+    """
     limb = bar("limb", Y, "0.4 0 0", "0.1 0 0") + '</body><body name="b"'
     text = TWO_BOXES.replace("0.3 -0.2 -9.81", "0 0 0").replace('</body><body name="b"', limb)
     weld = svkc.VirtualLink("weld", "a", "b", "weld", real_pos=(-0.6, 0.1, 0))
@@ -330,7 +359,7 @@ def box_with_a_limb() -> svkc.Chain:
 
 
 def free_tree() -> svkc.Chain:
-    """Return eight bodies on a free one; no gravity."""
+    """Return a random tree of eight bodies without gravity, whose root is a free body."""
     text = random_tree(8, seed=4, kinds=("free", "ball", "hinge"))
     first = re.compile(r'<body name="b1"([^>]*)>(<joint[^>]*/>)*')
     text = first.sub(r'<body name="b1"\1><freejoint/>', text, count=1)

@@ -1,5 +1,7 @@
-"""Parameters of derivatives (floats of a chain and of a state, by name), a run as numbers, and the
-error of derivatives against differences."""
+"""Parameters and outputs of the derivative tests, and the error of derivatives.
+
+Parameters are floats of a chain and of a state, by name. Outputs are the numbers of a run.
+"""
 
 import diffrax
 import equinox as eqx
@@ -14,32 +16,34 @@ TIGHT = {"rtol": 1e-11, "atol": 1e-13, "solver": diffrax.Dopri8()}
 FLOATS = "mass com inertia pos quat axis anchor gravity armature damping stiffness q_spring".split()
 
 
-def model(chain, *names):
-    """Return floats of the model by name; "grip" is the virtual links' placement in their real
-    links."""
+def model_floats(chain, *names):
+    """Return floats of the chain by name.
+
+    names: fields of the chain, or "grip" for the links' positions in their real links.
+    """
     return {
         name: chain.structure.real_pos if name == "grip" else getattr(chain, name) for name in names
     }
 
 
-def changed(chain, x):
+def with_model_floats(chain, x):
     """Return the chain with its floats replaced by those in x."""
     for name in FLOATS:
         if name in x:
             chain = eqx.tree_at(lambda c, name=name: getattr(c, name), chain, x[name])
-    if "heavier" in x:
-        # bodies whose inertia stays that of a body, for runs
-        grown = (chain.mass * x["heavier"], chain.inertia * x["heavier"][:, None, None])
-        chain = eqx.tree_at(lambda c: (c.mass, c.inertia), chain, grown)
+    if "mass_factors" in x:
+        # one factor for mass and inertia keeps the inertia physical
+        scaled = (chain.mass * x["mass_factors"], chain.inertia * x["mass_factors"][:, None, None])
+        chain = eqx.tree_at(lambda c: (c.mass, c.inertia), chain, scaled)
     return chain
 
 
-def heavier(chain):
-    """Return the parameter that scales mass and inertia, body by body."""
-    return {"heavier": jnp.ones(len(chain.mass))}
+def mass_factors(chain):
+    """Return the parameter that scales mass and inertia of each body, with factors of one."""
+    return {"mass_factors": jnp.ones(len(chain.mass))}
 
 
-def start(state, x):
+def with_state_floats(state, x):
     """Return the state with its floats replaced by those in x."""
     s = state.structure
     if "grip" in x:
@@ -47,8 +51,8 @@ def start(state, x):
     return svkc.State(x.get("q", state.q), x.get("v", state.v), s)
 
 
-def motion(traj):
-    """Return the numbers of a run; rows without an event are zero."""
+def run_outputs(traj):
+    """Return the numbers of a run by name. Times and impacts of unused rows are zero."""
     e, p = traj.events, traj.phases
     flat = lambda *parts: jnp.concatenate([jnp.ravel(part) for part in parts])
     times = flat(e.time, p.start, p.stop, traj.t_final)
@@ -61,18 +65,21 @@ def motion(traj):
     }
 
 
-def worst(program, x, step=0.05) -> float:
-    """The largest relative error of derivatives against differences, along a random direction of
-    each parameter, where one program has all of it.
+def worst_relative_error(program, x, step=0.05) -> float:
+    """Return the largest relative error of derivatives against central differences.
 
-    program(x, along): values, and their derivatives along a direction. (`svkc.check_grad` compiles
-    the function, too.)
+    Derivatives are taken along a random direction of each parameter. If a number is not finite, the
+    error is infinite. One program returns values and derivatives; `svkc.check_grad` would compile
+    two.
+
+    program: function (x, along) that returns values at x and their derivatives along a direction.
+    step: first step of the extrapolated differences.
     """
     named = lambda tree: {
         jax.tree_util.keystr(path): np.asarray(leaf)
         for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
     }
-    # (without weak types, which would compile it again for every parameter)
+    # weak types would compile the program again for every parameter
     x = jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype), x)
     rng, errors = np.random.default_rng(0), []
     for name, leaf in x.items():
@@ -90,5 +97,5 @@ def worst(program, x, step=0.05) -> float:
             errors.append(
                 np.abs(derivative[path] - expected).max() / (size if size > 1e-9 else 1.0)
             )
-    # (of what is no number neither max nor the comparison with a bound would tell)
+    # infinite instead of NaN, so that the comparison with a bound fails
     return float(np.max(errors)) if np.isfinite(errors).all() else np.inf

@@ -14,14 +14,18 @@ CACHE = tempfile.TemporaryDirectory()
 
 
 def run(*args, cwd=ROOT, optimized=True, settings=None):
-    """Run Python with these arguments."""
+    """Run Python with these arguments, and return the completed process with its output as text.
+
+    optimized: whether XLA optimizes, unlike in the tests' own process.
+    settings: further environment variables.
+    """
     env = dict(os.environ)
     if optimized:
         env["XLA_FLAGS"] = env.get("XLA_FLAGS", "").replace(
             "--xla_backend_optimization_level=0", ""
         )
-    # an example and the command of the same scene compile the same program; jax alone, as an
-    # example uses it, may leave half an entry: not among the tests' own
+    # an example and the command of one scene share programs; their cache is separate, because jax
+    # without svkc's patches, as in examples, may leave truncated entries
     kept = jax.config.jax_compilation_cache_dir
     env |= {
         "JAX_COMPILATION_CACHE_DIR": f"{kept}/processes" if kept else CACHE.name,
@@ -40,7 +44,7 @@ def run(*args, cwd=ROOT, optimized=True, settings=None):
 
 
 def looks_drawn(path):
-    """Assert that a picture has more than a few colours."""
+    """Assert that a picture has more than twenty colors."""
     from PIL import Image
 
     with Image.open(path) as image:

@@ -128,7 +128,7 @@ def render_without_opengl(s):
 
 
 def clashing_prefixes(s):
-    """Two specs attached with one prefix: two default classes of one name."""
+    """Attach two specs with one prefix, which gives two default classes one name."""
     spec = mujoco.MjSpec()
     for name in ("a", "b"):
         part = mujoco.MjSpec()

@@ -15,8 +15,10 @@ KEY = jax.random.key(3)
 
 
 def example(x, y, which):
-    """Use calls, gathers by shared and by batched indices, products of all kinds, loops, solves and
-    selects."""
+    """Return the result of calls, gathers, products of all kinds, loops, solves and selects.
+
+    Gathers have shared and batched indices.
+    """
     rows = x[np.array([2, 0, 1])] + x[which][None] + jnp.eye(3)[which][None]
     left = (
         jnp.einsum("ij,kj->ik", x, y)

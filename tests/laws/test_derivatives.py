@@ -43,7 +43,7 @@ def test_a_release_against_differences():
     def loss(x):
         events = [svkc.when(lambda t, s, args: svkc.poses(chain, s)[1][1, 2] - args, cut="rod")]
         start = svkc.State(state.q, x["speed"] * state.v, state.structure)
-        c = parameters.changed(chain, x)
+        c = parameters.with_model_floats(chain, x)
         traj = svkc.simulate(
             c,
             start,
@@ -57,7 +57,7 @@ def test_a_release_against_differences():
         # infinite if the event does not occur
         return traj.events.time[0] + jnp.sum(jnp.sin(traj.final.q)) + jnp.sum(traj.final.v**2) / 10
 
-    x = {"sine": jnp.asarray(0.3), "speed": jnp.asarray(1.0)} | parameters.heavier(chain)
+    x = {"sine": jnp.asarray(0.3), "speed": jnp.asarray(1.0)} | parameters.mass_factors(chain)
     rng = np.random.default_rng(0)
     direction = {name: jnp.asarray(rng.normal(size=leaf.shape)) for name, leaf in x.items()}
 
@@ -72,7 +72,7 @@ def test_a_release_against_differences():
     lowered = program.lower(part, part)
     # 10 % above what was counted with jax 0.10.1
     assert count_instructions(lowered.compiler_ir("hlo").as_hlo_text()) <= BUDGET
-    assert parameters.worst(lowered.compile(), part) <= derivatives.RUN
+    assert parameters.worst_relative_error(lowered.compile(), part) <= derivatives.RUN
 
 
 def jacobians_in_both_modes(f):
@@ -234,7 +234,7 @@ def test_derivatives_are_finite_at_degenerate_points():
     state = chain.state()
 
     def all_outputs(x):
-        c = parameters.changed(chain, x)
+        c = parameters.with_model_floats(chain, x)
         s = svkc.lock(c, svkc.State(x["q"], x["v"], state.structure), "fore")
         traj = svkc.simulate(
             c,
@@ -243,12 +243,12 @@ def test_derivatives_are_finite_at_degenerate_points():
             events=[svkc.at(x["time"], connect="hook", here=True), svkc.at(0.07, unlock="fore")],
             dt=0.02,
         )
-        return parameters.motion(traj) | {
+        return parameters.run_outputs(traj) | {
             "forces": svkc.loop_forces(c, traj.final, jnp.zeros(chain.dofs)).force,
             "gap": traj.gaps,
         }
 
-    x = {"q": state.q, "v": state.v, "time": jnp.asarray(0.05)} | parameters.model(
+    x = {"q": state.q, "v": state.v, "time": jnp.asarray(0.05)} | parameters.model_floats(
         chain, "mass", "inertia", "com", "pos", "gravity"
     )
     total = lambda x: sum(jnp.sum(leaf) for leaf in jax.tree.leaves(all_outputs(x)))

@@ -14,7 +14,7 @@ from svkc.transitions.transition import change_structure
 from svkc.tree.configuration import configuration_derivative
 
 
-@pytest.mark.parametrize("name", cases.params("afloat"))
+@pytest.mark.parametrize("name", cases.params("floating"))
 def test_the_rate_of_momentum_is_the_external_force(name):
     """The rate is that of the weight and of the loop forces; joint torques have no part in it."""
     chain, state, tau = cases.CASES[name].random_motion()

@@ -41,7 +41,7 @@ def acceleration_error(chain, state, vdot, result):
     )
 
 
-def test_square(five_bar):
+def test_as_many_motors_as_freedoms(five_bar):
     """Two motors for two freedoms reach the acceleration, without redundancy (paper (22))."""
     chain, state, vdot, co = five_bar
     motors = mask(chain, "left_arm", "right_arm")
@@ -55,7 +55,7 @@ def test_square(five_bar):
     np.testing.assert_allclose(short.tau, result.tau, rtol=ROUND_OFF)
 
 
-def test_redundant(five_bar):
+def test_more_motors_than_freedoms(five_bar):
     """Three motors give torques of least norm, compared with numpy's pseudo-inverse.
 
     Torques in the null space change the wrenches in the loop, but not the motion.
@@ -100,7 +100,7 @@ def test_redundant(five_bar):
     assert float(jnp.abs(result.null_force).max()) > 1e-3
 
 
-def test_deficient(five_bar):
+def test_fewer_motors_than_freedoms(five_bar):
     """One motor for two freedoms leaves a residual and one undriven direction."""
     chain, state, vdot, _ = five_bar
     motors = mask(chain, "left_arm")

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import models
 import numpy as np
 import pytest
-from kkt import acceleration
+from kkt import constrained_acceleration
 from tolerances import REFERENCE, ROUND_OFF
 
 import svkc
@@ -19,7 +19,7 @@ def linkage(request):
     return case, chain, chain.state()
 
 
-def test_one_freedom_where_counting_says_none(linkage):
+def test_mobility_is_one_where_the_counting_formula_gives_none(linkage):
     case, chain, state = linkage
     m = svkc.mobility(chain, state)
     actual = int(m.joint_freedoms), int(m.rank), int(m.freedoms)
@@ -48,7 +48,7 @@ def test_the_linkage_moves_a_finite_distance(linkage):
     )
     there = chain.state(traj.final.q)
     assert int(svkc.mobility(chain, there).rank) == case.rank
-    expected = acceleration(chain, start, np.zeros(chain.nv))
+    expected = constrained_acceleration(chain, start, np.zeros(chain.nv))
     vdot = svkc.forward_dynamics(chain, start, jnp.zeros(chain.nv))
     np.testing.assert_allclose(vdot[: chain.nv], expected, atol=REFERENCE * np.abs(expected).max())
 
@@ -83,7 +83,7 @@ def test_loop_forces_are_the_multipliers(name):
     assert forces.unique.tolist() == list(case.unique)
     linear, angular = (np.asarray(x) for x in svkc.loop_jacobian(chain, state))
     J = np.concatenate([angular, linear / float(chain.length)], 1).reshape(-1, chain.dofs)
-    vdot = acceleration(chain, state, tau)
+    vdot = constrained_acceleration(chain, state, tau)
     excess = np.zeros(chain.dofs)
     excess[: chain.nv] = (
         np.asarray(svkc.inverse_dynamics(chain, state, jnp.asarray(vdot)))

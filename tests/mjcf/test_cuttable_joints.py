@@ -62,7 +62,7 @@ def test_before_the_cut_it_is_the_plain_tree(case):
 
 
 @pytest.mark.slow
-def test_after_it_there_are_two_systems(case):
+def test_after_the_cut_there_are_two_systems(case):
     """The state is continuous at the cut; without gravity the momentum of the free part is
     conserved to 1e-12."""
     _, chain, cut, _, state = case

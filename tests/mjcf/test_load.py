@@ -217,7 +217,7 @@ def test_ignoring_an_unsupported_actuator_keeps_the_others_in_order():
             chain.motors(jnp.zeros(3))
 
 
-def test_limits_and_springs_are_the_models():
+def test_limits_and_springs_equal_those_of_the_model():
     """A spring equals MuJoCo's; a joint limit holds a pendulum against gravity."""
     xml = PENDULUM.replace('damping="0"', 'damping="2" range="-0.5 0.5" limited="true"').replace(
         "<mujoco>", '<mujoco><compiler angle="radian"/>'

@@ -66,7 +66,7 @@ def test_each_message(setting, opening):
 
 
 @pytest.mark.parametrize(("words", "call"), wrong_calls.ALSO, ids=range(len(wrong_calls.ALSO)))
-def test_other_ways_to_them(setting, words, call):
+def test_other_calls_that_raise_them(setting, words, call):
     with (
         error_page.as_users_see(),
         pytest.raises((ValueError, RuntimeError), match=words) as caught,

@@ -66,7 +66,7 @@ BOUNDS = {
 
 @pytest.fixture(params=BOUNDS)
 def bounds(request):
-    """The bounds of one precision, which is set during the test."""
+    """Return the bounds of one precision, which is set during the test."""
     with jax.enable_x64(request.param == "double"):
         yield BOUNDS[request.param]
 

@@ -18,7 +18,7 @@ from svkc.tree.spatial import quat_exp, quat_multiply
 
 @pytest.fixture(scope="module")
 def links():
-    """The two-link scene."""
+    """Return chain and state of the two-link scene."""
     return two_links()
 
 
@@ -199,7 +199,7 @@ def test_rodrigues_euler_keeps_quaternions_at_unit_length():
 
 @pytest.fixture(scope="module")
 def benchmark():
-    """The module benchmarks/joints.py, which builds both figures."""
+    """Return the module benchmarks/joints.py, which builds both figures."""
     spec = importlib.util.spec_from_file_location(
         "joints", pathlib.Path(__file__).parents[2] / "benchmarks" / "joints.py"
     )

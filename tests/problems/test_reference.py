@@ -12,13 +12,13 @@ import maximal
 import numpy as np
 import pytest
 from reference_problems import (
-    ROTATION,
+    TOP_MJCF,
     body_positions,
     load_reference,
     n_four_bar,
     numbers,
-    springs,
-    tight,
+    spring_control,
+    tight_tolerances,
 )
 from tolerances import REFERENCE, ROUND_OFF
 
@@ -38,13 +38,13 @@ def test_free_top(case):
     Where the motion amplifies round-off, the bound is three times the error of a plain integration
     in double precision.
     """
-    chain = svkc.load(ROTATION.format("0 0 0", "0 0 0", 1, numbers(case["inertia"])))
+    chain = svkc.load(TOP_MJCF.format("0 0 0", "0 0 0", 1, numbers(case["inertia"])))
     traj = svkc.simulate(
         chain,
         chain.state(v={"top": case["omega0_body"]}),
         case["t_end"],
         ts=jnp.array(case["t"]),
-        **tight(1e-13),
+        **tight_tolerances(1e-13),
     )
     bound = max(1e-9, 3 * case["plain"])
     np.testing.assert_allclose(
@@ -62,7 +62,7 @@ def test_heavy_top(case):
     """Orientations agree with the reference."""
     model = load_reference("heavy_top")["model"]
     chain = svkc.load(
-        ROTATION.format(
+        TOP_MJCF.format(
             numbers(model["gravity"]),
             numbers(model["com_body"]),
             model["mass"],
@@ -74,7 +74,7 @@ def test_heavy_top(case):
         chain.state(v={"top": case["omega0_body"]}),
         case["t_end"],
         ts=jnp.array(case["t"]),
-        **tight(1e-13),
+        **tight_tolerances(1e-13),
     )
     np.testing.assert_allclose(
         *align_quaternion_signs(traj.states.q, case["quat_wxyz_body_to_world"]), atol=REFERENCE
@@ -104,7 +104,9 @@ def test_n_four_bar_through_its_singular_configurations(windows, tolerances):
     chain, state = maximal.load(n_four_bar(windows))
     ts = jnp.array([*case["t"], 20.0] if windows == 2 else case["t"])
     run = jax.jit(
-        lambda state, tolerance: svkc.simulate(chain, state, ts[-1], ts=ts, **tight(tolerance))
+        lambda state, tolerance: svkc.simulate(
+            chain, state, ts[-1], ts=ts, **tight_tolerances(tolerance)
+        )
     )
     for tolerance in tolerances:
         traj = run(state, tolerance)
@@ -130,7 +132,7 @@ def forty_windows():
         20.0,
         ts=jnp.array([0.0, 1.0, 20.0]),
         dynamics=svkc.dynamics.CompositeBodies(hold=None),
-        **tight(1e-8),
+        **tight_tolerances(1e-8),
     )
     np.testing.assert_allclose(
         2 * body_positions(chain, traj, "vert0")[1, :2], case["B0"][1], atol=1e-6
@@ -172,8 +174,8 @@ def test_andrews_mechanism():
         state,
         0.05,
         ts=jnp.array(reference["t"]),
-        control=springs(chain, reference["problem"]),
-        **tight(1e-12),
+        control=spring_control(chain, reference["problem"]),
+        **tight_tolerances(1e-12),
     )
     # Absolute angles: beta of K1, gamma of K3, delta of K5, epsilon of K7. Relative angles: Theta
     # of K2 on K1, Phi of K4 on K5, Omega of K6 on K7.
@@ -210,7 +212,7 @@ def test_andrews_mechanism():
 def test_slider_crank_3d(variant):
     """Position and velocity of the slider agree with the reference over 5 s."""
     chain, state = maximal.load(variant["problem"])
-    traj = svkc.simulate(chain, state, 5.0, ts=jnp.array(variant["t"]), **tight(1e-12))
+    traj = svkc.simulate(chain, state, 5.0, ts=jnp.array(variant["t"]), **tight_tolerances(1e-12))
     np.testing.assert_allclose(
         body_positions(chain, traj, "slider")[:, 0], variant["slider_x"], atol=1e-10
     )
@@ -225,7 +227,9 @@ def test_rssr_motion_is_independent_of_the_idle_spin():
     crank_velocities = []
     for variant in load_reference("rssr")["variants"]:
         chain, state = maximal.load(variant["problem"])
-        traj = svkc.simulate(chain, state, 4.0, ts=jnp.array(variant["t"]), **tight(1e-12))
+        traj = svkc.simulate(
+            chain, state, 4.0, ts=jnp.array(variant["t"]), **tight_tolerances(1e-12)
+        )
         np.testing.assert_allclose(
             body_positions(chain, traj, "coupler"), variant["coupler_com"], atol=REFERENCE
         )
@@ -254,7 +258,11 @@ def test_light_cartpole(number, tolerance, error):
     case = load_reference("light_cartpole")["cases"][number]
     chain = svkc.load(CART.format(case["M"]))
     traj = svkc.simulate(
-        chain, chain.state({"theta": np.pi / 2}), 10.0, ts=jnp.array(case["t"]), **tight(tolerance)
+        chain,
+        chain.state({"theta": np.pi / 2}),
+        10.0,
+        ts=jnp.array(case["t"]),
+        **tight_tolerances(tolerance),
     )
     np.testing.assert_allclose(traj.states.q[:, 0], case["x"], atol=error)
     np.testing.assert_allclose(traj.states.q[:, 1], case["theta"], atol=error)
@@ -314,7 +322,13 @@ def test_slider_crank_with_gradients():
 
     def functional(args):
         traj = svkc.simulate(
-            chain, state, 10.0, ts=jnp.array(ts[order]), control=control, args=args, **tight(1e-12)
+            chain,
+            state,
+            10.0,
+            ts=jnp.array(ts[order]),
+            control=control,
+            args=args,
+            **tight_tolerances(1e-12),
         )
         states = jax.tree.map(lambda x: x[np.argsort(order)], (traj.states.q, traj.states.v))
         energy = jax.vmap(
@@ -381,7 +395,7 @@ def test_pendulum_released():
         2.0,
         ts=jnp.array(case["t"]),
         events=[event],
-        **tight(1e-13),
+        **tight_tolerances(1e-13),
     )
     assert float(traj.events.time[0]) == pytest.approx(case["t_event"], abs=ROUND_OFF)
     place, quat = (
@@ -407,7 +421,7 @@ def test_simple_pendulum_for_a_long_time():
         f' 0"/><worldbody>{rod}</worldbody></mujoco>'
     )
     ts = [t for t in case["t"] if t <= 100]
-    traj = svkc.simulate(chain, chain.state(), 100.0, ts=jnp.array(ts), **tight(1e-13))
+    traj = svkc.simulate(chain, chain.state(), 100.0, ts=jnp.array(ts), **tight_tolerances(1e-13))
     positions = np.stack([np.cos(traj.states.q[:, 0]), np.sin(traj.states.q[:, 0])], 1)
     np.testing.assert_allclose(positions, case["xy"][: len(ts)], atol=REFERENCE)
 

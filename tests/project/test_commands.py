@@ -17,12 +17,12 @@ ROD = """<mujoco><worldbody>
 
 
 def command(line, *args):
-    """Runs svkc with the words of the line, then the arguments."""
+    """Run the svkc command with the words of `line`, then the arguments."""
     return run("-m", "svkc", *line.split(), *args, optimized=False)
 
 
-def test_a_model_of_ones_own(tmp_path):
-    """Let go and caught by name and time; what was written opens again."""
+def test_run_and_view_of_a_model_file(tmp_path):
+    """`svkc run` of a model releases and catches a link; `svkc view` opens the saved run."""
     (tmp_path / "rod.xml").write_text(ROD)
     out = tmp_path / "out"
     done = command(
@@ -46,7 +46,7 @@ def test_a_model_of_ones_own(tmp_path):
 
 
 def test_wrong_arguments_are_reported(tmp_path):
-    """One line that names it and a status that is not zero; no traceback."""
+    """A wrong argument gives a message that names it and a nonzero status, without traceback."""
     (tmp_path / "rod.xml").write_text(ROD)
     (tmp_path / "no.npz").write_text("nothing")
     wrong = {
@@ -73,7 +73,7 @@ def test_the_scenes_command():
 
 
 def test_main_job(tmp_path):
-    """python -m svkc: the table, the npz, the strobe and, where there is GL, the animation."""
+    """`python -m svkc` prints the table and writes the run, the pictures and, with GL, the gif."""
     done = run("-m", "svkc", "--out", tmp_path)
     assert done.returncode == 0, done.stderr
     for word in (
@@ -101,7 +101,7 @@ def test_main_job(tmp_path):
 
 
 def test_the_swing_from_the_command_line(tmp_path):
-    """python -m svkc swing: 30 joint freedoms and the swing's own, two fewer at the end."""
+    """`python -m svkc swing` prints 31 joint freedoms, and 29 after the seat is lost."""
     done = run("-m", "svkc", "swing", "--out", tmp_path, optimized=False)
     assert done.returncode == 0, done.stderr
     for word in ("31     21        10", "29     12        17", "largest loop gap", "wrote"):

@@ -1,4 +1,4 @@
-"""README's example and those of the folder run, with public names only."""
+"""The example of the README and those of `examples/` run and use public names only."""
 
 import ast
 import re
@@ -40,8 +40,8 @@ EXAMPLES = {
 }
 
 
-def test_examples_are_all_here():
-    # the viewer's draws no picture: tests/mjcf/test_convert.py
+def test_every_example_is_tested():
+    # the example of the viewer draws no picture; tests/mjcf/test_convert.py runs it
     assert {path.stem for path in (ROOT / "examples").glob("*.py")} == {
         *EXAMPLES,
         "08_mujoco_viewer",
@@ -51,9 +51,9 @@ def test_examples_are_all_here():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", EXAMPLES)
 def test_example_draws_its_picture(name, tmp_path):
-    """From the command line, whole; at most 70 statements; no library code: only public names."""
+    """An example runs from the command line, has at most 70 statements, uses public names only."""
     text = (ROOT / "examples" / f"{name}.py").read_text()
-    # statements, which the formatter does not multiply as it does lines
+    # statements, because the formatter changes the number of lines
     assert sum(isinstance(node, ast.stmt) for node in ast.walk(ast.parse(text))) <= 70
     assert not re.search(r"from svkc\.(?!scenes)|import svkc\.(?!scenes)", text)
     done = run(
@@ -64,11 +64,11 @@ def test_example_draws_its_picture(name, tmp_path):
     assert done.returncode == 0, done.stderr
     for word in EXAMPLES[name]:
         assert word in done.stdout, done.stdout
-    # what an example says of its own derivatives
+    # the errors of derivatives that an example prints
     errors = [float(number) for number in re.findall(r"worst relative error (\S+)", done.stdout)]
     assert len(errors) == (2 if name >= "05" else 0)
     assert max(errors, default=0) <= 1e-6, done.stdout
-    # at least four steps
+    # the figure walks at least four steps
     assert (
         name != "04_walk" or min(done.stdout.count("foot down"), done.stdout.count("foot up")) >= 4
     )

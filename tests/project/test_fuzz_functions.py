@@ -1,26 +1,27 @@
-"""Random states, and random calls of public functions on them."""
+"""Random arguments of `chain.state` and of public functions of a state."""
 
 import math
+import operator
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from fuzzing import (
-    NOTHING,
-    NUMBER_OF,
-    TREE_NUMBER_OF,
+    RAISED,
+    SIZES,
+    TREE_SIZES,
     all_finite,
     anything,
-    broken,
+    defects,
     examples,
     or_anything,
     outcome,
-    ready,  # noqa: F401 (a fixture)
+    prepared_scenes,  # noqa: F401 (a fixture)
     scene,
     scenes,
     some_of,
     vectors,
-    wrongs,
+    with_defect,
 )
 from hypothesis import given as over_examples, strategies as st
 
@@ -31,9 +32,13 @@ pytestmark = pytest.mark.slow
 
 @st.composite
 def coordinate_arguments(draw, which: int, name: str):
-    """q or v for `chain.state`: an array, now and then near a good one, or a dict."""
+    """Draw q or v for `chain.state`: a valid array, an array near a valid one, or a dict.
+
+    which: 0 for q, 1 for v.
+    name: name of the scene.
+    """
     chain, state = scenes()[name]
-    size = draw(st.sampled_from([NUMBER_OF[name][which], TREE_NUMBER_OF[name][which], 2]))
+    size = draw(st.sampled_from([SIZES[name][which], TREE_SIZES[name][which], 2]))
     if draw(st.booleans()):
         good = np.asarray(state.v if which else state.q)[:size].copy()
         return (good + 1e-2 * draw(st.integers(0, 1)) * np.arange(len(good))).astype(
@@ -50,7 +55,7 @@ def coordinate_arguments(draw, which: int, name: str):
 
 @examples(0.06)
 @over_examples(st.data())
-def test_states(data):
+def test_chain_state(data):
     name = data.draw(scene)
     chain, _ = scenes()[name]
     state_arguments = data.draw(
@@ -70,18 +75,19 @@ def test_states(data):
         )
     )
     state = outcome(lambda: chain.state(**state_arguments))
-    if state is not NOTHING:
+    if state is not RAISED:
         assert all_finite(state)
         starts, _ = chain.topology.quaternion_starts
         norms = np.linalg.norm(np.asarray(state.q)[starts[:, None] + np.arange(4)], axis=1)
         np.testing.assert_allclose(norms, 1, atol=1e-12)
-        # (lengths up to 1e300 m are let through: what is closed is so in their round-off)
+        # coordinates may be up to 1e300 m: gaps are bounded by their round-off
         assert np.abs(svkc.loop_gaps(chain, state)).max(initial=0) < 1e-6 * max(
             1, np.abs(state.q).max()
         )
 
 
-# what each reads besides the state, and whether a NaN in q, v or that shows
+# kinds of the arguments after chain and state; and the inputs of which a NaN must appear in the
+# result: "q" and "v" of the state, "x" an argument
 FUNCTIONS = {
     "poses": ((), "q"),
     "velocities": ((), "qv"),
@@ -92,9 +98,9 @@ FUNCTIONS = {
     "bias_force": ((), "qv"),
     "mass_matrix": ((), ""),
     "coordinates": ((), ""),
-    "jacobian": ((), ""),
+    "loop_jacobian": ((), ""),
     "loop_gaps": ((), ""),
-    "velocity_gaps": ((), ""),
+    "loop_gap_rates": ((), ""),
     "mobility": ((), ""),
     "forward_dynamics": (("tau",), "qvx"),
     "inverse_dynamics": (("tau",), "qvx"),
@@ -103,18 +109,22 @@ FUNCTIONS = {
     "step": (("tau", "dt"), "qvx"),
     "integrate": (("q", "v"), "x"),
     "difference": (("q", "q"), "x"),
-    "tangent": (("q", "q"), ""),
-    "xyzw": (("q",), "x"),
+    "tangent_gradient": (("q", "q"), ""),
+    "interop.quaternions_xyzw": (("q",), "x"),
 }
-WITHOUT_STATE = ("integrate", "difference", "tangent", "xyzw")
+WITHOUT_STATE = ("integrate", "difference", "tangent_gradient", "interop.quaternions_xyzw")
 
 
 @st.composite
-def arguments(draw, name: str):
-    """Draw one argument, and whether it is valid, invalid, or valid except for a NaN."""
-    counts = {"tau": NUMBER_OF, "v": NUMBER_OF, "q": NUMBER_OF}
+def argument_strategy(draw, name: str):
+    """Draw a function that draws an argument of a kind, and a verdict.
 
-    def one(kind):
+    The verdict is "" for a valid argument, "x" for one with a non-finite number, None for one that
+    may be invalid.
+    """
+    counts = {"tau": SIZES, "v": SIZES, "q": SIZES}
+
+    def draw_argument(kind):
         if kind == "dt":
             return draw(
                 st.sampled_from([(1e-3, ""), (0.1, ""), (0.1, ""), (math.nan, "x"), ("a", None)])
@@ -136,46 +146,48 @@ def arguments(draw, name: str):
             choice % 5
         ], ("" if choice % 5 != 4 or kind != "q" else None)
 
-    return one
+    return draw_argument
 
 
 @examples(0.14)
 @over_examples(st.data())
-def test_verbs(data):
-    name, function, wrong, value = (
+def test_functions_of_a_state(data):
+    name, function, defect, value = (
         data.draw(st.sampled_from(["tree", "spare"])),
         data.draw(st.sampled_from(sorted(FUNCTIONS))),
-        data.draw(wrongs),
+        data.draw(defects),
         data.draw(anything),
     )
     chain, state = scenes()[name]
-    kinds, shows = FUNCTIONS[function]
+    kinds, nan_shows = FUNCTIONS[function]
     if function in WITHOUT_STATE:
-        wrong = ""
-    one = data.draw(arguments(name))
-    rest, kept = zip(*map(one, kinds), strict=True) if kinds else ((), ())
-    first = () if function in WITHOUT_STATE else (broken(state, wrong, value),)
-    called = data.draw(or_anything(st.just(chain), 20))
-    done = outcome(lambda: getattr(svkc, function)(called, *first, *rest))
-    if done is NOTHING:
-        assert called is not chain or wrong not in ("", "q", "v") or None in kept, (
+        defect = ""
+    draw_argument = data.draw(argument_strategy(name))
+    arguments, verdicts = zip(*map(draw_argument, kinds), strict=True) if kinds else ((), ())
+    state_argument = () if function in WITHOUT_STATE else (with_defect(state, defect, value),)
+    chain_argument = data.draw(or_anything(st.just(chain), 20))
+    result = outcome(
+        lambda: operator.attrgetter(function)(svkc)(chain_argument, *state_argument, *arguments)
+    )
+    if result is RAISED:
+        assert chain_argument is not chain or defect not in ("", "q", "v") or None in verdicts, (
             function,
-            wrong,
-            rest,
+            defect,
+            arguments,
         )
-    elif wrong == "" and not any(kept) and None not in kept:
-        assert all_finite(done), (function, rest)
-    elif ("x" in kept and "x" in shows) or (wrong in shows and wrong != ""):
-        assert not all_finite(done), (function, wrong, rest)
+    elif defect == "" and not any(verdicts) and None not in verdicts:
+        assert all_finite(result), (function, arguments)
+    elif ("x" in verdicts and "x" in nan_shows) or (defect in nan_shows and defect != ""):
+        assert not all_finite(result), (function, defect, arguments)
 
 
 @examples(0.03)
 @over_examples(st.data())
 def test_changes_of_structure(data):
     chain, state = scenes()["spare"]
-    wrong, value = data.draw(wrongs), data.draw(anything)
+    defect, value = data.draw(defects), data.draw(anything)
     name = or_anything(st.sampled_from(["pin", "spare_0", "crank", "rocker"]))
-    broken_state = broken(state, wrong, value)
+    broken_state = with_defect(state, defect, value)
     body = or_anything(st.sampled_from(["world", "rocker", "crank"]), 6)
     calls = {
         "connect": lambda: svkc.connect(
@@ -191,7 +203,7 @@ def test_changes_of_structure(data):
         "transition": lambda: svkc.transition(
             chain, broken_state, data.draw(or_anything(st.just("pin"), 2))
         ),
-        "prefer": lambda: svkc.with_independent(chain, broken_state, data.draw(name)),
+        "with_independent": lambda: svkc.with_independent(chain, broken_state, data.draw(name)),
         "bind": lambda: svkc.bind(
             chain,
             broken_state,
@@ -208,7 +220,7 @@ def test_changes_of_structure(data):
             ),
         ),
     }
-    done = outcome(calls[data.draw(st.sampled_from(sorted(calls)))])
-    if done is not NOTHING:
-        assert isinstance(done, svkc.State)
-        assert all_finite(done) == (wrong == ""), wrong
+    result = outcome(calls[data.draw(st.sampled_from(sorted(calls)))])
+    if result is not RAISED:
+        assert isinstance(result, svkc.State)
+        assert all_finite(result) == (defect == ""), defect

@@ -1,16 +1,16 @@
-"""Random models, files and virtual links."""
+"""Random arguments of `svkc.load`: models, files and virtual links."""
 
 import jax
 import models
 import numpy as np
 import pytest
 from fuzzing import (
-    NOTHING,
+    RAISED,
     anything,
     examples,
     or_anything,
     outcome,
-    ready,  # noqa: F401 (a fixture)
+    prepared_scenes,  # noqa: F401 (a fixture)
     some_of,
     vectors,
 )
@@ -36,50 +36,59 @@ label = st.one_of(
 
 
 def escaped(text: str) -> str:
+    """Return text in which XML's special characters are character references."""
     return text.translate({ord(c): f"&#{ord(c)};" for c in "<>&\"'"})
 
 
 @st.composite
-def attributes(draw, usual: dict, odd: dict):
-    """XML attributes: the usual ones, and now and then odd ones."""
-    values = dict(usual)
-    for name, strategy in odd.items():
+def attributes(draw, always: dict, sometimes: dict):
+    """Draw the text of XML attributes.
+
+    always: attributes with their values.
+    sometimes: strategies of attributes, each of which is drawn one time in eight.
+    """
+    values = dict(always)
+    for name, strategy in sometimes.items():
         if draw(st.integers(0, 7)) == 0:
             values[name] = draw(strategy)
     return "".join(f' {name}="{escaped(value)}"' for name, value in values.items())
 
 
-several = lambda n: st.lists(
+number_lists = lambda n: st.lists(
     st.one_of(good_number, good_number, good_number, number), min_size=n, max_size=n
 ).map(" ".join)
 
 
 @st.composite
 def joints(draw):
+    """Draw a joint element."""
     kind = draw(st.sampled_from(["hinge", "slide", "ball", "free", "hinge", "wheel"]))
-    odd = {
+    sometimes = {
         n: number for n in ("stiffness", "damping", "armature", "ref", "springref", "frictionloss")
     }
-    odd |= {
-        "axis": several(3),
-        "pos": several(3),
-        "range": several(2),
+    sometimes |= {
+        "axis": number_lists(3),
+        "pos": number_lists(3),
+        "range": number_lists(2),
         "limited": st.sampled_from(["true", "false", "maybe"]),
     }
-    fixed = {"type": kind, "name": draw(label)} if draw(st.booleans()) else {"type": kind}
-    return f"<joint{draw(attributes(fixed, odd))}/>"
+    always = {"type": kind, "name": draw(label)} if draw(st.booleans()) else {"type": kind}
+    return f"<joint{draw(attributes(always, sometimes))}/>"
 
 
 @st.composite
 def bodies(draw, budget: int):
-    """A body with several joints, a geom or an inertial of its own, and children."""
-    own = "".join(draw(st.lists(joints(), max_size=3)))
+    """Draw a body element with joints, geoms or inertials, and child bodies.
+
+    budget: halved at each level; a body with a budget of 1 has no children.
+    """
+    joint_elements = "".join(draw(st.lists(joints(), max_size=3)))
     geoms = st.builds(
         "<geom{}/>".format,
         attributes(
             {"size": "0.1 0.1 0.1"},
             {
-                "size": several(3),
+                "size": number_lists(3),
                 "mass": number,
                 "density": number,
                 "type": st.sampled_from(["box", "sphere", "mesh"]),
@@ -90,15 +99,19 @@ def bodies(draw, budget: int):
         "<inertial{}/>".format,
         attributes(
             {"pos": "0 0 0", "mass": "1", "diaginertia": "1 1 1"},
-            {"mass": number, "diaginertia": several(3), "pos": several(3)},
+            {"mass": number, "diaginertia": number_lists(3), "pos": number_lists(3)},
         ),
     )
-    mass = "".join(draw(st.lists(st.one_of(geoms, geoms, inertials), max_size=2)))
+    mass_elements = "".join(draw(st.lists(st.one_of(geoms, geoms, inertials), max_size=2)))
     children = draw(st.integers(0, 2)) if budget > 1 else 0
-    inside = "".join(draw(bodies(budget // 2)) for _ in range(children))
-    named = {"name": draw(label)} if draw(st.booleans()) else {}
-    own_frame = draw(attributes(named, {"pos": several(3), "quat": several(4), "gravcomp": number}))
-    return f"<body{own_frame}>{own}{mass}{inside}</body>"
+    child_elements = "".join(draw(bodies(budget // 2)) for _ in range(children))
+    name_attribute = {"name": draw(label)} if draw(st.booleans()) else {}
+    body_attributes = draw(
+        attributes(
+            name_attribute, {"pos": number_lists(3), "quat": number_lists(4), "gravcomp": number}
+        )
+    )
+    return f"<body{body_attributes}>{joint_elements}{mass_elements}{child_elements}</body>"
 
 
 EXTRAS = [
@@ -119,11 +132,11 @@ EXTRAS = [
 
 
 @st.composite
-def texts(draw):
-    """MJCF, URDF, and what is neither."""
+def model_texts(draw):
+    """Draw MJCF, URDF, corrupted MJCF, or any text."""
     kind = draw(st.integers(0, 9))
-    inside = "".join(draw(st.lists(bodies(draw(st.integers(1, 6))), max_size=2)))
-    text = f"<mujoco>{draw(st.sampled_from(EXTRAS))}<worldbody>{inside}</worldbody></mujoco>"
+    elements = "".join(draw(st.lists(bodies(draw(st.integers(1, 6))), max_size=2)))
+    text = f"<mujoco>{draw(st.sampled_from(EXTRAS))}<worldbody>{elements}</worldbody></mujoco>"
     if kind == 0:
         links = "".join(
             f"<link name='{escaped(draw(label))}'><inertial><mass value='{draw(number)}'/><inertia"
@@ -138,14 +151,18 @@ def texts(draw):
     elif kind == 1:
         text = text[: draw(st.integers(0, len(text)))]
     elif kind == 2:
-        at = draw(st.integers(0, len(text)))
-        text = text[:at] + draw(st.text(max_size=4)) + text[at + draw(st.integers(0, 6)) :]
+        start = draw(st.integers(0, len(text)))
+        text = text[:start] + draw(st.text(max_size=4)) + text[start + draw(st.integers(0, 6)) :]
     elif kind == 3:
         text = draw(st.text(max_size=30))
     return text
 
 
 def load_options(link):
+    """Return a strategy of keyword arguments of `svkc.load`.
+
+    link: strategy of a virtual link.
+    """
     return some_of(
         virtual_links=or_anything(st.lists(link, max_size=2)),
         cuttable=or_anything(st.lists(label, max_size=2)),
@@ -182,6 +199,7 @@ link_arguments = some_of(
 
 
 def make_link(fields):
+    """Return a virtual link with these fields, or RAISED."""
     return outcome(
         lambda: svkc.VirtualLink(**({"name": "x", "parent": "world", "real": "rocker"} | fields))
     )
@@ -190,8 +208,8 @@ def make_link(fields):
 links = link_arguments.map(make_link)
 
 
-def use_chain(chain):
-    """Every chain that loads is whole."""
+def check_chain(chain):
+    """Assert that a chain's numbers are valid, its names unique and its pointers complete."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(chain):
         assert not np.isnan(leaf).any(), path
         assert np.isfinite(leaf).all() or jax.tree_util.keystr(path) in (
@@ -212,16 +230,19 @@ def use_chain(chain):
 
 
 @examples(0.5)
-@over_examples(st.one_of(texts(), texts(), texts(), texts(), anything), load_options(links))
+@over_examples(
+    st.one_of(model_texts(), model_texts(), model_texts(), model_texts(), anything),
+    load_options(links),
+)
 def test_models(source, options):
     chain = outcome(lambda: svkc.load(source, **options))
-    if chain is not NOTHING:
-        use_chain(chain)
+    if chain is not RAISED:
+        check_chain(chain)
 
 
 @examples(0.02)
 @over_examples(st.binary(max_size=60), st.booleans())
-def test_files_that_are_no_models(tmp_path_factory, data, folder):
+def test_files_of_random_bytes(tmp_path_factory, data, folder):
     path = tmp_path_factory.mktemp("models") / "model.xml"
     path.mkdir() if folder else path.write_bytes(data)
     outcome(lambda: svkc.load(path))
@@ -229,11 +250,11 @@ def test_files_that_are_no_models(tmp_path_factory, data, folder):
 
 @examples(0.1)
 @over_examples(st.lists(links, max_size=2), load_options(links))
-def test_links(declared, options):
+def test_virtual_links(declared, options):
     chain = outcome(
         lambda: svkc.load(
             models.MJCF.format(models.FOUR_BAR), **options | {"virtual_links": declared}
         )
     )
-    if chain is not NOTHING:
-        use_chain(chain)
+    if chain is not RAISED:
+        check_chain(chain)

@@ -1,5 +1,4 @@
-"""The layout: imports only go down, internals of JAX are touched in one package, files and
-functions are small."""
+"""The layout: the order of imports, internals of JAX in one package, sizes, repetitions."""
 
 import ast
 import functools
@@ -11,10 +10,10 @@ from processes import run
 
 ROOT = pathlib.Path(__file__).parents[2] / "svkc"
 TESTS = pathlib.Path(__file__).parents[1]
-# a package may import from those to its left and from itself
+# a package may import from itself and from packages to its left
 ORDER = "_jax model mjcf tree loops transitions integration simulation tools viz scenes cli".split()
-# methods that the contract puts on the nouns: they import upwards when they are called
-CONVENIENCE = {
+# (file, method, imported file) of the public methods that import upwards when called
+UPWARD_IMPORTS = {
     ("model/chain", "state", "transitions/initial_state"),
     ("model/chain", "to_mjcf", "mjcf/convert"),
     ("simulation/trajectory", "save", "simulation/archive"),
@@ -54,7 +53,7 @@ def imports(file: str) -> list[tuple[str, str | None]]:
 
 
 def targets(file: str) -> set[tuple[str, str | None]]:
-    """Return the files of svkc that a file imports from."""
+    """Return (imported file of svkc, enclosing function or None) of each import in a file."""
     result = set()
     for name, function in imports(file):
         parts = name.split(".")[1:] if name.startswith("svkc.") else []
@@ -67,46 +66,52 @@ def targets(file: str) -> set[tuple[str, str | None]]:
 
 
 def package(file: str) -> str:
+    """Return the package of a file."""
     return file.split("/")[0]
 
 
 def test_imports_only_go_down():
     for file in FILES:
         for target, function in targets(file):
-            if (file, function, target) not in CONVENIENCE:
+            if (file, function, target) not in UPWARD_IMPORTS:
                 assert ORDER.index(package(target)) <= ORDER.index(package(file)), (
                     f"{file} imports {target}, which is above it"
                 )
 
 
-def test_every_exception_is_one():
-    """A method that no longer imports upwards is taken off the list."""
-    for file, function, target in CONVENIENCE:
+def test_every_listed_upward_import_exists():
+    """`UPWARD_IMPORTS` lists no import that has been removed."""
+    for file, function, target in UPWARD_IMPORTS:
         assert (target, function) in targets(file)
 
 
-def test_no_file_imports_itself_by_way_of_others():
-    below = {
-        file: {t for t, function in targets(file) if (file, function, t) not in CONVENIENCE}
+def test_no_import_cycles():
+    imports_of = {
+        file: {t for t, function in targets(file) if (file, function, t) not in UPWARD_IMPORTS}
         for file in FILES
     }
-    while free := {file for file, needed in below.items() if not needed}:
-        below = {file: needed - free for file, needed in below.items() if file not in free}
-    assert not below, f"in a cycle of imports: {sorted(below)}"
+    while free := {file for file, needed in imports_of.items() if not needed}:
+        imports_of = {
+            file: needed - free for file, needed in imports_of.items() if file not in free
+        }
+    assert not imports_of, f"in a cycle of imports: {sorted(imports_of)}"
 
 
-def test_each_package_keeps_to_its_subject():
-    """JAX's internals stay in `_jax`, MuJoCo in what reads, writes and draws its models, and no
-    package is a way into another."""
+def test_packages_import_only_the_libraries_of_their_subject():
+    """Who imports JAX's internals and MuJoCo, and that `__init__` files import nothing.
+
+    `_jax` alone imports JAX's internals. Only mjcf, viz, scenes and cli import MuJoCo. The packages
+    from tree to integration do not import mjcf. The `__init__` of scenes may import.
+    """
     for file in FILES:
-        names, room = [name for name, _ in imports(file)], package(file)
-        if room != "_jax":
+        names, package_name = [name for name, _ in imports(file)], package(file)
+        if package_name != "_jax":
             assert not [
                 name
                 for name, inside in itertools.product(names, INTERNALS)
                 if name.startswith(inside)
             ], file
-        if room in (
+        if package_name in (
             "_jax",
             "model",
             "tree",
@@ -117,13 +122,13 @@ def test_each_package_keeps_to_its_subject():
             "tools",
         ):
             assert not [name for name in names if name.split(".")[0] == "mujoco"], file
-        if room in ("tree", "loops", "transitions", "integration"):
+        if package_name in ("tree", "loops", "transitions", "integration"):
             assert not [target for target, _ in targets(file) if package(target) == "mjcf"], file
-        if file.endswith("__init__") and room != "scenes":
+        if file.endswith("__init__") and package_name != "scenes":
             assert not names, file
 
 
-def test_packages_are_about_a_dozen():
+def test_each_package_has_several_files():
     assert {package(file) for file in FILES} == set(ORDER)
     for name in ORDER:
         assert sum(package(file) == name for file in FILES) > 2, name
@@ -151,7 +156,7 @@ def test_files_and_functions_are_small():
                 assert lines <= 50, f"{path}: {node.name} has {lines} lines"
 
 
-def test_calls_pass_at_most_six_things_by_position():
+def test_calls_pass_at_most_six_arguments_by_position():
     wide = [
         f"{path}:{call.lineno}: {ast.unparse(call.func)}"
         for path in sources()
@@ -162,8 +167,10 @@ def test_calls_pass_at_most_six_things_by_position():
 
 
 def test_records_of_several_fields_are_built_by_keyword():
-    """A NamedTuple or Module with more than three fields is never built by position, but for
-    the contract's `VirtualLink(name, parent, real, joint, ...)`."""
+    """A record with more than three fields is never built by position.
+
+    `VirtualLink(name, parent, real, joint, ...)` is the exception, by its public contract.
+    """
     records = {
         node.name
         for path in ROOT.rglob("*.py")
@@ -181,19 +188,19 @@ def test_records_of_several_fields_are_built_by_keyword():
 
 
 def test_no_ten_lines_stand_twice():
-    first, repeated = {}, []
+    first_place, repeated = {}, []
     for path in sources():
         lines = [line.strip() for line in path.read_text().splitlines()]
         lines = [(i, line) for i, line in enumerate(lines, 1) if line and line[0] != "#"]
         for start in range(len(lines) - 9):
-            run = tuple(line for _, line in lines[start : start + 10])
-            here = f"{path.relative_to(ROOT.parent)}:{lines[start][0]}"
-            if first.setdefault(run, here) != here:
-                repeated.append(f"{first[run]} and {here}")
+            ten_lines = tuple(line for _, line in lines[start : start + 10])
+            place = f"{path.relative_to(ROOT.parent)}:{lines[start][0]}"
+            if first_place.setdefault(ten_lines, place) != place:
+                repeated.append(f"{first_place[ten_lines]} and {place}")
     assert not repeated, "\n".join(repeated)
 
 
-def test_the_page_on_the_architecture_names_what_there_is():
+def test_the_architecture_page_names_existing_files():
     page = (ROOT.parent / "docs" / "architecture.md").read_text()
     assert not [
         path for path in re.findall(r"`(svkc/[\w/.]+)`", page) if not (ROOT.parent / path).exists()
@@ -201,7 +208,7 @@ def test_the_page_on_the_architecture_names_what_there_is():
     assert not [name for name in ORDER if not re.search(rf"\b{name}\b", page)]
 
 
-def test_the_table_of_the_paper_names_what_there_is():
+def test_the_table_of_the_paper_names_existing_files_and_tests():
     page = (ROOT.parent / "docs" / "paper.md").read_text()
     table = page[page.index("| paper | where | test |") :].split("\n\n")[0]
     for file in re.findall(r"`((?:\w+/)+\w+\.\w+)", table):
@@ -210,6 +217,6 @@ def test_the_table_of_the_paper_names_what_there_is():
         assert f"def {test}(" in (TESTS / file).read_text(), test
 
 
-def test_ruff_is_content():
+def test_ruff_passes():
     done = run(*"-m ruff check svkc tests examples benchmarks".split())
     assert done.returncode == 0, done.stdout

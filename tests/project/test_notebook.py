@@ -1,5 +1,7 @@
-"""The tour: every cell runs headless and prints its stored output. `python
-tests/project/test_notebook.py` stores new output."""
+"""The notebook examples/tour.ipynb: every cell runs without a display and prints its stored output.
+
+`python tests/project/test_notebook.py` stores new output.
+"""
 
 import base64
 import io
@@ -17,20 +19,21 @@ import pytest
 ROOT = pathlib.Path(__file__).parents[2]
 TOUR = ROOT / "examples" / "tour.ipynb"
 NUMBER = re.compile(r"(?<![A-Za-z_])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?|\binf\b")
-# what another machine rounds otherwise: how good differences are, how many steps were tried; and
-# round-off itself is below 1e-6
+# lines whose numbers depend on the machine's round-off: errors of differences, numbers of steps
 ROUGH = re.compile(r"worst relative error .*?:|^work .*|^errors of steps.*|^rank margin.*")
 
 
-def executed():
-    """A fresh copy, executed by this Python in a new process; and that process's Python and svkc.
-    Nothing of the user's Jupyter is read or written."""
+def execute_tour():
+    """Return the executed notebook, and the paths of the Python and the svkc that executed it.
+
+    A new process of this Python executes a copy. No file of the user's Jupyter is read or written.
+    """
     from ipykernel.kernelspec import write_kernel_spec
     from traitlets.config import Config
 
-    # (a short path: that of a socket may have no more than some 100 letters)
+    # a short path, because a socket's path may have no more than some 100 characters
     with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
-        # the first place where Jupyter looks for kernels
+        # Jupyter searches JUPYTER_PATH for kernels first
         write_kernel_spec(os.path.join(folder, "kernels", "python3"))
         patch.setenv("JUPYTER_PATH", folder)
         patch.setenv("JUPYTER_NO_CONFIG", "1")
@@ -59,22 +62,24 @@ def executed():
             resources={"metadata": {"path": folder}},
             config=config,
         ).execute()
-    output = printed(notebook.cells.pop())
+    output = printed_text(notebook.cells.pop())
     return notebook, output.split("\n")
 
 
-def printed(cell):
+def printed_text(cell):
+    """Return what a cell printed."""
     return "".join(
         out.text for out in cell.get("outputs", ()) if out.output_type == "stream"
     ).strip()
 
 
-def drawn(cell):
+def picture_count(cell):
+    """Return the number of pictures in a cell's output."""
     return sum("image/png" in out.get("data", ()) for out in cell.get("outputs", ()))
 
 
-def smaller(picture):
-    """With 64 colours: a third of the size."""
+def compressed_png(picture):
+    """Return a picture with 64 colors, a third of the size, in base64."""
     from PIL import Image
 
     file = io.BytesIO()
@@ -87,16 +92,18 @@ def smaller(picture):
 @pytest.mark.slow
 def test_the_tour_runs_and_prints_what_is_stored():
     stored = nbformat.read(TOUR, 4)
-    fresh, (python, package) = executed()
+    fresh, (python, package) = execute_tour()
     assert pathlib.Path(python).samefile(sys.executable)
     assert pathlib.Path(package).is_relative_to(ROOT)
     numbers = 0
     for old, new in zip(stored.cells, fresh.cells, strict=True):
-        assert drawn(old) == drawn(new), new.source
-        assert not [out for out in new.get("outputs", ()) if out.get("name") == "stderr"], printed(
-            new
+        assert picture_count(old) == picture_count(new), new.source
+        assert not [out for out in new.get("outputs", ()) if out.get("name") == "stderr"], (
+            printed_text(new)
         )
-        for line, again in zip(printed(old).split("\n"), printed(new).split("\n"), strict=True):
+        for line, again in zip(
+            printed_text(old).split("\n"), printed_text(new).split("\n"), strict=True
+        ):
             assert NUMBER.sub("#", line) == NUMBER.sub("#", again)
             line, again = (NUMBER.findall(ROUGH.sub("", x)) for x in (line, again))
             np.testing.assert_allclose(
@@ -104,14 +111,14 @@ def test_the_tour_runs_and_prints_what_is_stored():
             )
             numbers += len(line)
     assert numbers > 30
-    assert sum(map(drawn, stored.cells)) == 3
+    assert sum(map(picture_count, stored.cells)) == 3
 
 
 @pytest.mark.slow
-def test_the_tour_is_small_and_says_nothing_of_a_machine():
+def test_the_tour_is_small_and_names_no_local_path():
     text = TOUR.read_text()
     assert len(text) < 300_000
-    # (a picture may have any letters)
+    # the base64 text of a picture may contain such a path by chance
     assert not re.search(
         r'/tmp|/home|/root|/usr|site-packages|"stderr"', re.sub(r'"image/png": "[^"]*"', "", text)
     )
@@ -123,10 +130,10 @@ def test_the_tour_is_small_and_says_nothing_of_a_machine():
 
 
 if __name__ == "__main__":
-    notebook, _ = executed()
+    notebook, _ = execute_tour()
     for cell in notebook.cells:
         for out in cell.get("outputs", ()):
             if "image/png" in out.get("data", ()):
-                out.data["image/png"] = smaller(out.data["image/png"])
+                out.data["image/png"] = compressed_png(out.data["image/png"])
     notebook.metadata = nbformat.read(TOUR, 4).metadata
     nbformat.write(notebook, TOUR)

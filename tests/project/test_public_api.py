@@ -1,4 +1,4 @@
-"""The public names: which there are, how they are documented, and what importing them costs."""
+"""The public names: their list, their documentation, the cost of importing them, old names."""
 
 import importlib
 import inspect
@@ -15,9 +15,9 @@ from svkc import _deprecated as deprecated
 
 ROOT = pathlib.Path(__file__).parents[2]
 NAMESPACES = ("accuracy", "dynamics", "integrators", "interop", "stabilization", "types")
-# the contract's nouns: their public methods are public names too
+# classes whose public methods are public names as well
 CLASSES = (svkc.Chain, svkc.State, svkc.Trajectory, svkc.types.Report)
-# what these name is said by the annotation and the name
+# parameters that need no description
 EXPLAINED = {"self", "chain", "state", "args", "kwargs"}
 
 
@@ -38,7 +38,7 @@ def public_objects() -> dict[str, object]:
     return out
 
 
-def test_importing_loads_nothing_heavy():
+def test_importing_loads_no_heavy_package_and_changes_no_setting():
     code = (
         "import sys, jax; before = dict(jax.config.values); import svkc; import jax._src.xla_bridge"
         " as b;assert 'mujoco' not in sys.modules and 'matplotlib' not in sys.modules,"
@@ -59,8 +59,11 @@ def test_the_flat_names_are_those_of_all():
 
 @pytest.mark.parametrize("name", public_objects())
 def test_every_public_object_is_documented(name):
-    """The first sentence ends with a period. That of a function starts with a verb. Every parameter
-    that its name does not explain is named, and is annotated or described."""
+    """The docstring of a public object has a first sentence and names every parameter.
+
+    The first sentence ends with a period. The first word of a function's docstring is an imperative
+    verb.
+    """
     thing = public_objects()[name]
     text = inspect.getdoc(thing)
     assert text, name

@@ -1,5 +1,7 @@
-"""The two tiers: the fast tier, without tests marked `slow`, covers every public function. Read
-from the sources of the tests."""
+"""The two tiers of the tests: tests marked `slow`, and the fast tier, which is run by default.
+
+The fast tier names every public function, according to the sources of the tests.
+"""
 
 import ast
 import functools
@@ -13,9 +15,14 @@ pytest_plugins = ["pytester"]
 
 TESTS = pathlib.Path(__file__).parents[1]
 FILES = {path.stem: path for path in TESTS.rglob("*.py")}
-# calls that are there to be refused
-REFUSED = ("test_messages", "test_fuzz_models", "test_fuzz_functions", "test_fuzz_runs")
-# nouns that are made by a function, not by their name
+# files whose calls are to raise errors
+FILES_OF_REFUSED_CALLS = (
+    "test_messages",
+    "test_fuzz_models",
+    "test_fuzz_functions",
+    "test_fuzz_runs",
+)
+# public classes that users create by a function
 CREATED_BY = {
     "Chain": "load",
     "Check": "check_grad",
@@ -25,16 +32,16 @@ CREATED_BY = {
 
 
 @functools.cache
-def parsed(name: str) -> ast.Module:
+def parse(name: str) -> ast.Module:
+    """Return the syntax tree of a file of the tests."""
     return ast.parse(FILES[name].read_text())
 
 
 @functools.cache
-def defined(name: str) -> dict[str, ast.AST]:
-    """What a file defines by name: functions, classes, constants, and the helper files that it
-    imports."""
+def definitions_of(name: str) -> dict[str, ast.AST]:
+    """Return the functions, classes and constants of a file, by name."""
     definitions: dict[str, ast.AST] = {}
-    for node in parsed(name).body:
+    for node in parse(name).body:
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
             definitions[node.name] = node
         elif isinstance(node, ast.Assign):
@@ -44,17 +51,18 @@ def defined(name: str) -> dict[str, ast.AST]:
     return definitions
 
 
-def says(node: ast.AST, what: str) -> bool:
+def has_attribute(node: ast.AST, what: str) -> bool:
+    """Return whether a dotted name such as `pytest.raises` occurs in a syntax tree."""
     return any(
         isinstance(part, ast.Attribute) and ast.unparse(part) == what for part in ast.walk(node)
     )
 
 
-def slow(test: ast.FunctionDef, file: str) -> bool:
-    """As a whole: a test of which only some parameters are marked has others in the fast tier."""
+def is_marked_slow(test: ast.FunctionDef, file: str) -> bool:
+    """Return whether a whole test is marked slow, not only some of its parameters."""
     is_slow = any(
         isinstance(node, ast.Assign) and ast.unparse(node) == "pytestmark = pytest.mark.slow"
-        for node in parsed(file).body
+        for node in parse(file).body
     )
     return is_slow or any(
         ast.unparse(decorator) == "pytest.mark.slow" for decorator in test.decorator_list
@@ -62,20 +70,22 @@ def slow(test: ast.FunctionDef, file: str) -> bool:
 
 
 class Names(ast.NodeVisitor):
-    """Collects the public names of svkc that a definition uses, directly, or through its file,
-    fixtures and helpers. Calls that the definition expects to raise do not count."""
+    """Visitor that collects the public names of svkc that a test uses.
+
+    Names used by the fixtures and helpers of the test count. Calls in `pytest.raises` do not.
+    """
 
     def __init__(self):
         self.public, self.visited = set(), set()
 
     def follow(self, file: str, name: str):
-        node = defined(file).get(name)
+        node = definitions_of(file).get(name)
         if node is None or (file, name) in self.visited:
             return
         self.visited.add((file, name))
         before, self.file = getattr(self, "file", None), file
-        if isinstance(node, ast.FunctionDef) and says(node, "pytest.raises"):
-            # parameters of such a test are the calls that it has refused
+        if isinstance(node, ast.FunctionDef) and has_attribute(node, "pytest.raises"):
+            # the decorators of such a test hold the calls that are to raise
             for part in (node.args, *node.body):
                 self.visit(part)
         else:
@@ -83,7 +93,7 @@ class Names(ast.NodeVisitor):
         self.file = before
 
     def visit_With(self, node):
-        if not any(says(item, "pytest.raises") for item in node.items):
+        if not any(has_attribute(item, "pytest.raises") for item in node.items):
             self.generic_visit(node)
 
     def visit_arg(self, node):
@@ -104,17 +114,19 @@ class Names(ast.NodeVisitor):
 
 
 def test_the_fast_tier_names_every_public_function():
-    """That a test of it reaches the name in code that is to succeed; what the test looks at there,
-    this does not say."""
+    """A fast test uses each public function in code that is to succeed.
+
+    Whether the test checks the result is not tested here.
+    """
     names = Names()
     for path in sorted(TESTS.rglob("test_*.py")):
-        if path.stem in (*REFUSED, "test_tiers"):
+        if path.stem in (*FILES_OF_REFUSED_CALLS, "test_tiers"):
             continue
-        for name, node in defined(path.stem).items():
+        for name, node in definitions_of(path.stem).items():
             if (
                 name.startswith("test_")
                 and isinstance(node, ast.FunctionDef)
-                and not slow(node, path.stem)
+                and not is_marked_slow(node, path.stem)
             ):
                 names.follow(path.stem, name)
     public = {
@@ -130,8 +142,7 @@ def test_the_fast_tier_names_every_public_function():
     [((), ["fast"]), (("-m", "slow"), ["slow"]), (("-m", "slow or not slow"), ["fast", "slow"])],
 )
 def test_which_tier_is_run(pytester, arguments, collected):
-    """Without -m the fast one, by the project's own settings; -m on the command line comes last and
-    holds."""
+    """By default pytest collects the fast tier; `-m` on the command line overrides the default."""
     settings = (TESTS.parent / "pyproject.toml").read_text()
     pytester.makepyprojecttoml(
         settings[settings.index("[tool.pytest.ini_options]") : settings.index("[tool.ruff]")]

@@ -1,4 +1,4 @@
-"""Identifiers use the field's terms: none of the code's former private words is part of one."""
+"""No identifier contains one of the words that earlier versions used as private terms."""
 
 import ast
 import pathlib
@@ -13,12 +13,12 @@ PRIVATE_WORDS = frozenset(
     settle settled sizes staged still taking tally tried verb wanted watched whole wish world
     """.split()
 )
-# named by the libraries whose interfaces these identifiers implement or call
+# identifiers of the interfaces of other libraries
 OF_LIBRARIES = frozenset({"FileNotFoundError", "made_jump", "slice_sizes"})
 
 
 def words(identifier: str) -> list[str]:
-    """Split an identifier at underscores and capitals."""
+    """Return the words of an identifier, split at underscores and capitals."""
     parts = re.findall(r"[A-Z]+(?![a-z])|[A-Z][a-z0-9]*|[a-z0-9]+", identifier)
     return [part.lower() for part in parts]
 
@@ -55,7 +55,7 @@ def test_no_identifier_holds_a_private_word():
     assert not uses, "\n".join(uses)
 
 
-def test_the_words_are_searched_for_in_every_kind_of_identifier(tmp_path, monkeypatch):
+def test_every_kind_of_identifier_is_searched(tmp_path, monkeypatch):
     monkeypatch.setattr("test_words.ROOT", tmp_path)
     file = tmp_path / "module.py"
     file.write_text(

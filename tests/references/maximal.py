@@ -1,5 +1,7 @@
-"""Mechanisms specs body by body in the world, as the reference problems are: a spanning tree of
-their joints as MJCF, virtual links for those left over."""
+"""Reference problems, whose bodies have poses in the ground frame, as chains.
+
+A spanning tree of the joints becomes MJCF. The other joints become virtual links.
+"""
 
 import numpy as np
 
@@ -23,7 +25,10 @@ def _quat(R) -> np.ndarray:
 
 
 class Body:
-    """Initial pose and velocity of a body. Without `specs`: the ground, which is at rest."""
+    """Initial pose and velocity of a body in the ground frame.
+
+    specs: the body's entry in a reference problem. None: the ground, which is at rest.
+    """
 
     def __init__(self, specs=None):
         specs = specs or {}
@@ -43,12 +48,15 @@ class Body:
 def load(problem: dict, **options) -> tuple[svkc.Chain, svkc.State]:
     """Return the chain and the initial state of a problem.
 
-    Frames of bodies are at their centres of mass. Joints of the tree are named by their child,
-    virtual links by parent and child.
+    The origins of body frames are the centers of mass. A joint of the tree has the name of its
+    child, a virtual link those of parent and child.
+
+    problem: contents of a data file of the reference problems.
+    options: keyword arguments of `svkc.load`.
     """
     text, bodies, tree, loops = mjcf(problem)
     chain = svkc.load(text, virtual_links=[_link(joint, bodies) for joint in loops], **options)
-    return chain, chain.state(v={name: _rate(joint, bodies) for name, joint in tree.items()})
+    return chain, chain.state(v={name: _joint_rate(joint, bodies) for name, joint in tree.items()})
 
 
 def mjcf(problem: dict) -> tuple[str, dict, dict, list]:
@@ -98,8 +106,8 @@ def mjcf(problem: dict) -> tuple[str, dict, dict, list]:
     return text, bodies, tree, loops
 
 
-def _rate(joint, bodies):
-    """Return the rate of a tree joint, given the velocities of its bodies."""
+def _joint_rate(joint, bodies):
+    """Return the initial velocity of a tree joint (rad/s or m/s), from those of its bodies."""
     parent, child, point = (
         bodies[joint["parent"]],
         bodies[joint["child"]],
@@ -122,7 +130,7 @@ def _link(joint, bodies):
     names = ["world" if joint[end] == "ground" else joint[end] for end in ("parent", "child")]
     options = {"pos": parent.rotation.T @ (point - parent.position)}
     if joint["type"] == "universal":
-        # The axes are x and the rotated y: x is the axis of the parent, y that of the child.
+        # the universal joint's x is the axis in the parent, its rotated y that in the child
         x, y = np.asarray(joint["axis_parent_world0"]), np.asarray(joint["axis_child_world0"])
         options["quat"] = _quat(parent.rotation.T @ np.stack([x, y, np.cross(x, y)], 1))
     elif "axis_world0" in joint:

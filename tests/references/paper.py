@@ -1,4 +1,4 @@
-"""The paper's joint_dofs formulas, where svkc uses other ones."""
+"""Formulas of the paper in places where svkc computes by other formulas."""
 
 import functools
 
@@ -36,10 +36,13 @@ def forward_dynamics_by_unit_vectors(
 def velocity_by_impulse(
     chain: Chain, state: State, name: str
 ) -> tuple[Float[Array, " dofs"], Float[Array, "6"]]:
-    """Return the velocity after connecting one link, and the impulse F_1 on it.
+    """Return the velocity after connecting one virtual link, and the impulse F_1 on the link.
 
-    By the paper's (34)-(38), in the coordinates theta_G of the old structure. B must be regular. In
-    `state` the link is not connected yet, and its gap is zero.
+    The formulas are the paper's (34)-(38), in the coordinates theta_G of the structure before. B
+    must be regular.
+
+    state: a state in which the link is not connected and its gap is zero.
+    name: name of the virtual link.
     """
     slot, nv = link_index(chain, name), chain.nv
     loops = loop_kinematics(chain, state.structure, state.q)

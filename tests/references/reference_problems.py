@@ -1,6 +1,6 @@
-"""Published problems as models, and their independent solutions.
+"""Published problems as chains, and their independent solutions.
 
-Each data file names its source.
+Each file in `data/` names the source of its problem and solution.
 """
 
 import json
@@ -15,22 +15,25 @@ import numpy as np
 import svkc
 
 FOLDER = pathlib.Path(__file__).parent / "data"
-ROTATION = (
+TOP_MJCF = (
     '<mujoco><compiler balanceinertia="false"/><option gravity="{}"/><worldbody><body'
     ' name="top"><joint name="top" type="ball"/>'
 )
-ROTATION += '<inertial pos="{}" mass="{}" diaginertia="{}"/></body></worldbody></mujoco>'
+TOP_MJCF += '<inertial pos="{}" mass="{}" diaginertia="{}"/></body></worldbody></mujoco>'
 
 
 def load_reference(name):
+    """Return the contents of a data file."""
     return json.loads((FOLDER / f"{name}.json").read_text())
 
 
-def tight(tolerance):
+def tight_tolerances(tolerance):
+    """Return options of `simulate`: Dopri8 with rtol `tolerance` and a hundredth of it as atol."""
     return {"rtol": tolerance, "atol": tolerance / 100, "solver": diffrax.Dopri8()}
 
 
 def numbers(x):
+    """Return numbers as MJCF text, with all digits."""
     return " ".join(repr(float(value)) for value in x)
 
 
@@ -62,10 +65,10 @@ def n_four_bar(windows):
     return problem | {"bodies": bodies, "joints": joints}
 
 
-def springs(chain, problem):
-    """Return a control: the joint torques of the springs and torques of a problem."""
+def spring_control(chain, problem):
+    """Return a control that applies the springs and the torques of a problem."""
 
-    def end(q, structure, body, point, name):
+    def end_position(q, structure, body, point, name):
         position, quat = svkc.poses(chain, svkc.State(q, jnp.zeros(chain.dofs), structure))
         row = chain.body_names.index("world" if name == "ground" else name)
         local = body.rotation.T @ (np.asarray(point) - body.position)
@@ -80,7 +83,9 @@ def springs(chain, problem):
         total = 0.0
         for spring in (force for force in problem["forces"] if force["type"] == "spring_damper"):
             start, stop = (
-                end(q, structure, bodies[spring[e]], spring[f"point_{e}_world0"], spring[e])
+                end_position(
+                    q, structure, bodies[spring[e]], spring[f"point_{e}_world0"], spring[e]
+                )
                 for e in ("parent", "child")
             )
             total = (

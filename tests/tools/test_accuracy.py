@@ -18,7 +18,7 @@ from svkc.tools.accuracy import Candidate, default_candidates
 
 @pytest.fixture(scope="module")
 def arm():
-    """A free body with a ball and a hinge on it, thrown and spinning."""
+    """Return chain and state of a free body with a ball and a hinge, thrown and spinning."""
     rods = models.bar(
         "base",
         'type="free"',
@@ -270,14 +270,14 @@ def test_a_non_finite_lane_stops_and_keeps_its_last_finite_state(arm):
     chain, state = arm
 
     def run(times, **kw):
-        """The control is no number from the first time on, the guard from the second."""
+        """Return a run: control is NaN from the first time on, the guard from the second."""
         control = lambda t, s, args: jnp.where(t > args[0], jnp.nan, 0.0) * jnp.ones(chain.dofs)
-        blind = svkc.when(lambda t, s, args: jnp.where(t > args[1], jnp.nan, 1.0), stop=True)
+        nan_guard = svkc.when(lambda t, s, args: jnp.where(t > args[1], jnp.nan, 1.0), stop=True)
         return svkc.simulate(
             chain,
             state,
             0.4,
-            events=[svkc.at(0.1, cut=()), blind],
+            events=[svkc.at(0.1, cut=()), nan_guard],
             control=control,
             args=jnp.asarray(times),
             **{"throw": False} | kw,

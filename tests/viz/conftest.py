@@ -12,7 +12,7 @@ import svkc
 
 @pytest.fixture(scope="module")
 def release(high_bar):
-    """The high bar for half a second: two hands, one, none."""
+    """Return chain and run of the high bar for half a second: two hands, one, none."""
     chain, state = high_bar
     events = [svkc.at(t, cut=link) for t, link in CUTS.items()]
     return chain, svkc.simulate(
@@ -22,7 +22,7 @@ def release(high_bar):
 
 @pytest.fixture(scope="module")
 def stopped():
-    """A four-bar that is cut and connected again; the second event stops the run."""
+    """Return chain and run of a four-bar that is cut and connected; the second event stops it."""
     chain = models.four_bar()
     events = [svkc.at(0.023, cut="pin"), svkc.at(0.035, connect="pin", here=True, stop=True)]
     return chain, svkc.simulate(
@@ -37,7 +37,7 @@ def stopped():
 
 @pytest.fixture(scope="module")
 def pendulum():
-    """A chain without virtual links, whose body name would end a script if not escaped."""
+    """Return a pendulum whose body name would end a script element if it were not escaped."""
     body = (
         f'<body name="{html.escape(NAME)}"><joint name="j" axis="0 1'
         f' 0"/>{models.BAR.format("0 0 -1")}</body>'

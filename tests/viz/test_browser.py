@@ -18,7 +18,7 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 @pytest.fixture(scope="module")
 def browser():
-    """Chromium without a window."""
+    """Start Chromium without a window."""
     playwright = pytest.importorskip(
         "playwright.sync_api", reason="the page is tried in a browser: pip install playwright"
     )
