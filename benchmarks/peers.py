@@ -1,8 +1,8 @@
 """The libraries that speed.py compares svkc with: MuJoCo, Pinocchio, MJX and JaxSim.
 
-MuJoCo and Pinocchio are called in this process. MJX and JaxSim each run in a process of their own,
-on one core. Run as a program, this file is such a process: it compiles, writes the compile times,
-and runs once for every line that it reads.
+MuJoCo and Pinocchio are called in this process. MJX and JaxSim each run in a separate process, on
+one core. This file is the program of that process: it compiles, prints the compile times, and runs
+all steps once for every line of its standard input.
 """
 
 import json
@@ -78,7 +78,7 @@ def pinocchio_runs(name: str, chain, state, batch: int, steps: int):
     )
     models, datas = pinocchio.StdVec_RigidConstraintModel(), pinocchio.StdVec_RigidConstraintData()
     for constraint in _point_constraints(
-        pinocchio, model, chain, state.structure, two="ball" not in name
+        pinocchio, model, chain, state.structure, two_points="ball" not in name
     ):
         models.append(constraint)
         datas.append(constraint.createData())
@@ -98,8 +98,11 @@ def pinocchio_runs(name: str, chain, state, batch: int, steps: int):
     yield who, lambda: [run() for _ in range(calls)]
 
 
-def _point_constraints(pinocchio, model, chain, structure, two: bool):
-    """Yield Pinocchio's point constraints of each link: one, or two along the axis."""
+def _point_constraints(pinocchio, model, chain, structure, two_points: bool):
+    """Yield Pinocchio's point constraints of each connected link.
+
+    two_points: whether a link has two points, 1 m apart along its axis, which make a hinge.
+    """
     frame = lambda quat, pos: pinocchio.SE3(
         pinocchio.Quaternion(*map(float, quat)).matrix(), np.asarray(pos, float)
     )
@@ -110,7 +113,7 @@ def _point_constraints(pinocchio, model, chain, structure, two: bool):
             frame(structure.real_quat[k], structure.real_pos[k]),
             frame(structure.quat[k], structure.pos[k]),
         )
-        for offset in (0.0, 1.0) if two else (0.0,):
+        for offset in (0.0, 1.0) if two_points else (0.0,):
             shift = pinocchio.SE3(np.eye(3), np.array([0, 0, offset]))
             one, other = (
                 (body.parentJoint, body.placement * body_placement * shift),
@@ -126,7 +129,7 @@ def _point_constraints(pinocchio, model, chain, structure, two: bool):
 
 
 class Process:
-    """A library in its own process, compiled with XLA's default options, on one core."""
+    """A separate process of one library, with XLA's default options, on one core."""
 
     def __init__(self, kind: str, name: str, dtype: str, batch: int, steps: int):
         env, case = (

@@ -7,10 +7,11 @@ One run: two hands until 8 s, one until 9 s, then flight. Batch: 1.8 s; the righ
 of rounds in which all compared programs alternate, with the XLA option that speed.py sets. MuJoCo:
 symplectic Euler steps of 5 ms of the same figure, with soft grips that are never released.
 
-Error: root mean square over the tree's coordinates at the end, relative to Dopri8 at rtol 1e-11; in
-    a batch, the median of some lanes. Ten seconds of undamped limbs are chaotic: there the energy
-    drift is the meaningful number. Joint ranges are left out unless the label says so. Without them
-    limbs reach 100 rad/s, and one in ten of 4096 lanes is not finite with symplectic Euler of 5 ms.
+The error is the root mean square over the tree's coordinates at the end, against Dopri8 at rtol
+1e-11; in a batch, the median over `REFERENCE_LANES` lanes. Ten seconds of undamped limbs are
+chaotic, so that only the energy drift of that run is meaningful. Joint ranges are left out unless
+the label names them. Without ranges limbs reach 100 rad/s, and with symplectic Euler of 5 ms one in
+ten of 4096 lanes is not finite.
 """
 
 import argparse
@@ -34,12 +35,12 @@ EULER = {
     **ARTICULATED,
 }
 TSIT5 = {"solver": diffrax.Tsit5(), "rtol": 1e-4, "atol": 1e-6, **ARTICULATED}
-ALONE = {"default": {}, "articulated bodies": ARTICULATED}
-LANES = {
+SINGLE_RUN_METHODS = {"default": {}, "articulated bodies": ARTICULATED}
+BATCH_METHODS = {
     "symplectic Euler, 2.5 ms": {"dt": 2.5e-3, **EULER},
     "Tsit5, rtol 1e-4": TSIT5,
 }
-RANGED = {"with ranges: symplectic Euler, 5 ms": {"dt": 5e-3, **EULER}}
+BATCH_METHODS_WITH_RANGES = {"with ranges: symplectic Euler, 5 ms": {"dt": 5e-3, **EULER}}
 HEAD = [
     "runs",
     "by",
@@ -103,7 +104,10 @@ def single_runs(chain, state):
     make_run = lambda **options: jax.jit(
         lambda s: svkc.simulate(chain, s, 10.0, events=events(8.0, 9.0), **options)
     )
-    programs = {who: make_run(rtol=1e-8, atol=1e-8, **options) for who, options in ALONE.items()}
+    programs = {
+        who: make_run(rtol=1e-8, atol=1e-8, **options)
+        for who, options in SINGLE_RUN_METHODS.items()
+    }
     reference = make_run(**REFERENCE)(state)
     runs = {who: (lambda f=f: jax.block_until_ready(f(state))) for who, f in programs.items()}
     seconds = speed.time_in_turns(runs | dict([mujoco_steps(chain, state, 1, 2000)]))
@@ -192,9 +196,13 @@ def main(lanes: int):
     tables = (
         single_runs(chain, state),
         batch_runs(
-            chain, state, lanes, LANES, [mujoco_steps(chain, state, lanes, round(END / 5e-3))]
+            chain,
+            state,
+            lanes,
+            BATCH_METHODS,
+            [mujoco_steps(chain, state, lanes, round(END / 5e-3))],
         ),
-        batch_runs(*svkc.scenes.high_bar(), lanes, RANGED),
+        batch_runs(*svkc.scenes.high_bar(), lanes, BATCH_METHODS_WITH_RANGES),
         unequal_runs(chain, state, lanes // 4),
     )
     for rows in tables:

@@ -157,7 +157,7 @@ class Run:
             (np.zeros(model.nq), np.zeros(model.nv)),
         )
         self.torque, self.gap, self.drift = np.zeros(model.nv), 0.0, 0.0
-        self.order = self._places(chain)
+        self.order = self._coordinate_indices(chain)
         self.start[0][self.order[0]], self.start[1][self.order[1]] = (
             state.q[: chain.nq],
             state.v[: chain.nv],
@@ -171,20 +171,21 @@ class Run:
         for dof, torque in problem.torques.items():
             self.torque[model.joint(dof).dofadr] = torque
 
-    def _places(self, chain):
-        """Return the indices of the chain's q and v in qpos and qvel. Sleds are left out."""
-        own = [
+    def _coordinate_indices(self, chain):
+        """Return the indices in qpos and qvel of the q and v of the chain's tree."""
+        tree_joints = [
             i for i in range(self.model.njnt) if self.model.joint(i).name not in chain.link_names
         ]
-        width = {mujoco.mjtJoint.mjJNT_FREE: (7, 6), mujoco.mjtJoint.mjJNT_BALL: (4, 3)}
+        sizes_qv = {mujoco.mjtJoint.mjJNT_FREE: (7, 6), mujoco.mjtJoint.mjJNT_BALL: (4, 3)}
         q, v = [], []
-        for i in own:
-            nq, nv = width.get(mujoco.mjtJoint(self.model.jnt_type[i]), (1, 1))
+        for i in tree_joints:
+            nq, nv = sizes_qv.get(mujoco.mjtJoint(self.model.jnt_type[i]), (1, 1))
             q += range(self.model.jnt_qposadr[i], self.model.jnt_qposadr[i] + nq)
             v += range(self.model.jnt_dofadr[i], self.model.jnt_dofadr[i] + nv)
         return q, v
 
     def _energy(self) -> float:
+        """Return the energy minus the work of the constant torques (J)."""
         mujoco.mj_forward(self.model, self.data)
         mujoco.mj_energyPos(self.model, self.data)
         mujoco.mj_energyVel(self.model, self.data)
@@ -195,12 +196,12 @@ class Run:
         model, data = self.model, self.data
         mujoco.mj_resetData(model, data)
         data.qpos[:], data.qvel[:], data.qfrc_applied[:], self.gap = *self.start, self.torque, 0.0
-        begun_with = self._energy()
-        for begun, stop in zip([0.0, *self.stops], self.stops):
-            steps = max(round((stop - begun) / self.dt), 1)
-            model.opt.timestep = (stop - begun) / steps
+        initial_energy = self._energy()
+        for segment_start, stop in zip([0.0, *self.stops], self.stops):
+            steps = max(round((stop - segment_start) / self.dt), 1)
+            model.opt.timestep = (stop - segment_start) / steps
             mujoco.mj_step(model, data, steps)
             self.gap = max(self.gap, float(np.abs(data.efc_pos).max()) if data.nefc else 0.0)
             data.eq_active[self.released.get(stop, [])] = 0
-        self.drift = self._energy() - begun_with
+        self.drift = self._energy() - initial_energy
         return data.qpos[self.order[0]].copy()

@@ -1,4 +1,4 @@
-"""Number of files that a reader enters to follow one object through the code.
+"""Numbers of files and moves between files in following one object through the code.
 
 Four walks: a `State` through `simulate`, a `VirtualLink` from `load` to the loop Jacobian, a guard
 from `when` to the derivative of its time, a torque through forward dynamics. A walk is the list of
