@@ -176,10 +176,10 @@ class Run:
         tree_joints = [
             i for i in range(self.model.njnt) if self.model.joint(i).name not in chain.link_names
         ]
-        sizes_qv = {mujoco.mjtJoint.mjJNT_FREE: (7, 6), mujoco.mjtJoint.mjJNT_BALL: (4, 3)}
+        joint_nq_nv = {mujoco.mjtJoint.mjJNT_FREE: (7, 6), mujoco.mjtJoint.mjJNT_BALL: (4, 3)}
         q, v = [], []
         for i in tree_joints:
-            nq, nv = sizes_qv.get(mujoco.mjtJoint(self.model.jnt_type[i]), (1, 1))
+            nq, nv = joint_nq_nv.get(mujoco.mjtJoint(self.model.jnt_type[i]), (1, 1))
             q += range(self.model.jnt_qposadr[i], self.model.jnt_qposadr[i] + nq)
             v += range(self.model.jnt_dofadr[i], self.model.jnt_dofadr[i] + nv)
         return q, v

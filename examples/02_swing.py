@@ -1,4 +1,4 @@
-"""A swing whose seat is lost: each thigh slides along the plate until it passes the edge.
+"""A figure slides off the seat of a swing: each thigh is cut as it passes the edge of the plate.
 
 The hands stay connected. Writes a picture to the folder named on the command line (default: the
 current one).
@@ -21,7 +21,7 @@ thighs = ["right_thigh_plate", "left_thigh_plate"]
 
 
 def distance_beyond_edge(link):
-    """Return a guard: the distance (m) of a thigh on its slide beyond the plate's edge."""
+    """Return a guard: the distance (m) by which a thigh on its slide is beyond the plate's edge."""
     along = svkc.touch(chain, link, 0.0, axes="z")
     return lambda t, state, args: jnp.abs(along(t, state)) - PLATE_EDGE
 

@@ -24,9 +24,10 @@ to_bar2, to_bar3 = (
 
 
 def per_joint(side="", **numbers):
-    """Return a number for each joint, selected by the end of its name; zero for other joints.
+    """Return a number for each joint whose name ends with a keyword, and zero for other joints.
 
-    side: prefix of the joint names that are selected.
+    side: beginning of the names of these joints. Empty: both sides.
+    numbers: the end of a joint's name, and its number.
     """
     return jnp.array(
         [
@@ -53,10 +54,10 @@ limb_inertia = jnp.diag(svkc.mass_matrix(chain, state))[6:]
 
 @jax.jit
 def control(t, state, args):
-    """Return joint torques.
+    """Return joint torques (N m).
 
-    Arms that hold a bar stay bent. Legs rise while the hips swing forwards (v[0], m/s). A spring
-    pulls the free hand to the next bar.
+    A PD controller keeps arms that hold a bar bent, and raises the legs while the hips move
+    forwards (v[0], m/s). A spring pulls the free hand to the next bar.
     """
     bar1, bar2, bar3 = state.structure.connected
     q, v = state.q[7:23], state.v[6:22]
@@ -77,9 +78,9 @@ def control(t, state, args):
 
 
 def swings_forward(bar):
-    """Return a guard: with hands on this bar and on bar 2, the velocity of the hips along x (m/s).
+    """Return a guard: the velocity of the hips along x (m/s), while this bar and bar 2 are held.
 
-    The guard is positive while other hands hold.
+    Otherwise the guard is one, so that it does not cross zero.
     """
     return lambda t, state, args: jnp.where(
         jnp.all(state.structure.connected[jnp.array([bar - 1, 1])]), state.v[0], 1.0

@@ -16,7 +16,8 @@ import jax.numpy as jnp
 import svkc
 from svkc.scenes.walking import ANKLE_HEIGHT, HIP_HEIGHT, SOLE_OFFSET, STRIDE, leg_angles, walking
 
-# number of steps; duration of a step (s); part of it on both feet; time to start and to stop (s)
+# number of steps; duration of a step (s); fraction of a step with both feet on the ground; duration
+# of the acceleration at the start and of the deceleration at the end (s)
 STEPS, PERIOD, DOUBLE_SUPPORT, RAMP = 5, 0.65, 0.12, 0.6
 END = RAMP + (STEPS + DOUBLE_SUPPORT / 2) * PERIOD
 chain, state = walking()
@@ -24,7 +25,7 @@ feet = {side: chain.link_names.index(f"{side}_foot_ground") for side in ("left",
 
 
 def steps_done(t):
-    """Return the number of steps done: the right foot touches down at 1, the left one at 2."""
+    """Return the planned number of steps at time t: the right foot lands at 1, the left at 2."""
     starting, stopping = jnp.minimum(t, RAMP), jnp.minimum(END - t, RAMP)
     return (starting**2 - stopping**2 + RAMP**2) / (2 * RAMP * PERIOD) + (
         jnp.clip(t, RAMP, END - RAMP) - RAMP
@@ -32,19 +33,19 @@ def steps_done(t):
 
 
 def planned_angles(t, structure):
-    """Return the planned angles of the 16 joints.
+    """Return the planned angles (rad) of the 16 joints.
 
-    The hips stay at one height and move slightly slower over the supporting foot. Supporting feet
-    stay where they are.
+    The hips stay at one height. They are slightly slower above the supporting foot. Supporting feet
+    do not move.
     """
-    steps, middle = steps_done(t), steps_done(t) - (1 + DOUBLE_SUPPORT) / 2
-    hips = STRIDE * middle - 0.007 * jnp.sin(2 * jnp.pi * middle) - SOLE_OFFSET
+    steps, hip_steps = steps_done(t), steps_done(t) - (1 + DOUBLE_SUPPORT) / 2
+    hips = STRIDE * hip_steps - 0.007 * jnp.sin(2 * jnp.pi * hip_steps) - SOLE_OFFSET
     swing, joints = 0.3 * jnp.cos(jnp.pi * (steps - DOUBLE_SUPPORT / 2)), {}
     for side, odd in (("right", 0), ("left", 1)):
-        link, step = feet[side], 2 * jnp.round((middle - odd) / 2) + odd
-        u = jnp.clip((steps - step - DOUBLE_SUPPORT) / (1 - DOUBLE_SUPPORT), 0, 1.2)
+        link, step = feet[side], 2 * jnp.round((hip_steps - odd) / 2) + odd
+        swing_time = jnp.clip((steps - step - DOUBLE_SUPPORT) / (1 - DOUBLE_SUPPORT), 0, 1.2)
         phase, lift_off_x, supports = (
-            jnp.minimum(u, 1),
+            jnp.minimum(swing_time, 1),
             structure.pos[link, 0],
             structure.connected[link],
         )
@@ -52,7 +53,7 @@ def planned_angles(t, structure):
             10 - 15 * phase + 6 * phase**2
         )
         # the plan continues below the ground, so that the foot touches down with some speed
-        foot_height = 0.6 * u**2 * (1 - u) * (1.15 - u)
+        foot_height = 0.6 * swing_time**2 * (1 - swing_time) * (1.15 - swing_time)
         angles = leg_angles(
             jnp.where(supports, lift_off_x, foot_x) - SOLE_OFFSET - hips,
             HIP_HEIGHT - ANKLE_HEIGHT - jnp.where(supports, 0, foot_height),
@@ -67,7 +68,10 @@ def planned_angles(t, structure):
 
 
 def torques_on_foot(foot, state, vdot):
-    """Return torques that produce these accelerations and put all load on one foot."""
+    """Return joint torques (N m) for the accelerations vdot, with all load on one foot.
+
+    foot: number of the foot's virtual link.
+    """
     single_support = eqx.tree_at(
         lambda s: (s.connected, s.rank),
         state.structure,
@@ -77,10 +81,10 @@ def torques_on_foot(foot, state, vdot):
 
 
 def control(t, state, args):
-    """Return joint torques by computed torque control.
+    """Return joint torques (N m) by computed-torque control.
 
-    Accelerations follow the plan as closely as the supporting feet allow. While both feet stand,
-    the load moves from the rear leg to the front one.
+    The accelerations are those nearest to the plan that the supporting feet allow. While both feet
+    are on the ground, the load moves from the rear foot to the front foot.
     """
     position_and_velocity = lambda t: jax.jvp(
         lambda t: planned_angles(t, state.structure), (t,), (jnp.ones_like(t),)
@@ -100,7 +104,8 @@ def control(t, state, args):
         state.structure.pos[:, 0],
     )
     phase = jnp.clip((steps_done(t) - jnp.round(steps_done(t))) / DOUBLE_SUPPORT, 0, 1)
-    # exceeds one at the end: the rear foot would have to be pulled, so its guard releases it
+    # fraction of the load on the front foot; it exceeds one at the end: the ground would have to
+    # pull the rear foot, so that the guard of this foot releases it
     front = 0.02 + 1.03 * phase**2 * (3 - 2 * phase)
     on_left = jnp.where(
         jnp.all(supports),

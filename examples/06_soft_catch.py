@@ -19,28 +19,30 @@ import optax
 import svkc
 from svkc.scenes import BAR_HEIGHT, hanging_state, high_bar
 
-# catch time without correction (s); velocity of the hands there (m/s)
+# catch time at zero delay (s); velocity of the hands at the catch without torques (m/s)
 HANDS, CATCH_TIME, ARRIVAL_VELOCITY = (
     ("right_hand_grip", "left_hand_grip"),
     0.4,
     jnp.array([0.6, 0.0, -1.2]),
 )
-# without joint ranges: the cost of torques keeps the joints' motion small
+# joint ranges are left out: the cost of torques keeps the motion of the joints small
 chain, _ = high_bar(ignore="limit")
 
-# a flight with stretched arms and limbs at rest, from the bar back along the parabola: without
-# torques the hands arrive at the bar
+# the figure at the bar, moved back in time along its parabola: without torques the hands arrive at
+# the bar, with stretched arms
 hanging_start, fall = hanging_state(chain, angle=0.3), chain.gravity
 q = hanging_start.q[: chain.nq].at[:3].add(fall * CATCH_TIME**2 / 2 - ARRIVAL_VELOCITY * CATCH_TIME)
 start = chain.state(q, {"base": [*(ARRIVAL_VELOCITY - fall * CATCH_TIME), 0, 0, 0]}, connected=())
-# kg m^2: inertia that each joint moves
+# kg m^2: inertia that each joint accelerates
 limb_inertia = jnp.diag(svkc.mass_matrix(chain, start))[6:22]
 
 
 def control(t, state, bend):
-    """Return joint torques, equal on both sides: linear in time during flight, then zero.
+    """Return joint torques (N m), equal on both sides: linear in time in flight, then zero.
 
-    Torques inside the figure leave the momentum of the flight unchanged.
+    Joint torques do not change the momentum of the flight.
+
+    bend: accelerations (rad/s^2) at the start and at CATCH_TIME, of arm and leg joints.
     """
     arm, leg = jnp.split(bend[0] + (bend[1] - bend[0]) * t / CATCH_TIME, 2)
     tau = limb_inertia * jnp.concatenate([arm, arm, leg, leg])
@@ -48,10 +50,12 @@ def control(t, state, bend):
 
 
 def fly(p, t1, ts=None):
-    """Return a run in which both hands connect to the ground at one time, at their current
-    positions.
+    """Return a run in which both hands are connected to the ground where they are.
 
-    The loss makes these positions coincide with the bar.
+    The loss moves these positions to the bar.
+
+    p: the parameters: `bend`, and the delay of the catch (0.01 s).
+    t1: end time (s).
     """
     events = [svkc.at(CATCH_TIME + p["delay"] / 100, connect=HANDS, here=True)]
     options = {"solver": diffrax.Dopri8(), "rtol": 1e-9, "atol": 1e-11}

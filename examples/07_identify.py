@@ -1,5 +1,4 @@
-"""Identification: masses of an arm's links and the strength of its wrist, from one run that breaks
-it.
+"""Identification: masses of an arm's links and strength of its wrist, from a run that breaks it.
 
 Writes a picture to the folder named on the command line (default: the current one).
 """
@@ -20,7 +19,7 @@ from jax.flatten_util import ravel_pytree
 
 import svkc
 
-# an arm of three links on hinges about y; the wrist can break; bodies without a joint are
+# an arm of three links on hinges about y, of which the wrist can break; bodies without joints are
 # markers at the ends of links
 ARM = """<mujoco><worldbody>
   <body name="upper"><joint name="shoulder" axis="0 1 0"/><geom type="capsule"
@@ -44,18 +43,18 @@ OPTIONS = {"solver": diffrax.Dopri8(), "rtol": 1e-9, "atol": 1e-11}
 
 
 def control(t, state, args):
-    """Return a known torque at the shoulder (N m).
+    """Return joint torques (N m): a known one at the shoulder.
 
-    Without a known torque, only ratios of masses and strength could be identified.
+    Without a known torque, one could identify only the ratios of masses and strength.
     """
     return jnp.zeros(chain.dofs).at[chain.dof_names.index("shoulder")].set(6 * jnp.sin(4 * t))
 
 
 @jax.jit
 def run(p):
-    """Return marker positions (m) [times markers 2] and the time at which the wrist breaks (s).
+    """Return x and z of the markers (m) [times markers 2], and when the wrist breaks (s).
 
-    p: factors on the masses and on the wrist's strength. Positions are x and z.
+    p: factors of the masses and of the wrist's strength.
     """
     scale = jnp.ones_like(chain.mass).at[rows].set(p["mass"])
     arm = eqx.tree_at(
@@ -87,9 +86,11 @@ derivatives = jax.jit(jax.jacfwd(lambda x: 2 * (residuals(tree(x)),), has_aux=Tr
 (J, r), damping = derivatives(x), 1e-2
 for _ in range(12):
     trial = x - jnp.linalg.solve(J.T @ J + damping * jnp.diag(jnp.sum(J * J, 0)), J.T @ r)
-    new = derivatives(trial)
-    better = bool(jnp.sum(new[1] ** 2) < jnp.sum(r**2))
-    x, (J, r), damping = (trial, new, damping / 10) if better else (x, (J, r), damping * 10)
+    trial_result = derivatives(trial)
+    accepted = bool(jnp.sum(trial_result[1] ** 2) < jnp.sum(r**2))
+    x, (J, r), damping = (
+        (trial, trial_result, damping / 10) if accepted else (x, (J, r), damping * 10)
+    )
 estimate = tree(x)
 error = tree(noise * jnp.sqrt(jnp.diag(jnp.linalg.inv(J.T @ J))))
 for what, p in (("true", true), ("guess", guess), ("found", estimate), ("expected error", error)):

@@ -240,8 +240,8 @@ def prepared_scenes():
 
 scene = st.sampled_from(["four", "tree", "spare"])
 # numbers of coordinates and of velocities: of the chain, and of its tree alone
-SIZES = {"four": (4, 4), "tree": (12, 10), "spare": (11, 10)}
-TREE_SIZES = {"four": (3, 3), "tree": (12, 10), "spare": (3, 3)}
+COORDINATE_COUNTS = {"four": (4, 4), "tree": (12, 10), "spare": (11, 10)}
+TREE_COORDINATE_COUNTS = {"four": (3, 3), "tree": (12, 10), "spare": (3, 3)}
 
 
 def with_defect(state, field: str, value):

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from fuzzing import (
+    COORDINATE_COUNTS,
     RAISED,
-    SIZES,
-    TREE_SIZES,
+    TREE_COORDINATE_COUNTS,
     all_finite,
     anything,
     defects,
@@ -38,7 +38,9 @@ def coordinate_arguments(draw, which: int, name: str):
     name: name of the scene.
     """
     chain, state = scenes()[name]
-    size = draw(st.sampled_from([SIZES[name][which], TREE_SIZES[name][which], 2]))
+    size = draw(
+        st.sampled_from([COORDINATE_COUNTS[name][which], TREE_COORDINATE_COUNTS[name][which], 2])
+    )
     if draw(st.booleans()):
         good = np.asarray(state.v if which else state.q)[:size].copy()
         return (good + 1e-2 * draw(st.integers(0, 1)) * np.arange(len(good))).astype(
@@ -122,7 +124,7 @@ def argument_strategy(draw, name: str):
     The verdict is "" for a valid argument, "x" for one with a non-finite number, None for one that
     may be invalid.
     """
-    counts = {"tau": SIZES, "v": SIZES, "q": SIZES}
+    counts = {"tau": COORDINATE_COUNTS, "v": COORDINATE_COUNTS, "q": COORDINATE_COUNTS}
 
     def draw_argument(kind):
         if kind == "dt":
