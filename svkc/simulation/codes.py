@@ -34,6 +34,14 @@ class RESULTS(eqx.Enumeration, metaclass=FormerMeta):  # pyright: ignore
         " mobility and its margin there."
     )
     non_finite = "A non-finite number appeared."
+    not_a_time = (
+        "A time is not a number or infinite: the start or end of the run, a save time, or the time"
+        " of an event. Nothing was run."
+    )
+    reversed = (
+        "Times are out of order: t1, an event or a save time is before t0, save times decrease, or"
+        " a save time is past t1. Nothing was run."
+    )
     no_slot = (
         "An event makes a grip, but every spare slot was bound, or the slot that the grip names was"
         " connected: the grip was skipped, all other changes were made. Load with more spare slots,"

@@ -20,6 +20,7 @@ from svkc.simulation.codes import DERIVATIVE, RESULTS
 from svkc.simulation.options import Options
 from svkc.simulation.phase import PhaseOutcome, RunState, solve_phase
 from svkc.simulation.records import empty_events, empty_phase_records, write_phase_row
+from svkc.simulation.traced_checks import check_traced_times
 from svkc.transitions.plan import Plan
 
 
@@ -36,8 +37,12 @@ def with_lock_mask(chain: Chain, state: State, plan: Plan) -> State:
     )
 
 
-def initial_run_state(chain: Chain, state: State, t0, ts, plan: Plan, options: Options) -> RunState:
-    """Return the state of a run before its first phase, with empty records."""
+def initial_run_state(chain: Chain, state: State, times, plan: Plan, options: Options) -> RunState:
+    """Return the state of a run before its first phase, with empty records.
+
+    times: start, end and save times.
+    """
+    t0, _, ts = times
     links, rows, dtype = len(chain.link_names), options.max_events, state.q.dtype
     state = with_lock_mask(chain, state, plan)
     # a link that is overloaded from the start breaks at once; guards that need no torques are
@@ -54,7 +59,7 @@ def initial_run_state(chain: Chain, state: State, t0, ts, plan: Plan, options: O
         records=empty_phase_records(rows + 1, state),
         count=jnp.asarray(0, jnp.int32),
         saved=jax.tree.map(lambda x: jnp.broadcast_to(x[None], (ts.shape[0], *x.shape)), state),
-        result=RESULTS.successful,
+        result=check_traced_times(times, plan) if options.traced_times else RESULTS.successful,
         derivative=DERIVATIVE.successful,
         invalid_from=jnp.asarray(rows + 1, jnp.int32),
     )  # fmt: skip

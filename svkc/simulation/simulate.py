@@ -98,7 +98,7 @@ def _run(chain: Chain, state: State, times, plan: Plan, options: Options, args) 
     """
     t0, t1, ts = times
     plan, options = _closure_convert(chain, state, t0, plan, options, args)
-    run = initial_run_state(chain, state, t0, ts, plan, options)
+    run = initial_run_state(chain, state, times, plan, options)
 
     def phase(run: RunState, index):
         return run_phase(chain, run, index, (t1, ts), plan=plan, options=options, args=args), None

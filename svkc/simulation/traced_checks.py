@@ -1,0 +1,34 @@
+"""Checks of the arguments of a run that are traced, compiled into the start of the run.
+
+Concrete arguments raise ValueError instead (`option_checks`), and compile none of this.
+"""
+
+import jax.numpy as jnp
+
+from svkc._jax.pytrees import stop_gradient_tree
+from svkc.simulation.codes import RESULTS
+from svkc.transitions.plan import Plan
+
+
+def check_traced_times(times, plan: Plan) -> RESULTS:
+    """Return `not_a_time` or `reversed` if the times of a run cannot be run, else `successful`.
+
+    The time of an event may be infinite: the event does not happen. Save times may lie outside of
+    the run by round-off.
+
+    times: start, end and save times (s).
+    """
+    t0, t1, ts = stop_gradient_tree(times)
+    event_times = stop_gradient_tree(plan.times)
+    # the rounding error of t0 + n dt is a few eps of the largest time
+    slack = 8 * jnp.finfo(ts.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
+    in_order = (
+        (t0 <= t1)
+        & jnp.all(event_times >= t0)
+        & jnp.all((ts >= t0 - slack) & (ts <= t1 + slack))
+        & jnp.all(ts[1:] >= ts[:-1])
+    )
+    finite = jnp.isfinite(t0) & jnp.isfinite(t1) & jnp.all(jnp.isfinite(ts))
+    finite = finite & ~jnp.any(jnp.isnan(event_times))
+    result = RESULTS.where(in_order, RESULTS.successful, RESULTS.reversed)
+    return RESULTS.where(finite, result, RESULTS.not_a_time)
