@@ -192,6 +192,7 @@ CASES = {
     "...: got shape ..., expected ... numbers": lambda s: s.drawn(lookat=(1, 2)),
     "...: got shape ..., expected one number": lambda s: s.simulate(t1=jnp.ones(2)),
     "... and ... both": lambda s: svkc.at(0.1, connect="pin", cut="pin"),
+    "...: the loops do not": lambda s: s.four.state({"crank": 0.3, "rocker": 1.0}),
     "...[...]: got": lambda s: s.four.state({"crank": [1.0, 2.0]}),
     "actuated: expected": lambda s: s.actuation(actuated=np.ones(2, bool)),
     "adjoint: expected": lambda s: s.simulate(adjoint="replay"),

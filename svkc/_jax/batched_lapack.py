@@ -12,7 +12,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 # largest number of operations that jaxlib runs in one thread
 SINGLE_THREAD_OPERATIONS = 200_000 - 1
@@ -83,4 +83,46 @@ def cholesky_solver(A: Float[Array, "n n"]) -> Callable:
     L = _cholesky(A)
     return lambda x: batched_solve_triangular(
         L, batched_solve_triangular(L, x, lower=True), trans=True, lower=True
+    )
+
+
+def _packed_lu(A):
+    """Return LU factors, then a column with the permutation and one with the pivots."""
+    lu, pivots, order = lax.linalg.lu(A)
+    return jnp.concatenate([lu, jnp.stack([order, pivots], -1).astype(A.dtype)], -1)
+
+
+_lu = _in_chunks(_packed_lu, lambda A: A[0] ** 3)
+
+
+def factor_general(
+    A: Float[Array, "*lanes n n"],
+) -> tuple[Float[Array, "*lanes n n"], Int[Array, "*lanes n"], Bool[Array, "*lanes"]]:
+    """Return LU factors of regular matrices, the order of their rows, and whether the determinant
+    is positive. Not to be differentiated."""
+    n, packed = A.shape[-1], _lu(A)
+    lu, order, pivots = packed[..., :n], packed[..., n], packed[..., n + 1]
+    negative = jnp.diagonal(lu, axis1=-2, axis2=-1) < 0
+    odd = negative ^ (pivots != jnp.arange(n, dtype=A.dtype).reshape((1,) * (A.ndim - 2) + (n,)))
+    return lu, order.astype(jnp.int32), jnp.sum(odd, -1, dtype=jnp.int32) % 2 == 0
+
+
+def solve_factored(lu: Float[Array, "n n"], order: Int[Array, " n"], x: Float[Array, "n *m"]):
+    """Return A^-1 x from the factors of A."""
+    x = lax.linalg.triangular_solve(
+        lu, x.reshape(len(x), -1)[order], left_side=True, lower=True, unit_diagonal=True
+    )
+    return batched_solve_triangular(lu, x)
+
+
+def solve_general(A: Float[Array, "n n"], x: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Return A^-1 x by LU for any regular A; the derivative is one more solve, in both modes."""
+
+    def by(matrix):
+        lu, order, _ = factor_general(matrix)
+        return lambda _, y: solve_factored(lu, order, y)[:, 0]
+
+    frozen = jax.lax.stop_gradient(A)
+    return jax.lax.custom_linear_solve(
+        lambda y: A @ y, x, solve=by(frozen), transpose_solve=by(frozen.T)
     )

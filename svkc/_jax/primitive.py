@@ -12,7 +12,11 @@ from jax.interpreters import ad
 
 
 def custom_primitive(
-    name: str, function: Callable, jvp: Callable, transpose: Callable | None = None
+    name: str,
+    function: Callable,
+    jvp: Callable,
+    transpose: Callable | None = None,
+    like: Callable | None = None,
 ) -> Callable:
     """Return `function` as a JAX primitive with the given derivative rules.
 
@@ -22,6 +26,8 @@ def custom_primitive(
     rule calls the primitive again for the value.
     transpose: transpose(inputs, cotangents) -> cotangents of the inputs; None: the primitive is not
     linear, and transposing raises NotImplementedError.
+    like: a function that is cheaper to trace and whose result has the same shapes and types; None:
+        `function` itself.
     """
 
     def abstract_eval(*args):
@@ -31,7 +37,7 @@ def custom_primitive(
         to_aval = lambda x: (
             core.ShapedArray(x.shape, x.dtype) if isinstance(x, jax.ShapeDtypeStruct) else x
         )
-        out = eqx.filter_eval_shape(function, *jax.tree.map(to_struct, args))
+        out = eqx.filter_eval_shape(like or function, *jax.tree.map(to_struct, args))
         return jax.tree.map(to_aval, out)
 
     def not_linear(*_, **__):

@@ -219,24 +219,50 @@ class Chain(eqx.Module):
         force = jnp.clip(force, self.force_range[:, 0], self.force_range[:, 1])
         return force @ self.gear
 
-    def state(self, q: Any = None, v: Any = None, connected: Any = None) -> State:
+    def state(
+        self,
+        q: Any = None,
+        v: Any = None,
+        connected: Any = None,
+        *,
+        near: State | None = None,
+        hold: bool | None = None,
+        tolerance: Any = None,
+        throw: bool = True,
+    ) -> State:
         """Return a state that satisfies the loop constraints.
 
-        Newton's method closes the loops; the velocity is projected onto the closed loops.
+        The loops are closed by continuation from the load pose, or from the State `near`: the
+        result is on the branch of closed configurations that is connected with this start. If the
+        named coordinates leave freedoms, the result is the point of least change from the start on
+        that branch. The velocity is projected onto the closed loops; a velocity that keeps the
+        loops is returned unchanged.
 
-        q: coordinates (m, rad, wxyz): an array over the tree or over every coordinate, or a dict by
-            joint name whose entries are kept where the loops allow it. None: the load pose.
+        q: coordinates (m, rad, wxyz): a dict by joint name, or an array over the tree or over every
+            coordinate. Named coordinates are held: they are returned as given. An array is a guess:
+            it is returned unchanged if it closes the loops, else with the least change that closes
+            them. None: the load pose.
         v: velocities (m/s, rad/s), in the same forms. None: at rest.
-        connected: names of the connected virtual links, or a mask [links]. None: as in the model.
+        connected: names of the connected virtual links, or a mask [links]. None: as in `near`, or
+            as in the model.
+        near: a State from which to start instead of the load pose.
+        hold: True: arrays are held too. False: named coordinates are a guess too. None: named
+            coordinates are held, arrays are a guess.
+        tolerance: largest deviation of a held coordinate from the given one if more coordinates are
+            held than there are freedoms (rad, or in `chain.length`s). None: eps^(4/7).
+        throw: False: a state that cannot be reached is filled with NaN instead of raising.
 
         Raises ValueError if a name is unknown, a size is wrong, a number is not finite, a
-        quaternion is not of unit length, or the loops cannot be closed. The message then names the
-        open loops and their gaps. Under jit, open loops raise RuntimeError at run time.
+        quaternion is not of unit length, the loops do not allow the held coordinates, or the loops
+        cannot be closed. The message names the joints or loops and the amounts. Under jit, a state
+        that cannot be reached raises RuntimeError at run time.
         """
         # an import against the order of packages: a state needs the loop solver
         from svkc.transitions.initial_state import assemble
 
-        return assemble(self, q, v, connected)
+        return assemble(
+            self, q, v, connected, near=near, hold=hold, tolerance=tolerance, throw=throw
+        )
 
     def to_mjcf(self) -> str:
         """Return MJCF text of the loaded model, with the virtual links as <equality> elements.

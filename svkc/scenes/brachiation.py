@@ -63,7 +63,7 @@ def hanging_state(chain: Chain, angle: float) -> State:
     }
     for side in ("right", "left"):
         q |= {f"{side}_hip_flexion": 0.1, f"{side}_knee": 0.3, f"{side}_ankle": -0.5}
-    return chain.state(q)
+    return chain.state(q, hold=False)
 
 
 def __getattr__(name: str):

@@ -57,4 +57,4 @@ def hanging_state(chain: Chain, angle: float) -> State:
             f"{side}_hip_flexion": 0.1,
             f"{side}_ankle": -0.5,
         }
-    return chain.state(q)
+    return chain.state(q, hold=False)

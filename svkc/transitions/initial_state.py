@@ -1,44 +1,26 @@
 """The initial state of a chain (`Chain.state`): the user's values by name or as arrays, the loops
-closed by Newton's method, the velocity projected onto the closed loops."""
+closed by continuation, the velocity projected, and errors that name what could not be reached."""
 
-import dataclasses
 import functools
 import warnings
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from svkc._jax.eager import eager_jit
 from svkc._jax.pytrees import is_concrete
-from svkc.loops.constraint import gap_tolerance, loop_gaps
-from svkc.model.chain import Chain, State, Structure, active_dofs
+from svkc.loops.constraint import gap_tolerance, jacobian_scales, loop_gaps
+from svkc.model.chain import Chain, State, Structure
+from svkc.model.checked_jit import check_state
 from svkc.model.names import connection_mask, joint_slice
 from svkc.model.topology import Q_SIZE, V_SIZE
-from svkc.model.validation import finite_array
-from svkc.transitions.newton import solve_structure
-from svkc.transitions.newton_state import (
-    CLOSE,
-    CLOSE_HELD,
-    PROJECT_VELOCITY,
-    PROJECT_VELOCITY_HELD,
-    RANK_SEARCH,
-    READ_COORDINATES,
-    HeldCoordinates,
-    Schedule,
-)
-from svkc.tree.configuration import normalize
-
-_NEWTON_ITERATIONS = 30
-_CLOSE_KINDS, _PROJECT_KINDS = (
-    (*(CLOSE_HELD,) * _NEWTON_ITERATIONS, *(CLOSE,) * _NEWTON_ITERATIONS),
-    (PROJECT_VELOCITY_HELD, PROJECT_VELOCITY),
-)
-_PLACE_SCHEDULE, _ASSEMBLE_SCHEDULE = (
-    Schedule((*_CLOSE_KINDS, *_PROJECT_KINDS)),
-    Schedule((READ_COORDINATES, *_CLOSE_KINDS, *RANK_SEARCH, *_PROJECT_KINDS)),
-)
+from svkc.model.validation import boolean, finite_array, positive_scalar
+from svkc.transitions.path_following import follow_path
+from svkc.transitions.stationarity import Targets
+from svkc.tree.configuration import difference, normalize
 
 
 def _set_values(array, at, values):
@@ -54,8 +36,8 @@ def _set_values(array, at, values):
 
 
 def _full_vector(chain: Chain, quantity: str, value, default):
-    """Return the full vector of a user's array or dict, and the mask of scalar coordinates and
-    velocities that the dict names.
+    """Return the full vector of a user's array or dict, and the mask of degrees of freedom whose
+    values the user gives.
 
     quantity: "q" or "v".
     default: values of the coordinates that the user does not give.
@@ -66,7 +48,7 @@ def _full_vector(chain: Chain, quantity: str, value, default):
         if quantity == "q"
         else (top.nv, V_SIZE, top.v_start, top.model_v)
     )
-    named = np.zeros(len(default), bool)
+    named = np.zeros(top.dofs, bool)
     if value is None:
         return default, named
     if isinstance(value, dict):
@@ -80,21 +62,22 @@ def _full_vector(chain: Chain, quantity: str, value, default):
                     f" {at.stop - at.start}"
                 )
             out = _set_values(out, at, number.reshape(-1))
-            if quantity == "v" or at.stop - at.start == 1:
-                named[at] = True
+            named[joint_slice(chain, name, V_SIZE, top.v_start)] = True
         return out, named
     value = finite_array(quantity, value, default.dtype)
     if top.cuttable_joints and value.shape == (len(model_entries),):
         # the size in the model itself, in which no joint is cut
+        named[np.array(top.model_v, int)] = True
         return _set_values(default, np.array(model_entries, int), value), named
     if value.shape == (tree_size,):
+        named[: top.nv] = True
         return _set_values(default, slice(tree_size), value), named
     if value.shape != default.shape:
         raise ValueError(
             f"{quantity}: got shape {value.shape}, expected ({tree_size},) for the tree or"
             f" {default.shape} for every coordinate"
         )
-    return value, named
+    return value, ~named
 
 
 def _check_quaternions(chain: Chain, q):
@@ -113,67 +96,103 @@ def _check_quaternions(chain: Chain, q):
         )
 
 
-def _place_cuttable_bodies(chain: Chain, structure: Structure, q, v, links_to_place):
-    """Return q and v with the bodies of cuttable joints placed by the coordinates of these joints.
+class HeldMasks(eqx.Module):
+    """Masks of the coordinates and velocities that the result must have as given."""
 
-    Coordinates and velocities of all other bodies stay unchanged.
-    links_to_place: mask of the virtual links that replace the cuttable joints.
-    """
-    top = chain.topology
-    movable = np.zeros(top.dofs, bool)
-    for row in top.link_child:
-        if row >= 0:
-            movable[top.v_start[row] : top.v_start[row] + 6] = True
-    max_rank = jnp.asarray(min(6 * len(links_to_place), top.dofs), jnp.int32)
-    placing_structure = eqx.tree_at(
-        lambda s: (s.connected, s.rank), structure, (structure.connected & links_to_place, max_rank)
-    )
-    solution = solve_structure(
-        chain,
-        placing_structure,
-        q,
-        v,
-        HeldCoordinates(jnp.asarray(~movable), jnp.asarray(~movable)),
-        _PLACE_SCHEDULE,
-    )
-    return solution.q, jnp.where(active_dofs(chain, placing_structure), solution.v, v)
+    q: Bool[Array, " dofs"]
+    v: Bool[Array, " dofs"]
+
+
+class Deviations(eqx.Module):
+    """Deviations of held coordinates (rad, m) and velocities (rad/s, m/s) from the given values, 0
+    within the tolerance, and whether the state is not the requested one."""
+
+    q: Float[Array, " dofs"]
+    v: Float[Array, " dofs"]
+    failed: Bool[Array, ""]
 
 
 @functools.partial(eager_jit, jit=eqx.filter_jit)
-def _close_and_project(
-    chain: Chain, structure: Structure, q, v, held: HeldCoordinates, q_is_complete: bool
-) -> tuple[State, Float[Array, " links"]]:
-    """Return the state with its loops closed, and the residual gap of each loop (rad, or in
-    `chain.length`s).
-
-    The first Newton steps hold the coordinates that the user named; further steps change all
-    coordinates, for loops that the first steps could not close. Velocities are projected likewise.
-
-    q_is_complete: whether q gives the poses of all bodies. Otherwise the bodies of cuttable joints
-        are placed by the coordinates of these joints first.
-    """
-    links_to_place = (np.array(chain.topology.link_child, int) >= 0) & (not q_is_complete)
-    if links_to_place.any():
-        q, v = _place_cuttable_bodies(chain, structure, q, v, links_to_place)
-    held = dataclasses.replace(held, read_links=jnp.asarray(~links_to_place) | ~structure.connected)
-    solution = solve_structure(chain, structure, q, v, held, _ASSEMBLE_SCHEDULE)
-    return (
-        State(
-            solution.q,
-            solution.v,
-            eqx.tree_at(lambda s: (s.rank, s.margin), structure, (solution.rank, solution.margin)),
-        ),
-        solution.residual_gaps,
+def _follow_and_compare(
+    chain: Chain, structure: Structure, targets: Targets, held: HeldMasks
+) -> tuple[State, Deviations]:
+    """Return the state at the end of the path from the start, and its deviations."""
+    start, requested = normalize(chain, targets.start), normalize(chain, targets.requested)
+    targets = eqx.tree_at(lambda t: (t.start, t.requested), targets, (start, requested))
+    end, column = follow_path(chain, structure, targets), jacobian_scales(chain)[1]
+    structure = eqx.tree_at(lambda s: (s.rank, s.margin), structure, (end.rank, end.margin))
+    last, requested, v = jax.lax.stop_gradient((end, targets.requested, targets.v))
+    deviation_q = jnp.where(held.q, jnp.abs(difference(chain, last.q, requested)), 0)
+    deviation_v = jnp.where(held.v, jnp.abs(v - last.v), 0)
+    limit = targets.tolerance * column
+    missed_q = ~(deviation_q <= limit)
+    missed_v = ~(deviation_v <= limit * (1 + jnp.max(jnp.abs(v / column))))
+    is_open = structure.connected & ~(last.residual_gaps < gap_tolerance(last.q.dtype))
+    deviations = Deviations(
+        q=jnp.where(missed_q, deviation_q, 0),
+        v=jnp.where(missed_v, deviation_v, 0),
+        failed=~last.reached | jnp.any(missed_q) | jnp.any(missed_v) | jnp.any(is_open),
     )
+    # the given velocity itself, without the round-off of the projection
+    correction = jnp.where(targets.held_v & ~missed_v, v - last.v, 0)
+    return State(end.q, end.v + correction, structure), deviations
 
 
-def assemble(chain: Chain, q, v, connected) -> State:
+def assemble(
+    chain: Chain, q, v, connected, *, near: State | None, hold: bool | None, tolerance, throw: bool
+) -> State:
     """Return a consistent state; see `Chain.state`."""
-    top = chain.topology
-    structure = eqx.tree_at(
-        lambda s: s.connected, chain.structure, jnp.asarray(connection_mask(chain, connected))
+    start, structure = _start(chain, near, connected)
+    _warn_of_precision(chain, q, v)
+    requested, specified_q = _full_vector(chain, "q", q, start)
+    v_full, specified_v = _full_vector(chain, "v", v, np.zeros(chain.dofs, chain.q_load.dtype))
+    requested, v_full = jnp.asarray(requested), jnp.asarray(v_full)
+    _check_quaternions(chain, requested)
+    holds = [isinstance(x, dict) if hold is None else boolean("hold", hold) for x in (q, v)]
+    throw, tolerance = boolean("throw", throw), _tolerance(chain, tolerance)
+    if not len(chain.link_names):
+        return State(normalize(chain, requested), v_full, structure)
+    held = HeldMasks(jnp.asarray(specified_q & holds[0]), jnp.asarray(specified_v & holds[1]))
+    follows_names = isinstance(q, dict) and holds[0]
+    # a full array gives the poses of the bodies of cuttable joints; names, and an array in the
+    # model's own order, give the coordinates of these joints
+    by_joint = q is None or isinstance(q, dict) or np.shape(q) == (len(chain.topology.model_q),)
+    cuttable = np.array(chain.topology.link_child, int) >= 0
+    targets = Targets(
+        start=jnp.asarray(start) if follows_names else requested,
+        requested=requested,
+        v=v_full,
+        held_q=jnp.asarray(specified_q & follows_names),
+        held_v=held.v,
+        read_links=jnp.asarray(~(cuttable & by_joint)),
+        tolerance=tolerance,
     )
-    user_q = q
+    state, deviations = _follow_and_compare(chain, structure, targets, held)
+    return _check_reached(chain, state, deviations, throw)
+
+
+def _tolerance(chain: Chain, tolerance) -> Float[Array, ""]:
+    """Return the largest deviation of a held coordinate (rad, or in `chain.length`s)."""
+    if tolerance is None:
+        tolerance = gap_tolerance(chain.q_load.dtype)
+    return jnp.asarray(positive_scalar("tolerance", tolerance), chain.q_load.dtype)
+
+
+def _start(chain: Chain, near: State | None, connected) -> tuple[Array, Structure]:
+    """Return the configuration at which the path starts, and the structure of the state."""
+    if near is None:
+        start, structure = chain.q_load, chain.structure
+    else:
+        check_state(chain, near)
+        start, structure = near.q, near.structure
+    if near is None or connected is not None:
+        mask = jnp.asarray(connection_mask(chain, connected))
+        structure = eqx.tree_at(lambda s: s.connected, structure, mask)
+    return start, structure
+
+
+def _warn_of_precision(chain: Chain, q, v):
+    """Warn about arrays in float64 that become float32."""
     float64_inputs = [
         name
         for name, x in (("q", q), ("v", v))
@@ -183,31 +202,40 @@ def assemble(chain: Chain, q, v, connected) -> State:
         warnings.warn(
             f"state: {' and '.join(float64_inputs)} in float64, kept in float32: jax_enable_x64 was"
             " off when the chain was loaded",
-            stacklevel=3,
+            stacklevel=4,
         )
-    q, held_q = _full_vector(chain, "q", q, chain.q_load)
-    v, held_v = _full_vector(chain, "v", v, np.zeros(top.dofs, chain.q_load.dtype))
-    q, v = jnp.asarray(q), jnp.asarray(v)
-    _check_quaternions(chain, q)
-    if not len(top.link_names):
-        return State(normalize(chain, q), v, structure)
-    # True for every chain without cuttable joints, so that one program serves all inputs
-    q_is_complete = max(top.link_child, default=-1) < 0 or (
-        user_q is not None
-        and not isinstance(user_q, dict)
-        and np.shape(user_q) != (len(top.model_q),)
-    )
-    held = HeldCoordinates(jnp.asarray(_q_mask_to_dofs(chain, held_q)), jnp.asarray(held_v))
-    return check_closed(chain, *_close_and_project(chain, structure, q, v, held, q_is_complete))
 
 
-def _q_mask_to_dofs(chain: Chain, held_q: np.ndarray) -> np.ndarray:
-    """Return the mask over v of the joints that a mask over q selects; joints of one freedom
-    only."""
-    held = np.zeros(chain.dofs, bool)
-    scalar_q, scalar_v = chain.topology.scalar_coordinates
-    held[scalar_v] = held_q[scalar_q]
-    return held
+def _check_reached(chain: Chain, state: State, deviations: Deviations, throw: bool) -> State:
+    """Return the state if it is the requested one; otherwise raise, or fill it with NaN."""
+    if not throw:
+        nan_if_failed = lambda x: jnp.where(deviations.failed, jnp.nan, x)
+        return State(nan_if_failed(state.q), nan_if_failed(state.v), state.structure)
+    if not is_concrete(deviations, state):
+        return eqx.error_if(
+            state, deviations.failed, "the loops of the initial state cannot be closed"
+        )
+    if not deviations.failed:
+        return state
+    for quantity, per, deviation in (("q", "", deviations.q), ("v", "/s", deviations.v)):
+        missed = _describe_deviations(chain, np.asarray(deviation), per)
+        if missed:
+            raise ValueError(
+                f"{quantity}: the loops do not allow the given values: {'; '.join(missed)}. Name"
+                " fewer joints, start from a State near them (near=), or give them as a guess"
+                " (hold=False)."
+            )
+    return check_closed(chain, state, jnp.where(state.structure.connected, jnp.inf, 0))
+
+
+def _describe_deviations(chain: Chain, deviation: np.ndarray, per: str) -> list[str]:
+    """Return name and deviation of each coordinate that was not reached."""
+    doubled = eqx.tree_at(lambda c: c.length, chain, jnp.full_like(chain.length, 2))
+    linear = np.asarray(jacobian_scales(doubled)[1]) == 2
+    return [
+        f"{chain.dof_names[i]} by {deviation[i]:.3g} {'m' if linear[i] else 'rad'}{per}"
+        for i in np.flatnonzero(~(deviation == 0))
+    ]
 
 
 def check_closed(chain: Chain, state: State, residual_gaps: Float[Array, " links"]) -> State:

@@ -12,10 +12,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from svkc._jax.primitive import custom_primitive
-from svkc.loops.constraint import LoopKinematics, jacobian_scales, loop_kinematics
+from svkc.loops.constraint import jacobian_scales, loop_kinematics
 from svkc.loops.pivoting import (
     PivotedQR,
     drop_below,
@@ -28,26 +28,16 @@ from svkc.model.chain import Chain, Structure, active_dofs
 from svkc.transitions.impact import velocity_after_impact
 from svkc.transitions.newton_state import (
     CLOSE,
-    CLOSE_HELD,
     CLOSE_PERTURBED,
     DECIDE_RANK,
     IMPACT,
     PERTURB,
-    PROJECT_VELOCITY,
-    PROJECT_VELOCITY_HELD,
     RANK_SEARCH,
-    READ_COORDINATES,
-    HeldCoordinates,
     NewtonState,
     Schedule,
+    is_any_of,
 )
-from svkc.transitions.placement import joint_coordinates, with_coordinates
 from svkc.tree.configuration import integrate
-
-
-def _is_any_of(kind, *kinds: int) -> Bool[Array, ""]:
-    """Return whether a traced kind is one of these kinds."""
-    return functools.reduce(jnp.logical_or, [kind == k for k in kinds])
 
 
 class _Iteration(eqx.Module):
@@ -59,7 +49,6 @@ class _Iteration(eqx.Module):
 
     chain: Chain
     structure: Structure
-    held: HeldCoordinates
     perturbation: Float[Array, " dofs"]
     kinds: tuple[int, ...] = eqx.field(static=True)
 
@@ -72,37 +61,25 @@ class _Iteration(eqx.Module):
         q_eval = current.q
         if DECIDE_RANK in self.kinds:
             q_eval = jnp.where(
-                _is_any_of(kind, CLOSE_PERTURBED, DECIDE_RANK), current.probe, current.q
+                is_any_of(kind, CLOSE_PERTURBED, DECIDE_RANK), current.probe, current.q
             )
         loops = loop_kinematics(chain, structure, q_eval)
-        J = self._zero_held_columns(loops.J, kind)
+        J = loops.J
         all_pivots, qr = self._pivots(J, current, kind, rank_known)
-        is_velocity_step, residual = (
-            _is_any_of(kind, PROJECT_VELOCITY_HELD, PROJECT_VELOCITY),
-            loops.gap,
-        )
-        if PROJECT_VELOCITY in self.kinds:
-            residual = jnp.where(
-                is_velocity_step, loops.J @ (current.v / jacobian_scales(chain)[1]), residual
-            )
-        step = -least_norm_change(chain, qr, J, residual[:, None])[:, 0]
+        step = -least_norm_change(chain, qr, J, loops.gap[:, None])[:, 0]
         residual_gaps = jnp.max(jnp.abs(loops.gap).reshape(-1, 6), 1)
         if DECIDE_RANK in self.kinds:
             current = current.record_rank_search(kind, all_pivots.diag_R, residual_gaps)
-        v, spatial_impulse, energy_lost = (
-            current.v + jnp.where(is_velocity_step, step, 0),
-            current.spatial_impulse,
-            current.energy_lost,
-        )
+        v, spatial_impulse, energy_lost = current.v, current.spatial_impulse, current.energy_lost
         if IMPACT in self.kinds:
             v, spatial_impulse, energy_lost = jax.lax.cond(
                 kind == IMPACT,
                 lambda: velocity_after_impact(chain, structure, loops, qr, current.v),
                 lambda: (v, spatial_impulse, energy_lost),
             )
-        q, probe = self._updated_configuration(loops, q_eval, kind, step), current.probe
+        q, probe = self._updated_configuration(q_eval, kind, step), current.probe
         if DECIDE_RANK in self.kinds:
-            in_rank_search = _is_any_of(kind, *RANK_SEARCH)
+            in_rank_search = is_any_of(kind, *RANK_SEARCH)
             q, probe = jnp.where(in_rank_search, current.q, q), jnp.where(in_rank_search, q, probe)
         return dataclasses.replace(
             current,
@@ -113,13 +90,6 @@ class _Iteration(eqx.Module):
             energy_lost=energy_lost,
             residual_gaps=residual_gaps,
         )
-
-    def _zero_held_columns(self, J, kind) -> Float[Array, "rows dofs"]:
-        """Return J with zero columns for the coordinates that this iteration holds."""
-        for which, mask in ((CLOSE_HELD, self.held.q), (PROJECT_VELOCITY_HELD, self.held.v)):
-            if mask is not None and which in self.kinds:
-                J = jnp.where(mask[None] & (kind == which), 0, J)
-        return J
 
     def _pivots(self, J, current: NewtonState, kind, rank_known) -> tuple[PivotedQR, PivotedQR]:
         """Return the pivoted QR of J, and the same without pivots too small to divide by."""
@@ -134,41 +104,31 @@ class _Iteration(eqx.Module):
         )
         return all_pivots, drop_below(all_pivots, threshold)
 
-    def _updated_configuration(self, loops: LoopKinematics, q, kind, step) -> Float[Array, " q"]:
+    def _updated_configuration(self, q, kind, step) -> Float[Array, " q"]:
         """Return the configuration after this iteration, from the one at which it evaluates."""
-        chain = self.chain
-        delta = jnp.where(_is_any_of(kind, CLOSE_HELD, CLOSE, CLOSE_PERTURBED), step, 0)
-        q_next = integrate(chain, q, jnp.where(kind == PERTURB, self.perturbation, delta))
-        if READ_COORDINATES not in self.kinds:
-            return q_next
+        delta = jnp.where(is_any_of(kind, CLOSE, CLOSE_PERTURBED), step, 0)
+        return integrate(self.chain, q, jnp.where(kind == PERTURB, self.perturbation, delta))
 
-        def read():
-            coordinates = joint_coordinates(chain, self.structure, loops.kin, q)
-            assert self.held.read_links is not None
-            return with_coordinates(chain, self.held.read_links, coordinates, q)
 
-        return jax.lax.cond(kind == READ_COORDINATES, read, lambda: q_next)
+def rank_search_perturbation(chain: Chain, structure: Structure) -> Float[Array, " dofs"]:
+    """Return the change of q by which the search for the rank starts.
+
+    The change has a fixed direction without symmetry, as q itself may be singular.
+    """
+    change = 0.05 * np.sin(1.0 + 2.3 * np.arange(chain.dofs)) * jacobian_scales(chain)[1]
+    return jnp.where(active_dofs(chain, structure), change, 0).astype(chain.q_load.dtype)
 
 
 def _iterate(
-    chain: Chain,
-    structure: Structure,
-    q,
-    v,
-    held: HeldCoordinates,
-    schedule: Schedule,
-    *,
-    all_row_steps: int,
+    chain: Chain, structure: Structure, q, v, schedule: Schedule, *, all_row_steps: int
 ) -> NewtonState:
     """Run the iterations of a schedule.
 
     all_row_steps: the number of first iterations that use all rows, whatever the rank.
     """
     kinds, active = schedule.kinds, active_dofs(chain, structure)
-    # a fixed direction without symmetry, as q itself may be singular
-    perturbation = 0.05 * np.sin(1.0 + 2.3 * np.arange(chain.dofs)) * jacobian_scales(chain)[1]
-    perturbation = jnp.where(active, perturbation, 0).astype(q.dtype)
-    iteration = _Iteration(chain, structure, held=held, perturbation=perturbation, kinds=kinds)
+    perturbation = rank_search_perturbation(chain, structure)
+    iteration = _Iteration(chain, structure, perturbation=perturbation, kinds=kinds)
 
     @functools.partial(jax.checkpoint, prevent_cse=False)
     def scan_body(current: NewtonState, x) -> tuple[NewtonState, None]:
@@ -183,21 +143,19 @@ def _iterate(
     )[0]
 
 
-def _solve(
-    chain: Chain, structure: Structure, q, v, held: HeldCoordinates, schedule: Schedule
-) -> NewtonState:
+def _solve(chain: Chain, structure: Structure, q, v, schedule: Schedule) -> NewtonState:
     """Run a schedule. All rows are used until the search for the rank has ended."""
     all_row_steps = (
         schedule.all_row_steps + len(RANK_SEARCH) if DECIDE_RANK in schedule.kinds else 0
     )
-    return _iterate(chain, structure, q, v, held, schedule, all_row_steps=all_row_steps)
+    return _iterate(chain, structure, q, v, schedule, all_row_steps=all_row_steps)
 
 
 def _solve_jvp(primals, tangents):
     """Return the solution and its tangent: that of the iterations that change q or v, at the rank
     of the solution. The search for the rank is not differentiated."""
     solution = solve_structure(*primals)
-    chain, structure, q, v, held, schedule = primals
+    chain, structure, q, v, schedule = primals
     with_rank = eqx.tree_at(
         lambda s: (s.rank, s.margin),
         structure,
@@ -214,7 +172,6 @@ def _solve_jvp(primals, tangents):
             structure,
             q,
             v,
-            held,
             without_rank_search,
             all_row_steps=schedule.all_row_steps,
         )
@@ -230,7 +187,7 @@ def _solve_jvp(primals, tangents):
     )
 
 
-# solve_structure(chain, structure, q, v, held, schedule) -> NewtonState after the schedule
+# solve_structure(chain, structure, q, v, schedule) -> NewtonState after the schedule
 solve_structure = custom_primitive("solve_structure", _solve, _solve_jvp)
 
 
@@ -244,7 +201,5 @@ def decide_rank(chain: Chain, structure: Structure, q: Float[Array, " q"]) -> St
     if not len(chain.topology.link_names):
         return structure
     constants = jax.lax.stop_gradient((chain, structure, q))
-    solution = _solve(
-        *constants, jnp.zeros(chain.dofs, q.dtype), HeldCoordinates(), Schedule(RANK_SEARCH)
-    )
+    solution = _solve(*constants, jnp.zeros(chain.dofs, q.dtype), Schedule(RANK_SEARCH))
     return eqx.tree_at(lambda s: (s.rank, s.margin), structure, (solution.rank, solution.margin))

@@ -4,6 +4,7 @@ A caller lists the kinds of iterations in a `Schedule`.
 """
 
 import dataclasses
+import functools
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -14,19 +15,19 @@ from svkc.model.chain import Chain, Structure
 from svkc.tree.configuration import normalize
 
 # kinds of iterations
-READ_COORDINATES = 0  # compute the coordinates of virtual joints from the poses of their bodies
-# a Newton step that closes the loops by the least change of scaled coordinates, with and without
-# held coordinates
-CLOSE_HELD, CLOSE = 1, 2
+CLOSE = 2  # a Newton step that closes the loops by the least change of scaled coordinates
 # record the pivots at q and perturb a copy of q by a few degrees; close the loops of the copy;
 # decide the rank
 PERTURB, CLOSE_PERTURBED, DECIDE_RANK = 3, 4, 5
-# project the velocity by its least change, with and without held velocities
-PROJECT_VELOCITY_HELD, PROJECT_VELOCITY = 6, 7
 IMPACT = 8  # project the velocity in the metric of the mass matrix
 
 RANK_SEARCH = (PERTURB, *(CLOSE_PERTURBED,) * 12, DECIDE_RANK)
 CONNECTION = (CLOSE, CLOSE, IMPACT)
+
+
+def is_any_of(kind, *kinds: int) -> Bool[Array, ""]:
+    """Return whether a traced kind is one of these kinds."""
+    return functools.reduce(jnp.logical_or, [kind == k for k in kinds])
 
 
 class Schedule(eqx.Module):
@@ -38,18 +39,6 @@ class Schedule(eqx.Module):
     def all_row_steps(self) -> int:
         """Return the number of iterations before the search for the rank; they use all rows."""
         return self.kinds.index(PERTURB) if PERTURB in self.kinds else 0
-
-
-class HeldCoordinates(eqx.Module):
-    """Coordinates that iterations of the held kinds do not change; None: no coordinates.
-
-    q, v: masks for positions (by degree of freedom) and for velocities.
-    read_links: virtual links whose coordinates READ_COORDINATES sets.
-    """
-
-    q: Bool[Array, " dofs"] | None = None
-    v: Bool[Array, " dofs"] | None = None
-    read_links: Bool[Array, " links"] | None = None
 
 
 class NewtonState(eqx.Module):

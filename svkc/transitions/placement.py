@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from svkc.loops.frames import loop_frames
+from svkc.loops.frames import LoopFrames, loop_frames
 from svkc.model.chain import Chain, Structure
 from svkc.tree.kinematics import Kinematics
 from svkc.tree.spatial import (
@@ -18,15 +18,20 @@ from svkc.tree.spatial import (
 
 
 def joint_coordinates(
-    chain: Chain, structure: Structure, kin: Kinematics, q: Float[Array, " q"]
+    chain: Chain,
+    structure: Structure,
+    kin: Kinematics,
+    q: Float[Array, " q"],
+    frames: LoopFrames | None = None,
 ) -> Float[Array, " q"]:
     """Return q with the coordinates of every virtual joint computed from the poses of its two
     bodies.
 
     The part of the relative pose that the joint's freedoms cannot express is left out.
+    frames: `loop_frames` at q, if they are known.
     """
     top = chain.topology
-    frames = loop_frames(chain, structure, kin, q)
+    frames = loop_frames(chain, structure, kin, q) if frames is None else frames
     rotation = quat_multiply(quat_conjugate(frames.base_quat), frames.real_quat)
     p = structure.parent
     origin = (
@@ -52,7 +57,8 @@ def joint_coordinates(
         (ball_quat, table.quat),
     ):
         at = np.flatnonzero((index < top.nq_all).ravel())
-        q = q.at[index.ravel()[at]].set(values.ravel()[at])
+        if len(at):
+            q = q.at[index.ravel()[at]].set(values.ravel()[at])
     return q
 
 
@@ -64,7 +70,8 @@ def with_coordinates(
     for index in (table.angle, table.slide, table.quat):
         at = np.flatnonzero((index < top.nq_all).ravel())
         slots = index.ravel()[at]
-        q = q.at[slots].set(jnp.where(links[at // index.shape[1]], new[slots], q[slots]))
+        if len(at):
+            q = q.at[slots].set(jnp.where(links[at // index.shape[1]], new[slots], q[slots]))
     return q
 
 

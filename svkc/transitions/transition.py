@@ -21,13 +21,7 @@ from svkc.model.validation import boolean
 from svkc.transitions.impact import StructureChange, lock_projection
 from svkc.transitions.initial_state import check_closed
 from svkc.transitions.newton import decide_rank, solve_structure
-from svkc.transitions.newton_state import (
-    CONNECTION,
-    RANK_SEARCH,
-    HeldCoordinates,
-    NewtonState,
-    Schedule,
-)
+from svkc.transitions.newton_state import CONNECTION, RANK_SEARCH, NewtonState, Schedule
 from svkc.transitions.placement import joint_coordinates, place_at_current_pose, with_coordinates
 from svkc.transitions.spare_links import check_bound, cleared
 from svkc.tree.kinematics import kinematics
@@ -87,9 +81,7 @@ def change_structure(
     if not len(chain.link_names):
         return _lock_without_links(chain, state, structure, any_new)
     structure, q = _place_new_links(chain, structure, new_links, at_current_pose, state.q)
-    solution = solve_structure(
-        chain, structure, q, state.v, HeldCoordinates(), Schedule(RANK_SEARCH + CONNECTION)
-    )
+    solution = solve_structure(chain, structure, q, state.v, Schedule(RANK_SEARCH + CONNECTION))
     return _select_change(state, structure, solution, any_new)
 
 

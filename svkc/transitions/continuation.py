@@ -1,0 +1,263 @@
+"""Paths of closed configurations: the state of a continuation and its linear systems.
+
+A continuation goes from a start along closed configurations to the requested coordinates, so that
+its end is on the branch that is connected with the start. The path has two legs, each with a
+parameter s from 0 to 1. The first leg closes the start: its loop gaps shrink as 1 - s. The second
+leg moves the held coordinates on a straight line. Every point of a leg is the stationary point of
+least change from the start (`stationarity.py`). `path_following.py` chooses the steps.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from svkc._jax.batched_lapack import factor_general, solve_factored
+from svkc.loops.constraint import jacobian_scales, loop_kinematics
+from svkc.loops.frames import LoopFrames
+from svkc.loops.pivoting import PivotedQR, pivoted_qr
+from svkc.model.chain import Chain, Structure, active_dofs
+from svkc.transitions.newton_state import CLOSE_PERTURBED, NewtonState, is_any_of
+from svkc.transitions.stationarity import (
+    Targets,
+    gradient,
+    independent_rows,
+    optimality_matrix,
+    weights,
+)
+from svkc.tree.configuration import difference, integrate
+from svkc.tree.kinematics import Kinematics
+
+# kinds of iterations, besides those of the search for the rank in `newton_state.py`: compute the
+# coordinates of virtual joints from the poses of their bodies; the leg that closes the start;
+# select which coordinates to hold; the leg that moves them; project the velocity with and without
+# held velocities; the path has ended
+(
+    READ_COORDINATES,
+    CLOSE_START,
+    SELECT_HELD,
+    FOLLOW,
+    PROJECT_VELOCITY_HELD,
+    PROJECT_VELOCITY,
+    DONE,
+) = range(20, 27)
+
+
+class PathPoint(eqx.Module):
+    """An accepted point of a leg.
+
+    q: configuration before its last correction.
+    correction: that correction, without units (see `stationarity.py`).
+    tangent: derivative of the path by s.
+    multiplier, multiplier_rate: multipliers of the loop rows, and their derivative by s.
+    s: parameter of the leg.
+    Q, P: the rows and the pivot columns selected at the point.
+    """
+
+    q: Float[Array, " q"]
+    correction: Float[Array, " dofs"]
+    tangent: Float[Array, " dofs"]
+    multiplier: Float[Array, " rows"]
+    multiplier_rate: Float[Array, " rows"]
+    s: Float[Array, ""]
+    Q: Float[Array, "steps rows"]
+    P: Float[Array, "steps dofs"]
+
+
+class PathState(eqx.Module):
+    """The state of the continuation.
+
+    newton: configuration, velocity and rank.
+    point: the last accepted point of the leg.
+    kind: kind of the next iteration.
+    corrections: number of Newton corrections since the last predictor step.
+    iterations: number of iterations of all kinds.
+    s, step_size: parameter of the leg and its last step.
+    correction_size: largest entry of the last correction.
+    initial_gap, initial_offset: loop gaps and deviations of held coordinates at the start of the
+        leg.
+    held: coordinates that the second leg moves; the loops determine the others.
+    origin: configuration at the start of the first leg.
+    closing_rows: number of independent rows at the end of the first leg.
+    has_point: whether the leg has an accepted point.
+    rank_known: whether the rank has been decided.
+    from_requested: whether the path starts at the requested coordinates instead of the start.
+    reached: whether the path has reached its end.
+    """
+
+    newton: NewtonState
+    point: PathPoint
+    kind: Int[Array, ""]
+    corrections: Int[Array, ""]
+    iterations: Int[Array, ""]
+    s: Float[Array, ""]
+    step_size: Float[Array, ""]
+    correction_size: Float[Array, ""]
+    multiplier: Float[Array, " rows"]
+    initial_gap: Float[Array, " rows"]
+    initial_offset: Float[Array, " dofs"]
+    held: Bool[Array, " dofs"]
+    origin: Float[Array, " q"]
+    closing_rows: Int[Array, ""]
+    has_point: Bool[Array, ""]
+    rank_known: Bool[Array, ""]
+    from_requested: Bool[Array, ""]
+    reached: Bool[Array, ""]
+
+    @classmethod
+    def init(cls, chain: Chain, structure: Structure, targets: Targets) -> "PathState":
+        """Return the state before the first iteration."""
+        rows, dofs, dtype = 6 * len(chain.link_names), chain.dofs, targets.start.dtype
+        steps, zero = min(rows, dofs), jnp.zeros((), dtype)
+        none, no = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
+        y, multiplier = jnp.zeros(dofs, dtype), jnp.zeros(rows, dtype)
+        v = jnp.where(active_dofs(chain, structure), targets.v, 0)
+        point = PathPoint(
+            q=targets.start,
+            correction=y,
+            tangent=y,
+            multiplier=multiplier,
+            multiplier_rate=multiplier,
+            s=zero,
+            Q=jnp.zeros((steps, rows), dtype),
+            P=jnp.zeros((steps, dofs), dtype),
+        )
+        return cls(
+            newton=NewtonState.init(chain, structure, targets.start, v),
+            point=point,
+            kind=none + READ_COORDINATES,
+            corrections=none,
+            iterations=none,
+            s=zero,
+            step_size=zero,
+            correction_size=zero,
+            multiplier=multiplier,
+            initial_gap=multiplier,
+            initial_offset=y,
+            held=jnp.zeros(dofs, bool),
+            origin=targets.start,
+            closing_rows=none,
+            has_point=no,
+            rank_known=no,
+            from_requested=no,
+            reached=no,
+        )
+
+
+class LinearSolution(eqx.Module):
+    """The solutions of the linear systems of one iteration.
+
+    kin, frames, gap: kinematics, frames of the virtual joints and loop gaps at the evaluated point.
+    all_pivots, selection: pivoted QR of the free columns, and the same without pivots too small to
+        divide by.
+    step, multiplier: Newton step and multipliers of the loop rows.
+    tangent, multiplier_rate: derivatives of the path by s.
+    initial_gap, initial_offset: as in `PathState`.
+    same_orientation: whether the selected block of the Jacobian has the orientation that it had
+        at the last accepted point.
+    """
+
+    kin: Kinematics
+    frames: LoopFrames
+    gap: Float[Array, " rows"]
+    all_pivots: PivotedQR
+    selection: PivotedQR
+    step: Float[Array, " dofs"]
+    multiplier: Float[Array, " rows"]
+    tangent: Float[Array, " dofs"]
+    multiplier_rate: Float[Array, " rows"]
+    initial_gap: Float[Array, " rows"]
+    initial_offset: Float[Array, " dofs"]
+    same_orientation: Bool[Array, ""]
+
+
+def _neighbourhood(chain: Chain, structure: Structure, q):
+    """Return loop kinematics, loop gaps and configurations at q and at a small step from q along
+    each coordinate, and the size of these steps.
+
+    The derivatives of the loop Jacobian are differences of these.
+    """
+    size, column = float(jnp.finfo(q.dtype).eps) ** 0.5, jacobian_scales(chain)[1]
+    steps = size * jnp.eye(chain.dofs + 1, chain.dofs, k=-1, dtype=q.dtype) * column[None]
+
+    def evaluate(step):
+        q_step = integrate(chain, q, step)
+        loops = loop_kinematics(chain, structure, q_step)
+        return loops.kin, loops.frames, loops.J, loops.gap, q_step
+
+    return (*jax.vmap(evaluate)(steps), size)
+
+
+def linearize(
+    chain: Chain, structure: Structure, targets: Targets, path: PathState, q
+) -> LinearSolution:
+    """Return the Newton step and the tangent of the path at q."""
+    kind, column, weight = path.kind, jacobian_scales(chain)[1], weights(chain, structure)
+    kins, frames, Js, gaps, qs, size = _neighbourhood(chain, structure, q)
+    kin, frames, J, gap = jax.tree.map(lambda x: x[0], (kins, frames, Js, gaps))
+    on_leg, moved = is_any_of(kind, CLOSE_START, FOLLOW), path.held & (kind == FOLLOW)
+    projects_held = (kind == PROJECT_VELOCITY_HELD) & targets.held_v
+    fixed = moved | projects_held | ~active_dofs(chain, structure)
+    free_J = jnp.where(fixed, 0, J)
+    rank = jnp.where(path.rank_known, path.newton.rank, min(J.shape))
+    all_pivots = pivoted_qr(free_J, rank, targets.held_q & (kind == SELECT_HELD))
+    with_margin = eqx.tree_at(lambda s: s.margin, structure, path.newton.margin)
+    selection = independent_rows(with_margin, free_J, all_pivots, path.rank_known)
+    start = jnp.where(path.from_requested, targets.requested, targets.start)
+    gradients = jax.vmap(lambda q, J: gradient(chain, start, q, J, path.multiplier, weight))(qs, Js)
+    hessian = jnp.where(
+        on_leg,
+        (gradients[1:] - gradients[:1]).T / size,
+        jnp.diag(jnp.where(kind == CLOSE_PERTURBED, 1, weight)),
+    )
+    gradient_of_change = gradients[0] - path.multiplier @ J
+    # gaps and offsets shrink as 1 - s from their values where the leg begins
+    offset = difference(chain, q, targets.requested) / column
+    initial_offset = jnp.where(path.has_point, path.initial_offset, offset)
+    gap_at_start = jnp.where(kind == CLOSE_START, gap, 0)
+    initial_gap = jnp.where(path.has_point, path.initial_gap, gap_at_start)
+    residual = jnp.where(on_leg, gap - (1 - path.s) * initial_gap, gap)
+    projects = is_any_of(kind, PROJECT_VELOCITY_HELD, PROJECT_VELOCITY)
+    residual = jnp.where(projects, J @ (path.newton.v / column), residual)
+    for_fixed = jnp.where(moved, offset - (1 - path.s) * initial_offset, 0)
+    upper = jnp.where(fixed, for_fixed, jnp.where(on_leg, -gradient_of_change, 0))
+    right_sides = jnp.stack(
+        [
+            jnp.concatenate([upper, -selection.Q @ residual]),
+            jnp.concatenate([jnp.where(moved, initial_offset, 0), selection.Q @ -initial_gap]),
+        ],
+        1,
+    )
+    matrix = optimality_matrix(hessian, selection.Q @ J, selection.active, fixed)
+    # one call of LAPACK for both matrices
+    orientation = _orientation_matrix(path.point, free_J)
+    lu, order, positive = factor_general(jnp.stack([matrix, orientation]))
+    n, solution = chain.dofs, solve_factored(lu[0], order[0], right_sides)
+    return LinearSolution(
+        kin=kin,
+        frames=frames,
+        gap=gap,
+        all_pivots=all_pivots,
+        selection=selection,
+        step=solution[:n, 0],
+        multiplier=solution[n:, 0] @ selection.Q,
+        tangent=solution[:n, 1],
+        multiplier_rate=solution[n:, 1] @ selection.Q,
+        initial_gap=initial_gap,
+        initial_offset=initial_offset,
+        same_orientation=positive[1],
+    )
+
+
+def _orientation_matrix(point: PathPoint, J) -> Float[Array, "n n"]:
+    """Return a matrix whose determinant has the sign of that of the rows and pivot columns of J
+    selected at `point`.
+
+    The sign was positive at `point`. It is negative on a branch that nearly crosses the path.
+    """
+    unused = jnp.diag(jnp.where(jnp.any(point.P > 0, 1), 0, 1).astype(J.dtype))
+    steps, n = point.P.shape
+    block = point.Q @ J @ point.P.T + unused
+    return jnp.pad(block - jnp.eye(steps, dtype=J.dtype), (0, n)) + jnp.eye(
+        n + steps, dtype=J.dtype
+    )

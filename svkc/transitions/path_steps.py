@@ -1,0 +1,253 @@
+"""The step control of a continuation: accept, correct or halve each step, and go from leg to leg.
+
+The order of a path: compute the coordinates of virtual joints, close the start, search for the
+rank, select the coordinates to hold, move them, project the velocity.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from svkc._jax.pytrees import tree_where
+from svkc.loops.constraint import gap_tolerance, jacobian_scales
+from svkc.model.chain import Chain, Structure
+from svkc.transitions.continuation import (
+    CLOSE_START,
+    DONE,
+    FOLLOW,
+    PROJECT_VELOCITY,
+    PROJECT_VELOCITY_HELD,
+    READ_COORDINATES,
+    SELECT_HELD,
+    LinearSolution,
+    PathPoint,
+    PathState,
+)
+from svkc.transitions.newton import rank_search_perturbation
+from svkc.transitions.newton_state import (
+    CLOSE_PERTURBED,
+    DECIDE_RANK,
+    PERTURB,
+    RANK_SEARCH,
+    is_any_of,
+)
+from svkc.transitions.placement import joint_coordinates, with_coordinates
+from svkc.transitions.stationarity import Targets
+from svkc.tree.configuration import difference, integrate
+
+# largest predictor step, and the smallest one before a leg is given up (rad, `chain.length`s)
+_LARGEST_STEP, _SMALLEST_STEP = 0.1, 1e-5
+
+
+class _StepDecision(eqx.Module):
+    """The decision about the point that an iteration of a leg evaluated.
+
+    accept, reject: a point that is neither accepted nor rejected is corrected.
+    leg_done: whether the leg has come to its end.
+    stuck: whether steps have become too small.
+    correction_size: largest entry of the correction.
+    step_size: the next step of the leg's parameter.
+    """
+
+    accept: Bool[Array, ""]
+    reject: Bool[Array, ""]
+    leg_done: Bool[Array, ""]
+    stuck: Bool[Array, ""]
+    correction_size: Float[Array, ""]
+    step_size: Float[Array, ""]
+
+
+def _decide(path: PathState, linear: LinearSolution) -> _StepDecision:
+    """Accept a point whose correction is small; reject one whose corrections do not converge."""
+    eps = float(jnp.finfo(linear.step.dtype).eps)
+    on_leg, rank_unknown = is_any_of(path.kind, CLOSE_START, FOLLOW), ~path.rank_known
+    size, length = jnp.max(jnp.abs(linear.step)), jnp.max(jnp.abs(linear.tangent))
+    at_end = path.s > 1 - 4 * eps
+    small = size <= jnp.where(at_end, eps**0.5, eps ** (1 / 3))
+    # an over-constrained loop has a higher rank while it is open: its corrections converge slowly,
+    # and the orientation of its pivots has no meaning
+    same_branch = linear.same_orientation | ~path.has_point | rank_unknown
+    accept = on_leg & small & same_branch
+    predicted = path.step_size * jnp.max(jnp.abs(path.point.tangent))
+    first = path.corrections == 0
+    contraction = jnp.where(rank_unknown, 0.95, 0.5)
+    converges = jnp.where(
+        first & path.has_point,
+        size <= 0.2 * predicted + eps ** (1 / 3),
+        first | (size <= contraction * path.correction_size),
+    )
+    converges &= ~(small & ~same_branch) & (path.corrections < jnp.where(rank_unknown, 60, 10))
+    reject = on_leg & ~accept & ~converges
+    grown = jnp.where(path.has_point, 2 * path.step_size, 1)
+    limit = _LARGEST_STEP / jnp.maximum(length, eps)
+    step_size = jnp.minimum(jnp.minimum(grown, 1 - path.s), limit)
+    too_small = (predicted < 2 * _SMALLEST_STEP) | (path.step_size < 1e-8)
+    return _StepDecision(
+        accept=accept,
+        reject=reject,
+        leg_done=accept & at_end,
+        stuck=reject & (~path.has_point | too_small),
+        correction_size=size,
+        step_size=jnp.where(reject, path.step_size / 2, step_size),
+    )
+
+
+def _advance(
+    chain: Chain, structure: Structure, path: PathState, q, linear: LinearSolution, decision
+) -> PathState:
+    """Return the path with its configuration, probe or velocity and the leg's parameter updated.
+
+    q: the configuration that the iteration evaluated.
+    """
+    kind, h = path.kind, decision.step_size
+    column, onward = jacobian_scales(chain)[1], decision.accept & ~decision.leg_done
+    accepted = PathPoint(
+        q=q,
+        correction=linear.step,
+        tangent=linear.tangent,
+        multiplier=linear.multiplier,
+        multiplier_rate=linear.multiplier_rate,
+        s=path.s,
+        Q=linear.selection.Q,
+        P=linear.selection.P,
+    )
+    point = tree_where(onward, accepted, path.point)
+    predicts, on_leg = onward | decision.reject, is_any_of(kind, CLOSE_START, FOLLOW)
+    corrects = on_leg | (kind == CLOSE_PERTURBED)
+    correction = jnp.where(corrects, linear.step, 0)
+    step = jnp.where(predicts, point.correction + h * point.tangent, correction)
+    perturbation = rank_search_perturbation(chain, structure)
+    change = column * step + jnp.where(kind == PERTURB, perturbation, 0)
+    q_next = integrate(chain, jnp.where(predicts, point.q, q), change)
+    newton, in_rank_search = path.newton, is_any_of(kind, *RANK_SEARCH)
+    projects = is_any_of(kind, PROJECT_VELOCITY_HELD, PROJECT_VELOCITY)
+    newton = dataclasses.replace(
+        newton.record_rank_search(kind, linear.all_pivots.diag_R, _gap_norms(linear)),
+        q=jnp.where(in_rank_search | (kind == SELECT_HELD), newton.q, q_next),
+        probe=jnp.where(in_rank_search, q_next, newton.probe),
+        v=newton.v + jnp.where(projects, column * linear.step, 0),
+        residual_gaps=_gap_norms(linear),
+    )
+    predicted_multiplier = point.multiplier + h * point.multiplier_rate
+    multiplier = jnp.where(on_leg, linear.multiplier, path.multiplier)
+    return dataclasses.replace(
+        path,
+        newton=newton,
+        point=point,
+        s=jnp.where(predicts, point.s + h, path.s),
+        step_size=jnp.where(predicts, h, path.step_size),
+        correction_size=decision.correction_size,
+        corrections=jnp.where(corrects & ~predicts, path.corrections + 1, 0),
+        has_point=path.has_point | onward,
+        multiplier=jnp.where(predicts, predicted_multiplier, multiplier),
+        initial_gap=linear.initial_gap,
+        initial_offset=linear.initial_offset,
+    )
+
+
+def _gap_norms(linear: LinearSolution) -> Float[Array, " links"]:
+    """Return the largest gap of each loop (rad, or in `chain.length`s)."""
+    return jnp.max(jnp.abs(linear.gap).reshape(-1, 6), 1)
+
+
+def next_path_state(
+    chain: Chain, structure: Structure, targets: Targets, path: PathState, q, linear: LinearSolution
+) -> PathState:
+    """Return the path after an iteration that evaluated the configuration q."""
+    kind, decision = path.kind, _decide(path, linear)
+    after = _advance(chain, structure, path, q, linear, decision)
+    after = _read_coordinates(chain, structure, targets, after, kind, linear)
+    start_closed = decision.leg_done & (kind == CLOSE_START)
+    used_rows = jnp.sum(linear.selection.active, dtype=jnp.int32)
+    # coordinates that the loops leave independent can be held
+    independent = targets.held_q & ~jnp.any(linear.all_pivots.P > 0, 0)
+    after = dataclasses.replace(
+        after,
+        held=jnp.where(kind == SELECT_HELD, independent, path.held),
+        rank_known=path.rank_known | (kind == DECIDE_RANK),
+        closing_rows=jnp.where(start_closed, used_rows, path.closing_rows),
+    )
+    scaled_offset = difference(chain, q, targets.requested) / jacobian_scales(chain)[1]
+    deviation = jnp.where(targets.held_q, jnp.abs(scaled_offset - linear.step), 0)
+    missed = ~(jnp.max(deviation) <= targets.tolerance)
+    failed = decision.stuck | (decision.leg_done & (kind == FOLLOW) & missed)
+    # an over-constrained loop was closed with more rows than its rank when closed: close it again
+    close_again = (kind == SELECT_HELD) & (path.closing_rows != path.newton.rank)
+    new_leg = decision.leg_done | close_again
+    last_q = jnp.where(decision.stuck, path.point.q, after.newton.q)
+    after = dataclasses.replace(
+        after,
+        kind=jnp.where(failed, DONE, _next_kind(path, decision, close_again)),
+        has_point=after.has_point & ~new_leg,
+        s=jnp.where(new_leg, 0, after.s),
+        reached=path.reached | (kind == PROJECT_VELOCITY),
+        multiplier=jnp.where(close_again, 0, after.multiplier),
+        newton=dataclasses.replace(after.newton, q=jnp.where(close_again, path.origin, last_q)),
+    )
+    return tree_where(
+        failed & ~path.from_requested & jnp.any(targets.held_q & ~(path.held & path.rank_known)),
+        _restarted(chain, structure, targets, path, after),
+        after,
+    )
+
+
+def _restarted(
+    chain: Chain, structure: Structure, targets: Targets, path: PathState, after: PathState
+) -> PathState:
+    """Return a path that starts at the requested coordinates.
+
+    It is taken if the start cannot be closed, or if more coordinates are held than there are
+    freedoms.
+    """
+    first = PathState.init(chain, structure, targets)
+    return dataclasses.replace(
+        first,
+        newton=dataclasses.replace(first.newton, q=targets.requested, v=path.newton.v),
+        from_requested=~first.from_requested,
+        iterations=after.iterations,
+    )
+
+
+def _next_kind(path: PathState, decision: _StepDecision, close_again) -> Int[Array, ""]:
+    """Return the kind of the next iteration of a path that does not fail."""
+    kind, last_search = path.kind, RANK_SEARCH.count(CLOSE_PERTURBED) - 1
+    search_closed = (kind == CLOSE_PERTURBED) & (path.corrections >= last_search)
+    after_closing = jnp.where(path.rank_known, FOLLOW, PERTURB)
+    table = (
+        (kind == READ_COORDINATES, CLOSE_START),
+        (decision.leg_done & (kind == CLOSE_START), after_closing),
+        (kind == PERTURB, CLOSE_PERTURBED),
+        (search_closed, DECIDE_RANK),
+        (kind == DECIDE_RANK, SELECT_HELD),
+        (kind == SELECT_HELD, jnp.where(close_again, CLOSE_START, FOLLOW)),
+        (decision.leg_done & (kind == FOLLOW), PROJECT_VELOCITY_HELD),
+        (kind == PROJECT_VELOCITY_HELD, PROJECT_VELOCITY),
+        (kind == PROJECT_VELOCITY, DONE),
+    )
+    for condition, following in table:
+        kind = jnp.where(condition, following, kind)
+    return kind
+
+
+def _read_coordinates(
+    chain: Chain, structure: Structure, targets: Targets, path: PathState, kind, linear
+) -> PathState:
+    """Return the path with the coordinates of virtual joints computed from the poses of their
+    bodies, except where they close their loop already."""
+    q = path.newton.q
+    is_open = ~(_gap_norms(linear) < gap_tolerance(q.dtype))
+    links = targets.read_links & structure.connected & is_open
+
+    def read():
+        coordinates = joint_coordinates(chain, structure, linear.kin, q, linear.frames)
+        return with_coordinates(chain, links, coordinates, q)
+
+    q = jax.lax.cond(kind == READ_COORDINATES, read, lambda: q)
+    return dataclasses.replace(
+        path,
+        newton=dataclasses.replace(path.newton, q=q),
+        origin=jnp.where(kind == READ_COORDINATES, q, path.origin),
+    )

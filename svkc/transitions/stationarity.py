@@ -1,0 +1,163 @@
+"""The point of least change among closed configurations: its equations, its derivative, and the
+projection of a velocity.
+
+These equations are separate from the path that leads to the point (`continuation.py`), as
+derivatives need the equations alone. All changes are without units: y is dv divided by the column
+scales of the loop Jacobian (rad, or in `chain.length`s).
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from svkc._jax.batched_lapack import solve_general
+from svkc.loops.constraint import jacobian_scales, loop_kinematics
+from svkc.loops.pivoting import (
+    PivotedQR,
+    drop_below,
+    pivoted_qr,
+    rank_tolerance,
+    release_threshold,
+    solve_positive,
+)
+from svkc.model.chain import Chain, Structure, active_dofs
+from svkc.model.topology import FREE, V_SIZE
+from svkc.tree.configuration import difference, integrate
+
+
+class Targets(eqx.Module):
+    """The targets of a continuation.
+
+    start: configuration from which the change is least.
+    requested: the start with the user's coordinates in it.
+    v: velocities.
+    held_q, held_v: coordinates and velocities that must have their requested values.
+    read_links: links whose own coordinates are computed from the poses of their bodies, unless
+        they close their loop already.
+    tolerance: largest deviation of a held coordinate (rad, or in `chain.length`s).
+    """
+
+    start: Float[Array, " q"]
+    requested: Float[Array, " q"]
+    v: Float[Array, " dofs"]
+    held_q: Bool[Array, " dofs"]
+    held_v: Bool[Array, " dofs"]
+    read_links: Bool[Array, " links"]
+    tolerance: Float[Array, ""]
+
+
+def weights(chain: Chain, structure: Structure) -> Float[Array, " dofs"]:
+    """Return the weight of each coordinate's change: 1 for the model's own joints, 0 for
+    coordinates that follow from these.
+
+    While a cuttable joint is connected, its body follows from the joint. Coordinates of a virtual
+    link that closes a loop follow from the tree's. Hence the change does not depend on which joint
+    of a loop is the virtual link, nor on which joints may be cut.
+    """
+    top = chain.topology
+    own = np.zeros(top.dofs)
+    own[: top.nv] = 1
+    for _, link, _ in top.cuttable_joints:
+        own[[d for d in top.links.dof[link] if d < top.dofs]] = 1
+    weight = jnp.asarray(own, chain.q_load.dtype)
+    for link, row in enumerate(top.link_child):
+        if row >= 0:
+            body = np.isin(np.arange(top.dofs), top.v_start[row] + np.arange(V_SIZE[FREE]))
+            weight = jnp.where(body & structure.connected[link], 0, weight)
+    return weight
+
+
+def independent_rows(structure: Structure, J, qr: PivotedQR, rank_known=True) -> PivotedQR:
+    """Return the pivoted QR of J without pivots too small to divide by.
+
+    rank_known: whether the margin of the structure is known.
+    """
+    weak = jnp.where(rank_known, release_threshold(J.dtype) * structure.margin, 0)
+    return drop_below(qr, jnp.maximum(rank_tolerance(J.dtype), weak))
+
+
+def optimality_matrix(
+    hessian: Float[Array, "dofs dofs"],
+    rows: Float[Array, "steps dofs"],
+    used: Bool[Array, " steps"],
+    fixed: Bool[Array, " dofs"],
+) -> Float[Array, "n n"]:
+    """Return the KKT matrix: stationarity of free coordinates, the identity for fixed ones, then
+    one row for each independent row of the loops and the identity for the others."""
+    dtype = rows.dtype
+    free = ~fixed[:, None]
+    upper = jnp.concatenate([jnp.where(free, hessian, 0), jnp.where(free, rows.T, 0)], 1)
+    lower = jnp.concatenate([rows, jnp.diag((~used).astype(dtype))], 1)
+    no_rows = jnp.zeros(rows.shape[0], bool)
+    identity = jnp.diag(jnp.concatenate([fixed, no_rows]).astype(dtype))
+    return jnp.concatenate([upper, lower]) + identity
+
+
+def gradient(chain: Chain, start, q, J, multiplier, weight) -> Float[Array, " dofs"]:
+    """Return the gradient of half the weighted squared change from the start, plus
+    J^T multiplier."""
+    change = difference(chain, start, q) / jacobian_scales(chain)[1]
+    return weight * change + multiplier @ J
+
+
+def _multiplier(J, selection: PivotedQR, gradient_of_change, fixed):
+    """Return the multipliers of the loop rows at a stationary point, by least squares."""
+    rows = selection.Q @ jnp.where(fixed, 0, J)
+    gram = rows @ rows.T + jnp.diag((~selection.active).astype(J.dtype))
+    return -solve_positive(gram, rows @ jnp.where(fixed, 0, gradient_of_change)) @ selection.Q
+
+
+def stationary_tangent(
+    primals, tangents, q, held: Bool[Array, " dofs"], structure: Structure
+) -> Float[Array, " dofs"]:
+    """Return the tangent of the stationary point q as a change y, by the implicit function theorem.
+
+    primals, tangents: chain, structure, start and requested coordinates, and their tangents.
+    held: coordinates that have their requested values.
+    structure: the structure with the rank of the loops at q.
+    """
+    chain, _, start, _ = primals
+    column, weight = jacobian_scales(chain)[1], weights(chain, structure)
+    fixed = held | ~active_dofs(chain, structure)
+    J = loop_kinematics(chain, structure, q).J
+    free_J = jax.lax.stop_gradient(jnp.where(fixed, 0, J))
+    selection = independent_rows(structure, free_J, pivoted_qr(free_J, structure.rank))
+    selection = jax.lax.stop_gradient(selection)
+    change = weight * difference(chain, start, q) / column
+    multiplier = _multiplier(J, selection, change, fixed)
+
+    def stationarity(y):
+        q_y = integrate(chain, q, column * y)
+        J_y = loop_kinematics(chain, structure, q_y).J
+        return gradient(chain, start, q_y, J_y, multiplier, weight)
+
+    def residual(chain, structure, start, requested):
+        loops = loop_kinematics(chain, structure, q)
+        slope = gradient(chain, start, q, loops.J, multiplier, weight)
+        target = jnp.where(held, difference(chain, q, requested), difference(chain, q, start))
+        return jnp.concatenate([jnp.where(fixed, -target / column, slope), selection.Q @ loops.gap])
+
+    hessian = jax.jacfwd(stationarity)(jnp.zeros_like(column))
+    matrix = optimality_matrix(hessian, selection.Q @ J, selection.active, fixed)
+    residual_dot = eqx.filter_jvp(residual, primals, tangents)[1]
+    return solve_general(matrix, -residual_dot)[: len(held)]
+
+
+def projected_velocity(
+    chain: Chain, structure: Structure, q, v, held: Bool[Array, " dofs"]
+) -> Float[Array, " dofs"]:
+    """Return the velocity that keeps the loops, by the least change of the velocities of the
+    model's own joints; held velocities stay."""
+    column, active = jacobian_scales(chain)[1], active_dofs(chain, structure)
+    fixed = held | ~active
+    J = loop_kinematics(chain, structure, q).J
+    qr = pivoted_qr(jax.lax.stop_gradient(jnp.where(fixed, 0, J)), structure.rank)
+    selection = independent_rows(structure, J, qr)
+    Q = jax.lax.stop_gradient(selection.Q)
+    hessian = jnp.diag(weights(chain, structure))
+    matrix = optimality_matrix(hessian, Q @ J, selection.active, fixed)
+    v_scaled = jnp.where(active, v, 0) / column
+    right_side = jnp.concatenate([jnp.zeros_like(v), -(Q @ (J @ v_scaled))])
+    return column * (v_scaled + solve_general(matrix, right_side)[: len(column)])

@@ -1,0 +1,180 @@
+"""`chain.state`: branches by continuation, names that are held, velocities that stay."""
+
+import jax
+import jax.numpy as jnp
+import linkages
+import models
+import numpy as np
+import pytest
+from references import continuation
+from tolerances import ROUND_OFF
+
+import svkc
+
+
+@pytest.fixture(scope="module")
+def four_bar():
+    return models.four_bar()
+
+
+def sweep(chain, angles):
+    return jax.jit(jax.vmap(lambda x: chain.state({"crank": x}).q))(jnp.asarray(angles))
+
+
+def test_neighbours_are_on_one_branch(four_bar):
+    """A crank turned in small steps: every joint moves in small steps, through several turns."""
+    angles = np.concatenate([np.arange(0, 0.8, 2e-2), np.arange(0.8, 14, 0.1)])
+    q = np.asarray(sweep(four_bar, angles))
+    assert np.array_equal(q[:, 0], angles)
+    rates = np.diff(q, axis=0) / np.diff(angles)[:, None]
+    assert np.abs(rates).max() < 3
+
+
+@pytest.mark.slow
+def test_the_sweep_of_the_issue(four_bar):
+    angles = np.arange(0, 0.8, 1e-3)
+    q = np.asarray(sweep(four_bar, angles))
+    assert np.abs(np.diff(q, axis=0)).max() < 3e-3
+
+
+def test_names_are_held_or_an_error(four_bar):
+    assert float(four_bar.state({"crank": 3.0}).q[0]) == 3.0
+    with pytest.raises(ValueError, match=r"q: .*rocker by 0\.78 rad"):
+        four_bar.state({"crank": 0.3, "rocker": 1.0})
+    with pytest.raises(ValueError, match=r"v: .*rocker by .* rad/s"):
+        four_bar.state(v={"crank": 1.0, "rocker": 2.0})
+    with pytest.raises(ValueError, match=r"q: .*rocker by"):
+        four_bar.state({"rocker": 3.0})
+    close = four_bar.state({"crank": 0.3}).q
+    q = {"crank": 0.3, "rocker": float(close[2]) + 1e-5}
+    np.testing.assert_allclose(four_bar.state(q, tolerance=1e-4).q, close, atol=ROUND_OFF)
+    with pytest.raises(ValueError, match="rocker by 1e-05 rad"):
+        four_bar.state(q)
+
+
+PLATE = """<mujoco><worldbody>
+<body name="plate" pos="0 0 1"><freejoint name="plate"/><geom type="box" size=".3 .3 .02"
+ contype="0"/></body>{}</worldbody></mujoco>"""
+LEG = """<body name="leg{0}" pos="{1} {2} 0"><joint name="foot{0}" type="ball"/><geom size="0.02"
+ contype="0"/><body name="rod{0}"><joint name="slide{0}" type="slide" axis="0 0 1"/>
+ <geom size="0.02" contype="0"/></body></body>"""
+
+
+def test_a_plate_on_legs_keeps_its_pose():
+    """All six coordinates of a free joint, which the legs allow."""
+    places = ((0.3, 0), (-0.2, 0.3), (-0.2, -0.3))
+    links = [
+        svkc.VirtualLink(f"top{i}", "plate", f"rod{i}", "ball", (x, y, 0), connected=True)
+        for i, (x, y) in enumerate(places)
+    ]
+    legs = "".join(LEG.format(i, *place) for i, place in enumerate(places))
+    chain = svkc.load(PLATE.format(legs), virtual_links=links)
+    pose = [0.1, -0.2, 1.1, np.cos(0.1), 0, np.sin(0.1), 0]
+    state = chain.state({"plate": pose}, {"plate": [0.1, 0.2, 0.3, 1, 2, 3]})
+    np.testing.assert_allclose(state.q[:7], pose, atol=1e-15)
+    assert state.v[:6].tolist() == [0.1, 0.2, 0.3, 1, 2, 3]
+
+
+def test_arrays_are_guesses_unless_held(four_bar):
+    state = four_bar.state({"crank": 0.7}, {"crank": 2.0})
+    for q, v in ((state.q, state.v), (state.q[:3], state.v[:3])):
+        again = four_bar.state(q, v)
+        np.testing.assert_allclose(again.q, state.q, atol=ROUND_OFF)
+        np.testing.assert_allclose(again.v, state.v, atol=ROUND_OFF)
+    open_ = np.add(state.q[:3], (0.01, 0, 0))
+    moved = four_bar.state(open_)
+    assert 1e-4 < np.abs(moved.q[:3] - open_).max() < 0.01
+    with pytest.raises(ValueError, match="q: "):
+        four_bar.state(open_, hold=True)
+    np.testing.assert_allclose(four_bar.state(state.q, hold=True).q, state.q, atol=ROUND_OFF)
+    guess = {"crank": 0.71, "coupler": float(state.q[1]), "rocker": float(state.q[2])}
+    assert float(four_bar.state(guess, hold=False).q[0]) != 0.71
+
+
+def test_a_state_to_start_from(four_bar):
+    """The other branch is reached from a state on it, and turns are counted from there."""
+    crossed = four_bar.state(np.array([0.0, 2.6, -2.8]))
+    there = four_bar.state({"crank": 0.4}, near=crossed)
+    assert np.abs(there.q - crossed.q).max() < 1
+    assert np.abs(there.q - four_bar.state({"crank": 0.4}).q).max() > 1
+    far = four_bar.state({"crank": 7.0})
+    near = four_bar.state({"crank": 7.1}, near=far)
+    np.testing.assert_allclose(near.q, four_bar.state({"crank": 7.1}).q, atol=ROUND_OFF)
+
+
+def test_lanes_that_fail_are_nan_alone(four_bar):
+    q = jax.jit(jax.vmap(lambda x: four_bar.state({"rocker": x}, throw=False).q))(
+        jnp.array([0.1, 3.0, -0.1])
+    )
+    assert np.isnan(q).all(1).tolist() == [False, True, False]
+    assert np.isnan(four_bar.state({"rocker": 3.0}, throw=False).q).all()
+    alone = four_bar.state({"rocker": 0.1}).q
+    np.testing.assert_allclose(q[0], alone, atol=ROUND_OFF)
+    with pytest.raises(Exception, match="cannot be closed"):
+        jax.jit(lambda x: four_bar.state({"rocker": x}).q)(3.0)
+
+
+def compare(name, count):
+    """Compare states with the reference, and derivatives with differences, for the first
+    geometries."""
+    chain, names = linkages.linkage(name)
+    numbers = tuple(x[:count] for x in linkages.geometries(name))
+    # from one geometry to another, so that a plane one stays plane
+    along = tuple(np.roll(x, 1, 0) - x for x in numbers)
+
+    def closed(pos, link_pos, target):
+        other = linkages.changed(chain, pos, link_pos)
+        return other.state(dict(zip(names, target, strict=True)), throw=False).q
+
+    @jax.jit
+    @jax.vmap
+    def program(x, along):
+        shifted = lambda h: closed(*(y + h * w for y, w in zip(x, along, strict=True)))
+        q, slope = jax.jvp(closed, x, along)
+        # fourth order
+        ends = jax.lax.map(shifted, 1e-4 * jnp.array([-2.0, -1.0, 1.0, 2.0]))
+        return q, slope, (ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / 12e-4
+
+    q, slope, difference = map(np.asarray, program(numbers, along))
+    (tree, balls), turns, reached = linkages.expected(name, count)
+    assert np.isfinite(q).all(1).tolist() == reached.tolist()
+    assert reached.sum() > count / 5
+    top = chain.topology
+    for iq, iv in zip(*top.scalar_coordinates, strict=True):
+        if iv < chain.nv:
+            np.testing.assert_allclose(q[reached, iq], tree[reached, iv], atol=1e-9)
+    for row in top.rows_of_kind(continuation.BALL):
+        turn = continuation.matrix(q[:, top.q_start[row] : top.q_start[row] + 4])
+        np.testing.assert_allclose(turn[reached], balls[reached, row], atol=1e-9)
+    for i, freedoms in enumerate(top.link_freedoms):
+        if sum(freedoms) == 1:
+            own = q[reached, top.links.angle[i, 2]]
+            np.testing.assert_allclose(own, turns[reached, i], atol=1e-9)
+    fine = reached & np.isfinite(difference).all(1)
+    size = 1 + np.abs(slope[fine]).max(1, keepdims=True)
+    off = np.abs(slope[fine] - difference[fine]) / size
+    return off.max(1)
+
+
+def test_states_and_derivatives():
+    """With a freedom left, by least change."""
+    assert compare("five-bar, one name", 20).max() < 1e-6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", linkages.TOPOLOGIES)
+def test_states_and_derivatives_of_every_geometry(name):
+    assert compare(name, 200).max() < 1e-6
+
+
+@pytest.mark.slow
+def test_derivatives_of_both_modes_and_second_ones():
+    """Of least change where one name leaves a freedom."""
+    chain, _ = linkages.linkage("five-bar, one name")
+    f = lambda x: jnp.sum(jnp.sin(chain.state({"crank0": x}, {"crank0": 1.0 + x}).q))
+    g = lambda x: f(x) + jnp.sum(chain.state({"crank0": x}, {"crank0": 1.0 + x}).v)
+    forward, backward = jax.jit(jax.jacfwd(g)), jax.jit(jax.grad(g))
+    np.testing.assert_allclose(forward(0.3), backward(0.3), rtol=1e-12)
+    second = jax.jit(jax.jacfwd(jax.grad(g)))(0.3)
+    h = 1e-4
+    np.testing.assert_allclose(second, (forward(0.3 + h) - forward(0.3 - h)) / (2 * h), rtol=1e-6)
