@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from svkc.model.link_pointers import link_pointers
 from svkc.model.topology import FREE, Topology
 from svkc.model.validation import real_array
 
@@ -160,24 +161,28 @@ class Chain(eqx.Module):
         return (self.inertia + jnp.swapaxes(self.inertia, -1, -2)) / 2
 
     @property
+    def _pointers(self) -> np.ndarray:
+        return link_pointers(self.topology, self.structure.parent, self.structure.real)
+
+    @property
     def parent(self) -> np.ndarray:
         """Parent of each body, then of each virtual link, as an index into both; -1: none."""
-        return _pointers(self)[0]
+        return self._pointers[0]
 
     @property
     def child(self) -> np.ndarray:
         """First child of each body and virtual link, indexed as `parent`; -1: none."""
-        return _pointers(self)[1]
+        return self._pointers[1]
 
     @property
     def brother(self) -> np.ndarray:
         """Next sibling of each body and virtual link, indexed as `parent`; -1: none."""
-        return _pointers(self)[2]
+        return self._pointers[2]
 
     @property
     def real(self) -> np.ndarray:
         """Real link of each virtual link, indexed as `parent`; -1 for bodies and spare slots."""
-        return _pointers(self)[3]
+        return self._pointers[3]
 
     @property
     def actuated(self) -> Bool[Array, " dofs"]:
@@ -189,19 +194,10 @@ class Chain(eqx.Module):
         if self.gear.shape[0]:
             driven = jnp.any(self.gear != 0, 0)
         else:
-            driven = jnp.asarray(
-                np.append(
-                    np.array(top.kind)[top.dof_row] != FREE, np.zeros(top.dofs - top.nv, bool)
-                )
-            )
-            driven = driven | self._link_dof_mask(np.array(top.link_child, int) >= 0)
-        return driven | self._link_dof_mask(np.array(top.link_actuated, bool))
-
-    def _link_dof_mask(self, links: np.ndarray) -> np.ndarray:
-        """Return the mask [dofs] of the joint coordinates of virtual links, given by a mask."""
-        table, mask = self.topology.links.dof[links], np.zeros(self.dofs, bool)
-        mask[table[table < self.dofs]] = True
-        return mask
+            not_free = np.array(top.kind)[top.dof_row] != FREE
+            driven = jnp.asarray(np.append(not_free, np.zeros(top.dofs - top.nv, bool)))
+            driven = driven | top.link_dof_mask(np.array(top.link_child, int) >= 0)
+        return driven | top.link_dof_mask(np.array(top.link_actuated, bool))
 
     def motors(self, u: Any) -> Float[Array, " dofs"]:
         """Return the joint torques (N m, N) of the model's actuators: gear times clipped controls.
@@ -282,31 +278,6 @@ class Chain(eqx.Module):
         from svkc.mjcf.convert import to_mjcf
 
         return to_mjcf(self)
-
-
-def _pointers(chain: Chain) -> np.ndarray:
-    """Return the table [4, bodies + links] of parent, child, brother and real link."""
-    top = chain.topology
-    bodies, count = len(top.body_names), len(top.body_names) + len(top.link_names)
-    body_of_row = np.full(len(top.parent), -1)
-    for body, row in enumerate(top.body_row):
-        body_of_row[row] = body
-    table = np.full((4, count), -1)
-    for body in range(1, bodies):
-        row = top.parent[top.body_row[body]]
-        while body_of_row[row] < 0:
-            row = top.parent[row]
-        table[0, body] = body_of_row[row]
-    for link, spare in enumerate(top.link_spare):
-        if not spare:
-            table[0, bodies + link] = body_of_row[int(chain.structure.parent[link])]
-            table[3, bodies + link] = body_of_row[int(chain.structure.real[link])]
-    for parent in range(bodies):
-        children = np.flatnonzero(table[0] == parent)
-        if len(children):
-            table[1, parent] = children[0]
-            table[2, children[:-1]] = children[1:]
-    return table
 
 
 def active_dofs(chain: Chain, structure: Structure) -> Bool[Array, " dofs"]:

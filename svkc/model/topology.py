@@ -132,6 +132,12 @@ class Topology:
         ]
         return np.array(q, int), np.array(v, int)
 
+    def link_dof_mask(self, links: np.ndarray) -> np.ndarray:
+        """Return the mask [dofs] of the joint coordinates of the virtual links in a mask."""
+        table, mask = self.links.dof[links], np.zeros(self.dofs, bool)
+        mask[table[table < self.dofs]] = True
+        return mask
+
     @functools.cached_property
     def dof_names(self) -> tuple[str, ...]:
         """Names of the joint coordinates; see `Chain.dof_names`."""
