@@ -131,7 +131,6 @@ def _advance(
         v=newton.v + jnp.where(projects, column * linear.step, 0),
         residual_gaps=_gap_norms(linear),
     )
-    predicted_multiplier = point.multiplier + h * point.multiplier_rate
     multiplier = jnp.where(on_leg, linear.multiplier, path.multiplier)
     return dataclasses.replace(
         path,
@@ -142,7 +141,7 @@ def _advance(
         correction_size=decision.correction_size,
         corrections=jnp.where(corrects & ~predicts, path.corrections + 1, 0),
         has_point=path.has_point | onward,
-        multiplier=jnp.where(predicts, predicted_multiplier, multiplier),
+        multiplier=jnp.where(predicts, point.multiplier + h * point.multiplier_rate, multiplier),
         initial_gap=linear.initial_gap,
         initial_offset=linear.initial_offset,
     )
