@@ -188,6 +188,15 @@ def _neighbourhood(chain: Chain, structure: Structure, q):
     return (*jax.vmap(evaluate)(steps), size)
 
 
+def _initial_values(path: PathState, offset, gap):
+    """Return offset and gap at the start of the leg: these, if the leg has no accepted point."""
+    gap_to_close = jnp.where(path.kind == CLOSE_START, gap, 0)
+    return (
+        jnp.where(path.has_point, path.initial_offset, offset),
+        jnp.where(path.has_point, path.initial_gap, gap_to_close),
+    )
+
+
 def linearize(
     chain: Chain, structure: Structure, targets: Targets, path: PathState, q
 ) -> LinearSolution:
@@ -205,34 +214,25 @@ def linearize(
     selection = independent_rows(with_margin, free_J, all_pivots, path.rank_known)
     start = jnp.where(path.from_requested, targets.requested, targets.start)
     gradients = jax.vmap(lambda q, J: gradient(chain, start, q, J, path.multiplier, weight))(qs, Js)
-    hessian = jnp.where(
-        on_leg,
-        (gradients[1:] - gradients[:1]).T / size,
-        jnp.diag(jnp.where(kind == CLOSE_PERTURBED, 1, weight)),
-    )
+    hessian_on_leg = (gradients[1:] - gradients[:1]).T / size
+    diagonal = jnp.diag(jnp.where(kind == CLOSE_PERTURBED, 1, weight))
     gradient_of_change = gradients[0] - path.multiplier @ J
-    # gaps and offsets shrink as 1 - s from their values where the leg begins
     offset = difference(chain, q, targets.requested) / column
-    initial_offset = jnp.where(path.has_point, path.initial_offset, offset)
-    gap_at_start = jnp.where(kind == CLOSE_START, gap, 0)
-    initial_gap = jnp.where(path.has_point, path.initial_gap, gap_at_start)
+    initial_offset, initial_gap = _initial_values(path, offset, gap)
+    # gaps and offsets shrink as 1 - s from their values where the leg begins
     residual = jnp.where(on_leg, gap - (1 - path.s) * initial_gap, gap)
     projects = is_any_of(kind, PROJECT_VELOCITY_HELD, PROJECT_VELOCITY)
     residual = jnp.where(projects, J @ (path.newton.v / column), residual)
     for_fixed = jnp.where(moved, offset - (1 - path.s) * initial_offset, 0)
     upper = jnp.where(fixed, for_fixed, jnp.where(on_leg, -gradient_of_change, 0))
-    right_sides = jnp.stack(
-        [
-            jnp.concatenate([upper, -selection.Q @ residual]),
-            jnp.concatenate([jnp.where(moved, initial_offset, 0), selection.Q @ -initial_gap]),
-        ],
-        1,
-    )
+    right_side = jnp.concatenate([upper, -selection.Q @ residual])
+    along = jnp.concatenate([jnp.where(moved, initial_offset, 0), selection.Q @ -initial_gap])
+    hessian = jnp.where(on_leg, hessian_on_leg, diagonal)
     matrix = optimality_matrix(hessian, selection.Q @ J, selection.active, fixed)
     # one call of LAPACK for both matrices
     orientation = _orientation_matrix(path.point, free_J)
     lu, order, positive = factor_general(jnp.stack([matrix, orientation]))
-    n, solution = chain.dofs, solve_factored(lu[0], order[0], right_sides)
+    n, solution = chain.dofs, solve_factored(lu[0], order[0], jnp.stack([right_side, along], 1))
     return LinearSolution(
         kin=kin,
         frames=frames,
