@@ -114,6 +114,35 @@ def test_lanes_that_fail_are_nan_alone(four_bar):
         jax.jit(lambda x: four_bar.state({"rocker": x}).q)(3.0)
 
 
+def test_a_run_from_an_unreachable_state_ends(four_bar):
+    state = four_bar.state({"rocker": 3.0}, throw=False)
+    traj = svkc.simulate(four_bar, state, 0.1, dt=0.05, throw=False)
+    assert traj.result == svkc.RESULTS.non_finite
+    assert traj.t_final == 0
+
+
+@pytest.mark.slow
+def test_a_control_that_closes_loops_is_smooth(four_bar):
+    """The crank is driven along a path of closed states; derivative of the run by the amplitude."""
+    start = four_bar.state({"crank": 0.3})
+
+    def control(t, state, amplitude):
+        target = four_bar.state({"crank": 0.3 + amplitude * jnp.sin(3 * t)}, near=start)
+        return jnp.zeros(four_bar.dofs).at[2].set(20 * (target.q[2] - state.q[2]) - state.v[2])
+
+    def end(amplitude):
+        run = svkc.simulate(
+            four_bar, start, 0.5, control=control, args=amplitude, rtol=1e-10, atol=1e-12
+        )
+        return run.final.q
+
+    slope = jax.jit(jax.jacrev(end))(0.2)
+    h = 1e-3
+    run = jax.jit(end)
+    difference = (8 * (run(0.2 + h) - run(0.2 - h)) - run(0.2 + 2 * h) + run(0.2 - 2 * h)) / 12 / h
+    np.testing.assert_allclose(slope, difference, atol=1e-8)
+
+
 def compare(name, count):
     """Compare states with the reference, and derivatives with differences, for the first
     geometries."""
