@@ -114,11 +114,19 @@ def test_lanes_that_fail_are_nan_alone(four_bar):
         jax.jit(lambda x: four_bar.state({"rocker": x}).q)(3.0)
 
 
-def test_a_run_from_an_unreachable_state_ends(four_bar):
-    state = four_bar.state({"rocker": 3.0}, throw=False)
-    traj = svkc.simulate(four_bar, state, 0.1, dt=0.05, throw=False)
-    assert traj.result == svkc.RESULTS.non_finite
-    assert traj.t_final == 0
+@pytest.mark.slow
+def test_runs_from_unreachable_states_end_with_their_code(four_bar):
+    def run(rocker):
+        state = four_bar.state({"rocker": rocker}, throw=False)
+        traj = svkc.simulate(four_bar, state, 0.1, dt=0.05, throw=False)
+        return traj.result, traj.t_final
+
+    result, t_final = jax.jit(jax.vmap(run))(jnp.array([0.1, 3.0]))
+    assert (result == svkc.RESULTS.non_finite).tolist() == [False, True]
+    assert (result == svkc.RESULTS.successful).tolist() == [True, False]
+    assert t_final[0] == 0.1
+    with pytest.raises(ValueError, match="must be finite"):
+        svkc.simulate(four_bar, four_bar.state({"rocker": 3.0}, throw=False), 0.1)
 
 
 @pytest.mark.slow
