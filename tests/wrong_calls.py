@@ -222,6 +222,7 @@ CASES = {
     "connect: spare": lambda s: svkc.connect(s.spare, s.empty, "spare_0", here=True),
     "connect: the bodies": connect_elsewhere,
     "connected: expected": lambda s: s.four.state(connected=np.ones(3)),
+    "control: expected control": lambda s: s.simulate(control=lambda t, x, args: None),
     "cost: got": lambda s: s.rollout(cost=jnp.ones((1, 2))),
     "cuttable: ... belongs": lambda s: s.load(
         models.MJCF.format(
@@ -244,6 +245,7 @@ CASES = {
     "dynamics.hold": lambda s: s.simulate(dynamics=svkc.dynamics.CompositeBodies(hold=2.0)),
     "dynamics.inertia": lambda s: s.simulate(dynamics=Dynamics(inertia=lambda *_: None)),
     "dynamics: expected": lambda s: s.simulate(dynamics=3),
+    "events[...]: expected": lambda s: s.simulate(events=[svkc.when(lambda t, x, args: t > 0)]),
     "events: expected": lambda s: s.simulate(events=["pin"]),
     "here: ...": lambda s: svkc.at(0.5, connect="pin", here="other"),
     "ignore: got": lambda s: s.load(ignore=("nothing",)),
@@ -256,6 +258,7 @@ CASES = {
     "no joint ...": lambda s: s.four.state({"nobody": 1.0}),
     "no joint coordinate": lambda s: svkc.with_independent(s.four, s.state, "nobody"),
     "source: no such file": lambda s: s.load("nowhere.xml"),
+    "no virtual link ..., but": lambda s: svkc.cut(s.four, s.state, "crank"),
     "no virtual link": lambda s: svkc.cut(s.four, s.state, "nobody"),
     "out: ... cannot": rollout_with_a_lock,
     "overload: give": lambda s: svkc.overload(s.four, "pin"),
@@ -328,7 +331,6 @@ CASES = {
     "virtual_links: names": lambda s: s.load(virtual_links=[link(), link()]),
     "weight: expected": lambda s: s.actuation(weight=-np.ones(4)),
     "when: direction": lambda s: svkc.when(lambda t, x, args: t, direction="up"),
-    "when: guard": lambda s: svkc.when(3),
 }
 
 # other ways to some of the messages, by words of those
@@ -340,9 +342,63 @@ ALSO = [
     ("max_events", lambda s: s.simulate(max_events=-1)),
     ("max_steps", lambda s: s.simulate(max_steps=0)),
     ("hoook", lambda s: s.simulate(events=[svkc.at(0.5, cut="hoook")])),
-    ("expected 4 joint torques", lambda s: s.simulate(control=lambda t, x, args: jnp.zeros(5))),
+    *(
+        (
+            rf"control\(t, state, args\) to return 4 joint torques.*or 3, the tree's.*, got {got}",
+            lambda s, value=value: s.simulate(control=lambda t, x, args: value),
+        )
+        for value, got in (
+            (np.zeros(5), r"float64 of shape \(5,\)"),
+            (0.0, r"float64 of shape \(\)"),
+            (np.zeros(4, bool), r"bool of shape \(4,\)"),
+            (np.zeros(4, complex), r"complex128 of shape \(4,\)"),
+            (None, "None"),
+            ([0.0, [1.0]], "a list"),
+        )
+    ),
+    *(
+        (
+            rf"events\[1\]: .* guard\(t, state, args\) to return one floating.*, got {got}",
+            lambda s, value=value: s.simulate(
+                events=[svkc.at(0.5), svkc.when(lambda t, x, args: value)]
+            ),
+        )
+        for value, got in (
+            (np.zeros(1), r"float64 of shape \(1,\)"),
+            (1, r"int64 of shape \(\)"),
+            (True, r"bool of shape \(\)"),
+            (1j, r"complex128 of shape \(\)"),
+            (None, "None"),
+            ([1.0], r"float64 of shape \(1,\)"),
+        )
+    ),
+    (
+        r"control: expected a function of \(t, state, args\), got one of \(t, x\)",
+        lambda s: s.simulate(control=lambda t, x: x.v),
+    ),
+    (
+        r"control: expected a function of \(t, state, args\), got one of \(t, x\)",
+        lambda s: s.rollout(control=lambda t, x: x.v),
+    ),
+    (
+        r"when: guard: expected a function of \(t, state, args\), got one of \(t, x, args, more\)",
+        lambda s: svkc.when(lambda t, x, args, more: t),
+    ),
+    (
+        r"lane: expected a function of \(chain, data\), got one of \(chain\)",
+        lambda s: s.rollout(lane=lambda chain: {}),
+    ),
+    (
+        "f: expected a function of .x., got one of .x, y.",
+        lambda s: svkc.check_grad(lambda x, y: x, 1.0),
+    ),
+    (
+        r"no virtual link 'crank', but a joint of the tree.*cuttable='crank'",
+        lambda s: s.simulate(events=[svkc.at(0.5, cut="crank")]),
+    ),
     ("expected 4 joint torques", lambda s: svkc.step(s.four, s.state, jnp.zeros(2), 1e-3)),
     ("here", lambda s: svkc.at(1.0, here="a")),
+    ("when: guard: expected a function of .*, got 3", lambda s: svkc.when(3)),
     ("target: got 0", lambda s: svkc.accuracy.tune(s.four, s.state, 0.5, target=0.0)),
     (
         "expected an object of svkc.dynamics",

@@ -3,23 +3,25 @@
 import pathlib
 import webbrowser
 
-from svkc.cli.run import print_report
+from svkc.cli.printing import print_error, print_report
 
 
-def info(path: str) -> int:
+def info(path: str, ignore: tuple[str, ...] = ()) -> int:
     """Print what svkc reads from a model file, and return the exit status.
 
-    path: MJCF or URDF file. If it has unsupported elements, they are named and left out.
+    path: MJCF or URDF file.
+    ignore: kinds of elements to leave out, as in `svkc.load`. If it is empty, unsupported elements
+        are named and left out.
     """
     import svkc
     from svkc._jax.compilation_cache import use_cache
 
     cache_folder = use_cache()
     try:
-        chain = svkc.load(path)
+        chain = svkc.load(path, ignore=ignore)
     except ValueError as error:
-        print(error)
-        if "not simulated" not in str(error):
+        print_error(error, f"svkc info {path}", ignore)
+        if ignore or not hasattr(error, "kinds"):
             return 1
         chain = svkc.load(path, ignore="all")
     state = chain.state() if not len(chain.link_names) else _load_state(chain)

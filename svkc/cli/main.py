@@ -7,6 +7,8 @@ import sys
 
 from svkc.cli import inspect, run
 
+IGNORE_HELP = "kinds of model elements to leave out, separated by commas, or all; may be repeated"
+
 
 def _event_parser(kind: str):
     """Return a parser of NAME@TIME, for argparse, that returns (kind, link, seconds).
@@ -44,9 +46,9 @@ def _argument_parser() -> argparse.ArgumentParser:
             help="simulate a scene, or a model from its load pose: table, npz, pictures, page",
         )
     )
-    add("info", help="print what svkc reads from a model").add_argument(
-        "model", help="MJCF or URDF file"
-    )
+    info = add("info", help="print what svkc reads from a model")
+    info.add_argument("model", help="MJCF or URDF file")
+    info.add_argument("--ignore", action="append", default=[], metavar="KINDS", help=IGNORE_HELP)
     view = add("view", help="table, curves and page of a saved run")
     view.add_argument("file", type=pathlib.Path, help="an .npz written by traj.save(path, chain)")
     view.add_argument("--no-open", action="store_true", help="write the page and do not open it")
@@ -78,12 +80,16 @@ def _add_run_options(parser: argparse.ArgumentParser):
             metavar="NAME@TIME",
             help=f"{purpose} at a time, s; may be repeated; replaces the scene's own events",
         )
-    ignore_help = "kinds of model elements to leave out, or all"
-    add("--ignore", nargs="*", default=[], metavar="KIND", help=ignore_help)
+    add("--ignore", nargs="*", action="extend", default=[], metavar="KINDS", help=IGNORE_HELP)
     folder = pathlib.Path("out")
     add("--out", type=pathlib.Path, default=folder, help="folder for results (default: out)")
     add("--mp4", action="store_true", help="write an mp4 as well (needs the extra svkc[video])")
     add("--quiet", action="store_true", help="no progress bar")
+
+
+def _kinds(words: list[str]) -> tuple[str, ...]:
+    """Return the kinds of `--ignore`, each of whose words may hold several."""
+    return tuple(kind for word in words for kind in word.split(",") if kind)
 
 
 def main(argv=None) -> int:
@@ -102,13 +108,13 @@ def main(argv=None) -> int:
             options.what,
             t1=options.t1,
             events=options.events,
-            ignore=tuple(options.ignore),
+            ignore=_kinds(options.ignore),
             out=options.out,
             video=options.mp4,
             quiet=options.quiet,
         )
     if options.command == "info":
-        return inspect.info(options.model)
+        return inspect.info(options.model, _kinds(options.ignore))
     if options.command == "view":
         return inspect.view(options.file, not options.no_open)
     return run.scenes()

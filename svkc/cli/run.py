@@ -8,6 +8,8 @@ import itertools
 import pathlib
 import time
 
+from svkc.cli.printing import print_error, print_report
+
 RELEASE_RIGHT, RELEASE_LEFT = 0.9, 1.15  # s
 TOLERANCES = {"rtol": 1e-8, "atol": 1e-10}
 
@@ -101,7 +103,7 @@ def run(
         _simulate(chain, state, events, end, progress.disable)
     except (ValueError, OSError) as error:
         progress.close()
-        print(error)
+        print_error(error, f"svkc run {name}", ignore)
         return 1
     clock.append(time.perf_counter())
     _next_stage(progress, "a run")
@@ -267,34 +269,3 @@ def _write_results(
         except (RuntimeError, ImportError) as error:
             failures.append(f"{file} not drawn: {error}")
     return written, failures
-
-
-def print_report(chain, traj):
-    """Print a table of the phases, the times of the events (s), and the run's report.
-
-    Phases of zero duration after the first one are left out.
-    """
-    p, report = traj.phases, traj.report()
-    names = {
-        i: (
-            ", ".join(n for n, on in zip(chain.link_names, p.connected[i], strict=True) if on)
-            or "nothing"
-        )
-        for i in range(int(p.count))
-    }
-    width = max(34, *map(len, names.values()))
-    print(
-        f"      from        to  {'held by':<{width}} joint   rank  mobility   steps  energy drift"
-    )
-    print(f"         s         s  {'':<{width}} freedoms                           J")
-    for i in range(int(p.count)):
-        if float(p.start[i]) == float(p.stop[i]) and i:
-            continue
-        print(
-            f"{float(p.start[i]):10.6f}{float(p.stop[i]):10.6f} "
-            f" {names[i]:<{width}}{int(p.joint_freedoms[i]):6d}{int(p.rank[i]):7d}"
-            f"{int(p.freedoms[i]):10d}{int(p.accepted[i]):8d}{float(p.energy_drift[i]):14.2e}"
-        )
-    times = ", ".join(f"{float(t):.6f} s" for t in traj.events.time[: int(traj.events.count)])
-    print(f"events at {times or 'no time'}; energy at the start {float(p.energy[0, 0]):.3f} J")
-    print(report)

@@ -12,7 +12,7 @@ from svkc._jax.pytrees import tree_where
 from svkc.integration.ode import FieldArgs, ODEState
 from svkc.integration.vector_field import VectorField
 from svkc.model.chain import State
-from svkc.model.validation import scalar
+from svkc.model.validation import as_array, description
 from svkc.transitions.plan import Plan
 
 # the most iterations of the root finder
@@ -97,7 +97,22 @@ class GuardValues(eqx.Module):
             else jnp.zeros_like(y.v)
         )
         values = [g.value(chain, t, state, field_args.args, tau) for g in guards]
-        return jnp.stack([jnp.asarray(scalar("guard", x), y.q.dtype) for x in values])
+        numbers = zip(self.plan.guarded, values, strict=True)
+        return jnp.stack([_guard_value(event, x, y.q.dtype) for event, x in numbers])
+
+
+def _guard_value(event: int, value, dtype) -> Float[Array, ""]:
+    """Return what a guard returned as an array. Integers jump, and have no crossing of zero.
+
+    event: index of the guard's event in the list that `simulate` was given.
+    """
+    number = as_array(value)
+    if number.shape != () or not jnp.issubdtype(number.dtype, jnp.floating):
+        raise ValueError(
+            f"events[{event}]: expected guard(t, state, args) to return one floating-point number,"
+            f" got {description(value)}"
+        )
+    return jnp.asarray(number, dtype)
 
 
 class EventInfo(eqx.Module):

@@ -22,7 +22,7 @@ from svkc.loops.forward_dynamics import (
 from svkc.loops.projection import ProjectionInfo, project, project_by_loop_forces
 from svkc.model.chain import Chain, State, active_dofs
 from svkc.model.checked_jit import torques_over_dofs
-from svkc.model.validation import real_array
+from svkc.model.validation import as_array, description, is_real
 from svkc.tree.configuration import configuration_derivative, normalize
 from svkc.tree.inverse_dynamics import limit_forces
 from svkc.tree.traversal import LEVELS_UNROLLED
@@ -108,13 +108,24 @@ class VectorField(eqx.Module):
             controlled = eqx.filter_jit(self.control)(
                 t, State(y.q, y.v, field_args.structure), field_args.args
             )
-            tau = tau + torques_over_dofs(chain, real_array("control", controlled, y.v.dtype))
+            tau = tau + _control_torques(chain, controlled, y.v.dtype)
         if chain.limit is not None:
             tau = tau + limit_forces(chain, y.q, y.v)
         if y.work is None:
             return tau, None
         v = jnp.where(active_dofs(chain, field_args.structure), y.v, 0)
         return tau, tau @ v if chain.damping is None else tau @ v - jnp.sum(chain.damping * v * v)
+
+
+def _control_torques(chain: Chain, value, dtype) -> Float[Array, " dofs"]:
+    """Return what the user's control returned as torques over every coordinate."""
+    tau = as_array(value)
+    if not is_real(tau) or tau.shape not in ((chain.dofs,), (chain.nv,)):
+        raise ValueError(
+            f"control: expected control(t, state, args) to return {chain.dofs} joint torques (or"
+            f" {chain.nv}, the tree's), got {description(value)}"
+        )
+    return torques_over_dofs(chain, jnp.asarray(tau, dtype))
 
 
 def initial_projection_info(field: VectorField, field_args: FieldArgs, q) -> ProjectionInfo | None:

@@ -125,6 +125,17 @@ def _unsupported_elements(model) -> list[tuple[str, str]]:
     return [(kind, elements[kind][1]) for kind in UNSUPPORTED_KINDS if elements[kind][0]]
 
 
+class UnsupportedElements(ValueError):
+    """The error of a model with elements that are not simulated.
+
+    kinds: their kinds, for `ignore`, with those that were ignored.
+    """
+
+    def __init__(self, message: str, kinds: list[str]):
+        super().__init__(message)
+        self.kinds = tuple(kinds)
+
+
 def left_out_elements(model, ignore) -> tuple[str, ...]:
     """Return one line for each kind of element of the model that svkc cannot simulate.
 
@@ -141,9 +152,10 @@ def left_out_elements(model, ignore) -> tuple[str, ...]:
     if missing:
         lines = "".join(f"\n  {kind}: {text}" for kind, text in missing)
         names = ", ".join(repr(kind) for kind, _ in missing)
-        raise ValueError(
+        raise UnsupportedElements(
             f"the model has elements that are not simulated:{lines}\nTo load it without them:"
-            f" svkc.load(..., ignore=({names},))"
+            f" svkc.load(..., ignore=({names},))",
+            [kind for kind, _ in elements],
         )
     colliding = int(np.sum((model.geom_contype != 0) | (model.geom_conaffinity != 0)))
     collisions = (

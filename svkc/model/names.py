@@ -32,6 +32,11 @@ def connection_mask(chain: Chain, connected) -> np.ndarray | jax.Array:
 
 def link_index(chain: Chain, name: str) -> int:
     """Return the index of a virtual link in `Structure`'s entries."""
+    if isinstance(name, str) and name in chain.joint_names:
+        raise ValueError(
+            f"no virtual link {name!r}, but a joint of the tree; to cut it, load the chain with"
+            f" svkc.load(..., cuttable={name!r})"
+        )
     if not isinstance(name, str) or name not in chain.link_names:
         raise ValueError(
             f"no virtual link {name!r}; virtual links: {', '.join(chain.link_names) or 'none'}"

@@ -4,6 +4,8 @@ that names the argument, what was given and what was expected.
 Values of tracers cannot be checked; their shapes and dtypes are.
 """
 
+import inspect
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -31,7 +33,7 @@ def real_array(name: str, value, dtype=None):
     Raises ValueError for strings, objects, Booleans, complex numbers and ragged lists.
     """
     array = as_array(value)
-    if not any(jnp.issubdtype(array.dtype, kind) for kind in (np.integer, np.floating)):
+    if not is_real(array):
         raise ValueError(
             f"{name}: expected real numbers, got"
             f" {repr(value) if array.dtype == object else array.dtype}"
@@ -89,10 +91,34 @@ def integer(name: str, value, minimum: int, maximum: int = 2**31 - 1) -> int:
     return int(number)
 
 
-def check_function(name: str, value, optional: bool = True) -> None:
-    """Raise ValueError if a value is not callable, nor None where `optional`."""
-    if not callable(value) and not (optional and value is None):
-        raise ValueError(f"{name}: expected a function, got {value!r}")
+def is_real(array) -> bool:
+    """Return whether an array holds real numbers: neither Booleans, complex numbers nor objects."""
+    return any(jnp.issubdtype(array.dtype, kind) for kind in (np.integer, np.floating))
+
+
+def description(value) -> str:
+    """Return what a function of the user returned, in words for a message."""
+    array = as_array(value)
+    if array.dtype == object:
+        return "None" if value is None else f"a {type(value).__name__}"
+    return f"{array.dtype} of shape {array.shape}"
+
+
+def check_function(name: str, value, *arguments: str) -> None:
+    """Raise ValueError if a value is no function of these positional arguments."""
+    got = repr(value)
+    if callable(value):
+        try:
+            signature = inspect.signature(value)
+            got = f"one of {signature}"
+            signature.bind(*arguments)
+            return
+        # some functions that are written in C have no signature
+        except ValueError:
+            return
+        except TypeError:
+            pass
+    raise ValueError(f"{name}: expected a function of ({', '.join(arguments)}), got {got}")
 
 
 def boolean(name: str, value) -> bool:

@@ -104,7 +104,8 @@ def prepare_options(
     dtype, events = state.q.dtype, as_events(events)
     check_times(t0, t1, ts, events)
     check_step_options(dt, rtol, atol, stepsize_controller)
-    check_function("control", control)
+    if control is not None:
+        check_function("control", control, "t", "state", "args")
     check_instance("stepsize_controller", stepsize_controller, diffrax.AbstractStepSizeController)
     check_instance("progress_meter", progress_meter, diffrax.AbstractProgressMeter)
     plan = make_plan(chain, events, dtype)

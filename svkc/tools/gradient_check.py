@@ -89,7 +89,7 @@ def check_grad(
     Raises ValueError if x or f(x) has no floating-point arrays, if f(x) is not finite, or if an
     option is invalid.
     """
-    check_function("f", f, optional=False)
+    check_function("f", f, "x")
     integer("directions", directions, 1)
     positive_scalar("step", step)
     if mode not in ("forward", "reverse", "both"):

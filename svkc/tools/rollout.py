@@ -57,7 +57,6 @@ def rollout(
     check_chain(chain)
     lanes = _count_lanes(states, data, cost)
     scalar("t1", t1)
-    check_function("lane", lane)
     devices, chunk = _prepare_devices(devices, chunk, lanes)
     size = chunk * len(devices)
     order = np.arange(lanes) if cost is None else np.argsort(np.asarray(cost), kind="stable")
@@ -113,6 +112,10 @@ def _chunk_runner(chain: Chain, t1, lane: Callable | None, options: dict, device
 
     Functions with equal code and data share a compiled program.
     """
+    if lane is not None:
+        check_function("lane", lane, "chain", "data")
+    if options.get("control") is not None:
+        check_function("control", options["control"], "t", "state", "args")
     common = {"throw": False, "adjoint": Replay(every=1 << 30), **options}
     mesh = Mesh(np.array(devices), ("lanes",))
     functions = {"control": options.get("control"), "events": options.get("events", ())}

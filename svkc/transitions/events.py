@@ -10,7 +10,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from svkc.model.validation import boolean, names, real_array
+from svkc.model.validation import boolean, check_function, names, real_array
 from svkc.transitions.spare_links import Grip
 
 
@@ -168,11 +168,10 @@ def when(
     connect, cut, lock, unlock, here, stop, bind, unbind: as for `svkc.at`.
     direction: True for rising crossings only, False for falling ones only, None for either.
 
-    Raises ValueError if the guard is not callable, the direction is not True, False or None, or an
-    argument is one that `svkc.at` refuses.
+    Raises ValueError if the guard is no function of these arguments, the direction is not True,
+    False or None, or an argument is one that `svkc.at` refuses.
     """
-    if not callable(guard):
-        raise ValueError(f"when: guard must be a function of (t, state, args), got {guard!r}")
+    check_function("when: guard", guard, "t", "state", "args")
     if direction is not None and not isinstance(direction, bool | np.bool_):
         raise ValueError(f"when: direction must be True, False or None, got {direction!r}")
     direction = None if direction is None else bool(direction)

@@ -4,8 +4,7 @@ import pytest
 from processes import looks_drawn, run
 
 import svkc
-
-pytestmark = pytest.mark.slow
+from svkc.__main__ import main
 
 ROD = """<mujoco><worldbody>
   <body name="rod" pos="0 0 1"><joint name="pivot" axis="0 1 0"/><geom type="capsule"
@@ -21,6 +20,38 @@ def command(line, *args):
     return run("-m", "svkc", *line.split(), *args, optimized=False)
 
 
+UNSUPPORTED = """<mujoco><option density="1.2"/><worldbody><body name="rod"><joint name="pivot"
+  frictionloss="1"/><geom size="0.1"/></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    "words", [["--ignore", "friction,fluid"], ["--ignore", "friction", "--ignore", "fluid"]]
+)
+def test_info_leaves_out_what_is_named(tmp_path, capsys, words):
+    """By kinds separated by commas, or by several options."""
+    path = tmp_path / "rod.xml"
+    path.write_text(UNSUPPORTED)
+    assert main(["info", *words, str(path)]) == 0
+    shown = capsys.readouterr().out
+    assert "left out: friction: joint friction loss" in shown
+    assert "not simulated:" not in shown
+
+
+def test_a_refused_model_names_the_option(tmp_path, capsys):
+    path = tmp_path / "rod.xml"
+    path.write_text(UNSUPPORTED)
+    assert main(["info", "--ignore", "fluid", str(path)]) == 1
+    assert f"svkc info {path} --ignore friction,fluid" in capsys.readouterr().out
+    assert main(["run", "--quiet", "--out", str(tmp_path / "out"), str(path)]) == 1
+    assert f"svkc run {path} --ignore friction,fluid" in capsys.readouterr().out
+    # without the option `info` shows what svkc reads, all that it cannot simulate left out
+    assert main(["info", str(path)]) == 0
+    shown = capsys.readouterr().out
+    assert f"svkc info {path} --ignore friction,fluid" in shown
+    assert "left out: fluid" in shown
+
+
+@pytest.mark.slow
 def test_run_and_view_of_a_model_file(tmp_path):
     """`svkc run` of a model releases and catches a link; `svkc view` opens the saved run."""
     (tmp_path / "rod.xml").write_text(ROD)
@@ -45,6 +76,7 @@ def test_run_and_view_of_a_model_file(tmp_path):
     assert "rod.html" in view.stdout
 
 
+@pytest.mark.slow
 def test_wrong_arguments_are_reported(tmp_path):
     """A wrong argument gives a message that names it and a nonzero status, without traceback."""
     (tmp_path / "rod.xml").write_text(ROD)
@@ -66,12 +98,14 @@ def test_wrong_arguments_are_reported(tmp_path):
         assert "Traceback" not in done.stderr, done.stderr
 
 
+@pytest.mark.slow
 def test_the_scenes_command():
     scenes = command("scenes")
     for name in ("high_bar", "swing", "brachiation", "walking"):
         assert name in scenes.stdout
 
 
+@pytest.mark.slow
 def test_main_job(tmp_path):
     """`python -m svkc` prints the table and writes the run, the pictures and, with GL, the gif."""
     done = run("-m", "svkc", "--out", tmp_path)
@@ -100,6 +134,7 @@ def test_main_job(tmp_path):
             assert len(image.convert("RGB").getcolors(1 << 20)) > 10
 
 
+@pytest.mark.slow
 def test_the_swing_from_the_command_line(tmp_path):
     """`python -m svkc swing` prints 31 joint freedoms, and 29 after the seat is lost."""
     done = run("-m", "svkc", "swing", "--out", tmp_path, optimized=False)
@@ -113,6 +148,7 @@ def test_the_swing_from_the_command_line(tmp_path):
     ]
 
 
+@pytest.mark.slow
 def test_info(tmp_path):
     xml = (
         '<mujoco><worldbody><body name="a"><joint name="j" frictionloss="1"/><geom'
