@@ -215,6 +215,13 @@ CASES = {
     "bounds: expected (": lambda s: s.actuation(bounds=3),
     "bounds: expected lower": lambda s: s.actuation(bounds=(1.0, -1.0)),
     "chain: expected": lambda s: svkc.poses(3, s.state),
+    "chain....: got": lambda s: svkc.poses(
+        eqx.tree_at(lambda c: c.mass, s.four, -s.four.mass), s.state
+    ),
+    "chain.armature": lambda s: svkc.poses(
+        eqx.tree_at(lambda c: c.armature, s.four, -jnp.ones(3), is_leaf=lambda x: x is None),
+        s.state,
+    ),
     "check_grad: f(x) has": lambda s: svkc.check_grad(lambda x: 1, jnp.asarray(1.0)),
     "check_grad: f(x)...": lambda s: svkc.check_grad(lambda x: jnp.log(x), jnp.asarray(-1.0)),
     "check_grad: x has": lambda s: svkc.check_grad(lambda x: x, jnp.asarray(1)),

@@ -11,15 +11,17 @@ from jaxtyping import Array, Float
 
 from svkc._jax.eager import eager_jit
 from svkc.model.chain import Chain, State, Structure
+from svkc.model.inertial_parameters import check_inertial_parameters
 from svkc.model.validation import real_array
 
 
 def check_chain(chain) -> None:
-    """Raise ValueError if `chain` is not a `Chain`."""
+    """Raise ValueError if `chain` is not a `Chain`, or has an invalid mass, inertia or armature."""
     if not isinstance(chain, Chain):
         raise ValueError(
             f"chain: expected a Chain, as svkc.load(...) returns, got {type(chain).__name__}"
         )
+    check_inertial_parameters(chain)
 
 
 def check_state(chain, state) -> None:
@@ -102,6 +104,10 @@ def checked_jit(fn: Callable | None = None, *, eager: bool = False) -> Callable:
 
     @functools.wraps(fn)
     def call(*args, **options):
+        chain = args[0] if args else options.get("chain")
+        # a compiled program validates shapes only
+        if isinstance(chain, Chain):
+            check_inertial_parameters(chain)
         try:
             return compiled(*args, **options)
         except (TypeError, OverflowError):

@@ -42,6 +42,10 @@ class RESULTS(eqx.Enumeration, metaclass=FormerMeta):  # pyright: ignore
         "Times are out of order: t1, an event or a save time is before t0, save times decrease, or"
         " a save time is past t1. Nothing was run."
     )
+    not_positive_definite = (
+        "A mass, inertia or armature of the chain is negative or not finite, so that the mass"
+        " matrix is not positive definite. Nothing was run."
+    )
     no_slot = (
         "An event makes a grip, but every spare slot was bound, or the slot that the grip names was"
         " connected: the grip was skipped, all other changes were made. Load with more spare slots,"

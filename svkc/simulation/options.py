@@ -39,7 +39,8 @@ class Options(eqx.Module):
     first_step: size of the first step with a controller (s).
     has_work: whether to integrate the work of control, joint limits and dampers.
     gap_tolerance: largest loop gap that does not fail a run (rad, m).
-    traced_times: whether a time is traced, so that the compiled run has to check it.
+    traced_times, traced_masses: whether a time, or a mass, inertia or armature of the chain, is
+        traced, so that the compiled run has to check it.
     """
 
     control: Callable | None
@@ -56,6 +57,7 @@ class Options(eqx.Module):
     has_work: bool = eqx.field(static=True)
     gap_tolerance: float = eqx.field(static=True)
     traced_times: bool = eqx.field(static=True)
+    traced_masses: bool = eqx.field(static=True)
 
     @property
     def field(self) -> VectorField:
@@ -132,6 +134,7 @@ def prepare_options(
         has_work=control is not None or chain.limit is not None or chain.damping is not None,
         gap_tolerance=1e3 * gap_tolerance(dtype),
         traced_times=not is_concrete(t0, t1, ts, plan.times),
+        traced_masses=not is_concrete(chain.mass, chain.inertia, chain.armature),
     )
     save_at = host.stack([cast(t0), cast(t1)]) if ts is None else ts
     return options, jnp.asarray(save_at, dtype), plan

@@ -20,7 +20,7 @@ from svkc.simulation.codes import DERIVATIVE, RESULTS
 from svkc.simulation.options import Options
 from svkc.simulation.phase import PhaseOutcome, RunState, solve_phase
 from svkc.simulation.records import empty_events, empty_phase_records, write_phase_row
-from svkc.simulation.traced_checks import check_traced_times
+from svkc.simulation.traced_checks import initial_result
 from svkc.transitions.plan import Plan
 
 
@@ -59,7 +59,7 @@ def initial_run_state(chain: Chain, state: State, times, plan: Plan, options: Op
         records=empty_phase_records(rows + 1, state),
         count=jnp.asarray(0, jnp.int32),
         saved=jax.tree.map(lambda x: jnp.broadcast_to(x[None], (ts.shape[0], *x.shape)), state),
-        result=check_traced_times(times, plan) if options.traced_times else RESULTS.successful,
+        result=initial_result(chain, times, plan, options),
         derivative=DERIVATIVE.successful,
         invalid_from=jnp.asarray(rows + 1, jnp.int32),
     )  # fmt: skip

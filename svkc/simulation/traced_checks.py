@@ -6,11 +6,26 @@ Concrete arguments raise ValueError instead (`option_checks`), and compile none 
 import jax.numpy as jnp
 
 from svkc._jax.pytrees import stop_gradient_tree
+from svkc.model.chain import Chain
+from svkc.model.inertial_parameters import has_invalid_inertial_parameters
 from svkc.simulation.codes import RESULTS
+from svkc.simulation.options import Options
 from svkc.transitions.plan import Plan
 
 
-def check_traced_times(times, plan: Plan) -> RESULTS:
+def initial_result(chain: Chain, times, plan: Plan, options: Options) -> RESULTS:
+    """Return the result of a run before its first phase: `successful`, or why nothing can be run.
+
+    times: start, end and save times (s).
+    """
+    result = _check_times(times, plan) if options.traced_times else RESULTS.successful
+    if not options.traced_masses:
+        return result
+    invalid = has_invalid_inertial_parameters(chain)
+    return RESULTS.where(invalid, RESULTS.not_positive_definite, result)
+
+
+def _check_times(times, plan: Plan) -> RESULTS:
     """Return `not_a_time` or `reversed` if the times of a run cannot be run, else `successful`.
 
     The time of an event may be infinite: the event does not happen. Save times may lie outside of
