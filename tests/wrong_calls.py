@@ -76,6 +76,11 @@ class Setting:
     def bound(self, *args, **kw):
         return svkc.bind(self.spare, self.empty, "spare_0", *args, **kw)
 
+    def gripping(self):
+        """Return a state whose spare slot is connected."""
+        state = svkc.bind(self.spare, self.empty, "spare_0", "world", "rocker", joint="ball")
+        return svkc.connect(self.spare, state, "spare_0", here=True)
+
 
 def connect_elsewhere(s):
     """Connect a virtual link whose bodies are not at its placement."""
@@ -201,6 +206,9 @@ CASES = {
     ),
     "at: got time": lambda s: s.simulate(events=[svkc.at(-1.0, cut="pin")]),
     "at: time must": lambda s: s.simulate(events=[svkc.at(jnp.ones(2), cut="pin")]),
+    "bind: ... is connected": lambda s: svkc.bind(
+        s.spare, s.gripping(), "spare_0", "world", "crank"
+    ),
     "bind: ... is not": lambda s: svkc.bind(s.four, s.state, "pin", "world", "rocker"),
     "bind: a spare slot has no": lambda s: s.bound("world", "rocker", joint="universal"),
     "bind: axis": lambda s: s.bound("world", "rocker", joint="hinge", axis=(0, 0, 0)),

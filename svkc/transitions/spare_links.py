@@ -82,22 +82,24 @@ def as_placement(name: str, value, dtype):
 def set_links(
     structure: Structure, links: Bool[Array, " links"], *, rows, freedoms, quat, pos, real_pos
 ) -> Structure:
-    """Return the structure with new bodies, joint and placement, except `real_quat`, of `links`.
+    """Return the structure with new bodies, joint and placement of `links`.
 
     rows: rows of the parent and of the real link among the bodies.
-    quat, pos: orientation and position of the joint in the parent (wxyz, m).
-    real_pos: position of the joint in the real link (m).
+    quat: orientation of the joint in the parent and in the real link (wxyz).
+    pos, real_pos: position of the joint in the parent and in the real link (m).
     """
     dtype = structure.pos.dtype
     column = links[:, None]
+    quat = jnp.asarray(quat, dtype)[None]
     return eqx.tree_at(
-        lambda s: (s.parent, s.real, s.freedoms, s.quat, s.pos, s.real_pos),
+        lambda s: (s.parent, s.real, s.freedoms, s.quat, s.real_quat, s.pos, s.real_pos),
         structure,
         (
             jnp.where(links, jnp.asarray(rows[0], structure.parent.dtype), structure.parent),
             jnp.where(links, jnp.asarray(rows[1], structure.real.dtype), structure.real),
             jnp.where(column, np.array(freedoms)[None], structure.freedoms),
-            jnp.where(column, jnp.asarray(quat, dtype)[None], structure.quat),
+            jnp.where(column, quat, structure.quat),
+            jnp.where(column, quat, structure.real_quat),
             jnp.where(column, jnp.asarray(pos, dtype)[None], structure.pos),
             jnp.where(column, jnp.asarray(real_pos, dtype)[None], structure.real_pos),
         ),
@@ -119,7 +121,7 @@ def check_bound(chain: Chain, state: State, to_connect) -> State:
     bodies.
     """
     spare = np.array(chain.topology.link_spare, bool)
-    if is_concrete(to_connect) and not np.any(np.asarray(to_connect) & spare):
+    if not spare.any() or (is_concrete(to_connect) and not np.any(np.asarray(to_connect) & spare)):
         return state
     structure = state.structure
     if not is_concrete(to_connect, structure.parent, structure.real):
@@ -218,14 +220,17 @@ def bind(
     joint: name of the joint, or six Booleans for its freedoms, as for `svkc.VirtualLink`; joints
         with two rotations, such as "universal", are refused, as a slot has no room for their
         coordinates.
-    axis: axis of the joint in the frame of the parent.
+    axis: axis of the joint in the frame of the parent, and in that of the real link: the placement
+        given here is one at which the axes of the two frames are parallel.
     pos, real_pos: point of the joint in the frames of the parent and of the real link (m).
 
-    Raises ValueError if `name` is not a spare slot, for unknown bodies, and for an invalid joint,
-    axis or point.
+    Raises ValueError if `name` is not a spare slot, for unknown bodies, for an invalid joint, axis
+    or point, and, as a runtime error under jit, if the slot is connected.
     """
     check_state(chain, state)
-    slot = jnp.asarray(np.arange(len(chain.link_names)) == spare_slot(chain, name))
+    index = spare_slot(chain, name)
+    state = _check_not_connected(state, index, name)
+    slot = jnp.asarray(np.arange(len(chain.link_names)) == index)
     pos, real_pos = (
         as_placement(key, x, state.q.dtype) for key, x in (("pos", pos), ("real_pos", real_pos))
     )
@@ -239,3 +244,15 @@ def bind(
         real_pos=real_pos,
     )
     return State(state.q, state.v, structure)
+
+
+def _check_not_connected(state: State, slot: int, name: str) -> State:
+    """Return the state. Raises ValueError (a runtime error under jit) if a slot is connected."""
+    connected = state.structure.connected
+    if not is_concrete(connected):
+        return eqx.error_if(
+            state, connected[slot], "bind: the spare slot is connected; cut or unbind it first"
+        )
+    if np.asarray(connected)[slot]:
+        raise ValueError(f"bind: {name!r} is connected; cut or unbind it first")
+    return state

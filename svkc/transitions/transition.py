@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from svkc._jax.eager import eager_jit
 from svkc._jax.pytrees import is_concrete
+from svkc.loops.constraint import gap_tolerance
 from svkc.model.chain import Chain, State, Structure
 from svkc.model.checked_jit import check_state
 from svkc.model.names import connection_mask, joint_slice, link_index, spare_slot
@@ -196,10 +197,16 @@ def _check_connected(chain: Chain, change: StructureChange) -> State:
     or a loop is still open.
     """
     if not is_concrete(change.initial_gap):
-        return eqx.error_if(
+        state = eqx.error_if(
             change.state,
-            change.initial_gap > CONNECT_TOLERANCE,
+            ~(change.initial_gap <= CONNECT_TOLERANCE),
             "connect: the bodies are not where the joint is declared; use here=True",
+        )
+        limit = gap_tolerance(state.q.dtype)
+        return eqx.error_if(
+            state,
+            ~(jnp.max(change.residual_gaps, initial=0) < limit),
+            "connect: a loop cannot be closed where the bodies are",
         )
     if change.initial_gap > CONNECT_TOLERANCE:
         raise ValueError(

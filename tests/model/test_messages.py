@@ -83,6 +83,12 @@ def test_inside_compiled_programs(setting):
     apart = setting.load(virtual_links=[wrong_calls.link(pos=(5, 0, 0), real_pos=(0, 0, 0))])
     beyond = wrong_calls.unclosable_loop(setting)
     calls = {
+        "bind: the spare slot": lambda: jax.jit(
+            lambda s: svkc.bind(setting.spare, s, "spare_0", "world", "crank")
+        )(setting.gripping()),
+        "connect: a loop": lambda: jax.jit(lambda s: svkc.connect(setting.spare, s, "spare_0"))(
+            svkc.bind(setting.spare, setting.empty, "spare_0", "world", "crank", pos=(0, 1e-3, 0))
+        ),
         "connect: a spare slot": lambda: jax.jit(
             lambda s: svkc.connect(setting.spare, s, "spare_0", here=True)
         )(setting.empty),

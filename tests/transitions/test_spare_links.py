@@ -151,3 +151,53 @@ def test_a_run_with_more_events_than_rows_keeps_the_state_before_the_next_event(
         assert int(traj.phases.count) == 2
     with pytest.raises(RuntimeError, match=r"t = 0\.1 s.*before this event"):
         svkc.simulate(chain, bound, 0.2, events=events, ts=ts, max_events=2, dt=0.1)
+
+
+def test_a_slot_keeps_nothing_of_an_earlier_grip(sliders):
+    """A slot that was connected at the current poses is bound, and cleared, as a fresh one. The
+    declared placement is one at which the frames of the two bodies are parallel."""
+    chain, state = sliders
+    bind = lambda s: svkc.bind(
+        chain, s, "spare_0", "a", "b", joint="hinge", axis=(0, 1, 0), real_pos=(-1, 0, 0)
+    )
+    fresh = bind(state)
+    other = svkc.bind(chain, state, "spare_0", "world", "b", joint="ball", axis=(1, 0, 0))
+    used = svkc.connect(chain, other, "spare_0", here=True)
+    placement = lambda s: eqx.tree_at(
+        lambda x: (x.rank, x.margin, x.connected), s.structure, (0, 0, 0)
+    )
+    for free in (svkc.cut(chain, used, "spare_0"), svkc.unbind(chain, used, "spare_0")):
+        assert eqx.tree_equal(placement(bind(free)), placement(fresh))
+    assert eqx.tree_equal(placement(svkc.unbind(chain, used, "spare_0")), placement(state))
+    np.testing.assert_allclose(svkc.connect(chain, fresh, "spare_0").v[:2], 2.0, atol=ROUND_OFF)
+
+
+def test_binding_a_slot_that_is_connected_is_an_error(sliders):
+    chain, state = sliders
+    held = svkc.connect(
+        chain, svkc.bind(chain, state, "spare_0", "world", "a"), "spare_0", here=True
+    )
+    with pytest.raises(ValueError, match="'spare_0' is connected; cut or unbind it first"):
+        svkc.bind(chain, held, "spare_0", "a", "b")
+    move = eqx.filter_jit(lambda s: svkc.bind(chain, s, "spare_0", "a", "b"))
+    assert eqx.tree_equal(move(state), svkc.bind(chain, state, "spare_0", "a", "b"))
+    with pytest.raises(RuntimeError, match="connected; cut or unbind"):
+        move(held)
+
+
+def test_a_loop_that_cannot_be_closed_is_an_error_under_jit_and_in_runs(sliders):
+    """The placement is 4 mm beside the line on which the boxes slide: near, but out of reach."""
+    chain, state = sliders
+    beside = svkc.bind(chain, state, "spare_0", "a", "b", real_pos=(-1, 0, 0.004))
+    connect = lambda s: svkc.connect(chain, s, "spare_0")
+    with pytest.raises(ValueError, match=r"cannot be closed.*spare_0 by 0\.004 m"):
+        connect(beside)
+    with pytest.raises(RuntimeError, match="connect: a loop cannot be closed"):
+        eqx.filter_jit(connect)(beside)
+    with pytest.raises(RuntimeError, match="connect: a loop cannot be closed"):
+        eqx.filter_jit(lambda s, m: svkc.transition(chain, s, m))(beside, jnp.array([True, False]))
+    traj = run(chain, beside, svkc.at(0.0, connect="spare_0"))
+    assert traj.result == svkc.RESULTS.loop_open
+    assert float(traj.t_final) == 0
+    assert traj.final.structure.connected.tolist() == [False, False]
+    assert traj.final.v[:2].tolist() == [1, 3]
