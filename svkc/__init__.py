@@ -1,5 +1,6 @@
 """svkc: structure-varying kinematic chains in JAX, after Nakamura and Yamane (2000)."""
 
+from typing import Any as _Any
 from importlib.metadata import PackageNotFoundError as _Missing, version as _version
 
 from svkc import _deprecated
@@ -147,6 +148,6 @@ except _Missing:  # a source tree that is not installed
     __version__ = "0"
 
 
-def __getattr__(name: str):
+def __getattr__(name: str) -> _Any:
     """Return the object of a deprecated name, with a `DeprecationWarning`."""
     return _deprecated.resolve(name)

@@ -7,11 +7,12 @@ import gc
 import itertools
 import pathlib
 import time
+from typing import Any
 
 from svkc.cli.printing import print_error, print_report
 
 RELEASE_RIGHT, RELEASE_LEFT = 0.9, 1.15  # s
-TOLERANCES = {"rtol": 1e-8, "atol": 1e-10}
+TOLERANCES: dict[str, Any] = {"rtol": 1e-8, "atol": 1e-10}
 
 
 def _high_bar():
@@ -77,18 +78,17 @@ def scenes() -> int:
 
 
 def run(
-    name: str, *, t1: float | None, events, ignore, out: pathlib.Path, video: bool, quiet: bool
-) -> int:
+    name: str, *, t1: float | None, events: Any, ignore: Any, out: pathlib.Path, video: bool,
+    quiet: bool,
+) -> int:  # fmt: skip
     """Run a scene or a model, print its report, write its files, and return the exit status.
 
     name: name of a scene, or path of a model.
     t1: end time (s). None: that of the scene.
-    events: (kind, link, time (s)) of each `--release` and `--catch`. If there are any, they replace
-        the scene's own events.
+    events: (kind, link, time (s)) of each `--release` and `--catch`, in place of the scene's own.
     ignore: kinds of model elements to leave out.
     out: folder for the files.
-    video: whether to write an mp4.
-    quiet: whether to show no progress bar.
+    video: whether to write an mp4. quiet: whether to show no progress bar.
     """
     cache_folder = _configure_process()
     import svkc

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from svkc.integration.event_location import EventInfo
-from svkc.integration.ode import ODEState
+from svkc.integration.ode import FieldArgs, ODEState, Times
 from svkc.integration.runge_kutta import with_scan_kind
 from svkc.integration.solution import (
     EVENT,
@@ -56,39 +56,48 @@ def _make_interpolation(cls, *, t0, t1, inner, shift):
     return _ProjectedInterpolation(t0=t0, t1=t1, inner=interpolation, shift=shift)
 
 
-class ProjectedSolver(diffrax.AbstractWrappedSolver):
+class ProjectedSolver(diffrax.AbstractWrappedSolver[Any]):
     """A diffrax solver whose steps are projected onto the closed loops."""
 
     # diffrax reads `scan_kind` from wrapped solvers too; this placeholder satisfies it.
     scan_kind: ClassVar[str] = "inner"
 
-    solver: diffrax.AbstractSolver
+    solver: diffrax.AbstractSolver[Any]
     field: VectorField
 
     @property
-    def term_structure(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+    def term_structure(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.solver.term_structure
 
     @property
-    def interpolation_cls(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+    def interpolation_cls(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
         return functools.partial(_make_interpolation, self.solver.interpolation_cls)
 
-    def order(self, terms):
+    def order(self, terms: Any) -> int | None:
         return self.solver.order(terms)
 
-    def strong_order(self, terms):
+    def strong_order(self, terms: Any) -> Any:
         return self.solver.strong_order(terms)
 
-    def error_order(self, terms):
+    def error_order(self, terms: Any) -> Any:
         return self.solver.error_order(terms)
 
-    def init(self, terms, t0, t1, y0, args):
+    def init(self, terms: Any, t0: Any, t1: Any, y0: ODEState, args: FieldArgs) -> Any:
         return self.solver.init(terms, t0, t1, y0, args)
 
-    def func(self, terms, t0, y0, args):
+    def func(self, terms: Any, t0: Any, y0: ODEState, args: FieldArgs) -> Any:
         return self.solver.func(terms, t0, y0, args)
 
-    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+    def step(
+        self,
+        terms: Any,
+        t0: Any,
+        t1: Any,
+        y0: ODEState,
+        args: FieldArgs,
+        solver_state: Any,
+        made_jump: Any,
+    ) -> Any:
         # Projection moved the state, so the FSAL derivative is stale: re-evaluate.
         stale = True if needs_projection(self.field.stabilization, args) else made_jump
         y_solver, error, dense_info, solver_state, result = self.solver.step(
@@ -101,7 +110,7 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver):
 
 def integrate_with_diffrax(
     start: ODEState,
-    times,
+    times: Times,
     problem: PhaseProblem,
     options: StepperOptions,
     adjoint: diffrax.AbstractAdjoint,

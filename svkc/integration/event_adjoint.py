@@ -13,6 +13,9 @@ Second derivatives differentiate dy by T as well: d(dy)/dT = f_y dy + f_p dp. `t
 has this derivative and the value dy.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -22,6 +25,7 @@ from svkc._jax.pytrees import materialise_zeros
 from svkc.integration.event_location import EventInfo, vector_field_of
 from svkc.integration.ode import FieldArgs, ODEState
 from svkc.integration.vector_field import VectorField
+from svkc.model.annotations import Scalar
 
 
 def _end_of_phase_jvp(primals, tangents):
@@ -31,7 +35,9 @@ def _end_of_phase_jvp(primals, tangents):
     return end, end_of_phase_tangent(primals, tangents, end, rate)
 
 
-def end_of_phase_tangent(primals, tangents, end, rate: ODEState):
+def end_of_phase_tangent(
+    primals: tuple[Any, ...], tangents: tuple[Any, ...], end: tuple[Any, ...], rate: ODEState
+) -> tuple[Any, ...]:
     """Return the tangent of `end_of_phase`.
 
     primals, tangents: of `end_of_phase`.
@@ -89,7 +95,9 @@ def _end_of_phase(t, y: ODEState, stop_shift, field_args: FieldArgs, guards, eve
     return t, y
 
 
-end_of_phase = custom_primitive("end_of_phase", _end_of_phase, _end_of_phase_jvp)
+end_of_phase: Callable[..., Any] = custom_primitive(
+    "end_of_phase", _end_of_phase, _end_of_phase_jvp
+)
 
 
 def _tangent_rate(tangents, t, y: ODEState, field_args: FieldArgs, field: VectorField) -> ODEState:
@@ -133,7 +141,14 @@ _transport = custom_primitive(
 
 
 def transport_tangent(
-    changes, rate: ODEState, *, duration, t, y: ODEState, field_args: FieldArgs, field: VectorField
+    changes: tuple[Any, ...],
+    rate: ODEState,
+    *,
+    duration: Scalar,
+    t: Scalar,
+    y: ODEState,
+    field_args: FieldArgs,
+    field: VectorField,
 ) -> ODEState:
     """Transport dy along the linearised flow over an interval of length zero.
 

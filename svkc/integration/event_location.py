@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from svkc._jax.pytrees import tree_where
 from svkc.integration.ode import FieldArgs, ODEState
 from svkc.integration.vector_field import VectorField
+from svkc.model.annotations import Scalar
 from svkc.model.chain import State
 from svkc.model.validation import as_array, description
 from svkc.transitions.plan import Plan
@@ -38,7 +39,9 @@ class Bracket(eqx.Module):
     count: Int[Array, ""]
 
     @staticmethod
-    def around(a, b, fa, fb) -> "Bracket":
+    def around(
+        a: Float[Array, ""], b: Float[Array, ""], fa: Float[Array, ""], fb: Float[Array, ""]
+    ) -> "Bracket":
         """Return the bracket [a, b] before the first iteration. Its tolerance is round-off."""
         eps = jnp.finfo(fb.dtype).eps
         tol = 2 * eps * jnp.maximum(jnp.abs(a), jnp.abs(b)) + eps * (b - a)
@@ -57,7 +60,7 @@ class Bracket(eqx.Module):
         c = jnp.where(bisect, self.a + (self.b - self.a) / 2, secant)
         return jnp.clip(c, self.a + self.tol / 4, self.b - self.tol / 4)
 
-    def update(self, c, fc) -> "Bracket":
+    def update(self, c: Float[Array, ""], fc: Float[Array, ""]) -> "Bracket":
         """Return the bracket shrunk by the value fc of the function at c."""
         right = fc >= 0
         # Illinois weights: an end that stays twice in a row counts half.
@@ -88,7 +91,7 @@ class GuardValues(eqx.Module):
     plan: Plan
     field: VectorField
 
-    def __call__(self, t, y: ODEState, field_args: FieldArgs) -> Float[Array, " guards"]:
+    def __call__(self, t: Scalar, y: ODEState, field_args: FieldArgs) -> Float[Array, " guards"]:
         chain, state = field_args.chain, State(y.q, y.v, field_args.structure)
         guards = self.plan.guards
         tau = (
@@ -185,7 +188,9 @@ class EventSearch(eqx.Module):
     done: Bool[Array, ""]
 
     @staticmethod
-    def inactive(t0, y: ODEState, values: Float[Array, " guards"]) -> "EventSearch":
+    def inactive(
+        t0: Float[Array, ""], y: ODEState, values: Float[Array, " guards"]
+    ) -> "EventSearch":
         """Return the search before any guard has crossed zero."""
         no = jnp.zeros((), bool)
         return EventSearch(
@@ -211,8 +216,8 @@ def update_search(
     old: EventSearch,
     before: Float[Array, " guards"],
     *,
-    t0,
-    t1,
+    t0: Float[Array, ""],
+    t1: Float[Array, ""],
     y: ODEState,
     keep_step: Bool[Array, ""],
     field_args: FieldArgs,
@@ -259,7 +264,9 @@ def update_search(
     return jnp.where(done, search.values, values), search
 
 
-def event_info(search: EventSearch, guard_values: Float[Array, " guards"], t) -> EventInfo:
+def event_info(
+    search: EventSearch, guard_values: Float[Array, " guards"], t: Float[Array, ""]
+) -> EventInfo:
     """Return which guards fired in a search that ended at t.
 
     guard_values: values of the guards at t.

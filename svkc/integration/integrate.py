@@ -15,7 +15,7 @@ from jaxtyping import Array
 from svkc._jax.control_flow import buffer_at_set, while_loop
 from svkc._jax.pytrees import tree_where
 from svkc.integration.event_location import EventSearch, event_info, update_search
-from svkc.integration.ode import ODEState, is_finite, rms_norm
+from svkc.integration.ode import ODEState, Times, is_finite, rms_norm
 from svkc.integration.solution import (
     EVENT,
     LOOP_OPEN,
@@ -40,7 +40,7 @@ from svkc.integration.vector_field import initial_projection_info, project_state
 
 
 def integrate_phase(
-    start: ODEState, times, problem: PhaseProblem, options: StepperOptions
+    start: ODEState, times: Times, problem: PhaseProblem, options: StepperOptions
 ) -> PhaseSolution:
     """Integrate one phase to its scheduled end, or to the first event.
 

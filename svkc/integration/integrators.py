@@ -1,6 +1,6 @@
 """Integrators that diffrax lacks, a root finder for implicit solvers, and a single step."""
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
@@ -18,7 +18,7 @@ from svkc.tree.configuration import integrate
 from svkc.tree.inverse_dynamics import limit_forces
 
 
-class RodriguesEuler(diffrax.AbstractSolver):
+class RodriguesEuler(diffrax.AbstractSolver[Any]):
     """The paper's integrator (39)-(44): explicit Euler of first order with fixed steps.
 
     q(t + dt) = q(t) exp(v(t) dt) and v(t + dt) = v(t) + vdot(t) dt, where exp is the exponential
@@ -28,23 +28,25 @@ class RodriguesEuler(diffrax.AbstractSolver):
     handles the states of `svkc.simulate` alone.
     """
 
-    term_structure: ClassVar = diffrax.AbstractTerm
-    interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
+    term_structure: ClassVar[Any] = diffrax.AbstractTerm
+    interpolation_cls: ClassVar[Any] = diffrax.LocalLinearInterpolation
 
     def _position_velocity(self, v0, v1):
         """Return the velocity that moves q, given those at the start and at the end of a step."""
         return v0
 
-    def order(self, terms):
+    def order(self, terms: Any) -> int:
         return 1
 
-    def init(self, terms, t0, t1, y0, args):
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> None:
         return None
 
-    def func(self, terms, t0, y0, args):
+    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
         return terms.vf(t0, y0, args)
 
-    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+    def step(
+        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: None, made_jump: Any
+    ) -> Any:
         dt = t1 - t0
         rate = terms.vf(t0, y0, args)
         y1 = eqx.tree_at(lambda y: y.v, y0, y0.v + dt * rate.v)
@@ -84,7 +86,7 @@ class SimplifiedNewton(diffrax.VeryChord):
     round-off. On the high bar that takes five times as many steps.
     """
 
-    def terminate(self, fn, y, args, options, state, tags):
+    def terminate(self, fn: Any, y: Any, args: Any, options: Any, state: Any, tags: Any) -> Any:
         update = state.diffsize
         rate = update / state.diffsize_prev
         round_off = 100 * jnp.finfo(update.dtype).eps * self.norm(y)

@@ -1,6 +1,6 @@
 """The state and the arguments of the ordinary differential equation of one phase."""
 
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -8,6 +8,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from svkc.model.chain import Chain, Structure
+
+# start, end and save times of a phase (s)
+Times: TypeAlias = tuple[Float[Array, ""], Float[Array, ""], Float[Array, " times"]]
 
 
 class ODEState(eqx.Module):

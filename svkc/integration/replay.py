@@ -7,6 +7,9 @@ cotangent. The stepping loop stores the times of the steps and a checkpoint of t
 there gives the derivative.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -43,7 +46,7 @@ class Replay(eqx.Module):
 
     every: int = eqx.field(static=True, default=16)
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         integer("every", self.every, 1)
 
 
@@ -266,6 +269,6 @@ def _broadcast_mask(mask, like):
     return mask.reshape(-1, *(1,) * (like.ndim - 1))
 
 
-integrate_with_replay = custom_primitive(
+integrate_with_replay: Callable[..., Any] = custom_primitive(
     "integrate_with_replay", _integrate, _integrate_with_replay_jvp
 )

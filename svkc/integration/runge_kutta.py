@@ -1,16 +1,21 @@
 """Single steps of a solver, in the form that is differentiated."""
 
+from typing import Any
+
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from svkc.integration.ode import FieldArgs, ODEState
 from svkc.integration.vector_field import VectorField, project_state
 
 
-def with_scan_kind(solver: diffrax.AbstractSolver, kind: str | None) -> diffrax.AbstractSolver:
+def with_scan_kind(
+    solver: diffrax.AbstractSolver[Any], kind: str | None
+) -> diffrax.AbstractSolver[Any]:
     """Return a Runge-Kutta solver whose loop over stages is of this kind; others as they are.
 
     kind: "lax" for forward mode, "bounded" for both modes, None for diffrax's own choice.
@@ -21,7 +26,12 @@ def with_scan_kind(solver: diffrax.AbstractSolver, kind: str | None) -> diffrax.
 
 
 def replay_step(
-    solver: diffrax.AbstractSolver, field: VectorField, t0, t1, y: ODEState, field_args: FieldArgs
+    solver: diffrax.AbstractSolver[Any],
+    field: VectorField,
+    t0: Float[Array, ""],
+    t1: Float[Array, ""],
+    y: ODEState,
+    field_args: FieldArgs,
 ) -> ODEState:
     """Take one projected step that depends on no earlier step, to be differentiated.
 

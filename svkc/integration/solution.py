@@ -12,15 +12,14 @@ from svkc.integration.ode import FieldArgs, ODEState
 from svkc.integration.vector_field import VectorField
 from svkc.loops.constraint import largest_gaps
 from svkc.loops.projection import ProjectionInfo
+from svkc.model.annotations import DType
 from svkc.model.chain import State
 
 # result codes of a phase: these of svkc, and diffrax's own
 NON_FINITE, LOOP_OPEN = -1, -2
-SUCCESSFUL, EVENT, MAX_STEPS = (
-    diffrax.RESULTS.successful._value,
-    diffrax.RESULTS.event_occurred._value,
-    diffrax.RESULTS.max_steps_reached._value,
-)
+SUCCESSFUL: Any = diffrax.RESULTS.successful._value
+EVENT: Any = diffrax.RESULTS.event_occurred._value
+MAX_STEPS: Any = diffrax.RESULTS.max_steps_reached._value
 
 
 class PhaseProblem(eqx.Module):
@@ -44,11 +43,11 @@ class StepperOptions(eqx.Module):
     checkpoint_interval: one state in so many steps is stored.
     """
 
-    solver: diffrax.AbstractSolver
+    solver: diffrax.AbstractSolver[Any]
     armed_guards: ArmedGuards | None
     controller: Any
     first_step: Any
-    progress_meter: diffrax.AbstractProgressMeter
+    progress_meter: diffrax.AbstractProgressMeter[Any]
     gap_tolerance: float = eqx.field(static=True)
     max_steps: int = eqx.field(static=True)
     checkpoint_interval: int = eqx.field(static=True)
@@ -74,7 +73,7 @@ class Stats(eqx.Module):
     gap: Float[Array, "2"]
 
     @classmethod
-    def zeros(cls, dtype, counts_swaps: bool) -> "Stats":
+    def zeros(cls, dtype: DType, counts_swaps: bool) -> "Stats":
         """Return the statistics before the first step."""
         zero = jnp.zeros((), jnp.int32)
         return cls(
@@ -87,7 +86,7 @@ class Stats(eqx.Module):
         )
 
     @classmethod
-    def attempts_only(cls, dtype, attempts: Int[Array, ""]) -> "Stats":
+    def attempts_only(cls, dtype: DType, attempts: Int[Array, ""]) -> "Stats":
         """Return the statistics of a loop that counts its attempts alone."""
         unknown, one = jnp.asarray(-1, jnp.int32), jnp.ones((), dtype)
         return cls(

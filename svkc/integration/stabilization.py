@@ -27,7 +27,7 @@ class Projection(AbstractStabilization):
 
     iterations: int = eqx.field(static=True, default=2)
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         integer("iterations", self.iterations, 0)
 
 
@@ -57,7 +57,7 @@ class Baumgarte(AbstractStabilization):
 
     rate: Float[Array, ""] | float = 20.0
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         scalar("rate", self.rate)
 
 

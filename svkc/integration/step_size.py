@@ -1,11 +1,14 @@
 """Step-size control: fixed steps, steps clipped at save times, and errors by projection."""
 
+from collections.abc import Callable
+from typing import Any
+
 import diffrax
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from svkc.integration.ode import ODEState, is_finite
+from svkc.integration.ode import ODEState, Times, is_finite
 
 # A step is stretched by up to this fraction of its length if it then ends at a save time.
 MAX_STRETCH = 1e-6
@@ -13,7 +16,7 @@ MAX_STRETCH = 1e-6
 PROJECTION_ERROR_WEIGHT = 1e-3
 
 
-class FixedSteps(diffrax.AbstractStepSizeController):
+class FixedSteps(diffrax.AbstractStepSizeController[None, Any]):
     """Steps of a fixed size, clipped at save times. A step to a non-finite state ends the solve.
 
     dt: step size (s).
@@ -23,7 +26,7 @@ class FixedSteps(diffrax.AbstractStepSizeController):
     dt: Float[Array, ""]
     ts: Float[Array, " times"]
 
-    def wrap(self, direction):
+    def wrap(self, direction: Any) -> "FixedSteps":
         return self
 
     def _tnext(self, t):
@@ -32,12 +35,30 @@ class FixedSteps(diffrax.AbstractStepSizeController):
         stop = jnp.min(times, initial=jnp.inf)
         return jnp.where(t + self.dt * (1 + MAX_STRETCH) >= stop, stop, t + self.dt)
 
-    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+    def init(
+        self,
+        terms: Any,
+        t0: Any,
+        t1: Any,
+        y0: Any,
+        dt0: Any,
+        args: Any,
+        func: Callable,
+        error_order: Any,
+    ) -> Any:
         return self._tnext(t0), None
 
     def adapt_step_size(
-        self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
-    ):
+        self,
+        t0: Any,
+        t1: Any,
+        y0: Any,
+        y1_candidate: Any,
+        args: Any,
+        y_error: Any,
+        error_order: Any,
+        controller_state: Any,
+    ) -> Any:
         keep_step = is_finite(y1_candidate)
         result = diffrax.RESULTS.where(
             keep_step, diffrax.RESULTS.successful, diffrax.RESULTS.internal_error
@@ -46,7 +67,9 @@ class FixedSteps(diffrax.AbstractStepSizeController):
         return keep_step, next_t0, self._tnext(t1), False, controller_state, result
 
 
-def clip_to_save_time(t, proposed, times) -> Float[Array, ""]:
+def clip_to_save_time(
+    t: Float[Array, ""], proposed: Float[Array, ""], times: Times
+) -> Float[Array, ""]:
     """Return the end of a step from t: the proposed one, clipped to the next save time or stop."""
     _, stop, save_ts = times
     next_save_t = jnp.min(jnp.where(save_ts > t, save_ts, jnp.inf), initial=jnp.inf)
@@ -54,7 +77,14 @@ def clip_to_save_time(t, proposed, times) -> Float[Array, ""]:
     return jnp.where(t + (proposed - t) * (1 + MAX_STRETCH) >= limit, limit, proposed)
 
 
-def unclipped_step_size(controller, keep_step, taken, *, proposed, before):
+def unclipped_step_size(
+    controller: Any,
+    keep_step: Bool[Array, ""],
+    taken: Float[Array, ""],
+    *,
+    proposed: Float[Array, ""],
+    before: Float[Array, ""],
+) -> Float[Array, ""]:
     """Return the size of the next step, as if the last one had not been clipped at a save time.
 
     A PID controller bounds the growth from the step taken. Where the proposed size reaches that

@@ -20,6 +20,7 @@ from svkc.loops.forward_dynamics import (
     velocity_and_acceleration_lanes_last,
 )
 from svkc.loops.projection import ProjectionInfo, project, project_by_loop_forces
+from svkc.model.annotations import Scalar
 from svkc.model.chain import Chain, State, active_dofs
 from svkc.model.checked_jit import torques_over_dofs
 from svkc.model.validation import as_array, description, is_real
@@ -50,7 +51,7 @@ class VectorField(eqx.Module):
             and not isinstance(self.stabilization, CoordinatePartitioning)
         )
 
-    def __call__(self, t, y: ODEState, field_args: FieldArgs) -> ODEState:
+    def __call__(self, t: Scalar, y: ODEState, field_args: FieldArgs) -> ODEState:
         chain, structure = field_args.chain, field_args.structure
         stabilization = self.stabilization
         if isinstance(stabilization, CoordinatePartitioning):
@@ -95,7 +96,7 @@ class VectorField(eqx.Module):
         )
 
     def torques(
-        self, t, y: ODEState, field_args: FieldArgs
+        self, t: Scalar, y: ODEState, field_args: FieldArgs
     ) -> tuple[Float[Array, " dofs"], Float[Array, ""] | None]:
         """Return the joint torques (N m, N) of control and joint limits, and their power (W).
 

@@ -3,6 +3,8 @@
 The system may be square, redundant or deficient, and the torques may be bounded.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -16,6 +18,7 @@ from svkc.loops.coordinates import closed_coordinates, open_coordinates
 from svkc.loops.forward_dynamics import constraint_forces
 from svkc.loops.least_squares import least_cost_solution, solve_bounded
 from svkc.loops.pivoting import PivotedQR, pivoted_qr, pivoted_qr_with_rank
+from svkc.model.annotations import Checked, Numbers, Scalar
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import check_state
 from svkc.model.validation import as_array, real_array
@@ -55,8 +58,9 @@ class Actuation(eqx.Module):
 
 
 def actuation(
-    chain: Chain, state: State, vdot_G, weight=None, *, actuated=None, bounds=None
-) -> Actuation:
+    chain: Chain, state: State, vdot_G: Numbers, weight: Scalar | Numbers | None = None, *,
+    actuated: Numbers | None = None, bounds: Checked[tuple[Any, Any] | None] = None,
+) -> Actuation:  # fmt: skip
     """Return the torques for the accelerations vdot_G of the independent coordinates theta_G.
 
     The forces of the joints' springs and dampers are subtracted. (Paper, section III-A.)
@@ -70,35 +74,34 @@ def actuation(
     Raises ValueError if a size is wrong, if a weight is not positive, or if bounds cross.
     """
     check_state(chain, state)
-    independent, vdot_G = None, real_array("vdot_G", vdot_G, state.v.dtype)
-    if vdot_G.shape != (chain.dofs,):
+    independent, vdot = None, real_array("vdot_G", vdot_G, state.v.dtype)
+    if vdot.shape != (chain.dofs,):
         independent = (
             np.asarray(_coordinates_and_twists(chain, state)[0].independent)
             if is_concrete(state.q)
             else None
         )
-        if independent is None or vdot_G.shape != (independent.sum(),):
+        if independent is None or vdot.shape != (independent.sum(),):
             count = (
                 "the number of independent ones" if independent is None else int(independent.sum())
             )
             raise ValueError(
-                f"vdot_G: got shape {vdot_G.shape}, expected ({chain.dofs},), every joint"
+                f"vdot_G: got shape {vdot.shape}, expected ({chain.dofs},), every joint"
                 f" coordinate, or ({count},), theta_G"
             )
-        vdot_G = jnp.zeros(chain.dofs, vdot_G.dtype).at[np.flatnonzero(independent)].set(vdot_G)
+        vdot = jnp.zeros(chain.dofs, vdot.dtype).at[np.flatnonzero(independent)].set(vdot)
     weight = _per_dof(chain, "weight", weight, 1.0, state)
     if is_concrete(weight) and not np.all(
         (np.asarray(weight) > 0) & np.isfinite(np.asarray(weight))
     ):
         raise ValueError(f"weight: expected positive numbers, got {np.asarray(weight)}")
-    actuated = chain.actuated if actuated is None else as_array(actuated)
-    if actuated.shape != (chain.dofs,) or actuated.dtype != bool:
+    mask = chain.actuated if actuated is None else as_array(actuated)
+    if mask.shape != (chain.dofs,) or mask.dtype != bool:
         raise ValueError(
-            f"actuated: expected {chain.dofs} Booleans, got {actuated.dtype} of shape"
-            f" {actuated.shape}"
+            f"actuated: expected {chain.dofs} Booleans, got {mask.dtype} of shape {mask.shape}"
         )
-    actuated = jnp.asarray(actuated)
-    result, problem = _solve_unbounded(chain, state, vdot_G, weight, actuated)
+    mask = jnp.asarray(mask)
+    result, problem = _solve_unbounded(chain, state, vdot, weight, mask)
     if bounds is None:
         return result
     tau, residual = solve_bounded(problem, weight, *_limits(chain, bounds, state))

@@ -3,7 +3,7 @@
 import abc
 import dataclasses
 from collections.abc import Callable
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -47,17 +47,14 @@ class AbstractDynamics(eqx.Module):
     uses_pivots: eqx.AbstractClassVar[bool]
     hold: float | None = eqx.field(static=True, default=0.3)
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         _check_hold(self.hold)
 
     @abc.abstractmethod
     def prepare(
-        self,
-        chain: Chain,
-        structure: Structure,
-        loops: LoopKinematics,
+        self, chain: Chain, structure: Structure, loops: LoopKinematics,
         selection: PivotedQR | None = None,
-    ) -> Callable:
+    ) -> Callable[..., Any]:  # fmt: skip
         """Return solve: (force [dofs], bias [rows]) -> x on a chain with virtual links.
 
         x solves M x = force + J_C^T lambda and J_C x + bias = 0 (III-B); bias has scaled rows.
@@ -88,7 +85,10 @@ class ArticulatedBodies(AbstractDynamics):
 
     uses_pivots: ClassVar[bool] = False
 
-    def prepare(self, chain, structure, loops, selection=None):
+    def prepare(
+        self, chain: Chain, structure: Structure, loops: LoopKinematics,
+        selection: PivotedQR | None = None,
+    ) -> Callable[..., Any]:  # fmt: skip
         column, active = jacobian_scales(chain)[1], active_dofs(chain, structure)
         J, chain_and_kin, locked = jax.lax.stop_gradient(
             (loops.J, (chain, loops.kin), structure.locked)
@@ -102,7 +102,9 @@ class ArticulatedBodies(AbstractDynamics):
         used = jnp.ones(loops.J.shape[0], bool)
         return _implicit_solve(chain, structure, loops, solve, lambda x: x, used)
 
-    def prepare_open(self, chain, structure, kin):
+    def prepare_open(
+        self, chain: Chain, structure: Structure, kin: Kinematics
+    ) -> Callable[..., Any]:
         free = None if structure.locked is None else ~structure.locked
         bodies = articulated_factors(*jax.lax.stop_gradient((chain, kin)), free)
         solve = lambda force: solve_mass_matrix(chain.topology, bodies, force)
@@ -116,7 +118,10 @@ class AbstractMassMatrix(AbstractDynamics):
     def mass_matrix(self, chain: Chain, kin: Kinematics) -> Float[Array, "nv nv"]:
         """Return the mass matrix of the tree."""
 
-    def prepare(self, chain, structure, loops, selection=None):
+    def prepare(
+        self, chain: Chain, structure: Structure, loops: LoopKinematics,
+        selection: PivotedQR | None = None,
+    ) -> Callable[..., Any]:  # fmt: skip
         assert selection is not None
         qr, J, chain_and_kin, frozen_structure = jax.lax.stop_gradient(
             (selection, loops.J, (chain, loops.kin), structure)
@@ -124,7 +129,9 @@ class AbstractMassMatrix(AbstractDynamics):
         solve = _solve_by_partitioning(*chain_and_kin, frozen_structure, qr, J, self.mass_matrix)
         return _implicit_solve(chain, structure, loops, solve, lambda x: qr.Q @ x, qr.active)
 
-    def prepare_open(self, chain, structure, kin):
+    def prepare_open(
+        self, chain: Chain, structure: Structure, kin: Kinematics
+    ) -> Callable[..., Any]:
         M = self.mass_matrix(*jax.lax.stop_gradient((chain, kin)))
         if structure.locked is not None:
             free = ~structure.locked
@@ -137,7 +144,7 @@ class CompositeBodies(AbstractMassMatrix):
 
     uses_pivots: ClassVar[bool] = True
 
-    def mass_matrix(self, chain, kin):
+    def mass_matrix(self, chain: Chain, kin: Kinematics) -> Float[Array, "nv nv"]:
         return mass_matrix_crba(chain, kin)
 
 
@@ -146,7 +153,7 @@ class UnitVectors(AbstractMassMatrix):
 
     uses_pivots: ClassVar[bool] = True
 
-    def mass_matrix(self, chain, kin):
+    def mass_matrix(self, chain: Chain, kin: Kinematics) -> Float[Array, "nv nv"]:
         return mass_matrix_unit_vectors(chain, kin)
 
 
@@ -155,7 +162,7 @@ def default_dynamics(chain: Chain) -> AbstractDynamics:
     return CompositeBodies() if chain.topology.link_names else ArticulatedBodies()
 
 
-def articulated_bodies(chain: Chain, kin: Kinematics):
+def articulated_bodies(chain: Chain, kin: Kinematics) -> Any:
     """Stand for `ArticulatedBodies` in `svkc.Dynamics(inertia=svkc.by_bodies)`."""
     return articulated_factors(chain, kin)
 
@@ -179,7 +186,7 @@ class Dynamics(eqx.Module):
     inertia: Callable | None = eqx.field(static=True, default=None)
     hold: float | None = eqx.field(static=True, default=0.3)
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         if self.inertia is not None and not any(
             self.inertia is old for old, _ in DEPRECATED_SPELLINGS
         ):

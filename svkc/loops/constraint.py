@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from svkc._jax.static_gather import static_take
 from svkc.loops.frames import LoopFrames, frame_gaps, loop_frames
+from svkc.model.annotations import DType, Scalar
 from svkc.model.chain import Chain, State, Structure, active_dofs
 from svkc.model.checked_jit import checked_jit
 from svkc.model.topology import FREE, SLIDE
@@ -143,7 +144,12 @@ def loop_kinematics(chain: Chain, structure: Structure, q: Float[Array, " q"]) -
 
 
 def constraint_bias(
-    chain: Chain, structure: Structure, v, loops: LoopKinematics, V, baumgarte=None
+    chain: Chain,
+    structure: Structure,
+    v: Float[Array, " dofs"],
+    loops: LoopKinematics,
+    V: Float[Array, "tree_rows 6"],
+    baumgarte: Scalar | None = None,
 ) -> Float[Array, " rows"]:
     """Return Jdot_C v with scaled rows, plus Baumgarte's terms.
 
@@ -224,7 +230,7 @@ def loop_gap_rates(chain: Chain, state: State) -> Float[Array, "links 6"]:
     return gaps_and_rates(chain, state)[1]
 
 
-def gap_tolerance(dtype) -> float:
+def gap_tolerance(dtype: DType) -> float:
     """Return the largest gap of a loop that counts as closed (rad, and m / `chain.length`).
 
     It is eps^(4/7): 1.1e-9 in float64, 1.1e-4 in float32.

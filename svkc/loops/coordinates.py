@@ -89,7 +89,11 @@ def partition_coordinates(
 
 
 def closed_coordinates(
-    chain: Chain, structure: Structure, v: Float[Array, " dofs"], loops: LoopKinematics, V
+    chain: Chain,
+    structure: Structure,
+    v: Float[Array, " dofs"],
+    loops: LoopKinematics,
+    V: Float[Array, "tree_rows 6"],
 ) -> Coordinates:
     """Return the coordinates of a chain with virtual links. V: twists of the tree."""
     bias = constraint_bias(chain, structure, v, loops, V)

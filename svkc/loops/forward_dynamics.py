@@ -1,6 +1,7 @@
 """Forward dynamics of any structure (paper, section III-B) and the wrenches in its loops."""
 
 import functools
+from collections.abc import Iterator
 
 import equinox as eqx
 import jax
@@ -93,7 +94,12 @@ def velocity_and_acceleration_lanes_last(
 
 
 def acceleration(
-    chain: Chain, structure: Structure, q, v, tau: Float[Array, " dofs"], dynamics: AbstractDynamics
+    chain: Chain,
+    structure: Structure,
+    q: Float[Array, " q"],
+    v: Float[Array, " dofs"],
+    tau: Float[Array, " dofs"],
+    dynamics: AbstractDynamics,
 ) -> Float[Array, " dofs"]:
     """Return the acceleration at v."""
     return velocity_and_acceleration(chain, structure, q, v, tau, dynamics=dynamics)[1]
@@ -144,7 +150,7 @@ class LoopForces(eqx.Module):
     torque: Float[Array, "links 3"]
     unique: Bool[Array, " links"]
 
-    def __iter__(self):
+    def __iter__(self) -> Iterator[Array]:
         return iter((self.force, self.torque))
 
 

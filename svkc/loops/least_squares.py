@@ -3,6 +3,8 @@
 The matrices may have any rank. Everything here is numbers: chains and states do not enter.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -12,7 +14,9 @@ from svkc._jax.pytrees import stop_gradient_tree
 from svkc.loops.pivoting import PivotedQR, pivoted_qr_with_rank, solve_positive
 
 
-def least_cost_solution(qr: PivotedQR, B, target_force, cost):
+def least_cost_solution(
+    qr: PivotedQR, B: Float[Array, "rows dofs"], target_force: Any, cost: Any
+) -> Any:
     """Return the y of least sum(cost y^2) among those of least |B y - target_force|.
 
     qr: pivoted QR of B, whose Q gives an orthonormal basis Z of B's range.

@@ -4,6 +4,9 @@ Pivots are chosen on stop_gradient(J) and have no derivative. Everything compute
 exact derivatives wherever the rank does not change.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -14,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from svkc._jax.batched_lapack import batched_solve_triangular, cholesky_solver
 from svkc._jax.control_flow import unvmap_any
 from svkc._jax.primitive import custom_primitive
+from svkc.model.annotations import DType
 from svkc.model.chain import Structure
 
 
@@ -33,7 +37,7 @@ class PivotedQR(eqx.Module):
     active: Bool[Array, " steps"]
 
 
-def rank_tolerance(dtype) -> float:
+def rank_tolerance(dtype: DType) -> float:
     """Return the |R_kk| / |R_11| below which a row of the scaled J_C counts as redundant.
 
     It is sqrt(eps): 1.5e-8 in float64, 3.5e-4 in float32.
@@ -41,7 +45,7 @@ def rank_tolerance(dtype) -> float:
     return float(np.sqrt(np.finfo(dtype).eps))
 
 
-def release_threshold(dtype) -> float:
+def release_threshold(dtype: DType) -> float:
     """Return the fraction of the phase's margin below which a row of the scaled J_C is dropped.
 
     It is eps^(1/4): 1.2e-4 in float64, 1.9e-2 in float32. A mechanism that passes a singular
@@ -162,7 +166,9 @@ def _frozen_qr_jvp(primals, tangents):
 
 
 # Returns Q and diag_R, already computed from J with the pivots P, with the derivatives above.
-frozen_qr = custom_primitive("frozen_qr", lambda J, Q, P, diag_R: (Q, diag_R), _frozen_qr_jvp)
+frozen_qr: Callable[..., Any] = custom_primitive(
+    "frozen_qr", lambda J, Q, P, diag_R: (Q, diag_R), _frozen_qr_jvp
+)
 
 
 def count_rank(diag_R: Float[Array, " steps"]) -> Int[Array, ""]:
@@ -242,7 +248,9 @@ def pivot_blocks(
 NEAR_SINGULAR = 0.1
 
 
-def select_pivots(structure: Structure, J: Float[Array, "rows dofs"], pivots=None) -> PivotedQR:
+def select_pivots(
+    structure: Structure, J: Float[Array, "rows dofs"], pivots: Any = None
+) -> PivotedQR:
     """Return the pivoted QR of J_C with the phase's rank, without the rows to be dropped.
 
     Coordinates in `structure.independent` become pivots only if no other is left. Rows below

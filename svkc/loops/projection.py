@@ -23,12 +23,13 @@ from svkc.loops.pivoting import (
     solve_pivot_block,
     solve_positive,
 )
+from svkc.model.annotations import DType
 from svkc.model.chain import Chain, Structure, active_dofs
 from svkc.tree.configuration import integrate, normalize
 
 
 def least_norm_change(
-    chain: Chain, qr: PivotedQR, J, x: Float[Array, "rows n"]
+    chain: Chain, qr: PivotedQR, J: Float[Array, "loop_rows dofs"], x: Float[Array, "rows n"]
 ) -> Float[Array, "dofs n"]:
     """Return the y (m, rad, or rates) with J (y / column) = x, of least norm of y / column."""
     Jm, _ = pivot_blocks(qr, J)
@@ -37,7 +38,7 @@ def least_norm_change(
 
 
 def dependent_change(
-    chain: Chain, qr: PivotedQR, J, x: Float[Array, "rows n"]
+    chain: Chain, qr: PivotedQR, J: Float[Array, "loop_rows dofs"], x: Float[Array, "rows n"]
 ) -> Float[Array, "dofs n"]:
     """Return the y (m, rad, or rates) with J (y / column) = x, zero where independent.
 
@@ -90,7 +91,7 @@ class ProjectionInfo(eqx.Module):
     pivots: Float[Array, "steps dofs"] | None = None
 
     @classmethod
-    def initial(cls, chain: Chain, dtype, *, with_pivots: bool) -> "ProjectionInfo":
+    def initial(cls, chain: Chain, dtype: DType, *, with_pivots: bool) -> "ProjectionInfo":
         """Return the value before the first projection."""
         links, dofs = len(chain.link_names), chain.dofs
         gap = jnp.zeros((links, 2), dtype)

@@ -1,10 +1,12 @@
 """Bodies, joints and actuators of a MuJoCo model as NumPy arrays, by row of `Topology`."""
 
 import dataclasses
+from collections.abc import Collection, Mapping
 
 import numpy as np
 
 from svkc.mjcf.unsupported import is_torque_motor
+from svkc.model.annotations import MuJoCo, Numbers
 from svkc.model.topology import BALL, FIXED, FREE, HINGE, Q_SIZE, SLIDE, V_SIZE, Topology
 
 # rad/s: outside of its range, a joint with its inertia in the load pose is a critically damped
@@ -13,7 +15,7 @@ _LIMIT_RATE = 50.0
 JOINT_KINDS = {0: FREE, 1: BALL, 2: SLIDE, 3: HINGE}  # mjtJoint
 
 
-def name_of(model, kind: str, index: int) -> str:
+def name_of(model: MuJoCo, kind: str, index: int) -> str:
     """Return the name of an element ("body", "joint", "site", "equality"), or KIND_INDEX if it has
     none."""
     import mujoco
@@ -22,7 +24,7 @@ def name_of(model, kind: str, index: int) -> str:
     return name or (f"{kind}_{index}" if index or kind != "body" else "world")
 
 
-def rotation_matrix(quat) -> np.ndarray:
+def rotation_matrix(quat: Numbers) -> np.ndarray:
     """Return the rotation matrix [3 3] of a quaternion (wxyz)."""
     import mujoco
 
@@ -51,7 +53,7 @@ class TreeJoint:
     v: int
 
 
-def tree_joints(model, cut_bodies) -> list[TreeJoint]:
+def tree_joints(model: MuJoCo, cut_bodies: Mapping[int, str]) -> list[TreeJoint]:
     """Return the joints of the tree in the model's order.
 
     cut_bodies: body -> name of the virtual link that holds the body. A free joint joins such a body
@@ -71,7 +73,9 @@ def tree_joints(model, cut_bodies) -> list[TreeJoint]:
     return out
 
 
-def tree_rows(model, cut_bodies) -> tuple[list[tuple[int, int]], Topology]:
+def tree_rows(
+    model: MuJoCo, cut_bodies: Mapping[int, str]
+) -> tuple[list[tuple[int, int]], Topology]:
     """Return (body, joint or -1) of each row, and the topology without virtual links.
 
     There is one row for each joint, and one for each body without joints, sorted by level.
@@ -109,7 +113,9 @@ def tree_rows(model, cut_bodies) -> tuple[list[tuple[int, int]], Topology]:
     return [order[i][:2] for i in rank], topology
 
 
-def body_arrays(model, topology, rows) -> dict[str, np.ndarray]:
+def body_arrays(
+    model: MuJoCo, topology: Topology, rows: list[tuple[int, int]]
+) -> dict[str, np.ndarray]:
     """Return pos, quat, axis, anchor, mass, com and inertia of each row; see `Chain`."""
     n = len(rows)
     out = {
@@ -141,7 +147,17 @@ def _inertia(model, body):
     return R @ np.diag(model.body_inertia[body]) @ R.T
 
 
-def springs_and_limits(model, ignored, topology) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def characteristic_length(bodies: dict[str, np.ndarray], topology: Topology) -> float:
+    """Return the root mean square of nonzero offsets (m) of joints and centres of mass, or 1."""
+    below_roots = bodies["pos"][np.array(topology.parent) > 0]
+    offsets = np.linalg.norm(np.concatenate([below_roots, bodies["com"]]), axis=1)
+    offsets = offsets[offsets > 1e-12]
+    return np.sqrt(np.mean(offsets**2)) if len(offsets) else 1.0
+
+
+def springs_and_limits(
+    model: MuJoCo, ignored: set[str], topology: Topology
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return stiffness [dofs], limit [2 dofs] and limit_spring [2 dofs]; see `Chain`."""
     n, model_v = topology.dofs, np.array(topology.model_v, int)
     stiffness, limit, spring = np.zeros(n), np.tile([[-np.inf], [np.inf]], (1, n)), np.zeros((2, n))
@@ -164,7 +180,7 @@ def springs_and_limits(model, ignored, topology) -> tuple[np.ndarray, np.ndarray
     return stiffness, limit, spring
 
 
-def joint_armature(model, ignored, without: tuple[str, ...]) -> np.ndarray:
+def joint_armature(model: MuJoCo, ignored: Collection[str], without: tuple[str, ...]) -> np.ndarray:
     """Return the model's armature [nv], zero for the joints in `without`.
 
     Raises ValueError if there is no such joint.
@@ -179,14 +195,14 @@ def joint_armature(model, ignored, without: tuple[str, ...]) -> np.ndarray:
     return armature
 
 
-def scatter_to_dofs(topology, values) -> np.ndarray:
+def scatter_to_dofs(topology: Topology, values: np.ndarray) -> np.ndarray:
     """Return values per dof of the model [model.nv] as [dofs], zero for other virtual joints."""
     out = np.zeros(topology.dofs)
     out[np.array(topology.model_v, int)] = np.ravel(values)
     return out
 
 
-def actuator_arrays(model, topology):
+def actuator_arrays(model: MuJoCo, topology: Topology) -> tuple[np.ndarray, ...]:
     """Return gear, control_range, force_range; see `Chain`.
 
     Actuators that svkc cannot simulate have no row. `left_out_elements` has checked that they are

@@ -5,6 +5,7 @@ import os
 import numpy as np
 
 from svkc.mjcf.bodies import name_of, rotation_matrix
+from svkc.model.annotations import MuJoCo
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import check_chain, check_state
 from svkc.model.virtual_link import JOINTS
@@ -17,7 +18,7 @@ def _links_with_equality(chain: Chain) -> list[tuple[int, int]]:
     return [(names[name], i) for name, i in equalities if name in names]
 
 
-def mjcf_text(spec) -> str:
+def mjcf_text(spec: MuJoCo) -> str:
     """Return the MJCF of a mujoco.MjSpec with all digits, and the folders of its files absolute."""
     spec.compiler.savecompiled = spec.compiler.savecanonical = False
     here = os.path.abspath(spec.modelfiledir or ".")
@@ -158,7 +159,7 @@ def _check_data(chain: Chain, data) -> None:
         )
 
 
-def to_mujoco(chain: Chain, state: State, data) -> None:
+def to_mujoco(chain: Chain, state: State, data: MuJoCo) -> None:
     """Copy a state into a `mujoco.MjData` of the chain's model; call `mj_forward` next.
 
     Writes qpos, qvel, and which <equality> elements are active. A joint that is cut has the
@@ -176,7 +177,7 @@ def to_mujoco(chain: Chain, state: State, data) -> None:
         data.eq_active[equality] = bool(state.structure.connected[link])
 
 
-def from_mujoco(chain: Chain, data) -> State:
+def from_mujoco(chain: Chain, data: MuJoCo) -> State:
     """Return the state in a `mujoco.MjData` of the chain's model, by copy.
 
     `chain.state` closes the loops and projects the velocity. Virtual links from an <equality> are

@@ -6,6 +6,7 @@ import dataclasses
 import numpy as np
 
 from svkc.mjcf.bodies import JOINT_KINDS, name_of, rotation_matrix
+from svkc.model.annotations import MuJoCo, Names
 from svkc.model.topology import BALL, FREE, HINGE, SLIDE, V_SIZE, Topology
 from svkc.model.virtual_link import VirtualLink
 
@@ -32,7 +33,7 @@ class CuttableJoint:
         return _FREEDOM_INDICES[self.link.joint]
 
 
-def cuttable_joints(model, cuttable) -> list[CuttableJoint]:
+def cuttable_joints(model: MuJoCo, cuttable: Names) -> list[CuttableJoint]:
     """Return the cuttable joints with these names, one for each body.
 
     Raises ValueError if a name is unknown, or if no virtual joint has the joint's freedoms.
@@ -92,7 +93,7 @@ def _cuttable_joint(model, name: str, body: int) -> CuttableJoint:
     return CuttableJoint(link, body, joints)
 
 
-def check_armature(model, cuts: list[CuttableJoint], armature: np.ndarray) -> None:
+def check_armature(model: MuJoCo, cuts: list[CuttableJoint], armature: np.ndarray) -> None:
     """Raise ValueError if a cuttable joint has armature [nv], as virtual joints have no inertia."""
     with_armature = set(np.asarray(model.dof_jntid)[armature != 0])
     names = [name_of(model, "joint", j) for cut in cuts for j in cut.joints if j in with_armature]
@@ -104,7 +105,7 @@ def check_armature(model, cuts: list[CuttableJoint], armature: np.ndarray) -> No
 
 
 def with_cuttable_joints(
-    model, topology: Topology, cuts: list[CuttableJoint], first: int
+    model: MuJoCo, topology: Topology, cuts: list[CuttableJoint], first: int
 ) -> Topology:
     """Return the topology with link_child, cuttable_joints, model_q and model_v filled.
 

@@ -5,6 +5,7 @@ import hashlib
 import os
 import pathlib
 import warnings
+from collections.abc import Iterable
 from typing import Any
 
 import jax
@@ -13,6 +14,7 @@ import numpy as np
 from svkc.mjcf.bodies import (
     actuator_arrays,
     body_arrays,
+    characteristic_length,
     joint_armature,
     name_of,
     scatter_to_dofs,
@@ -28,6 +30,7 @@ from svkc.mjcf.cuttable_joints import (
 )
 from svkc.mjcf.unsupported import left_out_elements
 from svkc.mjcf.virtual_links import declared_links, float_array, load_structure
+from svkc.model.annotations import Checked, Integer, MuJoCo, Names, Path
 from svkc.model.chain import Chain
 from svkc.model.topology import Topology
 from svkc.model.validation import integer, names
@@ -52,7 +55,10 @@ class Source:
     digest: str
 
 
-def load(source, *, virtual_links=(), cuttable=(), spare=0, ignore=(), ignore_armature=()) -> Chain:
+def load(
+    source: MuJoCo | Path, *, virtual_links: Checked[VirtualLink | Iterable[VirtualLink]] = (),
+    cuttable: Names = (), spare: Integer = 0, ignore: Names = (), ignore_armature: Names = (),
+) -> Chain:  # fmt: skip
     """Load a `Chain` from a model.
 
     Functions are compiled once for all loads of one model with equal arguments. They are compiled
@@ -247,14 +253,6 @@ def _gravity(model) -> np.ndarray:
     return np.zeros(3) if off else model.opt.gravity
 
 
-def _characteristic_length(bodies: dict[str, np.ndarray], topology: Topology) -> float:
-    """Return the root mean square of nonzero offsets (m) of joints and centres of mass, or 1."""
-    below_roots = bodies["pos"][np.array(topology.parent) > 0]
-    offsets = np.linalg.norm(np.concatenate([below_roots, bodies["com"]]), axis=1)
-    offsets = offsets[offsets > 1e-12]
-    return np.sqrt(np.mean(offsets**2)) if len(offsets) else 1.0
-
-
 def _passive_forces(model, ignored: set[str], topology: Topology, q_load) -> dict[str, Any]:
     """Return the chain's fields on damping, springs and limits; None if the model has none."""
     stiffness, limit, spring = springs_and_limits(model, ignored, topology)
@@ -285,7 +283,7 @@ def _build_chain(source: Source, topology, rows, structure, armature, left_out) 
         **{name: float_array(bodies[name]) for name in own},
         gravity=float_array(_gravity(model)),
         q_load=float_array(q_load),
-        length=float_array(_characteristic_length(bodies, topology)),
+        length=float_array(characteristic_length(bodies, topology)),
         gear=float_array(gear),
         control_range=float_array(control),
         force_range=float_array(force),

@@ -2,8 +2,10 @@
 
 import numpy as np
 
+from svkc.model.annotations import MuJoCo
 
-def is_torque_motor(model) -> np.ndarray:
+
+def is_torque_motor(model: MuJoCo) -> np.ndarray:
     """Return the mask [nu] of actuators that are a torque on a joint, gear times control."""
     import mujoco
 

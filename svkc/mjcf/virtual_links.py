@@ -2,17 +2,20 @@
 sites and the load pose."""
 
 import dataclasses
+from collections.abc import Iterable
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from svkc.mjcf.bodies import name_of
+from svkc.model.annotations import MuJoCo, Numbers
 from svkc.model.chain import Structure
 from svkc.model.topology import Topology
 from svkc.model.virtual_link import VirtualLink, joint_freedoms
 
 
-def links_from_equalities(model) -> list[VirtualLink]:
+def links_from_equalities(model: MuJoCo) -> list[VirtualLink]:
     """Return the model's <equality> elements as virtual links, children of the first body.
 
     A connect becomes a ball, a weld a weld. Other elements are skipped.
@@ -50,7 +53,9 @@ def links_from_equalities(model) -> list[VirtualLink]:
     return links
 
 
-def declared_links(model, declared, cuttable: list[VirtualLink], spare: int) -> list[VirtualLink]:
+def declared_links(
+    model: MuJoCo, declared: Iterable[VirtualLink], cuttable: list[VirtualLink], spare: int
+) -> list[VirtualLink]:
     """Return all virtual links in order: <equality>, declared, cuttable joints, spare slots.
 
     Raises ValueError if a declared link is no `VirtualLink`, or if names are not unique.
@@ -148,7 +153,7 @@ def _joint_frames(data, link: VirtualLink, parent: int, real: int) -> dict[str, 
     return {name: np.asarray(value, float) for name, value in frames.items()}
 
 
-def load_structure(model, topology: Topology, links: list[VirtualLink]) -> Structure:
+def load_structure(model: MuJoCo, topology: Topology, links: list[VirtualLink]) -> Structure:
     """Return the structure of the load pose, with the links at their declared placements."""
     import mujoco
 
@@ -177,6 +182,6 @@ def load_structure(model, topology: Topology, links: list[VirtualLink]) -> Struc
     )
 
 
-def float_array(x):
+def float_array(x: float | Numbers) -> Array:
     """Return an array of JAX's default float type: float64 if x64 is enabled, else float32."""
     return jnp.asarray(np.asarray(x, np.float64), dtype=jnp.result_type(float))

@@ -4,6 +4,7 @@ traces, so that a compiled call pays nothing for the validation."""
 import functools
 import inspect
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +25,7 @@ def check_chain(chain) -> None:
     check_inertial_parameters(chain)
 
 
-def check_state(chain, state) -> None:
+def check_state(chain: Any, state: Any) -> None:
     """Raise ValueError if `state` is not a state of this chain, by its shapes and dtypes."""
     check_chain(chain)
     if not isinstance(state, State) or not isinstance(state.structure, Structure):
@@ -65,7 +66,7 @@ def _validated(arguments: dict) -> dict:
     }
 
 
-def float_vector(chain: Chain, name: str, value, size: int | None = None):
+def float_vector(chain: Chain, name: str, value: Any, size: int | None = None) -> Array:
     """Return a value as a floating-point array, of the chain's dtype unless a floating JAX array.
 
     name: the argument's name, for messages.
@@ -118,7 +119,7 @@ def checked_jit(fn: Callable | None = None, *, eager: bool = False) -> Callable:
     return call
 
 
-def torques_over_dofs(chain: Chain, tau) -> Float[Array, " dofs"]:
+def torques_over_dofs(chain: Chain, tau: Array) -> Float[Array, " dofs"]:
     """Return torques [dofs] over every coordinate, with zeros for virtual joints if tau is [nv].
 
     Raises ValueError if tau has another length.

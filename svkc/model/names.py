@@ -3,6 +3,8 @@
 Raises ValueError, with the names that exist, for an unknown one.
 """
 
+from typing import Any
+
 import jax
 import numpy as np
 
@@ -11,7 +13,7 @@ from svkc.model.topology import V_SIZE
 from svkc.model.validation import as_array
 
 
-def connection_mask(chain: Chain, connected) -> np.ndarray | jax.Array:
+def connection_mask(chain: Chain, connected: Any) -> np.ndarray | jax.Array:
     """Return the mask [links] of connected virtual links from names, a mask, or None (the model's).
 
     Raises ValueError if `connected` is neither names nor a Boolean mask of this length.
@@ -44,7 +46,7 @@ def link_index(chain: Chain, name: str) -> int:
     return chain.link_names.index(name)
 
 
-def joint_slice(chain: Chain, name: str, widths, starts) -> slice:
+def joint_slice(chain: Chain, name: str, widths: Any, starts: Any) -> slice:
     """Return the slice of a joint in q or v, for a joint of the tree or a cuttable one.
 
     widths: number of coordinates by joint kind: `Q_SIZE` for q, `V_SIZE` for v.

@@ -5,15 +5,17 @@ Values of tracers cannot be checked; their shapes and dtypes are.
 """
 
 import inspect
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from svkc._jax.pytrees import is_concrete
+from svkc.model.annotations import DType
 
 
-def as_array(value):
+def as_array(value: Any) -> np.ndarray | jax.Array:
     """Return a value as an array; an array of None if NumPy cannot convert the value."""
     try:
         return (
@@ -27,7 +29,7 @@ def as_array(value):
         return np.asarray(None)
 
 
-def real_array(name: str, value, dtype=None):
+def real_array(name: str, value: Any, dtype: DType | None = None) -> Any:
     """Return a value as an array of real numbers, converted to `dtype` if one is given.
 
     Raises ValueError for strings, objects, Booleans, complex numbers and ragged lists.
@@ -41,7 +43,7 @@ def real_array(name: str, value, dtype=None):
     return array if dtype is None else jnp.asarray(array, dtype)
 
 
-def finite_array(name: str, value, dtype=None):
+def finite_array(name: str, value: Any, dtype: DType | None = None) -> Any:
     """Return a value as `real_array` does; raise ValueError if a concrete one is not finite."""
     array = real_array(name, value, dtype)
     if is_concrete(array) and not np.isfinite(np.asarray(array)).all():
@@ -49,7 +51,7 @@ def finite_array(name: str, value, dtype=None):
     return array
 
 
-def scalar(name: str, value):
+def scalar(name: str, value: Any) -> Any:
     """Return a real scalar unchanged; raise ValueError for another shape."""
     array = real_array(name, value)
     if array.shape != ():
@@ -59,7 +61,7 @@ def scalar(name: str, value):
     return value
 
 
-def vector(name: str, value, count: int):
+def vector(name: str, value: Any, count: int) -> Any:
     """Return a value as an array of `count` finite numbers."""
     array = finite_array(name, value)
     if array.shape != (count,):
@@ -67,7 +69,7 @@ def vector(name: str, value, count: int):
     return array
 
 
-def positive_scalar(name: str, value):
+def positive_scalar(name: str, value: Any) -> Any:
     """Return a real scalar unchanged; raise ValueError if a concrete one is not above zero."""
     scalar(name, value)
     if is_concrete(value) and not np.asarray(value) > 0:
@@ -75,7 +77,7 @@ def positive_scalar(name: str, value):
     return value
 
 
-def integer(name: str, value, minimum: int, maximum: int = 2**31 - 1) -> int:
+def integer(name: str, value: Any, minimum: int, maximum: int = 2**31 - 1) -> int:
     """Return a concrete whole number from `minimum` to `maximum` as an int."""
     number = np.asarray(as_array(value) if is_concrete(value) else None)
     if (
@@ -121,14 +123,14 @@ def check_function(name: str, value, *arguments: str) -> None:
     raise ValueError(f"{name}: expected a function of ({', '.join(arguments)}), got {got}")
 
 
-def boolean(name: str, value) -> bool:
+def boolean(name: str, value: Any) -> bool:
     """Return a Boolean of Python or NumPy as a bool."""
     if not isinstance(value, bool | np.bool_):
         raise ValueError(f"{name}: got {value!r}, expected True or False")
     return bool(value)
 
 
-def names(name: str, value) -> tuple[str, ...]:
+def names(name: str, value: Any) -> tuple[str, ...]:
     """Return one name or an iterable of names as a tuple."""
     values = (value,) if isinstance(value, str) or not np.iterable(value) else tuple(value)
     if not all(isinstance(x, str) for x in values):

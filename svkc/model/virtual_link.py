@@ -21,7 +21,7 @@ JOINTS = {
 }
 
 
-def joint_freedoms(joint) -> tuple[bool, ...]:
+def joint_freedoms(joint: Any) -> tuple[bool, ...]:
     """Return the six freedoms of a joint given by name or as six Booleans.
 
     Raises ValueError for anything else.
@@ -78,7 +78,7 @@ class VirtualLink:
     connected: bool = False
     actuated: bool = False
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         for name in ("name", "parent", "real"):
             if not isinstance(getattr(self, name), str):
                 raise ValueError(

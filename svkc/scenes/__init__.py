@@ -1,5 +1,7 @@
 """The scenes that ship with svkc: functions that return a chain and its initial state."""
 
+from typing import Any as _Any
+
 from svkc import _deprecated
 from svkc.scenes.figure import BAR_HEIGHT as BAR_HEIGHT, FOLDER as FOLDER, PALM as PALM
 from svkc.scenes.high_bar import (
@@ -9,6 +11,6 @@ from svkc.scenes.high_bar import (
 )
 
 
-def __getattr__(name: str):
+def __getattr__(name: str) -> _Any:
     """Return the object of a deprecated name, with a `DeprecationWarning`."""
     return _deprecated.resolve(f"scenes.{name}")

@@ -1,5 +1,7 @@
 """Brachiation: the 16-joint figure under three horizontal bars."""
 
+from typing import Any
+
 import numpy as np
 
 from svkc import _deprecated
@@ -11,7 +13,7 @@ BAR_RADIUS = 0.02  # m: bars, and the rails that carry them
 BAR_SPACING = 0.5  # m: distance between bars
 
 
-def brachiation(**options) -> tuple[Chain, State]:
+def brachiation(**options: Any) -> tuple[Chain, State]:
     """Return the chain of the 16-joint figure under three bars, and its initial state.
 
     The bars lie along y, `BAR_SPACING` apart along x, at `figure.BAR_HEIGHT` above the ground.
@@ -66,6 +68,6 @@ def hanging_state(chain: Chain, angle: float) -> State:
     return chain.state(q, hold=False)
 
 
-def __getattr__(name: str):
+def __getattr__(name: str) -> Any:
     """Return the object of a deprecated name, with a `DeprecationWarning`."""
     return _deprecated.resolve(f"scenes.brachiation.{name}")

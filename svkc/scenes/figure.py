@@ -1,9 +1,11 @@
 """Parts that several scenes use: the 16-joint figure, rods, hands on bars, the hanging pose."""
 
 import pathlib
+from collections.abc import Sequence
 
 import numpy as np
 
+from svkc.model.annotations import MuJoCo
 from svkc.model.virtual_link import VirtualLink
 
 FOLDER = pathlib.Path(__file__).parent
@@ -14,14 +16,20 @@ ARM_LENGTH = 0.2817 + 0.2689  # m: from the shoulder to the wrist
 PALM = 0.0681  # m: from the wrist to the palm's center
 
 
-def figure16():
+def figure16() -> MuJoCo:
     """Return the model of the 16-joint figure, a `mujoco.MjSpec`."""
     import mujoco
 
     return mujoco.MjSpec.from_file(str(FOLDER / "figure16.xml"))
 
 
-def add_rod(spec, start, end, radius: float, name: str = ""):
+def add_rod(
+    spec: MuJoCo,
+    start: Sequence[float | int],
+    end: Sequence[float | int],
+    radius: float,
+    name: str = "",
+) -> None:
     """Add a rod between two points of the ground frame (m) to a `mujoco.MjSpec`.
 
     radius: m.

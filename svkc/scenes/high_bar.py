@@ -1,5 +1,7 @@
 """The high bar of the paper's Fig. 20."""
 
+from typing import Any
+
 import numpy as np
 
 from svkc.mjcf.load import load
@@ -17,7 +19,7 @@ from svkc.scenes.figure import (
 HALF_GRIP_WIDTH = 0.30  # m: half the distance between the hands
 
 
-def high_bar(**options) -> tuple[Chain, State]:
+def high_bar(**options: Any) -> tuple[Chain, State]:
     """Return the chain of the high bar of the paper's Fig. 20, and its initial state.
 
     The 16-joint figure holds the bar with both hands. Each hand has a hinge about the bar (virtual

@@ -1,10 +1,13 @@
 """The swing of the paper's Fig. 21."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 
 from svkc import _deprecated
 from svkc.mjcf.load import load
+from svkc.model.annotations import MuJoCo
 from svkc.model.chain import Chain, State
 from svkc.model.virtual_link import VirtualLink
 from svkc.scenes.figure import PALM, figure16
@@ -19,7 +22,7 @@ HANDS_BELOW_PIVOT = 1.3  # m: hands below the pivot, along the rods
 THIGH_ABOVE_PLATE = 0.07  # m: axis of a thigh above the plate
 
 
-def swing(angle: float = 0.6, **options) -> tuple[Chain, State]:
+def swing(angle: float = 0.6, **options: Any) -> tuple[Chain, State]:
     """Return the chain of the 16-joint figure on a swing, and its initial state, at rest.
 
     Each hand holds a rod by a ball joint. Each thigh is on the plate by a slide. There are 31 joint
@@ -34,7 +37,7 @@ def swing(angle: float = 0.6, **options) -> tuple[Chain, State]:
     return chain, _sitting_state(chain, angle)
 
 
-def model_and_links():
+def model_and_links() -> tuple[MuJoCo, list[VirtualLink]]:
     """Return the swing and the figure as a `mujoco.MjSpec`, and the virtual links between them."""
     import mujoco
 
@@ -142,6 +145,6 @@ def _sitting_state(chain: Chain, angle: float) -> State:
     return chain.state(full)
 
 
-def __getattr__(name: str):
+def __getattr__(name: str) -> Any:
     """Return the object of a deprecated name, with a `DeprecationWarning`."""
     return _deprecated.resolve(f"scenes.swing.{name}")

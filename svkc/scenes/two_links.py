@@ -1,5 +1,7 @@
 """The example of the paper's section VII-A (Figs. 14 and 18): a free-flying chain of two links."""
 
+from collections.abc import Sequence
+
 from svkc.mjcf.load import load
 from svkc.model.chain import Chain, State
 from svkc.model.virtual_link import VirtualLink
@@ -13,7 +15,9 @@ _MJCF = f"""<mujoco model="two_links"><option gravity="{{}}"/><worldbody><body n
   </worldbody></mujoco>"""
 
 
-def two_links(gravity=(0.0, -9.81, 0.0), connected: bool = True) -> tuple[Chain, State]:
+def two_links(
+    gravity: Sequence[float | int] = (0.0, -9.81, 0.0), connected: bool = True
+) -> tuple[Chain, State]:
     """Return a free-flying chain of two links, and its state at rest in the pose of Fig. 14.
 
     Link 1 is on a hinge about z, one metre along y from the free base. Virtual Link 1v, one metre

@@ -1,10 +1,14 @@
 """Standing on flat ground: the paper's first example of a varying structure (section V-A)."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import mujoco
+from jaxtyping import Array
 
 from svkc import _deprecated
 from svkc.mjcf.load import load
+from svkc.model.annotations import Scalar
 from svkc.model.chain import Chain, State
 from svkc.model.virtual_link import VirtualLink
 from svkc.scenes.figure import figure16
@@ -17,7 +21,7 @@ SOLE_OFFSET = 0.04  # m: point of the sole that is welded to the ground, ahead o
 THIGH_LENGTH, SHANK_LENGTH = 0.4222, 0.434  # m
 
 
-def walking(**options) -> tuple[Chain, State]:
+def walking(**options: Any) -> tuple[Chain, State]:
     """Return the chain of the 16-joint figure on flat ground, and its initial state.
 
     The figure stands at rest, the right foot `STRIDE` behind the left one. A weld holds the sole of
@@ -59,7 +63,7 @@ def walking(**options) -> tuple[Chain, State]:
     return chain, chain.state(q)
 
 
-def leg_angles(forward, down) -> dict:
+def leg_angles(forward: Scalar, down: Scalar) -> dict[str, Array]:
     """Return a leg's joint angles (rad) by name, for an upright trunk and a level foot.
 
     forward, down: position of the ankle relative to the hip (m). The leg is stretched towards a
@@ -78,6 +82,6 @@ def leg_angles(forward, down) -> dict:
     return {"hip_flexion": hip, "knee": knee, "ankle": knee - hip}
 
 
-def __getattr__(name: str):
+def __getattr__(name: str) -> Any:
     """Return the object of a deprecated name, with a `DeprecationWarning`."""
     return _deprecated.resolve(f"scenes.walking.{name}")

@@ -1,5 +1,7 @@
 """The change of structure by the events at the end of a phase."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -33,7 +35,7 @@ def apply_events(
     plan: Plan,
     *,
     gap_tolerance: float,
-):
+) -> Any:
     """Apply the events that fired at the end of a phase, all in one change of structure.
 
     Returns the state after the change, the records of events, and the result of the run so far. A

@@ -17,6 +17,7 @@ import numpy as np
 
 from svkc._jax.enumerations import member_names, with_value
 from svkc.mjcf.load import load
+from svkc.model.annotations import Path
 from svkc.model.chain import Chain, State, Structure
 from svkc.model.checked_jit import check_chain
 from svkc.model.virtual_link import VirtualLink
@@ -69,7 +70,9 @@ def _build(cls, arrays: dict[str, Any], prefix: str = "", **known):
     return cls(**fields)
 
 
-def save(traj: Trajectory, path, chain=None, options=None) -> None:
+def save(
+    traj: Trajectory, path: Path, chain: Chain | None = None, options: dict[str, Any] | None = None
+) -> None:
     """Write one .npz file; see `Trajectory.save`.
 
     The metadata are the schema, the results, the versions, the certificate and the options, and the
@@ -148,7 +151,7 @@ def _as_json(value):
     return value.item() if isinstance(value, np.generic) else value
 
 
-def load_chain(path) -> Chain:
+def load_chain(path: Path) -> Chain:
     """Return the chain that a trajectory was saved with.
 
     The chain is loaded from the stored MJCF with the stored arguments of `svkc.load`; its arrays
@@ -172,7 +175,7 @@ def load_chain(path) -> Chain:
     return jax.tree.unflatten(treedef, stored)
 
 
-def load_trajectory(path) -> Trajectory:
+def load_trajectory(path: Path) -> Trajectory:
     """Return a trajectory, or a batch of trajectories, that `Trajectory.save` wrote.
 
     path: file that `Trajectory.save` wrote.

@@ -1,6 +1,8 @@
 """The certificate of a run: loop gaps, energy, momentum and rank margins, computed from the records
 after the run."""
 
+from typing import Any
+
 import diffrax
 import equinox as eqx
 import jax
@@ -189,7 +191,7 @@ def _momentum_drift(
     return jnp.stack([linear, norm(last.angular - first.angular)], 1)
 
 
-def evaluations_per_step(solver: diffrax.AbstractSolver) -> int:
+def evaluations_per_step(solver: diffrax.AbstractSolver[Any]) -> int:
     """Return the number of evaluations of the vector field in one attempted step. Newton iterations
     of implicit stages are not counted."""
     tableau = getattr(solver, "tableau", None)

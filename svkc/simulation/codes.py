@@ -3,12 +3,24 @@
 Files hold the names of the codes, so that codes may be added in any order.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 
 from svkc import _deprecated
-from svkc._jax.enumerations import FormerMeta, MovedMeta, connect_enumerations
+from svkc._jax.enumerations import connect_enumerations
+
+if TYPE_CHECKING:  # as equinox annotates the metaclass of its enumerations
+    from enum import EnumMeta
+
+    class FormerMeta(EnumMeta):
+        """The metaclass, with messages by member."""
+
+        def __getitem__(cls, item: Any) -> str: ...  # pyright: ignore
+
+    MovedMeta = FormerMeta
+else:
+    from svkc._jax.enumerations import FormerMeta, MovedMeta
 
 
 class RESULTS(eqx.Enumeration, metaclass=FormerMeta):  # pyright: ignore

@@ -1,16 +1,32 @@
 """Validation of the arguments of `simulate` that need no defaults: state, times, step sizes."""
 
+from collections.abc import Iterable
+from typing import Any, TypeAlias
+
+import diffrax
 import jax
 import numpy as np
 
 from svkc._jax.pytrees import is_concrete
+from svkc.integration.stabilization import AbstractStabilization
+from svkc.loops.constrained_dynamics import AbstractDynamics, Dynamics
+from svkc.model.annotations import Checked
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import check_state
 from svkc.model.validation import finite_array, positive_scalar, scalar
-from svkc.transitions.events import At
+from svkc.transitions.events import At, When
+
+# arguments of `simulate`
+EventList: TypeAlias = Checked[At | When | Iterable[At | When]]
+Solver: TypeAlias = Checked[diffrax.AbstractSolver[Any]]
+Controller: TypeAlias = Checked[diffrax.AbstractStepSizeController[Any, Any]]
+Adjoint: TypeAlias = Checked[diffrax.AbstractAdjoint]
+Progress: TypeAlias = Checked[diffrax.AbstractProgressMeter[Any]]
+Stabilization: TypeAlias = Checked[AbstractStabilization]
+AnyDynamics: TypeAlias = Checked[AbstractDynamics | Dynamics]
 
 
-def check_step_options(dt, rtol, atol, stepsize_controller) -> None:
+def check_step_options(dt: Any, rtol: Any, atol: Any, stepsize_controller: Any) -> None:
     """Raise ValueError unless dt, the tolerances or a controller alone sets the step size."""
     for name, value in (("dt", dt), ("rtol", rtol), ("atol", atol)):
         if value is not None:
@@ -25,13 +41,13 @@ def check_step_options(dt, rtol, atol, stepsize_controller) -> None:
         raise ValueError("rtol and atol: give them to the stepsize_controller instead")
 
 
-def check_instance(name: str, value, kind: type) -> None:
+def check_instance(name: str, value: Any, kind: type) -> None:
     """Raise ValueError if an option is neither None nor an instance of a class of diffrax."""
     if value is not None and not isinstance(value, kind):
         raise ValueError(f"{name}: expected a diffrax object for it, got {value!r}")
 
 
-def check_initial_state(chain: Chain, state: State):
+def check_initial_state(chain: Chain, state: State) -> None:
     """Raise ValueError if the state does not belong to the chain or is not finite."""
     check_state(chain, state)
     if state.q.dtype == np.float64 and not jax.config.read("jax_enable_x64"):
@@ -45,7 +61,7 @@ def check_initial_state(chain: Chain, state: State):
         raise ValueError("state: q and v must be finite")
 
 
-def check_times(t0, t1, ts, events):
+def check_times(t0: Any, t1: Any, ts: Any, events: Any) -> None:
     """Raise ValueError for invalid start, end, save and event times, if they are concrete."""
     for name, value in (("t0", t0), ("t1", t1)):
         scalar(name, value)

@@ -20,6 +20,7 @@ from svkc.integration.step_size import FixedSteps
 from svkc.integration.vector_field import VectorField
 from svkc.loops.constrained_dynamics import AbstractDynamics, Dynamics, default_dynamics
 from svkc.loops.constraint import gap_tolerance
+from svkc.model.annotations import DType, Scalar
 from svkc.model.chain import Chain, State
 from svkc.model.validation import check_function, integer
 from svkc.simulation.option_checks import (
@@ -44,12 +45,12 @@ class Options(eqx.Module):
     """
 
     control: Callable | None
-    solver: diffrax.AbstractSolver
+    solver: diffrax.AbstractSolver[Any]
     stabilization: AbstractStabilization
     dynamics: AbstractDynamics
     controller: Any
     adjoint: diffrax.AbstractAdjoint | Replay
-    progress_meter: diffrax.AbstractProgressMeter
+    progress_meter: diffrax.AbstractProgressMeter[Any]
     dt: Float[Array, ""] | None
     first_step: Float[Array, ""]
     max_events: int = eqx.field(static=True)
@@ -64,7 +65,7 @@ class Options(eqx.Module):
         """The vector field of each phase."""
         return VectorField(self.control, self.stabilization, self.dynamics)
 
-    def step_size_control(self, ts=None):
+    def step_size_control(self, ts: Float[Array, " times"] | None = None) -> Any:
         """Return the step-size controller and the size of the first step (None: the controller
         chooses it).
 
@@ -82,7 +83,9 @@ class Options(eqx.Module):
         )
 
 
-def resolve_tolerances(dtype, rtol=None, atol=None) -> tuple[Float[Array, ""], Float[Array, ""]]:
+def resolve_tolerances(
+    dtype: DType, rtol: Scalar | None = None, atol: Scalar | None = None
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Return rtol and atol as arrays. The defaults are 1e-7 (float32: 1e-4) for rtol, and a
     hundredth of rtol, but at least eight times round-off, for atol."""
     eps = np.finfo(dtype).eps
@@ -97,8 +100,9 @@ def resolve_tolerances(dtype, rtol=None, atol=None) -> tuple[Float[Array, ""], F
 
 
 def prepare_options(
-    chain: Chain, state: State, t0, t1, *, ts, events, control, dt, rtol, atol, solver,
-    stepsize_controller, stabilization, dynamics, adjoint, max_events, max_steps, progress_meter,
+    chain: Chain, state: State, t0: Any, t1: Any, *, ts: Any, events: Any, control: Any, dt: Any,
+    rtol: Any, atol: Any, solver: Any, stepsize_controller: Any, stabilization: Any, dynamics: Any,
+    adjoint: Any, max_events: Any, max_steps: Any, progress_meter: Any,
 ) -> tuple[Options, Float[Array, " times"], Plan]:  # fmt: skip
     """Return the options, the save times and the plan of events of a call of `simulate`. Raises
     ValueError for invalid arguments."""
@@ -175,7 +179,7 @@ def _resolve_dynamics(chain: Chain, dynamics) -> AbstractDynamics:
     return dynamics
 
 
-def _resolve_solver(solver, controller, dtype) -> diffrax.AbstractSolver:
+def _resolve_solver(solver, controller, dtype) -> diffrax.AbstractSolver[Any]:
     """Return the solver, by default Dopri8, or Tsit5 with fixed steps or in float32.
 
     An implicit solver whose root finder has no tolerances of its own takes those of the

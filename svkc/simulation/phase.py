@@ -84,7 +84,12 @@ class PhaseOutcome(eqx.Module):
 
 
 def solve_phase(
-    run: RunState, stop, ts, plan: Plan, options: Options, field_args: FieldArgs
+    run: RunState,
+    stop: Float[Array, ""],
+    ts: Float[Array, " times"],
+    plan: Plan,
+    options: Options,
+    field_args: FieldArgs,
 ) -> PhaseOutcome:
     """Integrate one phase from run.t to `stop`, or to the first guard that crosses zero.
 

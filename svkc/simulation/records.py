@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc.integration.solution import PhaseSolution, Stats
+from svkc.model.annotations import DType
 from svkc.model.chain import State, Structure
 
 
@@ -51,7 +52,7 @@ class Events(eqx.Module):
     count: Int[Array, ""]
 
 
-def empty_events(rows: int, links: int, dtype) -> Events:
+def empty_events(rows: int, links: int, dtype: DType) -> Events:
     """Return records of events with empty rows: times inf, indices -1."""
     impulse = jnp.zeros((rows, links, 3), dtype)
     return Events(
@@ -86,9 +87,9 @@ def empty_phase_records(rows: int, state: State) -> PhaseRecords:
 def write_phase_row(
     records: PhaseRecords,
     row: Bool[Array, " phases"],
-    start: tuple,
-    end: tuple,
-    work,
+    start: tuple[Float[Array, ""], State],
+    end: tuple[Float[Array, ""], State],
+    work: Float[Array, ""],
     solution: PhaseSolution,
 ) -> PhaseRecords:
     """Return the records with the row of one phase written.

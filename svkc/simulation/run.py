@@ -4,6 +4,7 @@ The body integrates one phase and applies the events at the end of the phase.
 """
 
 from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -13,7 +14,7 @@ from jaxtyping import Array, Bool, Int
 
 from svkc._jax.pytrees import stop_gradient_tree
 from svkc.integration.event_location import GuardValues, event_tolerance
-from svkc.integration.ode import FieldArgs, ODEState
+from svkc.integration.ode import FieldArgs, ODEState, Times
 from svkc.model.chain import Chain, State
 from svkc.simulation.apply_events import apply_events, reevaluated_guards
 from svkc.simulation.codes import DERIVATIVE, RESULTS
@@ -37,7 +38,9 @@ def with_lock_mask(chain: Chain, state: State, plan: Plan) -> State:
     )
 
 
-def initial_run_state(chain: Chain, state: State, times, plan: Plan, options: Options) -> RunState:
+def initial_run_state(
+    chain: Chain, state: State, times: Times, plan: Plan, options: Options
+) -> RunState:
     """Return the state of a run before its first phase, with empty records.
 
     times: start, end and save times.
@@ -90,8 +93,8 @@ def _next_stop(run: RunState, t1, plan: Plan):
 
 
 def run_phase(
-    chain: Chain, run: RunState, index, times, *, plan: Plan, options: Options, args
-) -> RunState:
+    chain: Chain, run: RunState, index: Any, times: Any, *, plan: Plan, options: Options, args: Any
+) -> RunState:  # fmt: skip
     """Integrate one phase, apply the events at its end, and write the records of both.
 
     index: of the phase.

@@ -7,6 +7,7 @@ interpolation. Finished elements of a batch run zero-length phases until all ele
 """
 
 from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -17,9 +18,19 @@ from svkc._jax.eager import eager_jit
 from svkc._jax.functions import call_with_comparable
 from svkc._jax.primitive import ClosureConverted
 from svkc._jax.pytrees import is_concrete
+from svkc.model.annotations import Function, Integer, Numbers, Scalar
 from svkc.model.chain import Chain, State
 from svkc.simulation.certificate import certificate, evaluations_per_step
 from svkc.simulation.codes import DERIVATIVE, RESULTS
+from svkc.simulation.option_checks import (
+    Adjoint,
+    AnyDynamics,
+    Controller,
+    EventList,
+    Progress,
+    Solver,
+    Stabilization,
+)
 from svkc.simulation.options import Options, prepare_options
 from svkc.simulation.phase import RunState
 from svkc.simulation.run import initial_run_state, run_phase, with_lock_mask
@@ -28,9 +39,13 @@ from svkc.transitions.plan import Plan
 
 
 def simulate(
-    chain: Chain, state: State, t1, *, t0=0.0, ts=None, events=(), control=None, args=None,
-    dt=None, rtol=None, atol=None, solver=None, stepsize_controller=None, stabilization=None,
-    dynamics=None, adjoint=None, max_events=None, max_steps=None, throw=True, progress_meter=None,
+    chain: Chain, state: State, t1: Scalar, *, t0: Scalar = 0.0, ts: Numbers | None = None,
+    events: EventList = (), control: Function | None = None, args: Any = None,
+    dt: Scalar | None = None, rtol: Scalar | None = None, atol: Scalar | None = None,
+    solver: Solver | None = None, stepsize_controller: Controller | None = None,
+    stabilization: Stabilization | None = None, dynamics: AnyDynamics | None = None,
+    adjoint: Adjoint | None = None, max_events: Integer | None = None,
+    max_steps: Integer | None = None, throw: bool = True, progress_meter: Progress | None = None,
 ) -> Trajectory:  # fmt: skip
     """Integrate the motion from t0 to t1, through the changes of structure of `events`.
 
@@ -38,8 +53,7 @@ def simulate(
     ts: save times (s), which steps meet exactly; None: t0 and t1. A state saved at the time of an
         event is the state after the event. Times past an early end hold the last state.
     events: `svkc.at(...)`, `svkc.when(...)`, or several.
-    control: function (t, state, args) -> joint torques (N m, N) over every coordinate, or the
-        tree's.
+    control: function (t, state, args) -> torques (N m, N) over every coordinate, or the tree's.
     args: passed to `control` and to guards.
     dt: fixed step size (s).
     rtol, atol: tolerances of adaptive steps; by default 1e-7 (float32: 1e-4) and a hundredth of

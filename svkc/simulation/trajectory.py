@@ -10,7 +10,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.eager import eager_jit
 from svkc._jax.pytrees import is_concrete
-from svkc.model.chain import State
+from svkc.model.annotations import Path, Scalar
+from svkc.model.chain import Chain, State
 from svkc.model.validation import scalar
 from svkc.simulation.codes import DERIVATIVE, RESULTS
 from svkc.simulation.records import Events, Phases
@@ -46,7 +47,7 @@ class Trajectory(eqx.Module):
         """Which virtual links are connected at each save time."""
         return self.states.structure.connected
 
-    def save(self, path, chain=None, **options) -> None:
+    def save(self, path: Path, chain: Chain | None = None, **options: Any) -> None:
         """Write the run, or a batch of runs, to one .npz file, with its certificate.
 
         The file is written atomically. `svkc.load_trajectory` returns an equal object.
@@ -63,7 +64,7 @@ class Trajectory(eqx.Module):
 
         save(self, path, chain, options)
 
-    def plot(self, chain=None) -> Any:
+    def plot(self, chain: Chain | None = None) -> Any:
         """Return a matplotlib figure of joint coordinates, loop gaps, energy and mobility over
         time, with events as vertical lines.
 
@@ -73,7 +74,7 @@ class Trajectory(eqx.Module):
 
         return plot(self, chain)
 
-    def report(self, halved=None) -> "Report":
+    def report(self, halved: Scalar | None = None) -> "Report":
         """Return the certificate of the run, or of each run of a batch.
 
         halved: an error of the run as `svkc.accuracy.estimate_error` returns, to be shown in the

@@ -17,6 +17,7 @@ import numpy as np
 from svkc.integration.integrators import RodriguesEuler, SymplecticEuler
 from svkc.integration.stabilization import NoStabilization, Projection
 from svkc.loops.constrained_dynamics import ArticulatedBodies
+from svkc.model.annotations import DType, Scalar
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import check_state
 from svkc.model.validation import integer, positive_scalar, scalar
@@ -87,7 +88,7 @@ class Tuning:
         )
 
 
-def default_candidates(dtype, span: float) -> list[Candidate]:
+def default_candidates(dtype: DType, span: float) -> list[Candidate]:
     """Return the candidates of `tune`, from fast to accurate.
 
     They are explicit solvers with fixed steps, explicit solvers with adaptive steps (with
@@ -146,7 +147,7 @@ def configuration_error(chain: Chain, run: Trajectory, reference: Trajectory) ->
     return float(jnp.max(jnp.sqrt(jnp.mean(errors**2, 1))))
 
 
-def estimate_error(chain: Chain, state: State, t1, **options) -> float:
+def estimate_error(chain: Chain, state: State, t1: Scalar, **options: Any) -> float:
     """Return an estimate of a run's integration error from a second, finer run.
 
     The finer run has half the step (`dt`), or tolerances (`rtol`, `atol`) divided by 32. The result
@@ -168,8 +169,8 @@ def estimate_error(chain: Chain, state: State, t1, **options) -> float:
 
 
 def tune(
-    chain: Chain, state: State, t1, target: float = 1e-6,
-    options: Sequence[Candidate] | None = None, repeats: int = 3, show: bool = True, **common,
+    chain: Chain, state: State, t1: Scalar, target: float = 1e-6,
+    options: Sequence[Candidate] | None = None, repeats: int = 3, show: bool = True, **common: Any,
 ) -> Tuning:  # fmt: skip
     """Measure candidate options on this scene and return them, the fastest sufficient one first.
 

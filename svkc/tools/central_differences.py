@@ -1,11 +1,17 @@
 """Central differences of a function of a pytree, extrapolated to step zero."""
 
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 
-def central_differences(value, differentiable, direction, step):
+def central_differences(
+    value: Callable[[Any], dict[str, Array]], differentiable: Any, direction: Any, step: float
+) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return central differences extrapolated to step zero, and an estimate of their errors.
 
     Ridders' method: eight halved steps fill a Neville tableau. For every entry, the estimate that

@@ -69,7 +69,7 @@ def _written(numbers: np.ndarray, name: str) -> str:
 
 
 def check_grad(
-    f: Callable, x, mode: str = "both", directions: int = 2, step: float = 0.05, seed: int = 0
+    f: Callable, x: Any, mode: str = "both", directions: int = 2, step: float = 0.05, seed: int = 0
 ) -> GradientCheck:
     """Compare the derivative of f at x with central differences and return the worst entry.
 

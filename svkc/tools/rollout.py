@@ -17,6 +17,7 @@ from jax.sharding import Mesh, PartitionSpec
 from svkc._jax.content_digest import content_digest
 from svkc._jax.functions import call_with_comparable
 from svkc.integration.replay import Replay
+from svkc.model.annotations import Checked, Function, Integer, Numbers, Path, Scalar
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import check_chain
 from svkc.model.validation import check_function, finite_array, integer, scalar
@@ -26,8 +27,9 @@ from svkc.simulation.trajectory import Trajectory
 
 
 def rollout(
-    chain: Chain, states, t1, *, data: Any = None, lane: Callable | None = None, cost=None,
-    chunk: int | None = None, out=None, devices=None, progress: bool = True, **options,
+    chain: Chain, states: Checked[State], t1: Scalar, *, data: Any = None,
+    lane: Function | None = None, cost: Numbers | None = None, chunk: Integer | None = None,
+    out: Path | None = None, devices: Any = None, progress: bool = True, **options: Any,
 ) -> Trajectory:  # fmt: skip
     """Run `svkc.simulate` for every lane of `states`; return one batch of numpy arrays (no grad).
 
@@ -40,8 +42,7 @@ def rollout(
         events, args, control, t1, or `chain` with other floats. Compared as in `simulate`, so that
         a lambda in the call is not compiled again.
     cost: expected run time of each lane, no objective [lanes]. Lanes of similar cost share a chunk.
-    chunk: lanes that one device runs at once; memory grows with them. Default: 64 on a CPU, else
-        4096.
+    chunk: lanes that a device runs at once; memory grows with them. Default: 4096, on a CPU 64.
     out: folder for finished chunks (chunk_00000.npz and so on, readable by `svkc.load_trajectory`).
         An equal call continues from it. All arguments are compared by content: functions by code
         and by the values that they read, functions of installed packages by name.
@@ -76,7 +77,7 @@ def rollout(
     return jax.tree.map(lambda *x: np.concatenate(x)[np.argsort(order)], *all_chunks)
 
 
-def _prepare_devices(devices, chunk: int | None, lanes: int) -> tuple[list[Any], int]:
+def _prepare_devices(devices, chunk: Integer | None, lanes: int) -> tuple[list[Any], int]:
     """Return the devices and how many lanes each runs at once.
 
     Raises ValueError if either is invalid.

@@ -5,13 +5,18 @@ a chain and turns them into tables.
 """
 
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import numpy as np
 
+from svkc.model.annotations import Checked, Function, Names, Scalar
 from svkc.model.validation import boolean, check_function, names, real_array
 from svkc.transitions.spare_links import Grip
+
+# one grip or several; spare slots by name, or pairs (parent, real) of body names
+Grips: TypeAlias = Checked[Grip | Iterable[Grip]]
+SlotsOrPairs: TypeAlias = Checked[str | Iterable[str | tuple[str, str]]]
 
 
 class Action(eqx.Module):
@@ -31,7 +36,7 @@ class Action(eqx.Module):
     unlock: tuple[str, ...] = eqx.field(static=True, default=())
     at_current_pose: tuple[str, ...] = eqx.field(static=True, default=())
     stop: bool = eqx.field(static=True, default=False)
-    unbind: tuple = eqx.field(static=True, default=())
+    unbind: tuple[Any, ...] = eqx.field(static=True, default=())
     bind: tuple[Grip, ...] = ()
 
 
@@ -53,7 +58,7 @@ class When(eqx.Module):
     direction: bool | None = eqx.field(static=True, default=None)
 
 
-def _as_tuple(value) -> tuple:
+def _as_tuple(value) -> tuple[Any, ...]:
     """Return an iterable as a tuple, and any other value or a string as a tuple of one."""
     return tuple(value) if isinstance(value, Iterable) and not isinstance(value, str) else (value,)
 
@@ -106,7 +111,16 @@ def _check_no_contradiction(**arguments) -> None:
 
 
 def at(
-    time, connect=(), cut=(), *, lock=(), unlock=(), here=False, stop=False, bind=(), unbind=()
+    time: Scalar,
+    connect: Names = (),
+    cut: Names = (),
+    *,
+    lock: Names = (),
+    unlock: Names = (),
+    here: bool | Names = False,
+    stop: Checked[bool] = False,
+    bind: Grips = (),
+    unbind: SlotsOrPairs = (),
 ) -> At:
     """Return an event that changes the structure at a given time.
 
@@ -141,17 +155,17 @@ def at(
 
 
 def when(
-    guard,
-    connect=(),
-    cut=(),
-    direction=None,
+    guard: Function,
+    connect: Names = (),
+    cut: Names = (),
+    direction: Checked[bool | None] = None,
     *,
-    lock=(),
-    unlock=(),
-    here=False,
-    stop=False,
-    bind=(),
-    unbind=(),
+    lock: Names = (),
+    unlock: Names = (),
+    here: bool | Names = False,
+    stop: Checked[bool] = False,
+    bind: Grips = (),
+    unbind: SlotsOrPairs = (),
 ) -> When:
     """Return an event that changes the structure when a guard crosses zero.
 
@@ -182,7 +196,7 @@ def when(
     return When(guard, action, direction)
 
 
-def as_events(events) -> tuple:
+def as_events(events: Any) -> tuple[Any, ...]:
     """Return one event or an iterable of events as a tuple.
 
     Raises ValueError if an element is not an event.

@@ -6,7 +6,7 @@ would have to pull, an overloaded joint.
 
 import abc
 from collections.abc import Callable
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from svkc._jax.primitive import ClosureConverted
 from svkc.loops.forward_dynamics import loop_forces
 from svkc.loops.frames import loop_frames
+from svkc.model.annotations import Numbers, Scalar
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import check_chain, torques_over_dofs
 from svkc.model.names import link_index
@@ -35,14 +36,14 @@ class AbstractGuard(eqx.Module):
 
     @abc.abstractmethod
     def value(
-        self, chain: Chain, t, state: State, args, tau: Float[Array, " dofs"]
+        self, chain: Chain, t: Scalar, state: State, args: Any, tau: Float[Array, " dofs"]
     ) -> Float[Array, ""]:
         """Return the guard's value.
 
         tau: joint torques at this time (N m, N); zeros if no guard of the run needs torques.
         """
 
-    def closure_convert(self, t, state: State, args) -> "AbstractGuard":
+    def closure_convert(self, t: Scalar, state: State, args: Any) -> "AbstractGuard":
         """Return the guard with every array that it closes over as a leaf, so that derivatives with
         respect to these arrays exist.
 
@@ -59,10 +60,10 @@ class UserGuard(AbstractGuard):
     needs_torques: ClassVar[bool] = False
     initial_value: ClassVar[float] = 1.0
 
-    def value(self, chain, t, state, args, tau):
+    def value(self, chain: Chain, t: Scalar, state: State, args: Any, tau: Any) -> Any:
         return self.function(t, state, args)
 
-    def closure_convert(self, t, state, args):
+    def closure_convert(self, t: Scalar, state: State, args: Any) -> "UserGuard":
         return UserGuard(ClosureConverted.from_function(self.function, t, state, args))
 
 
@@ -75,7 +76,9 @@ class LinkGuard(AbstractGuard):
     chain: Chain
     link: int = eqx.field(static=True)
 
-    def __call__(self, t, state: State, args=None, tau=None) -> Float[Array, ""]:
+    def __call__(
+        self, t: Scalar, state: State, args: Any = None, tau: Any = None
+    ) -> Float[Array, ""]:
         """Return the guard's value with the guard's own chain.
 
         tau: joint torques (N m, N) over every coordinate, or the tree's; None: zeros.
@@ -92,7 +95,7 @@ class Touch(LinkGuard):
     distance: Float[Array, ""]
     axes: tuple[int, ...] = eqx.field(static=True)
 
-    def value(self, chain, t, state, args, tau):
+    def value(self, chain: Chain, t: Scalar, state: State, args: Any, tau: Any) -> Float[Array, ""]:
         s, kin, i = state.structure, kinematics(chain, state.q), self.link
         frames = loop_frames(chain, s, kin, state.q)
         p, r = s.parent[i], s.real[i]
@@ -118,7 +121,7 @@ class Leaves(LinkGuard):
     initial_value: ClassVar[float] = 1.0
     axis: Float[Array, "3"]
 
-    def value(self, chain, t, state, args, tau):
+    def value(self, chain: Chain, t: Scalar, state: State, args: Any, tau: Any) -> Float[Array, ""]:
         s, i = state.structure, self.link
         kin = kinematics(chain, state.q)
         normal = quat_rotate(loop_frames(chain, s, kin, state.q).base_quat[i], self.axis)
@@ -136,13 +139,13 @@ class Overload(LinkGuard):
     force: Float[Array, ""]
     torque: Float[Array, ""]
 
-    def value(self, chain, t, state, args, tau):
+    def value(self, chain: Chain, t: Scalar, state: State, args: Any, tau: Any) -> Float[Array, ""]:
         load = loop_forces(chain, state, tau)
         norm = lambda x: jnp.sqrt(jnp.maximum(jnp.sum(x[self.link] ** 2), jnp.finfo(x.dtype).tiny))
         return jnp.maximum(norm(load.force) / self.force, norm(load.torque) / self.torque) - 1
 
 
-def touch(chain: Chain, link: str, distance=0.01, axes: str | None = None) -> Touch:
+def touch(chain: Chain, link: str, distance: Scalar = 0.01, axes: str | None = None) -> Touch:
     """Return a guard that falls through zero when the two ends of a virtual link come close.
 
     The guard's value (m) is the distance between the link's point on the real link and its point on
@@ -183,7 +186,7 @@ def touch(chain: Chain, link: str, distance=0.01, axes: str | None = None) -> To
     return Touch(chain=chain, link=slot, distance=distance, axes=indices)
 
 
-def leaves(chain: Chain, link: str, axis=(0.0, 0.0, 1.0)) -> Leaves:
+def leaves(chain: Chain, link: str, axis: Numbers = (0.0, 0.0, 1.0)) -> Leaves:
     """Return a lift-off guard: falls through zero when a virtual link would have to pull.
 
     The guard's value (N) is the force of the link's parent on its real link along `axis`. With
@@ -204,7 +207,9 @@ def leaves(chain: Chain, link: str, axis=(0.0, 0.0, 1.0)) -> Leaves:
     return Leaves(chain, link_index(chain, link), jnp.asarray(axis / norm, chain.q_load.dtype))
 
 
-def overload(chain: Chain, link: str, force=None, torque=None) -> Overload:
+def overload(
+    chain: Chain, link: str, force: Scalar | None = None, torque: Scalar | None = None
+) -> Overload:
     """Return a guard that rises through zero when a virtual link is overloaded.
 
     The guard's value is the larger one of |force| / `force` and |torque| / `torque`, less one. With

@@ -1,5 +1,7 @@
 """Velocities and impulses of inelastic impacts at changes of structure (paper, (29)-(38))."""
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -14,8 +16,12 @@ from svkc.tree.kinematics import kinematics
 
 
 def velocity_after_impact(
-    chain: Chain, structure: Structure, loops: LoopKinematics, qr: PivotedQR, v
-):
+    chain: Chain,
+    structure: Structure,
+    loops: LoopKinematics,
+    qr: PivotedQR,
+    v: Float[Array, " dofs"],
+) -> Any:
     """Return v+ = W (W^T M W)^-1 W^T M v-, the impulse of each loop on its real link, and the
     energy lost (J): the paper's (29)-(38) in one formula.
 
@@ -48,7 +54,9 @@ class StructureChange(eqx.Module):
     residual_gaps: Float[Array, " links"]
 
 
-def lock_projection(chain: Chain, structure: Structure, q, v):
+def lock_projection(
+    chain: Chain, structure: Structure, q: Float[Array, " q"], v: Float[Array, " dofs"]
+) -> Any:
     """Return the velocity after locking joints of a chain without virtual links, and the energy
     lost (J)."""
     if structure.locked is None:

@@ -5,6 +5,7 @@ A caller lists the kinds of iterations in a `Schedule`.
 
 import dataclasses
 import functools
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -66,7 +67,9 @@ class NewtonState(eqx.Module):
     energy_lost: Float[Array, ""]
 
     @classmethod
-    def init(cls, chain: Chain, structure: Structure, q, v) -> "NewtonState":
+    def init(
+        cls, chain: Chain, structure: Structure, q: Float[Array, " q"], v: Float[Array, " dofs"]
+    ) -> "NewtonState":
         """Return the state before the first iteration."""
         links, dtype, q = len(chain.link_names), q.dtype, normalize(chain, q)
         gaps, zero = jnp.zeros((2, links), dtype), jnp.zeros((), dtype)
@@ -84,7 +87,7 @@ class NewtonState(eqx.Module):
             energy_lost=zero,
         )
 
-    def record_rank_search(self, kind, diag_R, gaps) -> "NewtonState":
+    def record_rank_search(self, kind: Any, diag_R: Any, gaps: Any) -> "NewtonState":
         """Return the state with the pivots and gaps of this iteration recorded if the iteration
         starts or ends the search for the rank, and with the rank if it ends the search."""
         rows = jnp.stack([kind == PERTURB, kind == DECIDE_RANK])[:, None]

@@ -98,7 +98,11 @@ def _euler_angles(
 
 
 def place_at_current_pose(
-    chain: Chain, structure: Structure, q, links: Bool[Array, " links"], kin: Kinematics
+    chain: Chain,
+    structure: Structure,
+    q: Float[Array, " q"],
+    links: Bool[Array, " links"],
+    kin: Kinematics,
 ) -> Structure:
     """Return the structure with the links in the mask `links` placed at the current poses of their
     bodies.

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from svkc._jax.pytrees import is_concrete
+from svkc.model.annotations import DType
 from svkc.model.chain import Chain, Structure
 from svkc.model.names import body_rows, joint_slice, link_index, spare_slot
 from svkc.model.topology import V_SIZE
@@ -143,7 +145,7 @@ class Plan(eqx.Module):
         return jnp.where(either, rises | falls, jnp.where(rising, rises, falls))
 
 
-def make_plan(chain: Chain, events: tuple, dtype) -> Plan:
+def make_plan(chain: Chain, events: tuple[Any, ...], dtype: DType) -> Plan:
     """Return the tables of these events. Raises ValueError for names that the chain does not
     have."""
     timed = tuple(i for i, e in enumerate(events) if isinstance(e, At))

@@ -4,6 +4,7 @@ The bodies, the joint and the placement of a spare link are data of the `Structu
 a slot does not compile a new program.
 """
 
+from collections.abc import Iterable
 from typing import Any
 
 import equinox as eqx
@@ -12,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from svkc._jax.pytrees import is_concrete
+from svkc.model.annotations import Checked, DType, Numbers
 from svkc.model.chain import Chain, State, Structure
 from svkc.model.checked_jit import check_state
 from svkc.model.names import body_rows, spare_slot
@@ -49,7 +51,7 @@ class Grip(eqx.Module):
     slot: str | None = eqx.field(static=True, default=None)
 
 
-def spare_link_freedoms(joint) -> tuple[bool, ...]:
+def spare_link_freedoms(joint: Any) -> tuple[bool, ...]:
     """Return the joint's six freedoms. Raises ValueError for a joint with two rotations, for which
     a spare slot has no coordinates."""
     freedoms = joint_freedoms(joint)
@@ -60,7 +62,7 @@ def spare_link_freedoms(joint) -> tuple[bool, ...]:
     return freedoms
 
 
-def rotation_to_axis(axis) -> np.ndarray:
+def rotation_to_axis(axis: Numbers) -> np.ndarray:
     """Return the quaternion (wxyz) of the smallest rotation that takes z to an axis. Raises
     ValueError for an axis of zero length."""
     axis = np.asarray(finite_array("bind: axis", axis), float)
@@ -71,7 +73,7 @@ def rotation_to_axis(axis) -> np.ndarray:
     return quat / np.linalg.norm(quat)
 
 
-def as_placement(name: str, value, dtype):
+def as_placement(name: str, value: Any, dtype: DType) -> Array:
     """Return a point (m) as an array. Raises ValueError if it is not three finite numbers."""
     point = finite_array(f"bind: {name}", value, dtype)
     if point.shape != (3,):
@@ -80,7 +82,14 @@ def as_placement(name: str, value, dtype):
 
 
 def set_links(
-    structure: Structure, links: Bool[Array, " links"], *, rows, freedoms, quat, pos, real_pos
+    structure: Structure,
+    links: Bool[Array, " links"],
+    *,
+    rows: Any,
+    freedoms: Any,
+    quat: Any,
+    pos: Any,
+    real_pos: Any,
 ) -> Structure:
     """Return the structure with new bodies, joint and placement of `links`.
 
@@ -112,7 +121,7 @@ def unbound_slots(chain: Chain, structure: Structure) -> Bool[Array, " links"]:
     return spare & (structure.parent == 0) & (structure.real == 0)
 
 
-def check_bound(chain: Chain, state: State, to_connect) -> State:
+def check_bound(chain: Chain, state: State, to_connect: Any) -> State:
     """Return the state.
 
     to_connect: mask of the links to connect.
@@ -204,10 +213,10 @@ def bind(
     parent: str,
     real: str,
     *,
-    joint="weld",
-    axis=(0.0, 0.0, 1.0),
-    pos=(0.0, 0.0, 0.0),
-    real_pos=(0.0, 0.0, 0.0),
+    joint: Checked[str | Iterable[bool]] = "weld",
+    axis: Numbers = (0.0, 0.0, 1.0),
+    pos: Numbers = (0.0, 0.0, 0.0),
+    real_pos: Numbers = (0.0, 0.0, 0.0),
 ) -> State:
     """Return the state with a spare slot, which must not be connected, bound to two bodies.
 

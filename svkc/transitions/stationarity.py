@@ -69,7 +69,9 @@ def weights(chain: Chain, structure: Structure) -> Float[Array, " dofs"]:
     return weight
 
 
-def independent_rows(structure: Structure, J, qr: PivotedQR, rank_known=True) -> PivotedQR:
+def independent_rows(
+    structure: Structure, J, qr: PivotedQR, rank_known: bool | Bool[Array, ""] = True
+) -> PivotedQR:
     """Return the pivoted QR of J without pivots too small to divide by.
 
     rank_known: whether the margin of the structure is known.

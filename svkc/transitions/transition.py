@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 from svkc._jax.eager import eager_jit
 from svkc._jax.pytrees import is_concrete
 from svkc.loops.constraint import gap_tolerance
+from svkc.model.annotations import Names, Numbers
 from svkc.model.chain import Chain, State, Structure
 from svkc.model.checked_jit import check_state
 from svkc.model.names import connection_mask, joint_slice, link_index, spare_slot
@@ -145,7 +146,7 @@ def release_constraints(
     )
 
 
-def transition(chain: Chain, state: State, connected) -> State:
+def transition(chain: Chain, state: State, connected: Names | Numbers) -> State:
     """Return the state with exactly these virtual links connected.
 
     Links that are not connected yet are connected at their declared placements, with the inelastic

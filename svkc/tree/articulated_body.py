@@ -5,7 +5,7 @@ add up without a change of coordinates. All rows of a level are one array. Joint
 freedoms than the widest of their level are padded with freedoms without motion and with inertia 1.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -99,7 +99,9 @@ def _inward_pass(top: Topology, bodies, f: Float[Array, "nv *k"]):
     )
 
 
-def delassus_matrix(top: Topology, bodies, J: Float[Array, "rows nv"]) -> Float[Array, "rows rows"]:
+def delassus_matrix(
+    top: Topology, bodies: Any, J: Float[Array, "rows nv"]
+) -> Float[Array, "rows rows"]:
     """Return J M^-1 J^T.
 
     M = L^T D L with a block of D for each joint (Featherstone section 6.5), so that the inward
@@ -112,7 +114,7 @@ def delassus_matrix(top: Topology, bodies, J: Float[Array, "rows nv"]) -> Float[
     return sum_in_chunks(u[:, :, None] * x[:, None], (0,))
 
 
-def solve_mass_matrix(top: Topology, bodies, f: Float[Array, " nv"]) -> Float[Array, " nv"]:
+def solve_mass_matrix(top: Topology, bodies: Any, f: Float[Array, " nv"]) -> Float[Array, " nv"]:
     """Return M^-1 f, the joint accelerations at rest without gravity (Featherstone table 7.1)."""
 
     def step(previous, level_data):

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from svkc._jax.static_gather import static_take
+from svkc.model.annotations import Numbers
 from svkc.model.chain import Chain
 from svkc.model.checked_jit import check_chain, checked_jit, float_vector
 from svkc.tree.spatial import (
@@ -100,7 +101,7 @@ def normalize(chain: Chain, q: Float[Array, " q"]) -> Float[Array, " q"]:
     return replace_rows(q, at.ravel(), quat_normalize(static_take(q, at)).ravel())
 
 
-def tangent_gradient(chain: Chain, q, gradient) -> Float[Array, " dofs"]:
+def tangent_gradient(chain: Chain, q: Numbers, gradient: Numbers) -> Float[Array, " dofs"]:
     """Return a gradient with respect to q as one with respect to tangent vectors (per m, per rad).
 
     The result is the gradient of f(integrate(chain, q, dv)) with respect to dv at dv = 0. An
@@ -121,7 +122,7 @@ def tangent_gradient(chain: Chain, q, gradient) -> Float[Array, " dofs"]:
     ]
 
 
-def quaternions_xyzw(chain: Chain, q) -> Float[Array, " q"]:
+def quaternions_xyzw(chain: Chain, q: Numbers) -> Float[Array, " q"]:
     """Return q with the scalar part of every quaternion last, as in Pinocchio, ROS and scipy.
 
     q: configuration with quaternions wxyz.

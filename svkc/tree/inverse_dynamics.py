@@ -48,7 +48,13 @@ def newton_euler(
     return jnp.sum(kin.S * static_take(F, chain.topology.dof_row), -1)
 
 
-def rnea(chain: Chain, kin: Kinematics, V, v, vdot: Float[Array, " nv"]) -> Float[Array, " nv"]:
+def rnea(
+    chain: Chain,
+    kin: Kinematics,
+    V: Float[Array, "rows 6"],
+    v: Float[Array, " _"],
+    vdot: Float[Array, " nv"],
+) -> Float[Array, " nv"]:
     """Return ID(q, v, vdot) of the tree with gravity and armature (paper, section III-A, step 2).
 
     V: twists at v.

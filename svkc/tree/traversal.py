@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from svkc._jax.static_gather import static_take
+from svkc.model.annotations import DType
 from svkc.model.topology import BALL, FREE, HINGE, SLIDE, V_SIZE, Topology
 
 # Trees with more levels use pointer doubling and `lax.scan`: unrolled, their compile time would
@@ -179,7 +180,7 @@ def _pad(top: Topology, levels: list[Level]) -> Level:
     )
 
 
-def scan_levels(step: Callable, start, over, reverse: bool = False) -> Any:
+def scan_levels(step: Callable, start: Any, over: Any, reverse: bool = False) -> Any:
     """Return the outputs of `carry, output = step(carry, level)` over all levels.
 
     The recursion is unrolled over a list of levels, and a `lax.scan` over stacked levels.
@@ -193,7 +194,7 @@ def scan_levels(step: Callable, start, over, reverse: bool = False) -> Any:
     return outputs[::-1] if reverse else outputs
 
 
-def initial_carry(top: Topology, *shape: int, dtype) -> Array | None:
+def initial_carry(top: Topology, *shape: int, dtype: DType) -> Array | None:
     """Return the first carry of `scan_levels`: zeros for stacked levels, None for a list."""
     levels = level_tables(top)
     return None if isinstance(levels, list) else jnp.zeros((levels.rows.shape[1], *shape), dtype)
@@ -209,7 +210,7 @@ def sum_children(
     return jnp.sum(static_take(below, children), 1)
 
 
-def with_level_data(top: Topology, *functions: Callable):
+def with_level_data(top: Topology, *functions: Callable) -> Any:
     """Return (level, f(level), ...) for each level, or for the stacked levels at once."""
     levels = level_tables(top)
     return (
@@ -219,6 +220,6 @@ def with_level_data(top: Topology, *functions: Callable):
     )
 
 
-def zip_levels(a, b):
+def zip_levels(a: Any, b: Any) -> Any:
     """Return the pairs of two results of `scan_levels` or `with_level_data`, level by level."""
     return list(zip(a, b, strict=True)) if isinstance(a, list) else (a, b)

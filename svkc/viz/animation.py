@@ -2,11 +2,13 @@
 
 import pathlib
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
 from svkc.mjcf.bodies import rotation_matrix
+from svkc.model.annotations import Checked, Names
 from svkc.model.chain import Chain
 from svkc.simulation.trajectory import Trajectory
 from svkc.viz.shapes import (
@@ -40,7 +42,7 @@ def _use_offscreen_context():
     )
 
 
-def write_gif(path: pathlib.Path, images: Iterator, fps: float):
+def write_gif(path: pathlib.Path, images: Iterator[Any], fps: float) -> None:
     """Write a repeating gif with 96 colors a frame."""
     from PIL import Image
 
@@ -48,7 +50,7 @@ def write_gif(path: pathlib.Path, images: Iterator, fps: float):
     first.save(path, save_all=True, append_images=others, duration=round(1000 / fps), loop=0)
 
 
-def write_mp4(path: pathlib.Path, images: Iterator, fps: float):
+def write_mp4(path: pathlib.Path, images: Iterator[Any], fps: float) -> None:
     """Write H.264 with imageio-ffmpeg's ffmpeg.
 
     Raises RuntimeError if imageio-ffmpeg is not installed.
@@ -80,8 +82,9 @@ def write_mp4(path: pathlib.Path, images: Iterator, fps: float):
 
 
 def frames(
-    chain: Chain, traj: Trajectory, *, fps: float, size, trails, **camera_options
-) -> Iterator:
+    chain: Chain, traj: Trajectory, *, fps: float, size: Checked[Sequence[int]], trails: Names,
+    **camera_options: Any,
+) -> Iterator[Any]:  # fmt: skip
     """Yield PIL images `1/fps` s apart, each of the saved state nearest in time.
 
     Connected virtual links are drawn as spheres. A strip below the image shows the time, the

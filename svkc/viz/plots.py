@@ -2,6 +2,7 @@
 
 import functools
 import pathlib
+from typing import Any
 
 import jax
 import numpy as np
@@ -128,7 +129,7 @@ def _add_legend(axes, chain: Chain, starts, structures, colors: dict):
     )
 
 
-def curves(traj: Trajectory, chain: Chain | None = None):
+def curves(traj: Trajectory, chain: Chain | None = None) -> Any:
     """Return a matplotlib figure of coordinates, energy, loop gaps and mobility over time.
 
     Events are numbered vertical lines.

@@ -4,6 +4,7 @@ import os
 import pathlib
 from typing import Any
 
+from svkc.model.annotations import Integer, Names, Numbers, Path, Scalar
 from svkc.model.chain import Chain
 from svkc.model.checked_jit import check_chain
 from svkc.model.validation import integer, names, positive_scalar, scalar, vector
@@ -24,9 +25,10 @@ def _require_packages() -> None:
 
 
 def render(
-    chain: Chain, traj: Trajectory, path, *, fps: float = 25, frames: int = 10, size=(640, 480),
-    trails=(), camera: str | None = None, lookat=None, distance=None, azimuth: float = 90,
-    elevation: float = -8,
+    chain: Chain, traj: Trajectory, path: Path, *, fps: Scalar = 25, frames: Integer = 10,
+    size: Numbers = (640, 480), trails: Names = (), camera: str | None = None,
+    lookat: Numbers | None = None, distance: Scalar | None = None, azimuth: Scalar = 90,
+    elevation: Scalar = -8,
 ) -> pathlib.Path:  # fmt: skip
     """Write a picture of a run in the format of the path's suffix, and return the path.
 
@@ -41,8 +43,7 @@ def render(
     trails: names of bodies whose paths are drawn in an animation.
     camera: name of a camera of the model, for an animation. None: a free camera, as follows.
     lookat: point at which the free camera looks (m, ground frame). None: the middle of the motion.
-    distance: distance of the free camera from `lookat` (m). None: far enough to see the whole
-        motion.
+    distance: distance of the free camera from `lookat` (m). None: the whole motion is in view.
     azimuth, elevation: direction of the free camera (degrees), as in MuJoCo.
 
     Raises ValueError if the suffix is unknown, `traj` is a batch, a name does not exist, or a
@@ -53,7 +54,7 @@ def render(
 
     check_chain(chain)
     check_single_run(traj)
-    frames, fps = integer("frames", frames, 1), positive_scalar("fps", fps)
+    frames, rate = integer("frames", frames, 1), float(positive_scalar("fps", fps))
     path = pathlib.Path(os.fspath(path))
     size = tuple(integer("size", n, 16, 8192) for n in vector("size", size, 2))
     trails = names("trails", trails)
@@ -69,8 +70,8 @@ def render(
         raise ValueError(f"render: {path.name} should end in .png, .gif, .mp4 or .html")
     writer(
         path,
-        animation.frames(chain, traj, fps=fps, size=size, trails=trails, **camera_options),
-        fps,
+        animation.frames(chain, traj, fps=rate, size=size, trails=trails, **camera_options),
+        rate,
     )
     return path
 

@@ -1,5 +1,7 @@
 """Poses, shapes, link positions and descriptions of events, which all pictures of a run use."""
 
+from typing import Any
+
 import jax
 import numpy as np
 
@@ -12,7 +14,7 @@ from svkc.tree.kinematics import poses
 COLORS = ("#1f5fa8", "#d9822b", "#2f8f4e", "#8e3b8e", "#b03030")
 
 
-def check_single_run(traj) -> None:
+def check_single_run(traj: Any) -> None:
     """Raise ValueError if the argument is no trajectory or is a batch of trajectories."""
     if not isinstance(traj, Trajectory):
         raise ValueError(f"traj: expected one run of svkc.simulate, got {type(traj).__name__}")
@@ -82,7 +84,7 @@ def positions_and_rotations(chain: Chain, states: State) -> tuple[np.ndarray, np
 
 
 def connected_link_positions(
-    chain: Chain, states: State, positions, R
+    chain: Chain, states: State, positions: Any, R: Any
 ) -> list[dict[int, np.ndarray]]:
     """Return {link: position (m)} of the connected virtual links, for each state.
 
