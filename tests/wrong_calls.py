@@ -412,6 +412,10 @@ ALSO = [
         lambda s: s.simulate(events=[svkc.at(0.5, cut="crank")]),
     ),
     ("expected 4 joint torques", lambda s: svkc.step(s.four, s.state, jnp.zeros(2), 1e-3)),
+    (
+        "implicit_damping: got 'no'",
+        lambda s: svkc.step(s.four, s.state, jnp.zeros(3), 1e-3, implicit_damping="no"),
+    ),
     ("here", lambda s: svkc.at(1.0, here="a")),
     ("when: guard: expected a function of .*, got 3", lambda s: svkc.when(3)),
     ("target: got 0", lambda s: svkc.accuracy.tune(s.four, s.state, 0.5, target=0.0)),

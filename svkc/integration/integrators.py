@@ -13,7 +13,7 @@ from svkc.loops.constrained_dynamics import ArticulatedBodies
 from svkc.loops.forward_dynamics import velocity_and_acceleration
 from svkc.model.chain import Chain, State, active_dofs
 from svkc.model.checked_jit import checked_jit, torques_over_dofs
-from svkc.model.validation import scalar
+from svkc.model.validation import boolean, scalar
 from svkc.tree.configuration import integrate
 from svkc.tree.inverse_dynamics import limit_forces
 
@@ -67,6 +67,9 @@ class SymplecticEuler(RodriguesEuler):
     Wanner, Geometric Numerical Integration). Where the mass matrix depends on q, as for a double
     pendulum, the energy drifts.
 
+    Joint damping is explicit, as this solver knows the vector field alone: a step equals one of
+    `svkc.step` with `implicit_damping=False`.
+
     Use as `solver` of `svkc.simulate` together with `dt`: the solver estimates no error and
     handles the states of `svkc.simulate` alone.
     """
@@ -107,30 +110,55 @@ class SimplifiedNewton(diffrax.VeryChord):
         )
 
 
-@checked_jit
+@checked_jit(static=("implicit_damping",))
 def step(
-    chain: Chain, state: State, tau: Float[Array, " torques"], dt: Float[Array, ""] | float
+    chain: Chain,
+    state: State,
+    tau: Float[Array, " torques"],
+    dt: Float[Array, ""] | float,
+    *,
+    implicit_damping=True,
 ) -> State:
     """Take one step of symplectic Euler and return the new state.
 
-    v(t + dt) = v(t) + vdot(t) dt, then q moves by v(t + dt) dt along the exponential map. For loops
+    v(t + dt) = v(t) + a dt, then q moves by v(t + dt) dt along the exponential map. For loops
     of one's own, such as control or reinforcement learning. Springs, dampers and joint limits act.
     The structure stays. First order; `svkc.simulate` has events, other solvers and error control.
+
+    The acceleration a solves (M + dt D) a = f(q(t), v(t)) under the loop constraints. D is the
+    diagonal matrix of the joints' damping, so that dampers are stable with any step size: an open
+    chain moves as by `mj_step` of MuJoCo's default integrator, Euler, which differs from its
+    `implicitfast`. Springs stay explicit, as in MuJoCo. Joint limits are explicit springs and
+    dampers of svkc's own law (paper, section VII-B), and so is the damping of virtual links that
+    are not cuttable joints: beyond a joint's range motions differ from those of MuJoCo.
 
     Each step reduces the gaps of loops by a quarter (Baumgarte stabilization of rate 1 / (2 dt)).
 
     tau: joint torques (N m, N), constant over the step; over all coordinates or over the tree's.
     dt: step size (s).
+    implicit_damping: whether joint damping is implicit. False: a = vdot(t), as in a step of
+        `svkc.integrators.SymplecticEuler`, and of MuJoCo without its flag `eulerdamp`.
 
-    Raises ValueError if `tau` has neither of these sizes, or if `dt` is not one real number.
+    Raises ValueError if `tau` has neither of these sizes, if `dt` is not one real number, or if
+    `implicit_damping` is neither True nor False.
     """
     return _step(
-        chain, state, torques_over_dofs(chain, tau), jnp.asarray(scalar("dt", dt), state.q.dtype)
+        chain,
+        state,
+        torques_over_dofs(chain, tau),
+        jnp.asarray(scalar("dt", dt), state.q.dtype),
+        chain.damping if boolean("implicit_damping", implicit_damping) else None,
     )
 
 
 @with_lanes_last
-def _step(chain: Chain, state: State, tau: Float[Array, " dofs"], dt: Float[Array, ""]) -> State:
+def _step(
+    chain: Chain,
+    state: State,
+    tau: Float[Array, " dofs"],
+    dt: Float[Array, ""],
+    damping: Float[Array, " dofs"] | None,
+) -> State:
     tau = tau + limit_forces(chain, state.q, state.v)
     v, vdot = velocity_and_acceleration(
         chain,
@@ -140,6 +168,7 @@ def _step(chain: Chain, state: State, tau: Float[Array, " dofs"], dt: Float[Arra
         tau,
         dynamics=ArticulatedBodies(),
         baumgarte=0.5 / dt if chain.link_names else None,
+        added_inertia=None if damping is None else dt * damping,
     )
     v = v + dt * vdot
     return State(

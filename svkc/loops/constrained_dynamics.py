@@ -14,6 +14,7 @@ from svkc._jax.batched_lapack import batched_solve_triangular, cholesky_solver
 from svkc.loops.constraint import LoopKinematics, jacobian_scales
 from svkc.loops.coordinates import Coordinates, partition_coordinates
 from svkc.loops.delassus import loop_force_solver
+from svkc.loops.diagonal_inertia import refined
 from svkc.loops.pivoting import PivotedQR, pivot_blocks
 from svkc.model.chain import Chain, Structure, active_dofs
 from svkc.model.validation import scalar
@@ -80,6 +81,12 @@ class ArticulatedBodies(AbstractDynamics):
     J_C near singular configurations. With `svkc.stabilization.Projection` the report knows the
     margin at the ends of phases only, and counts no changes of pivots.
 
+    Massless bodies that loops hold cost one more solve for each coordinate of their joints. They
+    are those whose mass, or moment of inertia about a joint, is below 1e-7 of the model's largest
+    when loaded; both may then be zero too. If another body's mass becomes zero, where the tree
+    alone has no inertia then, the run ends with `non_finite` or `step_too_small`. `CompositeBodies`
+    simulates it, or loading a model with a tiny mass.
+
     hold: for stabilizations that choose pivots whatever the method; see `AbstractDynamics`.
     """
 
@@ -100,7 +107,8 @@ class ArticulatedBodies(AbstractDynamics):
         )
         # all rows, dependent ones included
         used = jnp.ones(loops.J.shape[0], bool)
-        return _implicit_solve(chain, structure, loops, solve, lambda x: x, used)
+        refine = len(chain.topology.massless_dofs) > 0
+        return _implicit_solve(chain, structure, loops, solve, lambda x: x, used, refine=refine)
 
     def prepare_open(
         self, chain: Chain, structure: Structure, kin: Kinematics
@@ -215,6 +223,8 @@ def _implicit_solve(
     factor_solve: Callable,
     select_rows: Callable,
     active_rows: Bool[Array, " selected"],
+    *,
+    refine: bool = False,
 ) -> Callable:
     """Return (force, bias) -> x by `factor_solve`, differentiated as an implicit function.
 
@@ -225,6 +235,7 @@ def _implicit_solve(
     factor_solve: (force, -bias) -> (x, mu) on selected rows, which has no derivative.
     select_rows: the linear map from all loop rows to the selected ones.
     active_rows: which of the selected rows count.
+    refine: whether the solution is refined once by its residual.
     """
     nv, column = chain.nv, jacobian_scales(chain)[1]
     active = active_dofs(chain, structure)
@@ -239,7 +250,12 @@ def _implicit_solve(
     def solve(force: Float[Array, " dofs"], bias: Float[Array, " rows"]) -> Float[Array, " dofs"]:
         right_sides = _link_tangents(jnp.where(active, force, 0), -select_rows(bias))
         return jax.lax.custom_linear_solve(
-            equations, right_sides, solve=lambda _, sides: factor_solve(*sides), symmetric=True
+            equations,
+            right_sides,
+            solve=lambda matvec, sides: (
+                refined(factor_solve, matvec, sides) if refine else factor_solve(*sides)
+            ),
+            symmetric=True,
         )[0]
 
     return solve

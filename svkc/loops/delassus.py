@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float
 
 from svkc._jax.batched_lapack import cholesky_solver
 from svkc._jax.static_gather import static_take
+from svkc.loops.diagonal_inertia import auxiliary_inertia, with_armature, with_inertia
 from svkc.model.chain import Chain
 from svkc.tree.articulated_body import articulated_factors, delassus_matrix, solve_mass_matrix
 from svkc.tree.kinematics import Kinematics
@@ -148,6 +149,26 @@ def loop_force_solver(
     chain: Chain, kin: Kinematics, J: Float[Array, "rows dofs"], free: Bool[Array, " nv"] | None
 ) -> Callable:
     """Return (force, loop_bias) -> (x, mu) with M x + J^T mu = force and J x = loop_bias.
+
+    Where M is singular, or nearly so, as loops alone hold massless bodies, D does not exist, or
+    one of its entries hides the others. An auxiliary inertia makes M regular; Woodbury's formula
+    takes the inertia off again, exactly.
+
+    free: coordinates that are not locked (None: all).
+    """
+    massless = np.array(chain.topology.massless_dofs, int)
+    if not len(massless):
+        return _solver_of_regular_mass_matrix(chain, kin, J, free)
+    inertia = auxiliary_inertia(chain)
+    solve = _solver_of_regular_mass_matrix(with_armature(chain, inertia), kin, J, free)
+    removed = -inertia if free is None else jnp.where(free, -inertia, 0)
+    return with_inertia(chain, solve, massless, removed[massless])
+
+
+def _solver_of_regular_mass_matrix(
+    chain: Chain, kin: Kinematics, J: Float[Array, "rows dofs"], free: Bool[Array, " nv"] | None
+) -> Callable:
+    """Return `loop_force_solver` of a chain whose mass matrix M is regular.
 
     The rows of J may be dependent. D is regularized and factored, and the forces are refined
     against D itself (the proximal form): forces of dependent rows stay finite, and the motion is

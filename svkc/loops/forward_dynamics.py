@@ -1,11 +1,12 @@
 """Forward dynamics of any structure (paper, section III-B) and the wrenches in its loops."""
 
 import functools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from svkc._jax.lanes_last import with_lanes_last
@@ -16,6 +17,7 @@ from svkc.loops.constrained_dynamics import (
 )
 from svkc.loops.constraint import constraint_bias, jacobian_scales, loop_kinematics
 from svkc.loops.coordinates import with_dependent_velocities
+from svkc.loops.diagonal_inertia import with_armature, with_inertia
 from svkc.loops.pivoting import (
     NEAR_SINGULAR,
     PivotedQR,
@@ -43,6 +45,7 @@ def velocity_and_acceleration(
     baumgarte=None,
     project_velocity: bool = False,
     pivots=None,
+    added_inertia: Float[Array, " dofs"] | None = None,
 ) -> tuple[Float[Array, " dofs"], Float[Array, " dofs"]]:
     """Return the velocity and the acceleration (paper, section III-B, steps 1 to 5).
 
@@ -53,6 +56,8 @@ def velocity_and_acceleration(
     project_velocity: near a singular configuration compute the dependent velocities from the
     independent ones, as the errors of v would grow there from stage to stage of a step.
     pivots: as in `select_pivots`.
+    added_inertia: added to the diagonal of the mass matrix (None: nothing), on the coordinates of
+    the tree and of cuttable joints.
     """
     if chain.topology.link_names:
         loops = loop_kinematics(chain, structure, q)
@@ -77,10 +82,25 @@ def velocity_and_acceleration(
     V = twists(chain, kin, v)
     bias = rnea(chain, kin, V, v, jnp.zeros(chain.nv, v.dtype))
     force = tau + passive_forces(chain, q, v) - pad_to_dofs(chain, bias)
+    if added_inertia is not None:
+        chain = with_armature(chain, added_inertia[: chain.nv])
     if loops is None:
         return v, dynamics.prepare_open(chain, structure, kin)(force)
     loop_bias = constraint_bias(chain, structure, v, loops, V, baumgarte)
-    return v, dynamics.prepare(chain, structure, loops, qr)(force, loop_bias)
+    solve = dynamics.prepare(chain, structure, loops, qr)
+    if added_inertia is not None:
+        solve = _with_cuttable_inertia(chain, solve, added_inertia)
+    return v, solve(force, loop_bias)
+
+
+def _with_cuttable_inertia(
+    chain: Chain, solve: Callable, inertia: Float[Array, " dofs"]
+) -> Callable:
+    """Return `solve` of a chain whose cuttable joints have inertia, from one without."""
+    top = chain.topology
+    dofs = top.links.dof[np.array(top.link_child, int) >= 0].ravel()
+    dofs = dofs[dofs < chain.dofs]
+    return with_inertia(chain, solve, dofs, inertia[dofs]) if len(dofs) else solve
 
 
 @with_lanes_last

@@ -12,6 +12,9 @@ from svkc.model.topology import BALL, FIXED, FREE, HINGE, Q_SIZE, SLIDE, V_SIZE,
 # rad/s: outside of its range, a joint with its inertia in the load pose is a critically damped
 # oscillator of this angular frequency
 _LIMIT_RATE = 50.0
+# Of the largest inertia: what is below counts as massless. Delassus' matrix is regularized by
+# 1.6e-10 of its largest entry, so that accelerations are exact to 1e-11 down to here.
+_MASSLESS = 1e-7
 JOINT_KINDS = {0: FREE, 1: BALL, 2: SLIDE, 3: HINGE}  # mjtJoint
 
 
@@ -109,8 +112,48 @@ def tree_rows(
         joint_row=tuple(row_of[j.name] for j in joints),
         link_freedoms=(),
         link_spare=(),
+        massless_dofs=_massless_dofs(model, joints),
     )
     return [order[i][:2] for i in rank], topology
+
+
+def _massless_dofs(model: MuJoCo, joints: list[TreeJoint]) -> tuple[int, ...]:
+    """Return the coordinates of joints along which their own body has almost no inertia.
+
+    Masses are compared with the largest mass, moments of inertia about joints with the largest.
+    """
+    lightest, inertias = _joint_inertias(model, joints)
+    bound = _MASSLESS * np.max(inertias, 0, initial=0)
+    return tuple(
+        j.v + k
+        for j, least in zip(joints, lightest, strict=True)
+        for k in range(V_SIZE[j.kind])
+        if (least < bound)[int(j.kind == SLIDE or (j.kind == FREE and k < 3))]
+    )
+
+
+def _joint_inertias(model: MuJoCo, joints: list[TreeJoint]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the (rotational, linear) inertia of each joint's body, least and largest by axis.
+
+    A body includes the bodies fixed to it. Moments of inertia are about the joint's anchor, of
+    free joints about the centre of mass, in the load pose.
+    """
+    import mujoco
+
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    out = np.zeros((2, len(joints), 2))
+    for i, j in enumerate(joints):
+        fixed = np.flatnonzero(model.body_weldid == model.body_weldid[j.body])
+        m, R = model.body_mass[fixed], data.ximat[fixed].reshape(-1, 3, 3)
+        com = m @ data.xipos[fixed] / max(m.sum(), mujoco.mjMINVAL)
+        r = data.xipos[fixed] - (com if j.kind == FREE else data.xanchor[j.joint])
+        own = np.einsum("bij,bj,bkj->ik", R, model.body_inertia[fixed], R)
+        inertia = own + np.eye(3) * (m @ np.sum(r * r, 1)) - np.einsum("b,bi,bj", m, r, r)
+        axis = data.xaxis[j.joint]
+        axes = np.linalg.eigvalsh(inertia) if j.kind in (BALL, FREE) else [axis @ inertia @ axis]
+        out[:, i] = [[np.min(axes), m.sum()], [np.max(axes), m.sum()]]
+    return out[0], out[1]
 
 
 def body_arrays(

@@ -53,8 +53,11 @@ def check_state(chain: Any, state: Any) -> None:
             )
 
 
-def _validated(arguments: dict) -> dict:
-    """Return the arguments by name, converted to arrays; raise ValueError for invalid ones."""
+def _validated(arguments: dict, static: tuple[str, ...] = ()) -> dict:
+    """Return the arguments by name, converted to arrays unless static.
+
+    Raises ValueError for an invalid argument.
+    """
     chain = arguments["chain"]
     check_chain(chain)
     if "state" in arguments:
@@ -62,7 +65,7 @@ def _validated(arguments: dict) -> dict:
     lengths = dict.fromkeys(("q", "q1", "q2"), chain.topology.nq_all) | {"dv": chain.dofs}
     return arguments | {
         name: float_vector(chain, name, arguments[name], lengths.get(name))
-        for name in arguments.keys() - {"chain", "state"}
+        for name in arguments.keys() - {"chain", "state", *static}
     }
 
 
@@ -86,22 +89,27 @@ def float_vector(chain: Chain, name: str, value: Any, size: int | None = None) -
     )
 
 
-def checked_jit(fn: Callable | None = None, *, eager: bool = False) -> Callable:
+def checked_jit(
+    fn: Callable | None = None, *, eager: bool = False, static: tuple[str, ...] = ()
+) -> Callable:
     """Wrap a function of a chain, a state and arrays in `jax.jit`, and validate its arguments.
 
     eager: outside of all transformations, compile for short compile time (`eager_jit`).
+    static: names of keyword-only arguments that are static. The function validates them itself.
 
     The wrapped function raises ValueError for an invalid argument.
     """
     if fn is None:
-        return functools.partial(checked_jit, eager=eager)
+        return functools.partial(checked_jit, eager=eager, static=static)
     signature = inspect.signature(fn)
 
     @functools.wraps(fn)
     def with_validation(*args, **options):
-        return fn(**_validated(signature.bind(*args, **options).arguments))
+        return fn(**_validated(signature.bind(*args, **options).arguments, static))
 
-    compiled = eager_jit(with_validation) if eager else jax.jit(with_validation)
+    compiled = (
+        eager_jit(with_validation) if eager else jax.jit(with_validation, static_argnames=static)
+    )
 
     @functools.wraps(fn)
     def call(*args, **options):
@@ -113,7 +121,7 @@ def checked_jit(fn: Callable | None = None, *, eager: bool = False) -> Callable:
             return compiled(*args, **options)
         except (TypeError, OverflowError):
             # JAX rejected an argument: validation says which
-            _validated(signature.bind(*args, **options).arguments)
+            _validated(signature.bind(*args, **options).arguments, static)
             raise
 
     return call

@@ -36,6 +36,7 @@ class Topology:
     model_q: index in q of each entry of the model's qpos.
     model_v: index in v of each entry of the model's qvel.
     link_actuated: whether a motor drives the coordinates of each virtual link.
+    massless_dofs: the tree's coordinates along which the joint's own body has almost no inertia.
     """
 
     body_names: tuple[str, ...]
@@ -56,6 +57,7 @@ class Topology:
     model_q: tuple[int, ...] = ()
     model_v: tuple[int, ...] = ()
     link_actuated: tuple[bool, ...] = ()
+    massless_dofs: tuple[int, ...] = ()
 
     @functools.cached_property
     def _hash(self) -> int:
