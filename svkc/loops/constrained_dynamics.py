@@ -83,9 +83,8 @@ class ArticulatedBodies(AbstractDynamics):
 
     Massless bodies that loops hold cost one more solve for each coordinate of their joints. They
     are those whose mass, or moment of inertia about a joint, is below 1e-7 of the model's largest
-    when loaded; both may then be zero too. If another body's mass becomes zero, where the tree
-    alone has no inertia then, the run ends with `non_finite` or `step_too_small`. `CompositeBodies`
-    simulates it, or loading a model with a tiny mass.
+    when loaded; both may then be zero too. If another body's mass is set to zero, runs may end with
+    `non_finite` or `step_too_small`: load a tiny mass, or use `CompositeBodies`.
 
     hold: for stabilizations that choose pivots whatever the method; see `AbstractDynamics`.
     """
@@ -252,9 +251,7 @@ def _implicit_solve(
         return jax.lax.custom_linear_solve(
             equations,
             right_sides,
-            solve=lambda matvec, sides: (
-                refined(factor_solve, matvec, sides) if refine else factor_solve(*sides)
-            ),
+            solve=refined(factor_solve) if refine else lambda _, sides: factor_solve(*sides),
             symmetric=True,
         )[0]
 

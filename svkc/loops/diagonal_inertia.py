@@ -61,8 +61,15 @@ def auxiliary_inertia(chain: Chain) -> Float[Array, " nv"]:
     return jnp.where(mask, size, 0)
 
 
-def refined(solve: Callable, equations: Callable, right_sides):
-    """Return the solution of `equations(x) = right_sides` by `solve`, refined once."""
-    x = solve(*right_sides)
-    residual = jax.tree.map(jnp.subtract, right_sides, equations(x))
-    return jax.tree.map(jnp.add, x, solve(*residual))
+def refined(solve: Callable) -> Callable:
+    """Return (equations, right_sides) -> x, which solves by `solve` and refines once.
+
+    equations: the linear map from x to the right sides.
+    """
+
+    def solve_and_refine(equations, right_sides):
+        x = solve(*right_sides)
+        residual = jax.tree.map(jnp.subtract, right_sides, equations(x))
+        return jax.tree.map(jnp.add, x, solve(*residual))
+
+    return solve_and_refine

@@ -69,14 +69,7 @@ def velocity_and_acceleration(
         )
         if project_velocity:
             assert qr is not None
-            near = pivot_ratio(qr) < NEAR_SINGULAR * structure.margin
-            v = jnp.where(
-                near,
-                with_dependent_velocities(
-                    chain, qr, J, jnp.where(active_dofs(chain, structure), v, 0)
-                ),
-                v,
-            )
+            v = _projected_if_near_singular(chain, structure, qr, J, v)
     else:
         kin, loops = kinematics(chain, q), None
     V = twists(chain, kin, v)
@@ -91,6 +84,15 @@ def velocity_and_acceleration(
     if added_inertia is not None:
         solve = _with_cuttable_inertia(chain, solve, added_inertia)
     return v, solve(force, loop_bias)
+
+
+def _projected_if_near_singular(
+    chain: Chain, structure: Structure, qr: PivotedQR, J, v
+) -> Float[Array, " dofs"]:
+    """Return v, near a singular configuration with its dependent part from the independent one."""
+    near = pivot_ratio(qr) < NEAR_SINGULAR * structure.margin
+    active_v = jnp.where(active_dofs(chain, structure), v, 0)
+    return jnp.where(near, with_dependent_velocities(chain, qr, J, active_v), v)
 
 
 def _with_cuttable_inertia(

@@ -122,7 +122,9 @@ def _massless_dofs(model: MuJoCo, joints: list[TreeJoint]) -> tuple[int, ...]:
 
     Masses are compared with the largest mass, moments of inertia about joints with the largest.
     """
-    lightest, inertias = _joint_inertias(model, joints)
+    # numbers that are not finite have an error of their own, later
+    with np.errstate(all="ignore"):
+        lightest, inertias = _joint_inertias(model, joints)
     bound = _MASSLESS * np.max(inertias, 0, initial=0)
     return tuple(
         j.v + k
@@ -151,6 +153,7 @@ def _joint_inertias(model: MuJoCo, joints: list[TreeJoint]) -> tuple[np.ndarray,
         own = np.einsum("bij,bj,bkj->ik", R, model.body_inertia[fixed], R)
         inertia = own + np.eye(3) * (m @ np.sum(r * r, 1)) - np.einsum("b,bi,bj", m, r, r)
         axis = data.xaxis[j.joint]
+        inertia = np.nan_to_num(inertia)
         axes = np.linalg.eigvalsh(inertia) if j.kind in (BALL, FREE) else [axis @ inertia @ axis]
         out[:, i] = [[np.min(axes), m.sum()], [np.max(axes), m.sum()]]
     return out[0], out[1]
