@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from svkc._jax.lanes_last import with_lanes_last
 from svkc.loops.constrained_dynamics import ArticulatedBodies
 from svkc.loops.forward_dynamics import velocity_and_acceleration
+from svkc.model.annotations import Checked
 from svkc.model.chain import Chain, State, active_dofs
 from svkc.model.checked_jit import checked_jit, torques_over_dofs
 from svkc.model.validation import boolean, scalar
@@ -117,7 +118,7 @@ def step(
     tau: Float[Array, " torques"],
     dt: Float[Array, ""] | float,
     *,
-    implicit_damping=True,
+    implicit_damping: Checked[bool] = True,
 ) -> State:
     """Take one step of symplectic Euler and return the new state.
 

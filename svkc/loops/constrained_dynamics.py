@@ -14,7 +14,6 @@ from svkc._jax.batched_lapack import batched_solve_triangular, cholesky_solver
 from svkc.loops.constraint import LoopKinematics, jacobian_scales
 from svkc.loops.coordinates import Coordinates, partition_coordinates
 from svkc.loops.delassus import loop_force_solver
-from svkc.loops.diagonal_inertia import refined
 from svkc.loops.pivoting import PivotedQR, pivot_blocks
 from svkc.model.chain import Chain, Structure, active_dofs
 from svkc.model.validation import scalar
@@ -106,8 +105,7 @@ class ArticulatedBodies(AbstractDynamics):
         )
         # all rows, dependent ones included
         used = jnp.ones(loops.J.shape[0], bool)
-        refine = len(chain.topology.massless_dofs) > 0
-        return _implicit_solve(chain, structure, loops, solve, lambda x: x, used, refine=refine)
+        return _implicit_solve(chain, structure, loops, solve, lambda x: x, used)
 
     def prepare_open(
         self, chain: Chain, structure: Structure, kin: Kinematics
@@ -222,8 +220,6 @@ def _implicit_solve(
     factor_solve: Callable,
     select_rows: Callable,
     active_rows: Bool[Array, " selected"],
-    *,
-    refine: bool = False,
 ) -> Callable:
     """Return (force, bias) -> x by `factor_solve`, differentiated as an implicit function.
 
@@ -234,7 +230,6 @@ def _implicit_solve(
     factor_solve: (force, -bias) -> (x, mu) on selected rows, which has no derivative.
     select_rows: the linear map from all loop rows to the selected ones.
     active_rows: which of the selected rows count.
-    refine: whether the solution is refined once by its residual.
     """
     nv, column = chain.nv, jacobian_scales(chain)[1]
     active = active_dofs(chain, structure)
@@ -249,10 +244,7 @@ def _implicit_solve(
     def solve(force: Float[Array, " dofs"], bias: Float[Array, " rows"]) -> Float[Array, " dofs"]:
         right_sides = _link_tangents(jnp.where(active, force, 0), -select_rows(bias))
         return jax.lax.custom_linear_solve(
-            equations,
-            right_sides,
-            solve=refined(factor_solve) if refine else lambda _, sides: factor_solve(*sides),
-            symmetric=True,
+            equations, right_sides, solve=lambda _, sides: factor_solve(*sides), symmetric=True
         )[0]
 
     return solve

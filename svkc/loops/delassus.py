@@ -19,6 +19,7 @@ from svkc._jax.static_gather import static_take
 from svkc.loops.diagonal_inertia import auxiliary_inertia, with_armature, with_inertia
 from svkc.model.chain import Chain
 from svkc.tree.articulated_body import articulated_factors, delassus_matrix, solve_mass_matrix
+from svkc.tree.inverse_dynamics import mass_matrix_product, pad_to_dofs
 from svkc.tree.kinematics import Kinematics
 from svkc.tree.spatial import inverse_positive, matvec
 
@@ -152,7 +153,7 @@ def loop_force_solver(
 
     Where M is singular, or nearly so, as loops alone hold massless bodies, D does not exist, or
     one of its entries hides the others. An auxiliary inertia makes M regular; Woodbury's formula
-    takes the inertia off again, exactly.
+    takes the inertia off again, and one refinement by the residual restores the digits it costs.
 
     free: coordinates that are not locked (None: all).
     """
@@ -162,7 +163,18 @@ def loop_force_solver(
     inertia = auxiliary_inertia(chain)
     solve = _solver_of_regular_mass_matrix(with_armature(chain, inertia), kin, J, free)
     removed = -inertia if free is None else jnp.where(free, -inertia, 0)
-    return with_inertia(chain, solve, massless, removed[massless])
+    solve = with_inertia(chain, solve, massless, removed[massless])
+    nv = chain.nv
+
+    def refined_solve(force, loop_bias):
+        x, mu = solve(force, loop_bias)
+        rest = force - pad_to_dofs(chain, mass_matrix_product(chain, kin, x[:nv])) - mu @ J
+        if free is not None:
+            rest = jnp.concatenate([jnp.where(free, rest[:nv], 0), rest[nv:]])
+        dx, dmu = solve(rest, loop_bias - J @ x)
+        return x + dx, mu + dmu
+
+    return refined_solve
 
 
 def _solver_of_regular_mass_matrix(

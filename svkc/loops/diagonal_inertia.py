@@ -59,17 +59,3 @@ def auxiliary_inertia(chain: Chain) -> Float[Array, " nv"]:
     column = jacobian_scales(chain)[1][: chain.nv]
     size = jnp.finfo(column.dtype).eps ** 0.25 * jnp.max(chain.mass) * (chain.length / column) ** 2
     return jnp.where(mask, size, 0)
-
-
-def refined(solve: Callable) -> Callable:
-    """Return (equations, right_sides) -> x, which solves by `solve` and refines once.
-
-    equations: the linear map from x to the right sides.
-    """
-
-    def solve_and_refine(equations, right_sides):
-        x = solve(*right_sides)
-        residual = jax.tree.map(jnp.subtract, right_sides, equations(x))
-        return jax.tree.map(jnp.add, x, solve(*residual))
-
-    return solve_and_refine
