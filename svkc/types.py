@@ -7,6 +7,6 @@ from svkc.loops.forward_dynamics import LoopForces as LoopForces
 from svkc.loops.mobility import Mobility as Mobility
 from svkc.simulation.codes import DERIVATIVE as DERIVATIVE
 from svkc.simulation.records import Events as Events, Phases as Phases
-from svkc.simulation.trajectory import Report as Report
+from svkc.simulation.report import Report as Report
 from svkc.tools.gradient_check import GradientCheck as GradientCheck
 from svkc.transitions.guards import AbstractGuard as AbstractGuard

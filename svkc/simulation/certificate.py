@@ -1,6 +1,7 @@
 """The certificate of a run: loop gaps, energy, momentum and rank margins, computed from the records
 after the run."""
 
+import dataclasses
 from typing import Any
 
 import diffrax
@@ -17,7 +18,7 @@ from svkc.loops.pivoting import pivot_ratio, pivoted_qr, rank_tolerance
 from svkc.model.chain import Chain, State, Structure, active_dofs
 from svkc.model.topology import FREE
 from svkc.simulation.records import PhaseRecords, Phases
-from svkc.tree.energy import energy_and_momentum
+from svkc.tree.energy import body_motions, energy_and_momentum, kinetic_of_bodies
 from svkc.tree.kinematics import kinematics
 
 
@@ -25,6 +26,7 @@ class StateCheck(eqx.Module):
     """Quantities of the certificate at one state.
 
     gap, gap_rate: largest gaps of the loops (rad, m) and their rates (rad/s, m/s).
+    kinetic: kinetic energy (J), not differentiable.
     energy: mechanical energy (J).
     linear, angular: linear momentum (N s), and angular momentum about the centre of mass (N m s).
     margin: rank margin |R_mm| / |R_11|.
@@ -35,6 +37,7 @@ class StateCheck(eqx.Module):
 
     gap: Float[Array, "*states 2"]
     gap_rate: Float[Array, "*states 2"]
+    kinetic: Float[Array, "*states"]
     energy: Float[Array, "*states"]
     linear: Float[Array, "*states 3"]
     angular: Float[Array, "*states 3"]
@@ -42,21 +45,28 @@ class StateCheck(eqx.Module):
 
 
 def certificate(
-    chain: Chain, records: PhaseRecords, count: Int[Array, ""], saved: State, stages: int
+    chain: Chain, records: PhaseRecords, count: Int[Array, ""], saved: tuple, stages: int
 ) -> tuple[Phases, StateCheck, Int[Array, ""]]:
     """Return the phases of a run, the checks of its saved states, and the index of the first phase
     whose loops lose rank at one of its two ends (the number of rows if none does).
 
     count: number of phases.
+    saved: the save times, and the states at these.
     stages: evaluations of the vector field in one attempted step.
     """
     rows = records.start.shape[0]
-    first, last, saved_checks = _check_states(chain, records, saved)
+    ts, saved_states = saved
+    first, last, saved_checks = _check_states(chain, records, saved_states)
     written = jnp.arange(rows, dtype=jnp.int32) < count
     margin = stop_gradient_tree(jnp.minimum(first.margin, last.margin))
     lost = written & (margin < rank_tolerance(margin.dtype))
     lost_at = jnp.where(jnp.any(lost), jnp.argmax(lost).astype(jnp.int32), rows)
+    at_ends = jnp.maximum(first.kinetic, last.kinetic)
+    within = (ts[None] >= records.start[:, None]) & (ts[None] <= records.stop[:, None])
+    at_saves = jnp.max(jnp.where(within, saved_checks.kinetic[None], 0), 1, initial=0)
+    kinetic = jnp.where(written, jnp.maximum(at_ends, at_saves), 0)
     phases = _phases(chain, records, count, (first, last), stages)
+    phases = dataclasses.replace(phases, kinetic_energy=kinetic)
     return phases, saved_checks, lost_at
 
 
@@ -146,8 +156,10 @@ def _check_state(chain: Chain, state: State, is_phase_end: Bool[Array, ""]) -> S
             largest_norms((J @ state.v).reshape(-1, 6)),
         )
 
+    bodies = body_motions(chain, kin, state.v)
+
     def at_phase_end():
-        energy, *momenta = energy_and_momentum(chain, state, kin)
+        energy, *momenta = energy_and_momentum(chain, state, kin, bodies)
         row, column = jacobian_scales(chain)
         margin = (
             pivot_ratio(
@@ -163,7 +175,13 @@ def _check_state(chain: Chain, state: State, is_phase_end: Bool[Array, ""]) -> S
     none = jnp.zeros((), dtype), jnp.zeros(3, dtype), jnp.zeros(3, dtype), jnp.ones((), dtype)
     energy, linear, angular, margin = jax.lax.cond(is_phase_end, at_phase_end, lambda: none)
     return StateCheck(
-        gap=gaps, gap_rate=rates, energy=energy, linear=linear, angular=angular, margin=margin
+        gap=gaps,
+        gap_rate=rates,
+        kinetic=stop_gradient_tree(kinetic_of_bodies(chain, state.v, bodies)),
+        energy=energy,
+        linear=linear,
+        angular=angular,
+        margin=margin,
     )
 
 

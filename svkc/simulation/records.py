@@ -140,6 +140,8 @@ class Phases(eqx.Module):
     momentum_drift: of a free phase, change of linear momentum that gravity does not explain (N s),
         and change of angular momentum about the centre of mass (N m s).
     count: number of phases. Rows past `count` are empty.
+    kinetic_energy: largest kinetic energy at the two ends of the phase and at the save times within
+        (J); None in files of older versions.
     """
 
     start: Float[Array, " phases"]
@@ -161,6 +163,7 @@ class Phases(eqx.Module):
     free: Bool[Array, " phases"]
     momentum_drift: Float[Array, "phases 2"]
     count: Int[Array, ""]
+    kinetic_energy: Float[Array, " phases"] | None = None
 
     @property
     def freedoms(self) -> Int[Array, "... phases"]:

@@ -134,7 +134,9 @@ def _with_certificate(
     """
     incomplete = (run.t < t1) & (run.result == RESULTS.successful)
     result = RESULTS.where(incomplete, RESULTS.max_events, run.result)
-    phases, saved, rank_lost_at = certificate(chain, run.records, run.count, run.saved, stages)
+    phases, saved, rank_lost_at = certificate(
+        chain, run.records, run.count, (ts, run.saved), stages
+    )
     largest_gap = jnp.maximum(jnp.max(saved.gap), jnp.max(phases.gap))
     result = RESULTS.where(
         (result == RESULTS.successful) & (largest_gap > gap_tolerance), RESULTS.loop_open, result

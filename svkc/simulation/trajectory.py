@@ -1,4 +1,4 @@
-"""The result of a run (`Trajectory`), and its certificate (`Report`)."""
+"""The result of a run (`Trajectory`), and the numbers of its certificate (`Report`)."""
 
 import dataclasses
 import functools
@@ -6,7 +6,8 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+import numpy as np
+from jaxtyping import Array, Bool, Float
 
 from svkc._jax.eager import eager_jit
 from svkc._jax.pytrees import is_concrete
@@ -15,6 +16,7 @@ from svkc.model.chain import Chain, State
 from svkc.model.validation import scalar
 from svkc.simulation.codes import DERIVATIVE, RESULTS
 from svkc.simulation.records import Events, Phases
+from svkc.simulation.report import ROUND_OFF_DRIFT, Report
 
 
 class Trajectory(eqx.Module):
@@ -41,6 +43,24 @@ class Trajectory(eqx.Module):
     t_final: Float[Array, ""]
     result: RESULTS
     derivative: DERIVATIVE
+
+    def __str__(self) -> str:
+        """Return two lines: the extent of the run or of the batch, and the report's verdict."""
+        if not is_concrete(self.t_final):
+            return repr(self)
+        lanes = "x".join(map(str, np.shape(self.t_final)))
+        runs = f"Trajectories of {lanes} lanes" if lanes else "Trajectory"
+        many = lambda number, noun: f"{number} {noun}" + "s" * (number != 1)
+        most = lambda counts: int(np.max(np.asarray(counts), initial=0))
+        extent = ", ".join(
+            [
+                f"t = {np.min(self.ts):.6g} to {np.max(self.t_final):.6g} s",
+                many(np.shape(self.ts)[-1], "save time"),
+                many(most(self.phases.count), "phase"),
+                many(most(self.events.count), "event"),
+            ]
+        )
+        return f"{runs}: {extent}\n{self.report().verdict()}"
 
     @property
     def connected(self) -> Bool[Array, "... times links"]:
@@ -116,6 +136,8 @@ def _report(traj: Trajectory) -> "Report":
         accepted=jnp.sum(p.accepted, -1),
         rejected=jnp.sum(p.rejected, -1),
         evaluations=jnp.sum(p.evaluations, -1),
+        drift_share=_drift_share(p),
+        error_share=_error_share(traj),
         loop=jnp.max(p.loop, -1),
         phases=p.count,
         t_final=traj.t_final,
@@ -124,96 +146,23 @@ def _report(traj: Trajectory) -> "Report":
     )
 
 
-class Report(eqx.Module):
-    """The certificate of a run: how far the numbers of the run can be relied on.
+def _drift_share(p: Phases) -> Float[Array, "..."]:
+    """Return the energy drifts of all phases, added without sign, by the largest kinetic energy.
 
-    gap, angular_gap: largest loop gaps at the ends of steps and at save times (m, rad).
-    gap_rate, angular_gap_rate: largest rates of the loop gaps at the save times and at the ends of
-        phases (m/s, rad/s).
-    energy_drift: change of energy that neither work nor impacts explain (J).
-    energy_lost: energy lost in impacts (J).
-    momentum_drift, angular_momentum_drift: over phases in which the bodies are free of the ground,
-        largest change of linear momentum that gravity does not explain (N s), and of angular
-        momentum about the centre of mass (N m s).
-    free: whether there is such a phase.
-    error: sum of the estimated errors of all steps (inf: none from this solver or adjoint).
-    margin: least rank margin |R_mm| / |R_11|.
-    swaps: how often the choice of dependent coordinates changed (-1: not recorded).
-    accepted, rejected: numbers of steps.
-    evaluations: of the vector field in steps.
-    loop: index of the loop that could not be closed (-1: none).
-    phases: number of phases.
-    t_final: end of the run (s).
-    result, derivative: of the trajectory.
-    halved: result of `svkc.accuracy.estimate_error` (a finer run), if `report` was given it.
+    Drift within round-off of the energy counts as zero. NaN if no kinetic energy is recorded.
     """
+    drift = jnp.sum(jnp.where(jnp.isfinite(p.start), jnp.abs(p.energy_drift), 0), -1)
+    if p.kinetic_energy is None:
+        return drift * jnp.nan
+    round_off = ROUND_OFF_DRIFT * jnp.finfo(drift.dtype).eps * jnp.max(jnp.abs(p.energy), (-2, -1))
+    kinetic = jnp.max(p.kinetic_energy, -1)
+    share = drift / jnp.where(kinetic > 0, kinetic, 1)
+    return jnp.where(drift <= round_off, 0, jnp.where(kinetic > 0, share, drift * jnp.inf))
 
-    gap: Float[Array, ""]
-    angular_gap: Float[Array, ""]
-    gap_rate: Float[Array, ""]
-    angular_gap_rate: Float[Array, ""]
-    energy_drift: Float[Array, ""]
-    energy_lost: Float[Array, ""]
-    momentum_drift: Float[Array, ""]
-    angular_momentum_drift: Float[Array, ""]
-    free: Bool[Array, ""]
-    error: Float[Array, ""]
-    margin: Float[Array, ""]
-    swaps: Int[Array, ""]
-    accepted: Int[Array, ""]
-    rejected: Int[Array, ""]
-    evaluations: Int[Array, ""]
-    loop: Int[Array, ""]
-    phases: Int[Array, ""]
-    t_final: Float[Array, ""]
-    result: RESULTS
-    derivative: DERIVATIVE
-    halved: Any = None
 
-    def __str__(self) -> str:
-        if not is_concrete(self.gap) or self.gap.ndim:
-            return repr(self)
-        balance = (
-            f"{float(self.momentum_drift):.2e} N s, {float(self.angular_momentum_drift):.2e} N m s"
-            if self.free
-            else "held to the ground throughout"
-        )
-        error = (
-            f"{float(self.error):.2e}"
-            if jnp.isfinite(self.error)
-            else "not estimated by this solver"
-        )
-        swaps = (
-            f"{int(self.swaps)} changes of the dependent coordinates"
-            if self.swaps >= 0
-            else "changes of the dependent coordinates not recorded"
-        )
-        if self.halved is not None:
-            error += f"; by a finer run {float(self.halved):.2e} rad, m"
-        lines = [
-            (
-                f"largest loop gap        {float(self.gap):.2e} m, {float(self.angular_gap):.2e}"
-                f" rad; rate {float(self.gap_rate):.2e} m/s, {float(self.angular_gap_rate):.2e}"
-                " rad/s"
-            ),
-            (
-                f"energy                  drift {float(self.energy_drift):.2e} J, lost in impacts"
-                f" {float(self.energy_lost):.4g} J"
-            ),
-            f"momentum where free     {balance}",
-            f"errors of steps, summed {error}",
-            f"rank margin             {float(self.margin):.2e}; {swaps}",
-            (
-                f"work                    {int(self.accepted)} steps, {int(self.rejected)}"
-                f" rejected, {int(self.evaluations)} evaluations, {int(self.phases)} phases"
-            ),
-            (
-                f"ended                   at {float(self.t_final):.9g} s:"
-                f" {RESULTS[self.result] or 'successful'}"
-            ),
-        ]
-        if self.loop >= 0:
-            lines.append(f"could not be closed     loop {int(self.loop)}, counted from 0")
-        if self.derivative != DERIVATIVE.successful:
-            lines.append(f"derivatives             {DERIVATIVE[self.derivative]}")
-        return "\n".join(lines)
+def _error_share(traj: Trajectory) -> Float[Array, "..."]:
+    """Return the summed errors of the steps by the largest root mean square of q and v at the save
+    times, or by one (rad, m, rad/s, m/s) if that is larger."""
+    states = jnp.concatenate([traj.states.q, traj.states.v], -1)
+    size = jnp.max(jnp.sqrt(jnp.mean(states**2, -1)), -1)
+    return jnp.sum(traj.phases.error, -1) / jnp.maximum(size, 1)

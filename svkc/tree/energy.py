@@ -10,7 +10,7 @@ from svkc.tree.kinematics import Kinematics, kinematics, twists
 from svkc.tree.spatial import cross, matvec
 
 
-def _body_motions(chain: Chain, kin: Kinematics, v):
+def body_motions(chain: Chain, kin: Kinematics, v):
     """Return of each row its centre of mass and that point's velocity, w, and I w.
 
     Centres of mass are given from the root's origin; I w is the angular momentum about the centre
@@ -23,14 +23,20 @@ def _body_motions(chain: Chain, kin: Kinematics, v):
     return c, V[:, 3:] + cross(w, c), w, spin
 
 
+def kinetic_of_bodies(chain: Chain, v, bodies) -> Float[Array, ""]:
+    """Return the kinetic energy (J), armature included. bodies: from `body_motions`."""
+    _, u, w, spin = bodies
+    kinetic = jnp.sum(chain.mass * jnp.sum(u * u, -1)) / 2 + jnp.sum(w * spin) / 2
+    if chain.armature is None:
+        return kinetic
+    return kinetic + jnp.sum(chain.armature * v[: chain.nv] ** 2) / 2
+
+
 def _energies(
     chain: Chain, state: State, kin: Kinematics, bodies
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return the kinetic and the potential energy. bodies: from `_body_motions`."""
-    c, u, w, spin = bodies
-    kinetic = jnp.sum(chain.mass * jnp.sum(u * u, -1)) / 2 + jnp.sum(w * spin) / 2
-    if chain.armature is not None:
-        kinetic = kinetic + jnp.sum(chain.armature * state.v[: chain.nv] ** 2) / 2
+    """Return the kinetic and the potential energy. bodies: from `body_motions`."""
+    kinetic, c = kinetic_of_bodies(chain, state.v, bodies), bodies[0]
     potential = -jnp.sum(chain.mass * jnp.sum((kin.root_position + c) * chain.gravity[None], -1))
     if chain.stiffness is not None:
         stretch = difference(chain, chain.q_spring, state.q)
@@ -42,7 +48,7 @@ def _energies(
 def _kinetic_and_potential(chain: Chain, state: State) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Return the kinetic and the potential energy (J)."""
     kin = kinematics(chain, state.q)
-    return _energies(chain, state, kin, _body_motions(chain, kin, state.v))
+    return _energies(chain, state, kin, body_motions(chain, kin, state.v))
 
 
 @checked_jit(eager=True)
@@ -68,13 +74,14 @@ def energy(chain: Chain, state: State) -> Float[Array, ""]:
 
 
 def energy_and_momentum(
-    chain: Chain, state: State, kin: Kinematics
+    chain: Chain, state: State, kin: Kinematics, bodies
 ) -> tuple[Float[Array, ""], Float[Array, "3"], Float[Array, "3"]]:
     """Return `energy` (J), linear momentum (N s) and angular momentum (N m s).
 
     Angular momentum is taken about the centre of mass of all bodies; both are in world axes.
+
+    bodies: from `body_motions`.
     """
-    bodies = _body_motions(chain, kin, state.v)
     kinetic, potential = _energies(chain, state, kin, bodies)
     c, u, _, spin = bodies
     p, position = chain.mass[:, None] * u, kin.root_position + c
@@ -90,6 +97,6 @@ def momentum(chain: Chain, state: State) -> tuple[Float[Array, "3"], Float[Array
     section 2.12).
     """
     kin = kinematics(chain, state.q)
-    c, u, _, spin = _body_motions(chain, kin, state.v)
+    c, u, _, spin = body_motions(chain, kin, state.v)
     p = chain.mass[:, None] * u
     return jnp.sum(p, 0), jnp.sum(spin + cross(kin.root_position + c, p), 0)

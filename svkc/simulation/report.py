@@ -1,0 +1,196 @@
+"""The certificate of a run (`Report`), and its verdict in words."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from svkc._jax.pytrees import is_concrete
+from svkc.loops.constraint import gap_tolerance
+from svkc.simulation.codes import DERIVATIVE, RESULTS
+
+# Energy drift by the kinetic energy. Speeds are wrong by half of it: at a tenth by 5 %, so that the
+# motion is no longer that of the model; a hundredth is what a run of low accuracy has.
+DRIFT_TOO_LARGE, DRIFT_NOTABLE = 0.1, 0.01
+# Energy is a sum over bodies and steps: its round-off is some hundred times that of one number.
+ROUND_OFF_DRIFT = 1e3
+# Errors of the steps by the size of the state: their sum is a bound where errors do not grow.
+ERROR_NOTABLE = 0.1
+# Rejected steps for each accepted one. Controllers reject up to one for each at smooth forces. A
+# run of a few steps says nothing.
+REJECTED_NOTABLE, REJECTED_AT_LEAST = 2, 20
+
+
+class Report(eqx.Module):
+    """The certificate of a run: how far the numbers of the run can be relied on.
+
+    gap, angular_gap: largest loop gaps at the ends of steps and at save times (m, rad).
+    gap_rate, angular_gap_rate: largest rates of the loop gaps at the save times and at the ends of
+        phases (m/s, rad/s).
+    energy_drift: change of energy that neither work nor impacts explain (J).
+    energy_lost: energy lost in impacts (J).
+    momentum_drift, angular_momentum_drift: over phases in which the bodies are free of the ground,
+        largest change of linear momentum that gravity does not explain (N s), and of angular
+        momentum about the centre of mass (N m s).
+    free: whether there is such a phase.
+    error: sum of the estimated errors of all steps (inf: none from this solver or adjoint).
+    margin: least rank margin |R_mm| / |R_11|.
+    swaps: how often the choice of dependent coordinates changed (-1: not recorded).
+    accepted, rejected: numbers of steps.
+    evaluations: of the vector field in steps.
+    drift_share: energy drifts of the phases, added without sign, by the largest kinetic energy at
+        the ends of phases and at save times; drift within round-off is zero.
+    error_share: `error` by the largest root mean square of q and v at save times, or by one (rad,
+        m, rad/s, m/s) if that is larger.
+    loop: index of the loop that could not be closed (-1: none).
+    phases: number of phases.
+    t_final: end of the run (s).
+    result, derivative: of the trajectory.
+    halved: result of `svkc.accuracy.estimate_error` (a finer run), if `report` was given it.
+    """
+
+    gap: Float[Array, "*lanes"]
+    angular_gap: Float[Array, "*lanes"]
+    gap_rate: Float[Array, "*lanes"]
+    angular_gap_rate: Float[Array, "*lanes"]
+    energy_drift: Float[Array, "*lanes"]
+    energy_lost: Float[Array, "*lanes"]
+    momentum_drift: Float[Array, "*lanes"]
+    angular_momentum_drift: Float[Array, "*lanes"]
+    free: Bool[Array, "*lanes"]
+    error: Float[Array, "*lanes"]
+    margin: Float[Array, "*lanes"]
+    swaps: Int[Array, "*lanes"]
+    accepted: Int[Array, "*lanes"]
+    rejected: Int[Array, "*lanes"]
+    evaluations: Int[Array, "*lanes"]
+    drift_share: Float[Array, "*lanes"]
+    error_share: Float[Array, "*lanes"]
+    loop: Int[Array, "*lanes"]
+    phases: Int[Array, "*lanes"]
+    t_final: Float[Array, "*lanes"]
+    result: RESULTS
+    derivative: DERIVATIVE
+    halved: Any = None
+
+    def verdict(self) -> str:
+        """Return in words whether the run can be relied on; of a batch, that of the worst lane.
+
+        What is judged, and the limits, are in docs/accuracy.md.
+        """
+        shape = np.shape(self.gap)
+        gap = np.maximum(np.asarray(self.gap), np.asarray(self.angular_gap))
+        ended = (RESULTS.successful._value, RESULTS.stopped._value)
+        failed = ~np.isin(np.asarray(self.result._value), [np.asarray(code) for code in ended])
+        fields = {
+            "failed": failed,
+            "drift": self.drift_share,
+            "error": self.error_share,
+            "gap": gap,
+            "is_open": ~(gap <= gap_tolerance(gap.dtype)),
+            "accepted": self.accepted,
+            "rejected": self.rejected,
+        }
+        values = zip(*(np.ravel(x).tolist() for x in fields.values()))
+        lanes = [_judge(**dict(zip(fields, lane))) for lane in values]
+        worst = max(range(len(lanes)), key=lambda i: lanes[i][0])
+        words = lanes[worst][1]
+        if failed.flat[worst]:
+            result = jax.tree.map(lambda x: jnp.ravel(x)[worst], self.result)
+            words = [f"the run did not reach its end: {RESULTS[result]}", *words]
+        lane = ", ".join(map(str, np.unravel_index(worst, shape)))
+        return f"worst of {len(lanes)} lanes, lane {lane}: " * bool(shape) + "; ".join(words)
+
+    def __str__(self) -> str:
+        if not is_concrete(self.gap):
+            return repr(self)
+        if np.ndim(self.gap):
+            return f"verdict                 {self.verdict()}"
+        balance = (
+            f"{float(self.momentum_drift):.2e} N s, {float(self.angular_momentum_drift):.2e} N m s"
+            if self.free
+            else "held to the ground throughout"
+        )
+        error = (
+            f"{float(self.error):.2e}"
+            if jnp.isfinite(self.error)
+            else "not estimated by this solver"
+        )
+        swaps = (
+            f"{int(self.swaps)} changes of the dependent coordinates"
+            if self.swaps >= 0
+            else "changes of the dependent coordinates not recorded"
+        )
+        if self.halved is not None:
+            error += f"; by a finer run {float(self.halved):.2e} rad, m"
+        lines = [
+            (
+                f"largest loop gap        {float(self.gap):.2e} m, {float(self.angular_gap):.2e}"
+                f" rad; rate {float(self.gap_rate):.2e} m/s, {float(self.angular_gap_rate):.2e}"
+                " rad/s"
+            ),
+            (
+                f"energy                  drift {float(self.energy_drift):.2e} J, lost in impacts"
+                f" {float(self.energy_lost):.4g} J"
+            ),
+            f"momentum where free     {balance}",
+            f"errors of steps, summed {error}",
+            f"rank margin             {float(self.margin):.2e}; {swaps}",
+            (
+                f"work                    {int(self.accepted)} steps, {int(self.rejected)}"
+                f" rejected, {int(self.evaluations)} evaluations, {int(self.phases)} phases"
+            ),
+            (
+                f"ended                   at {float(self.t_final):.9g} s:"
+                f" {RESULTS[self.result] or 'successful'}"
+            ),
+        ]
+        if self.loop >= 0:
+            lines.append(f"could not be closed     loop {int(self.loop)}, counted from 0")
+        if self.derivative != DERIVATIVE.successful:
+            lines.append(f"derivatives             {DERIVATIVE[self.derivative]}")
+        return "\n".join([*lines, f"verdict                 {self.verdict()}"])
+
+
+def _percent(share: float) -> str:
+    """Return a share in percent, with two digits below 100 %."""
+    return f"{100 * share:.2g} %" if share < 1 else f"{100 * share:.0f} %"
+
+
+def _judge(
+    *,
+    failed: bool,
+    drift: float,
+    error: float,
+    gap: float,
+    is_open: bool,
+    accepted: int,
+    rejected: int,
+) -> tuple[tuple[int, float], list[str]]:
+    """Return how bad one run is, to compare lanes, and the verdict in words.
+
+    drift, error: `drift_share` and `error_share`.
+    gap: largest loop gap (rad, m). is_open: whether the gap is above `gap_tolerance`.
+    """
+    drift_text, words = f"energy drift is {_percent(drift)} of the kinetic energy", []
+    if drift >= DRIFT_TOO_LARGE:
+        words.append(f"{drift_text}: the steps are too long for this motion (smaller dt, or rtol)")
+    elif drift >= DRIFT_NOTABLE:
+        words.append(f"{drift_text}: shorter steps (dt, or rtol) would be more accurate")
+    if is_open:
+        words.append(f"a loop is open by {gap:.1e} (m or rad): shorter steps, or Projection()")
+    if rejected > max(REJECTED_NOTABLE * accepted, REJECTED_AT_LEAST):
+        words.append(f"{rejected} of {accepted + rejected} steps were rejected: a force may jump")
+    if ERROR_NOTABLE <= error < np.inf:
+        words.append(f"errors of the steps add up to {_percent(error)} of the state")
+    level = 3 if failed else 2 if drift >= DRIFT_TOO_LARGE else int(bool(words))
+    if np.isnan(drift):
+        words.append("the energy balance is not known; judged by loop gaps, rejected steps, errors")
+    elif not words and not failed:
+        drift_text = f"{drift:.1e} of the kinetic energy" if drift else "within round-off"
+        loops = f", loops are closed to {gap:.1e} (m, rad)" if gap else ""
+        words.append(f"no fault found: energy drift is {drift_text}{loops}")
+    return (level, np.inf if np.isnan(drift) else float(drift)), words
