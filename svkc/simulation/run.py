@@ -22,7 +22,7 @@ from svkc.simulation.options import Options
 from svkc.simulation.phase import PhaseOutcome, RunState, solve_phase
 from svkc.simulation.records import empty_events, empty_phase_records, write_phase_row
 from svkc.simulation.traced_checks import initial_result
-from svkc.transitions.plan import Plan
+from svkc.transitions.plan import Plan, guard_round_off
 
 
 def with_lock_mask(chain: Chain, state: State, plan: Plan) -> State:
@@ -49,8 +49,8 @@ def initial_run_state(
     links, rows, dtype = len(chain.link_names), options.max_events, state.q.dtype
     state = with_lock_mask(chain, state, plan)
     # a link that is overloaded from the start breaks at once; guards that need no torques are
-    # re-evaluated at the start of the first phase
-    initial = [g.initial_value for g in plan.guards]
+    # re-evaluated at the start of the first phase, and are on no side of zero before
+    initial = [g.initial_value if g.needs_torques else 0.0 for g in plan.guards]
     return RunState(
         t=t0,
         state=state,
@@ -69,7 +69,11 @@ def initial_run_state(
 
 
 def _rearm_guards(chain: Chain, run: RunState, plan: Plan, options: Options, args) -> RunState:
-    """Return the run with its stale guards re-evaluated at the start of a phase."""
+    """Return the run with its stale guards re-evaluated at the start of a phase.
+
+    The sign of a value within round-off of zero is chance, and a guard that starts at zero has not
+    crossed zero. Such a guard keeps the value that `_guard_values_after` has carried over.
+    """
     if not plan.guards or not reevaluated_guards(plan).any():
         return run
     field_args = FieldArgs(chain, run.state.structure, args)
@@ -78,7 +82,32 @@ def _rearm_guards(chain: Chain, run: RunState, plan: Plan, options: Options, arg
     values = stop_gradient_tree(GuardValues(plan, options.field))(
         *stop_gradient_tree((run.t, ODEState(run.state.q, run.state.v), field_args))
     )
+    at_zero = jnp.abs(values) < guard_round_off(values.dtype)
+    values = jnp.where(at_zero, run.guard_values, values)
     return replace(run, guard_values=jnp.where(run.stale, values, run.guard_values))
+
+
+def _guard_values_after(
+    chain: Chain, run: RunState, outcome: PhaseOutcome, fired: Bool[Array, " events"], plan: Plan
+):
+    """Return the guards after a phase, and which of them are stale.
+
+    A stale guard becomes zero, unless the guard is armed and may be about to cross zero: within
+    round-off of zero, on the side on which the phase started, or on either side if no guard ended
+    the phase. After the event of a guard, another one of the same function has just crossed zero.
+    """
+    if not plan.guards:
+        return None, None
+    values, before = outcome.guard_values, run.guard_values
+    assert values is not None
+    assert before is not None
+    # a guard that is exactly zero after its event is not re-evaluated: it has not crossed again
+    stale = jnp.asarray(reevaluated_guards(plan)) & jnp.any(fired) & (values != 0)
+    at_zero = jnp.abs(values) < guard_round_off(values.dtype)
+    on_first_side = jnp.sign(values) == jnp.sign(before)
+    may_cross = at_zero & (on_first_side | ~jnp.any(outcome.fired))
+    may_cross = may_cross & plan.armed(chain, run.state.structure)
+    return jnp.where(stale & ~may_cross, 0, values), stale
 
 
 def _next_stop(run: RunState, t1, plan: Plan):
@@ -123,15 +152,12 @@ def run_phase(
             chain, run, end_state, outcome, fired, plan, gap_tolerance=options.gap_tolerance
         )
     result = RESULTS.where(run.result == RESULTS.successful, result, run.result)
-    stale = None
-    if plan.guards:
-        # a guard that is exactly zero after its event is not re-evaluated: it has not crossed again
-        stale = jnp.asarray(reevaluated_guards(plan)) & jnp.any(fired) & (outcome.guard_values != 0)
+    guard_values, stale = _guard_values_after(chain, run, outcome, fired, plan)
     return RunState(
         t=outcome.t,
         state=after,
         work=outcome.y.work,
-        guard_values=outcome.guard_values,
+        guard_values=guard_values,
         stale=stale,
         pending=run.pending & ~timed,
         events=events,

@@ -171,12 +171,17 @@ def when(
 
     The time of the event is located to round-off and is differentiable if the guard is smooth.
 
-    A guard is armed while its action would change the structure. A guard whose event stops the
-    run, or has no action, is always armed. A guard that is exactly zero at the start has not
-    crossed zero, nor has a guard that stays at zero (to eps^(3/4)) after its event. Crossings are
-    detected between the ends of steps: two crossings within one step are missed, so bound the step
-    size (`stepsize_controller`, `dt`) where that can happen. The event of a discontinuous guard is
-    located at the jump; derivatives treat its time as constant.
+    A guard is armed while its action would change the structure. A guard whose event stops the run,
+    or has no action, is always armed.
+
+    A guard that starts the run within round-off of zero (eps^(3/4): 1.8e-12 in float64, 6.4e-6 in
+    float32) has not crossed zero, whatever its sign and `direction`. It fires at its first crossing
+    after it has left zero. The same holds after an event, for the guard that fired and for a guard
+    that the event puts at zero; an armed guard that is on its way through zero at the time of
+    another event does fire. Crossings are detected between the ends of steps: two crossings within
+    one step are missed, so bound the step size (`stepsize_controller`, `dt`) where that can happen.
+    The event of a discontinuous guard is located at the jump; derivatives treat its time as
+    constant.
 
     guard: function (t, state, args) -> real number, or a guard such as `svkc.touch` returns.
     connect, cut, lock, unlock, here, stop, bind, unbind: as for `svkc.at`.

@@ -145,6 +145,14 @@ class Plan(eqx.Module):
         return jnp.where(either, rises | falls, jnp.where(rising, rises, falls))
 
 
+def guard_round_off(dtype: DType) -> float:
+    """Return the absolute value below which a guard that starts a phase counts as zero.
+
+    eps^(3/4): 1.8e-12 in float64, 6.4e-6 in float32, for guards whose values are of order one.
+    """
+    return float(np.finfo(dtype).eps ** 0.75)
+
+
 def make_plan(chain: Chain, events: tuple[Any, ...], dtype: DType) -> Plan:
     """Return the tables of these events. Raises ValueError for names that the chain does not
     have."""
