@@ -76,7 +76,8 @@ def _event_time_tangent(event: EventInfo, primals, tangents, rate: ODEState):
     guard = lambda t, y, field_args, guards: guards(t, y, field_args)[event.first]
     along = lambda t, y: guard(t, y, field_args, guards)
     slope = jax.jvp(along, (t, y), (jnp.ones_like(t), rate))[1]
-    change = eqx.filter_jvp(guard, primals, tangents)[1]
+    # a guard that only jumps has no tangent at all
+    change = materialise_zeros(*eqx.filter_jvp(guard, primals, tangents))
     fixed = event.jumps | ~event.occurred
     # The time of a grazing event has no derivative: NaN rather than a plausible number.
     denominator = jnp.where(fixed, 1, jnp.where(event.grazing, jnp.nan, slope))

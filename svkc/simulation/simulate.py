@@ -17,7 +17,7 @@ import numpy as np
 from svkc._jax.eager import eager_jit
 from svkc._jax.functions import call_with_comparable
 from svkc._jax.primitive import ClosureConverted
-from svkc._jax.pytrees import is_concrete
+from svkc._jax.pytrees import is_concrete, stop_gradient_tree
 from svkc.model.annotations import Function, Integer, Numbers, Scalar
 from svkc.model.chain import Chain, State
 from svkc.simulation.certificate import certificate, evaluations_per_step
@@ -87,21 +87,29 @@ def simulate(
     )
     run = call_with_comparable(run, control=options.control, events=plan.guards)
     traj = _certified(chain, run, times, options)
-    return _raise_on_failure(chain, traj) if throw else traj
+    if not throw:
+        return traj
+    return _raise_on_failure(chain, traj, control=control, events=events, args=args, dt=dt)
 
 
-def _raise_on_failure(chain: Chain, traj: Trajectory) -> Trajectory:
-    """Return the trajectory. Raises RuntimeError (a runtime error under jit) if the run failed."""
+def _raise_on_failure(chain: Chain, traj: Trajectory, **arguments) -> Trajectory:
+    """Return the trajectory. Raises RuntimeError (a runtime error under jit) if the run failed.
+
+    arguments: of `simulate`, for `Trajectory.trace_non_finite`.
+    """
     result, success = traj.result, (RESULTS.successful, RESULTS.stopped)
     if not is_concrete(result._value):
         return result.error_if(traj, (result != success[0]) & (result != success[1]))
     if np.all(np.isin(np.asarray(result._value), [code._value for code in success])):
         return traj
+    # inside of jvp and grad the primal values are concrete
+    chain, traj, arguments = stop_gradient_tree((chain, traj, arguments))
     phase, loop = int(traj.phases.count), int(traj.report().loop)
     where = f"phase {phase}" if loop < 0 else f"phase {phase}, loop {chain.link_names[loop]!r}"
-    raise RuntimeError(
-        f"simulate stopped at t = {float(traj.t_final):.9g} s, in {where}: {RESULTS[traj.result]}"
-    )
+    reason = RESULTS[result]
+    if result == RESULTS.non_finite and is_concrete(chain, traj, arguments):
+        reason += f" First: {traj.trace_non_finite(chain, **arguments)}"
+    raise RuntimeError(f"simulate stopped at t = {float(traj.t_final):.9g} s, in {where}: {reason}")
 
 
 @eqx.filter_jit

@@ -11,10 +11,12 @@ from jaxtyping import Array, Bool, Float
 
 from svkc._jax.eager import eager_jit
 from svkc._jax.pytrees import is_concrete
-from svkc.model.annotations import Path, Scalar
+from svkc.model.annotations import Function, Path, Scalar
 from svkc.model.chain import Chain, State
 from svkc.model.validation import scalar
 from svkc.simulation.codes import DERIVATIVE, RESULTS
+from svkc.simulation.non_finite import trace_non_finite
+from svkc.simulation.option_checks import EventList
 from svkc.simulation.records import Events, Phases
 from svkc.simulation.report import ROUND_OFF_DRIFT, Report
 
@@ -93,6 +95,23 @@ class Trajectory(eqx.Module):
         from svkc.viz.render import plot
 
         return plot(self, chain)
+
+    def trace_non_finite(
+        self, chain: Chain, *, control: Function | None = None, events: EventList = (),
+        args: Any = None, dt: Scalar | None = None, lane: Function | None = None, data: Any = None,
+    ) -> str:  # fmt: skip
+        """Return what was not finite first, if the run ended with `RESULTS.non_finite`.
+
+        That is a parameter of the chain, the initial state, the control, a guard, the acceleration
+        or the motion itself; "" for other results. The numbers are evaluated again at the last
+        finite state and within a step after it, outside of compiled functions. Of a batch, each
+        such lane has a line.
+
+        chain, control, events, args, dt: arguments of the run, as `simulate` was given them.
+        lane, data: as `svkc.rollout` was given them.
+        """
+        options = {"control": control, "events": events, "args": args, "dt": dt}
+        return trace_non_finite(self, chain, lane, data, options)
 
     def report(self, halved: Scalar | None = None) -> "Report":
         """Return the certificate of the run, or of each run of a batch.
