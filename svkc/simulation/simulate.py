@@ -87,15 +87,13 @@ def simulate(
     )
     run = call_with_comparable(run, control=options.control, events=plan.guards)
     traj = _certified(chain, run, times, options)
-    if not throw:
-        return traj
-    return _raise_on_failure(chain, traj, control=control, events=events, args=args, dt=dt)
+    return _raise_on_failure(chain, traj, (control, events, args, dt)) if throw else traj
 
 
-def _raise_on_failure(chain: Chain, traj: Trajectory, **arguments) -> Trajectory:
+def _raise_on_failure(chain: Chain, traj: Trajectory, arguments) -> Trajectory:
     """Return the trajectory. Raises RuntimeError (a runtime error under jit) if the run failed.
 
-    arguments: of `simulate`, for `Trajectory.trace_non_finite`.
+    arguments: control, events, args and dt of the run.
     """
     result, success = traj.result, (RESULTS.successful, RESULTS.stopped)
     if not is_concrete(result._value):
@@ -108,7 +106,9 @@ def _raise_on_failure(chain: Chain, traj: Trajectory, **arguments) -> Trajectory
     where = f"phase {phase}" if loop < 0 else f"phase {phase}, loop {chain.link_names[loop]!r}"
     reason = RESULTS[result]
     if result == RESULTS.non_finite and is_concrete(chain, traj, arguments):
-        reason += f" First: {traj.trace_non_finite(chain, **arguments)}"
+        control, events, args, dt = arguments
+        source = traj.trace_non_finite(chain, control=control, events=events, args=args, dt=dt)
+        reason += f" First: {source}"
     raise RuntimeError(f"simulate stopped at t = {float(traj.t_final):.9g} s, in {where}: {reason}")
 
 

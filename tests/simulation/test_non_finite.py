@@ -122,6 +122,7 @@ def test_lanes_of_a_batch_are_named(arm):
     assert first.trace_non_finite(arm, args=ARGS, **options) == ""
 
 
+@pytest.mark.slow
 def test_placement_of_a_virtual_link_is_named():
     """A change of structure with a placement that is not finite."""
     four = models.four_bar()
