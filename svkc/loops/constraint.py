@@ -15,7 +15,7 @@ from svkc.model.annotations import DType, Scalar
 from svkc.model.chain import Chain, State, Structure, active_dofs
 from svkc.model.checked_jit import checked_jit
 from svkc.model.topology import FREE, SLIDE
-from svkc.tree.kinematics import Kinematics, bias_accelerations, kinematics
+from svkc.tree.kinematics import Jacobian, Kinematics, bias_accelerations, kinematics
 from svkc.tree.spatial import (
     motion_cross,
     shift_motion,
@@ -206,9 +206,7 @@ def loop_gaps(chain: Chain, state: State) -> Float[Array, "links 6"]:
 
 
 @checked_jit(eager=True)
-def loop_jacobian(
-    chain: Chain, state: State
-) -> tuple[Float[Array, "links 3 dofs"], Float[Array, "links 3 dofs"]]:
+def loop_jacobian(chain: Chain, state: State) -> Jacobian:
     """Return J_C (paper (11)) as its linear and its angular rows.
 
     They are the linear (m/s) and the angular (rad/s) velocity of each connected virtual link
@@ -218,7 +216,7 @@ def loop_jacobian(
     kin = kinematics(chain, state.q)
     frames = loop_frames(chain, state.structure, kin, state.q)
     J = assemble_loop_jacobian(chain, state.structure, kin, frames).reshape(-1, 6, chain.dofs)
-    return J[:, 3:], J[:, :3]
+    return Jacobian(linear=J[:, 3:], angular=J[:, :3])
 
 
 @checked_jit(eager=True)

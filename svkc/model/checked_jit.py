@@ -4,7 +4,7 @@ traces, so that a compiled call pays nothing for the validation."""
 import functools
 import inspect
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar, overload
 
 import jax
 import jax.numpy as jnp
@@ -89,9 +89,18 @@ def float_vector(chain: Chain, name: str, value: Any, size: int | None = None) -
     )
 
 
+_Result = TypeVar("_Result")
+
+
+@overload
+def checked_jit(fn: Callable[..., _Result]) -> Callable[..., _Result]: ...
+@overload
+def checked_jit(
+    *, eager: bool = False, static: tuple[str, ...] = ()
+) -> Callable[[Callable[..., _Result]], Callable[..., _Result]]: ...
 def checked_jit(
     fn: Callable | None = None, *, eager: bool = False, static: tuple[str, ...] = ()
-) -> Callable:
+) -> Any:
     """Wrap a function of a chain, a state and arrays in `jax.jit`, and validate its arguments.
 
     eager: outside of all transformations, compile for short compile time (`eager_jit`).

@@ -1,5 +1,7 @@
 """Energy and momentum of the tree. Virtual links have no mass and take no part."""
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -89,8 +91,19 @@ def energy_and_momentum(
     return kinetic + potential, jnp.sum(p, 0), jnp.sum(spin + cross(position - center[None], p), 0)
 
 
+class Momentum(NamedTuple):
+    """Momentum of all bodies in world axes.
+
+    linear: N s.
+    angular: about the world's origin (N m s).
+    """
+
+    linear: Float[Array, "3"]
+    angular: Float[Array, "3"]
+
+
 @checked_jit(eager=True)
-def momentum(chain: Chain, state: State) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+def momentum(chain: Chain, state: State) -> Momentum:
     """Return the linear momentum (N s) and the angular momentum (N m s) of all bodies.
 
     Angular momentum is taken about the world's origin; both are in world axes (Featherstone
@@ -99,4 +112,5 @@ def momentum(chain: Chain, state: State) -> tuple[Float[Array, "3"], Float[Array
     kin = kinematics(chain, state.q)
     c, u, _, spin = body_motions(chain, kin, state.v)
     p = chain.mass[:, None] * u
-    return jnp.sum(p, 0), jnp.sum(spin + cross(kin.root_position + c, p), 0)
+    angular = jnp.sum(spin + cross(kin.root_position + c, p), 0)
+    return Momentum(jnp.sum(p, 0), angular)

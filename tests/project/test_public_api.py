@@ -7,6 +7,8 @@ import pkgutil
 import re
 import typing
 
+import jax
+import models
 import pytest
 from processes import run
 
@@ -121,3 +123,17 @@ def test_unknown_names_are_attribute_errors():
         svkc.nothing
     with pytest.raises(AttributeError, match=r"module 'svkc.page' has no attribute 'nothing'"):
         importlib.import_module("svkc.page").nothing
+
+
+def test_parts_of_results_have_names():
+    chain = models.four_bar()
+    functions = (svkc.poses, svkc.velocities, svkc.momentum, svkc.loop_jacobian)
+    shapes = jax.eval_shape(lambda state: [f(chain, state) for f in functions], chain.state())
+    assert [(type(x).__name__, *x._fields) for x in shapes] == [
+        ("Poses", "position", "quaternion"),
+        ("Velocities", "linear", "angular"),
+        ("Momentum", "linear", "angular"),
+        ("Jacobian", "linear", "angular"),
+    ]
+    position, quaternion = shapes[0]
+    assert (position.shape, quaternion.shape) == ((4, 3), (4, 4))
