@@ -19,6 +19,7 @@ from svkc.model.names import connection_mask, joint_slice
 from svkc.model.topology import Q_SIZE, V_SIZE
 from svkc.model.validation import boolean, finite_array, positive_scalar
 from svkc.transitions.path_following import follow_path
+from svkc.transitions.spare_links import check_bound
 from svkc.transitions.stationarity import Targets
 from svkc.tree.configuration import difference, normalize
 
@@ -186,8 +187,10 @@ def _start(chain: Chain, near: State | None, connected) -> tuple[Array, Structur
         check_state(chain, near)
         start, structure = near.q, near.structure
     if near is None or connected is not None:
-        mask = jnp.asarray(connection_mask(chain, connected))
-        structure = eqx.tree_at(lambda s: s.connected, structure, mask)
+        mask = connection_mask(chain, connected)
+        state = check_bound(chain, State(start, chain.q_load, structure), mask)
+        start = state.q
+        structure = eqx.tree_at(lambda s: s.connected, state.structure, jnp.asarray(mask))
     return start, structure
 
 

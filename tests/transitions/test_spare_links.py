@@ -37,6 +37,8 @@ def test_connecting_a_slot_that_is_not_bound_is_an_error(sliders):
         svkc.connect(chain, state, "spare_0", here=True)
     with pytest.raises(ValueError, match="spare_1"):
         svkc.transition(chain, state, np.array([False, True]))
+    with pytest.raises(ValueError, match="spare_1"):
+        chain.state(connected="spare_1")
     with pytest.raises(RuntimeError, match="not bound"):
         eqx.filter_jit(lambda s: svkc.connect(chain, s, "spare_0", here=True))(state)
     bound = svkc.bind(chain, state, "spare_0", "a", "b", real_pos=(-1, 0, 0))
