@@ -184,6 +184,7 @@ CASES = {
     "...: expected finite": lambda s: s.four.state([np.nan, 0, 0]),
     "...: expected real": lambda s: s.four.state(["a", "b", "c"]),
     "...: expected names": lambda s: svkc.at(0.5, connect=3),
+    "...: got ..., with which": lambda s: s.simulate(dt=1e-12),
     "...: got ..., expected True": lambda s: link(connected="no"),
     "...: got ..., expected a whole": lambda s: s.load(spare=1e300),
     "...: got shape ..., expected (...,); use vmap for": lambda s: svkc.interop.quaternions_xyzw(
@@ -255,7 +256,6 @@ CASES = {
         s.four, s.state, type("Data", (), {"qpos": np.zeros(1), "qvel": np.zeros(1)})()
     ),
     "devices: expected": lambda s: s.rollout(devices=[]),
-    "dt: got": lambda s: s.simulate(dt=1e-12),
     "dt sets": lambda s: s.simulate(dt=0.1, rtol=1e-3),
     "dynamics.hold": lambda s: s.simulate(dynamics=svkc.dynamics.CompositeBodies(hold=2.0)),
     "dynamics.inertia": lambda s: s.simulate(dynamics=Dynamics(inertia=lambda *_: None)),
@@ -284,7 +284,7 @@ CASES = {
     ),
     "render: a picture": lambda s: svkc.render(s.four, s.lanes(s.short()), s.folder / "x.html"),
     "render: ... should": lambda s: svkc.render(s.four, s.short(), "x.bmp"),
-    "rtol and atol": lambda s: s.simulate(
+    "rtol, atol and dtmax": lambda s: s.simulate(
         rtol=1e-3, stepsize_controller=diffrax.PIDController(rtol=1e-3, atol=1e-6)
     ),
     "simulate stopped": lambda s: s.simulate(t1=1e-2, dt=1e-3, max_steps=2),
@@ -356,6 +356,11 @@ ALSO = [
     ("rtol", lambda s: s.simulate(rtol=0.0)),
     ("max_events", lambda s: s.simulate(max_events=-1)),
     ("max_steps", lambda s: s.simulate(max_steps=0)),
+    ("dtmax: got", lambda s: s.simulate(dtmax=0.0)),
+    ("dtmax: expected finite", lambda s: s.simulate(dtmax=np.inf)),
+    ("dtmax and stepsize_controller", lambda s: s.simulate(dt=0.1, dtmax=0.2)),
+    ("max_step: got", lambda s: svkc.when(lambda t, x, args: t, max_step=-1.0)),
+    ("max_step: expected finite", lambda s: svkc.when(lambda t, x, args: t, max_step=np.inf)),
     ("hoook", lambda s: s.simulate(events=[svkc.at(0.5, cut="hoook")])),
     *(
         (

@@ -11,6 +11,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 
+from svkc.integration.dense_output import make_interpolation
 from svkc.integration.event_location import EventInfo
 from svkc.integration.ode import FieldArgs, ODEState, Times
 from svkc.integration.runge_kutta import with_scan_kind
@@ -25,35 +26,6 @@ from svkc.integration.solution import (
 )
 from svkc.integration.stabilization import needs_projection
 from svkc.integration.vector_field import VectorField, project_state
-
-
-class _ProjectedInterpolation(diffrax.AbstractLocalInterpolation):
-    """The wrapped solver's dense output plus a linear part that ends at the projected state.
-
-    shift: the change of the step's end by the projection.
-    """
-
-    t0: Any
-    t1: Any
-    inner: Any
-    shift: ODEState
-
-    def evaluate(self, t0, t1=None, left=True):
-        def at(t):
-            fraction = (t - self.t0) / (self.t1 - self.t0)
-            return jax.tree.map(
-                lambda y, s: y + fraction * s, self.inner.evaluate(t, left=left), self.shift
-            )
-
-        if t1 is None:
-            return at(t0)
-        return jax.tree.map(lambda a, b: b - a, at(t0), at(t1))
-
-
-def _make_interpolation(cls, *, t0, t1, inner, shift):
-    """Return the interpolation of one step. cls: interpolation class of the wrapped solver."""
-    interpolation = cls(t0=t0, t1=t1, **inner)
-    return _ProjectedInterpolation(t0=t0, t1=t1, inner=interpolation, shift=shift)
 
 
 class ProjectedSolver(diffrax.AbstractWrappedSolver[Any]):
@@ -71,7 +43,7 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver[Any]):
 
     @property
     def interpolation_cls(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return functools.partial(_make_interpolation, self.solver.interpolation_cls)
+        return functools.partial(make_interpolation, self.solver.interpolation_cls)
 
     def order(self, terms: Any) -> int | None:
         return self.solver.order(terms)

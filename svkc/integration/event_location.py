@@ -174,6 +174,7 @@ class EventSearch(eqx.Module):
     active: whether a search is under way.
     narrowing: whether the bracket has yet to converge.
     done: whether the search has just ended.
+    retry_time: end of the next step if a guard crossed zero several times in the last; else inf.
     """
 
     step_size: Float[Array, ""]
@@ -186,6 +187,7 @@ class EventSearch(eqx.Module):
     active: Bool[Array, ""]
     narrowing: Bool[Array, ""]
     done: Bool[Array, ""]
+    retry_time: Float[Array, ""]
 
     @staticmethod
     def inactive(
@@ -204,38 +206,43 @@ class EventSearch(eqx.Module):
             active=no,
             narrowing=no,
             done=no,
+            retry_time=jnp.full_like(t0, jnp.inf),
         )
 
-    def next_time(self) -> Float[Array, ""]:
-        """Return the time of the next evaluation: in the bracket, then just after its right end."""
+    def end_of_attempt(self, tnext) -> Float[Array, ""]:
+        """Return the end of the next attempted step.
+
+        A search evaluates the guards in the bracket, then just after the bracket's right end.
+
+        tnext: end of the next step if there is neither a search nor a shorter step to take.
+        """
         b = self.bracket.b
-        return jnp.where(self.narrowing, self.bracket.next_point(), b + event_tolerance(b))
+        locate = jnp.where(self.narrowing, self.bracket.next_point(), b + event_tolerance(b))
+        return jnp.where(self.active, locate, jnp.minimum(tnext, self.retry_time))
 
 
 def update_search(
     old: EventSearch,
     before: Float[Array, " guards"],
+    values: Float[Array, " guards"],
     *,
     t0: Float[Array, ""],
     t1: Float[Array, ""],
     y: ODEState,
     keep_step: Bool[Array, ""],
-    field_args: FieldArgs,
+    retry_time,
     armed_guards: ArmedGuards,
 ) -> tuple[Float[Array, " guards"], EventSearch]:
-    """Evaluate the guards after an attempted step from t0 to t1, and advance the event search.
+    """Advance the event search after an attempted step from t0 to t1.
 
     A search starts if a guard crosses zero in a step that is kept, narrows its bracket, and ends
     with one evaluation after the root. Return the guards at t1 or, once done, at the root.
 
-    before: values of the guards at t0.
+    before, values: of the guards at t0 and t1.
     y: state at t1.
-    keep_step: whether the step-size controller keeps the step.
+    keep_step: whether the step is kept.
+    retry_time: as in `EventSearch`.
     """
-    values = armed_guards.evaluate(t1, y, field_args)
-    # A guard at zero is armed once it has left zero by more than round-off.
-    round_off = jnp.finfo(values.dtype).eps ** 0.75
-    values = jnp.where((before == 0) & (jnp.abs(values) < round_off), 0, values)
     crossed = armed_guards.evaluate.plan.crossed(before, values)
     crossed = crossed & armed_guards.armed & keep_step & ~old.active
     starts = jnp.any(crossed)
@@ -260,6 +267,7 @@ def update_search(
         active=active,
         narrowing=active & bracket.not_converged(),
         done=done,
+        retry_time=retry_time,
     )
     return jnp.where(done, search.values, values), search
 

@@ -5,6 +5,7 @@ stages of the solver and the projection once. Nothing in this module is differen
 """
 
 import dataclasses
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -14,7 +15,9 @@ from jaxtyping import Array
 
 from svkc._jax.control_flow import buffer_at_set, while_loop
 from svkc._jax.pytrees import tree_where
-from svkc.integration.event_location import EventSearch, event_info, update_search
+from svkc.integration.dense_output import ProjectedInterpolation, make_interpolation
+from svkc.integration.event_location import EventSearch, event_info
+from svkc.integration.guard_scan import locate_event
 from svkc.integration.ode import ODEState, Times, is_finite, rms_norm
 from svkc.integration.solution import (
     EVENT,
@@ -32,7 +35,7 @@ from svkc.integration.solution import (
 )
 from svkc.integration.stabilization import needs_projection
 from svkc.integration.step_size import (
-    clip_to_save_time,
+    clip_step,
     unclipped_step_size,
     with_projection_error,
 )
@@ -115,7 +118,7 @@ def _init_stepper(
     return StepperState(
         t=t0,
         y=start,
-        tnext=clip_to_save_time(t0, t1, times),
+        tnext=clip_step(t0, t1, times, options.max_step),
         step_size=t1 - t0,
         made_jump=jnp.zeros((), bool),
         solver_state=options.solver.init(term, t0, t1, start, field_args),
@@ -142,14 +145,13 @@ def _attempt_step(
     term = diffrax.ODETerm(field)
     # Projection moved the state, so the FSAL derivative is stale: re-evaluate.
     stale = True if needs_projection(field.stabilization, field_args) else s.made_jump
-    y_solver, error, _, solver_state, solver_result = options.solver.step(
+    y_solver, error, dense_info, solver_state, solver_result = options.solver.step(
         term, s.t, t1, s.y, field_args, s.solver_state, made_jump=stale
     )
     y, info = project_state(field, field_args, y_solver)
     if error is not None and field.projects_by_loop_forces:
         error = with_projection_error(error, y, y_solver)
-    ok = is_finite(y)
-    failure = jnp.where(ok, LOOP_OPEN, NON_FINITE)
+    failure = jnp.where(ok := is_finite(y), LOOP_OPEN, NON_FINITE)
     if info is not None:
         ok = ok & (jnp.max(info.gap) <= options.gap_tolerance)
     error = jax.tree.map(lambda x: jnp.where(ok & jnp.isfinite(x), x, jnp.inf), error)
@@ -183,38 +185,28 @@ def _attempt_step(
         result=result.astype(jnp.int32),
         error_norm=jnp.asarray(jnp.inf, t.dtype) if error is None else rms_norm(error),
         projection_info=info,
+        interpolation=_interpolation((s.t, t1), dense_info, y, y_solver, options),
     )
 
 
-def _locate_event(
-    s: StepperState, attempt: StepAttempt, t1, problem: PhaseProblem, options: StepperOptions
-) -> tuple[StepAttempt, Array, EventSearch, Array]:
-    """Evaluate the guards after an attempt to t1 and advance the event search.
+def _interpolation(
+    step: tuple[Array, Array],
+    dense_info: Any,
+    y: ODEState,
+    y_solver: ODEState,
+    options: StepperOptions,
+) -> ProjectedInterpolation | None:
+    """Return the dense output of a step, None where there are no guards.
 
-    Return the attempt as the loop takes it, the values of the guards, the search, and whether the
-    loop stands still because a root is being located.
+    step: its start and end.
+    dense_info: what the solver's step returned for the dense output.
+    y, y_solver: the end of the step with and without projection.
     """
-    assert s.search is not None
-    assert s.guard_values is not None
-    assert options.armed_guards is not None
-    guard_values, search = update_search(
-        s.search,
-        s.guard_values,
-        t0=s.t,
-        t1=t1,
-        y=attempt.y,
-        keep_step=attempt.keep_step,
-        field_args=problem.field_args,
-        armed_guards=options.armed_guards,
-    )
-    locating = s.search.active | search.active
-    land = search.done
-    guard_is_nan = attempt.keep_step & jnp.any(jnp.isnan(guard_values))
-    advance = (attempt.keep_step & ~guard_is_nan & ~locating) | land
-    t, y = tree_where(land, (search.bracket.b, search.y), (attempt.t, attempt.y))
-    result = jnp.where(guard_is_nan, NON_FINITE, attempt.result)
-    attempt = dataclasses.replace(attempt, t=t, y=y, keep_step=advance, result=result)
-    return attempt, guard_values, search, locating
+    if options.armed_guards is None:
+        return None
+    shift = jax.tree.map(lambda a, b: a - b, y, y_solver)
+    cls = options.solver.interpolation_cls
+    return make_interpolation(cls, t0=step[0], t1=step[1], inner=dense_info, shift=shift)
 
 
 def _write_states(
@@ -246,16 +238,19 @@ def _body_fun(
         )
     if s.search is None:
         attempt = _attempt_step(s, s.tnext, problem, options)
-        guard_values, search, locating = None, None, jnp.zeros((), bool)
+        guard_values, search, hold = None, None, jnp.zeros((), bool)
     else:
-        t1 = jnp.where(s.search.active, s.search.next_time(), s.tnext)
+        t1 = s.search.end_of_attempt(s.tnext)
         attempt = _attempt_step(s, t1, problem, options)
-        attempt, guard_values, search, locating = _locate_event(s, attempt, t1, problem, options)
+        attempt, guard_values, search, hold = locate_event(s, attempt, t1, problem, options)
+    rejected = ~attempt.keep_step & ~hold
+    if search is not None:
+        rejected = rejected | jnp.isfinite(search.retry_time)
     if_advancing = lambda new, old: tree_where(attempt.keep_step, new, old)
-    unless_locating = lambda new, old: tree_where(locating, old, new)
+    unless_held = lambda new, old: tree_where(hold, old, new)
     t, accepted = if_advancing(attempt.t, s.t), s.accepted + attempt.keep_step.astype(jnp.int32)
     ys, checkpoints = _write_states(s, attempt, t, save_ts, accepted, options.checkpoint_interval)
-    result = unless_locating(attempt.result, s.result)
+    result = unless_held(attempt.result, s.result)
     progress = (t - t0) / jnp.where(stop > t0, stop - t0, 1)
     return StepperState(
         # These move when the loop advances.
@@ -265,10 +260,10 @@ def _body_fun(
         solver_state=if_advancing(attempt.solver_state, s.solver_state),
         guard_values=None if guard_values is None else if_advancing(guard_values, s.guard_values),
         projection_info=if_advancing(attempt.projection_info, info),
-        # These stand still while a root is located.
-        tnext=unless_locating(clip_to_save_time(t, t + attempt.step_size, times), s.tnext),
-        step_size=unless_locating(attempt.step_size, s.step_size),
-        controller_state=unless_locating(attempt.controller_state, s.controller_state),
+        # These stand still while a root is located or a step is divided.
+        tnext=unless_held(clip_step(t, t + attempt.step_size, times, options.max_step), s.tnext),
+        step_size=unless_held(attempt.step_size, s.step_size),
+        controller_state=unless_held(attempt.controller_state, s.controller_state),
         result=result,
         # These are updated by every attempt.
         progress_meter_state=options.progress_meter.step(s.progress_meter_state, progress),
@@ -277,7 +272,7 @@ def _body_fun(
         checkpoints=checkpoints,
         ys=ys,
         accepted=accepted,
-        rejected=s.rejected + (~attempt.keep_step & ~locating).astype(jnp.int32),
+        rejected=s.rejected + rejected.astype(jnp.int32),
         stats=update_stats(s, attempt, result, problem.field_args),
     )
 

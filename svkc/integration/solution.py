@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from svkc.integration.dense_output import ProjectedInterpolation
 from svkc.integration.event_location import ArmedGuards, EventInfo, EventSearch
 from svkc.integration.ode import FieldArgs, ODEState
 from svkc.integration.vector_field import VectorField
@@ -38,6 +39,7 @@ class StepperOptions(eqx.Module):
     armed_guards: guards that may end the phase. None: no event can.
     controller: step-size controller of diffrax.
     first_step: size of the first step (s). None: the controller chooses.
+    max_step: the longest step that the armed guards allow (s). None: no guard limits steps.
     gap_tolerance: steps that leave a larger loop gap are rejected (rad, units of `chain.length`).
     max_steps: the most steps of a phase, accepted and rejected; event location is not counted.
     checkpoint_interval: one state in so many steps is stored.
@@ -47,6 +49,7 @@ class StepperOptions(eqx.Module):
     armed_guards: ArmedGuards | None
     controller: Any
     first_step: Any
+    max_step: Float[Array, ""] | None
     progress_meter: diffrax.AbstractProgressMeter[Any]
     gap_tolerance: float = eqx.field(static=True)
     max_steps: int = eqx.field(static=True)
@@ -161,6 +164,7 @@ class StepAttempt(eqx.Module):
     keep_step: whether the loop advances to (t, y).
     step_size: size that the controller proposes for the next step.
     error_norm: root mean square of the estimated error over q and v. inf: no estimate.
+    interpolation: dense output of the step. None: there are no guards.
     """
 
     t: Float[Array, ""]
@@ -173,6 +177,7 @@ class StepAttempt(eqx.Module):
     result: Int[Array, ""]
     error_norm: Float[Array, ""]
     projection_info: ProjectionInfo | None
+    interpolation: ProjectedInterpolation | None
 
 
 def update_stats(

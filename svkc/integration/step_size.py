@@ -67,11 +67,19 @@ class FixedSteps(diffrax.AbstractStepSizeController[None, Any]):
         return keep_step, next_t0, self._tnext(t1), False, controller_state, result
 
 
-def clip_to_save_time(
-    t: Float[Array, ""], proposed: Float[Array, ""], times: Times
+def clip_step(
+    t: Float[Array, ""],
+    proposed: Float[Array, ""],
+    times: Times,
+    max_step: Float[Array, ""] | None = None,
 ) -> Float[Array, ""]:
-    """Return the end of a step from t: the proposed one, clipped to the next save time or stop."""
+    """Return the end of a step from t: the proposed one, clipped to the next save time or stop.
+
+    max_step: the longest step (s). None: any.
+    """
     _, stop, save_ts = times
+    if max_step is not None:
+        proposed = jnp.minimum(proposed, t + max_step / (1 + MAX_STRETCH))
     next_save_t = jnp.min(jnp.where(save_ts > t, save_ts, jnp.inf), initial=jnp.inf)
     limit = jnp.minimum(stop, next_save_t)
     return jnp.where(t + (proposed - t) * (1 + MAX_STRETCH) >= limit, limit, proposed)

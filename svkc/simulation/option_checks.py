@@ -26,19 +26,21 @@ Stabilization: TypeAlias = Checked[AbstractStabilization]
 AnyDynamics: TypeAlias = Checked[AbstractDynamics | Dynamics]
 
 
-def check_step_options(dt: Any, rtol: Any, atol: Any, stepsize_controller: Any) -> None:
+def check_step_options(dt: Any, rtol: Any, atol: Any, dtmax: Any, stepsize_controller: Any) -> None:
     """Raise ValueError unless dt, the tolerances or a controller alone sets the step size."""
-    for name, value in (("dt", dt), ("rtol", rtol), ("atol", atol)):
+    for name, value in (("dt", dt), ("rtol", rtol), ("atol", atol), ("dtmax", dtmax)):
         if value is not None:
             positive_scalar(name, value)
-    tolerance = rtol is not None or atol is not None
-    if dt is not None and (tolerance or stepsize_controller is not None):
+    if dtmax is not None:
+        finite_array("dtmax", dtmax)
+    adaptive = rtol is not None or atol is not None or dtmax is not None
+    if dt is not None and (adaptive or stepsize_controller is not None):
         raise ValueError(
-            "dt sets fixed steps; rtol, atol and stepsize_controller set adaptive steps; give one"
-            " or the other"
+            "dt sets fixed steps; rtol, atol, dtmax and stepsize_controller set adaptive steps;"
+            " give one or the other"
         )
-    if stepsize_controller is not None and tolerance:
-        raise ValueError("rtol and atol: give them to the stepsize_controller instead")
+    if stepsize_controller is not None and adaptive:
+        raise ValueError("rtol, atol and dtmax: give them to the stepsize_controller instead")
 
 
 def check_instance(name: str, value: Any, kind: type) -> None:

@@ -16,7 +16,7 @@ from svkc.integration.integrators import SimplifiedNewton
 from svkc.integration.ode import rms_norm
 from svkc.integration.replay import Replay
 from svkc.integration.stabilization import AbstractStabilization, Projection
-from svkc.integration.step_size import FixedSteps
+from svkc.integration.step_size import MAX_STRETCH, FixedSteps
 from svkc.integration.vector_field import VectorField
 from svkc.loops.constrained_dynamics import AbstractDynamics, Dynamics, default_dynamics
 from svkc.loops.constraint import gap_tolerance
@@ -101,15 +101,15 @@ def resolve_tolerances(
 
 def prepare_options(
     chain: Chain, state: State, t0: Any, t1: Any, *, ts: Any, events: Any, control: Any, dt: Any,
-    rtol: Any, atol: Any, solver: Any, stepsize_controller: Any, stabilization: Any, dynamics: Any,
-    adjoint: Any, max_events: Any, max_steps: Any, progress_meter: Any,
+    rtol: Any, atol: Any, dtmax: Any, solver: Any, stepsize_controller: Any, stabilization: Any,
+    dynamics: Any, adjoint: Any, max_events: Any, max_steps: Any, progress_meter: Any,
 ) -> tuple[Options, Float[Array, " times"], Plan]:  # fmt: skip
     """Return the options, the save times and the plan of events of a call of `simulate`. Raises
     ValueError for invalid arguments."""
     check_initial_state(chain, state)
     dtype, events = state.q.dtype, as_events(events)
     check_times(t0, t1, ts, events)
-    check_step_options(dt, rtol, atol, stepsize_controller)
+    check_step_options(dt, rtol, atol, dtmax, stepsize_controller)
     if control is not None:
         check_function("control", control, "t", "state", "args")
     check_instance("stepsize_controller", stepsize_controller, diffrax.AbstractStepSizeController)
@@ -122,7 +122,7 @@ def prepare_options(
     controller = stepsize_controller
     if controller is None:
         smallest = np.finfo(dtype).eps * host.maximum(host.abs(span), host.abs(cast(t1)))
-        controller = _default_controller(rtol, atol, smallest, dtype)
+        controller = _default_controller(rtol, atol, smallest, dtmax, dtype)
     options = Options(
         control=control,
         solver=_resolve_solver(solver, None if dt is not None else controller, dtype),
@@ -134,7 +134,7 @@ def prepare_options(
         dt=None if dt is None else jnp.asarray(dt, dtype),
         first_step=jnp.asarray(host.maximum(span, np.finfo(dtype).tiny) * 1e-3, dtype),
         max_events=_resolve_max_events(max_events, plan),
-        max_steps=_resolve_max_steps(max_steps, span, dt),
+        max_steps=_resolve_max_steps(max_steps, span, dt, dtmax),
         has_work=control is not None or chain.limit is not None or chain.damping is not None,
         gap_tolerance=1e3 * gap_tolerance(dtype),
         traced_times=not is_concrete(t0, t1, ts, plan.times),
@@ -144,13 +144,21 @@ def prepare_options(
     return options, jnp.asarray(save_at, dtype), plan
 
 
-def _default_controller(rtol, atol, smallest, dtype) -> diffrax.PIDController:
-    """Return the default step-size controller. smallest: lower bound of the step size (s)."""
+def _default_controller(
+    rtol: Any, atol: Any, smallest: Any, dtmax: Any, dtype: Any
+) -> diffrax.PIDController:
+    """Return the default step-size controller.
+
+    smallest, dtmax: bounds of the step size (s); dtmax may be None.
+    """
     # arrays, so that a run with other tolerances uses the same program
     rtol, atol = resolve_tolerances(dtype, rtol, atol)
+    # a step is stretched by up to MAX_STRETCH if it then ends at a save time
+    largest = None if dtmax is None else jnp.asarray(dtmax, dtype) / (1 + MAX_STRETCH)
     return diffrax.PIDController(
-        rtol, atol, norm=rms_norm, dtmin=jnp.asarray(smallest, dtype), force_dtmin=False
-    )
+        rtol, atol, norm=rms_norm, dtmin=jnp.asarray(smallest, dtype), dtmax=largest,
+        force_dtmin=False,
+    )  # fmt: skip
 
 
 def _resolve_stabilization(stabilization) -> AbstractStabilization:
@@ -265,18 +273,19 @@ def _resolve_max_events(max_events, plan: Plan) -> int:
     return capacity if plan.actions else 0
 
 
-def _resolve_max_steps(max_steps, span, dt) -> int:
-    """Return the bound on the number of steps of a phase, large enough for all fixed steps by
-    default. Raises ValueError if these are more than 1e9."""
+def _resolve_max_steps(max_steps: Any, span: Any, dt: Any, dtmax: Any) -> int:
+    """Return the bound on the number of steps of a phase, by default large enough for all steps of
+    size dt or dtmax. Raises ValueError if these are more than 1e9."""
     if max_steps is not None:
         return integer("max_steps", max_steps, 1)
-    if dt is None or not is_concrete(span, dt):
+    name, size = ("dtmax", dtmax) if dt is None else ("dt", dt)
+    if size is None or not is_concrete(span, size):
         return 65536
-    # save times and events shorten some fixed steps, so there are more than span / dt
-    steps = float(np.max(np.asarray(span / dt)))
+    # save times and events shorten some steps, so there are more than span / size
+    steps = float(np.max(np.asarray(span / size)))
     if not steps < 1e9:
         raise ValueError(
-            f"dt: got {dt}, with which a run of {float(span):g} s has more than 1e9 steps; give a"
-            " larger dt, or max_steps"
+            f"{name}: got {size}, with which a run of {float(span):g} s has more than 1e9 steps;"
+            f" give a larger {name}, or max_steps"
         )
     return max(65536, int(1.1 * steps) + 1024)

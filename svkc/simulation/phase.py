@@ -141,11 +141,16 @@ def _stepper_options(options: Options, armed: ArmedGuards | None) -> StepperOpti
     solver, armed_guards, (controller, first_step) = stop_gradient_tree(
         (with_scan_kind(options.solver, "lax"), armed, options.step_size_control())
     )
+    max_step = None
+    if armed_guards is not None and armed_guards.evaluate.plan.max_steps is not None:
+        limits = armed_guards.evaluate.plan.max_steps
+        max_step = jnp.min(jnp.where(armed_guards.armed, limits, jnp.inf))
     return StepperOptions(
         solver=solver,
         armed_guards=armed_guards,
         controller=controller,
         first_step=first_step,
+        max_step=max_step,
         progress_meter=options.progress_meter if replays else diffrax.NoProgressMeter(),
         gap_tolerance=options.gap_tolerance,
         max_steps=options.max_steps,

@@ -46,6 +46,7 @@ def simulate(
     stabilization: Stabilization | None = None, dynamics: AnyDynamics | None = None,
     adjoint: Adjoint | None = None, max_events: Integer | None = None,
     max_steps: Integer | None = None, throw: bool = True, progress_meter: Progress | None = None,
+    dtmax: Scalar | None = None,
 ) -> Trajectory:  # fmt: skip
     """Integrate the motion from t0 to t1, through the changes of structure of `events`.
 
@@ -58,6 +59,7 @@ def simulate(
     dt: fixed step size (s).
     rtol, atol: tolerances of adaptive steps; by default 1e-7 (float32: 1e-4) and a hundredth of
         rtol.
+    dtmax: the longest adaptive step (s); None: any. A `stepsize_controller` has its own.
     solver: of diffrax; by default Dopri8, or Tsit5 with dt or in float32.
     stepsize_controller, progress_meter: of diffrax.
     stabilization: of `svkc.stabilization`; by default `Projection()`.
@@ -77,9 +79,9 @@ def simulate(
     """
     options, save_at, plan = prepare_options(
         chain, state, t0, t1, ts=ts, events=events, control=control, dt=dt, rtol=rtol, atol=atol,
-        solver=solver, stepsize_controller=stepsize_controller, stabilization=stabilization,
-        dynamics=dynamics, adjoint=adjoint, max_events=max_events, max_steps=max_steps,
-        progress_meter=progress_meter,
+        dtmax=dtmax, solver=solver, stepsize_controller=stepsize_controller,
+        stabilization=stabilization, dynamics=dynamics, adjoint=adjoint, max_events=max_events,
+        max_steps=max_steps, progress_meter=progress_meter,
     )  # fmt: skip
     times = jnp.asarray(t0, state.q.dtype), jnp.asarray(t1, state.q.dtype), save_at
     run = lambda control, events: _run(

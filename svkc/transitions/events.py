@@ -11,7 +11,14 @@ import equinox as eqx
 import numpy as np
 
 from svkc.model.annotations import Checked, Function, Names, Scalar
-from svkc.model.validation import boolean, check_function, names, real_array
+from svkc.model.validation import (
+    boolean,
+    check_function,
+    finite_array,
+    names,
+    positive_scalar,
+    real_array,
+)
 from svkc.transitions.spare_links import Grip
 
 # one grip or several; spare slots by name, or pairs (parent, real) of body names
@@ -51,11 +58,13 @@ class When(eqx.Module):
     """An event at the time at which guard(t, state, args) crosses zero.
 
     direction: True for rising crossings only, False for falling ones only, None for either.
+    max_step: the longest step while the guard is armed (s). None: any.
     """
 
     guard: Callable
     action: Action
     direction: bool | None = eqx.field(static=True, default=None)
+    max_step: Any = None
 
 
 def _as_tuple(value) -> tuple[Any, ...]:
@@ -166,6 +175,7 @@ def when(
     stop: Checked[bool] = False,
     bind: Grips = (),
     unbind: SlotsOrPairs = (),
+    max_step: Scalar | None = None,
 ) -> When:
     """Return an event that changes the structure when a guard crosses zero.
 
@@ -178,17 +188,22 @@ def when(
     float32) has not crossed zero, whatever its sign and `direction`. It fires at its first crossing
     after it has left zero. The same holds after an event, for the guard that fired and for a guard
     that the event puts at zero; an armed guard that is on its way through zero at the time of
-    another event does fire. Crossings are detected between the ends of steps: two crossings within
-    one step are missed, so bound the step size (`stepsize_controller`, `dt`) where that can happen.
-    The event of a discontinuous guard is located at the jump; derivatives treat its time as
-    constant.
+    another event does fire.
+    The event of a discontinuous guard is at the jump; derivatives treat its time as constant.
+
+    The first of several crossings within a step is located too: guards are evaluated at seven
+    points in a step (one if a guard needs torques) and closer where needed. Missed are jumps to
+    the other side and back, oscillations faster than the points, and pairs closer than 1e-5 of a
+    step or the error of the solver's dense output; `max_step` bounds the steps for these.
 
     guard: function (t, state, args) -> real number, or a guard such as `svkc.touch` returns.
     connect, cut, lock, unlock, here, stop, bind, unbind: as for `svkc.at`.
     direction: True for rising crossings only, False for falling ones only, None for either.
+    max_step: the longest step while this guard is armed (s); None: any. With an adjoint of diffrax
+        it holds while the event is located.
 
     Raises ValueError if the guard is no function of these arguments, the direction is not True,
-    False or None, or an argument is one that `svkc.at` refuses.
+    False or None, `max_step` is not positive and finite, or `svkc.at` refuses an argument.
     """
     check_function("when: guard", guard, "t", "state", "args")
     if direction is not None and not isinstance(direction, bool | np.bool_):
@@ -198,7 +213,9 @@ def when(
         connect=connect, cut=cut, lock=lock, unlock=unlock, here=here, stop=stop, bind=bind,
         unbind=unbind,
     )  # fmt: skip
-    return When(guard, action, direction)
+    if max_step is not None:
+        positive_scalar("when: max_step", finite_array("when: max_step", max_step))
+    return When(guard=guard, action=action, direction=direction, max_step=max_step)
 
 
 def as_events(events: Any) -> tuple[Any, ...]:

@@ -149,8 +149,8 @@ def touch(chain: Chain, link: str, distance: Scalar = 0.01, axes: str | None = N
     """Return a guard that falls through zero when the two ends of a virtual link come close.
 
     The guard's value (m) is the distance between the link's point on the real link and its point on
-    the parent, less `distance`. Use the guard with direction=False, and choose a distance that the
-    points do not enter and leave within one step.
+    the parent, less `distance`. Use the guard with direction=False. Points that enter and leave
+    this distance within one step are noticed; `svkc.when` states what can be missed.
 
     link: name of a virtual link.
     distance: distance between the points at the event (m).

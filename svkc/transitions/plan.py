@@ -30,6 +30,8 @@ class Plan(eqx.Module):
 
     times: of the timed events (s).
     guards: of the events with a guard.
+    max_steps: of the guards, the longest step while a guard is armed (s), inf where not given.
+        None: no event gives one.
     timed, guarded: indices of the timed events and of the events with a guard in the user's list.
     directions: of the guards: True rising, False falling, None either.
     actions: what each event changes, without its grips, which hold differentiable data.
@@ -38,6 +40,7 @@ class Plan(eqx.Module):
 
     times: Float[Array, " timed"]
     guards: tuple[AbstractGuard, ...]
+    max_steps: Float[Array, " guards"] | None
     timed: tuple[int, ...] = eqx.field(static=True)
     guarded: tuple[int, ...] = eqx.field(static=True)
     directions: tuple[bool | None, ...] = eqx.field(static=True)
@@ -161,14 +164,14 @@ def make_plan(chain: Chain, events: tuple[Any, ...], dtype: DType) -> Plan:
     times = [events[i].time for i in timed]
     if any(np.shape(t) != () for t in times):
         raise ValueError("at: time must be one number; for a time in each lane use vmap")
-    # concrete times are stacked by numpy: JAX compiles a program for every eager operation
-    times = (
-        np.array(times, dtype)
-        if is_concrete(*times)
-        else jnp.stack([jnp.asarray(t, dtype) for t in times])
-    )
+    max_steps = [events[i].max_step for i in guarded]
     plan = Plan(
-        times=jnp.asarray(times, dtype),
+        times=_stack(times, dtype),
+        max_steps=(
+            None
+            if all(x is None for x in max_steps)
+            else _stack([np.inf if x is None else x for x in max_steps], dtype)
+        ),
         guards=tuple(_as_guard(events[i].guard) for i in guarded),
         timed=timed,
         guarded=guarded,
@@ -181,6 +184,17 @@ def make_plan(chain: Chain, events: tuple[Any, ...], dtype: DType) -> Plan:
     )
     _check_names(chain, plan)
     return plan
+
+
+def _stack(numbers: list, dtype) -> Float[Array, " numbers"]:
+    """Return numbers as an array."""
+    # concrete numbers are stacked by numpy: JAX compiles a program for every eager operation
+    return jnp.asarray(
+        np.array(numbers, dtype)
+        if is_concrete(*numbers)
+        else jnp.stack([jnp.asarray(x, dtype) for x in numbers]),
+        dtype,
+    )
 
 
 def _check_names(chain: Chain, plan: Plan) -> None:
