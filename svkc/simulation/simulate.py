@@ -44,9 +44,8 @@ def simulate(
     dt: Scalar | None = None, rtol: Scalar | None = None, atol: Scalar | None = None,
     solver: Solver | None = None, stepsize_controller: Controller | None = None,
     stabilization: Stabilization | None = None, dynamics: AnyDynamics | None = None,
-    adjoint: Adjoint | None = None, max_events: Integer | None = None,
+    adjoint: Adjoint | None = None, max_events: Integer | None = None, dtmax: Scalar | None = None,
     max_steps: Integer | None = None, throw: bool = True, progress_meter: Progress | None = None,
-    dtmax: Scalar | None = None,
 ) -> Trajectory:  # fmt: skip
     """Integrate the motion from t0 to t1, through the changes of structure of `events`.
 
@@ -56,10 +55,9 @@ def simulate(
     events: `svkc.at(...)`, `svkc.when(...)`, or several.
     control: function (t, state, args) -> torques (N m, N) over every coordinate, or the tree's.
     args: passed to `control` and to guards.
-    dt: fixed step size (s).
+    dt: fixed step size (s). dtmax: longest adaptive step (s); `stepsize_controller` has its own.
     rtol, atol: tolerances of adaptive steps; by default 1e-7 (float32: 1e-4) and a hundredth of
         rtol.
-    dtmax: the longest adaptive step (s); None: any. A `stepsize_controller` has its own.
     solver: of diffrax; by default Dopri8, or Tsit5 with dt or in float32.
     stepsize_controller, progress_meter: of diffrax.
     stabilization: of `svkc.stabilization`; by default `Projection()`.

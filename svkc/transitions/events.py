@@ -190,17 +190,14 @@ def when(
     that the event puts at zero; an armed guard that is on its way through zero at the time of
     another event does fire.
     The event of a discontinuous guard is at the jump; derivatives treat its time as constant.
-
-    The first of several crossings within a step is located too: guards are evaluated at seven
-    points in a step (one if a guard needs torques) and closer where needed. Missed are jumps to
-    the other side and back, oscillations faster than the points, and pairs closer than 1e-5 of a
-    step or the error of the solver's dense output; `max_step` bounds the steps for these.
+    Of several crossings within a step the first is located: guards are evaluated at seven points of
+    its dense output (one if a guard needs torques), and closer where needed. Missed are jumps there
+    and back, faster oscillations, and pairs closer than 1e-5 of the step or the output's error.
 
     guard: function (t, state, args) -> real number, or a guard such as `svkc.touch` returns.
     connect, cut, lock, unlock, here, stop, bind, unbind: as for `svkc.at`.
     direction: True for rising crossings only, False for falling ones only, None for either.
-    max_step: the longest step while this guard is armed (s); None: any. With an adjoint of diffrax
-        it holds while the event is located.
+    max_step: the longest step while this guard is armed (s); None: any.
 
     Raises ValueError if the guard is no function of these arguments, the direction is not True,
     False or None, `max_step` is not positive and finite, or `svkc.at` refuses an argument.
