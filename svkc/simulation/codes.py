@@ -51,8 +51,8 @@ class RESULTS(eqx.Enumeration, metaclass=FormerMeta):  # pyright: ignore
         " of an event. Nothing was run."
     )
     reversed = (
-        "Times are out of order: t1, an event or a save time is before t0, save times decrease, or"
-        " a save time is past t1. Nothing was run."
+        "Times are out of order: t1, an event or a save time is before t0, or save times decrease."
+        " Nothing was run."
     )
     not_positive_definite = (
         "A mass, inertia or armature of the chain is negative or not finite, so that the mass"

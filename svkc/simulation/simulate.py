@@ -51,7 +51,7 @@ def simulate(
 
     t0, t1: start and end of the run (s).
     ts: save times (s), which steps meet exactly; None: t0 and t1. A state saved at the time of an
-        event is the state after the event. Times past an early end hold the last state.
+        event is the state after the event. Times past the end of a lane hold its last state.
     events: `svkc.at(...)`, `svkc.when(...)`, or several.
     control: function (t, state, args) -> torques (N m, N) over every coordinate, or the tree's.
     args: passed to `control` and to guards.
