@@ -1,6 +1,7 @@
 """Ten topologies of one to three loops, planar and spatial, with 200 geometries each."""
 
 import functools
+import pathlib
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -157,21 +158,41 @@ def changed(chain, pos, link_pos):
     )
 
 
-def expected(name, count):
-    """Return tree coordinates as rows of numbers, hinges' turns, whether they were reached, and
-    rotations of balls, all from `references/continuation.py`."""
+REFERENCE = pathlib.Path(__file__).parent / "references" / "continuation.npz"
+FIELDS = ("scalars", "balls", "turns", "reached")
+
+
+def recompute(name, count=200):
+    """Return the fields of `expected`, computed by `references/continuation.py`."""
     chain, names = linkage(name)
-    pos, link_pos, target = geometries(name)
-    pos, link_pos, target = pos[:count], link_pos[:count], target[:count]
+    pos, link_pos, target = (x[:count] for x in geometries(name))
     reference = continuation.Linkage.of(chain, pos, link_pos, np.full(count, float(chain.length)))
-    named = [
-        chain.v_index(n).start if hasattr(chain, "v_index") else _index(chain, n) for n in names
-    ]
+    top = chain.topology
+    named = [top.v_start[top.joint_row[top.joint_names.index(joint)]] for joint in names]
     goal = np.zeros((count, chain.nv))
     goal[:, named] = target
-    return continuation.continued(reference, named, goal, 100)
+    (scalars, rotations), turns, reached = continuation.continued(reference, named, goal, 100)
+    balls = rotations[:, list(top.rows_of_kind(continuation.BALL))]
+    parts = (scalars, balls, turns)
+    blank = [np.where(reached.reshape(-1, *[1] * (x.ndim - 1)), x, 0) for x in parts]
+    return *blank, reached
 
 
-def _index(chain, name):
-    top = chain.topology
-    return top.v_start[top.joint_row[top.joint_names.index(name)]]
+def expected(name, count):
+    """Return the reference for the first geometries, from its file.
+
+    These are coordinates of hinges and slides [count dofs], rotations of balls [count balls 3 3],
+    turns of the virtual hinges [count links], and whether the geometry was reached. Numbers of
+    geometries that were not reached are 0. `python tests/linkages.py` writes the file (half an
+    hour).
+    """
+    with np.load(REFERENCE) as file:
+        return [file[f"{name}: {field}"][:count] for field in FIELDS]
+
+
+if __name__ == "__main__":
+    arrays = {}
+    for name in TOPOLOGIES:
+        for field, value in zip(FIELDS, recompute(name), strict=True):
+            arrays[f"{name}: {field}"] = value
+    np.savez_compressed(REFERENCE, **arrays)

@@ -217,20 +217,22 @@ def subset(linkage, which):
 
 
 def continued(linkage, named, target, steps):
-    """Return `followed`, with ten times as many steps for the geometries that need them."""
+    """Return `followed`, with ten times as many steps and twice as many iterations in each for the
+    geometries that need them."""
     q, turns, ok = followed(linkage, named, target, steps)
     if not ok.all():
         some = np.flatnonzero(~ok)
-        finer = followed(subset(linkage, some), named, target[some], 10 * steps)
+        finer = followed(subset(linkage, some), named, target[some], 10 * steps, iterations=6)
         q[0][some], q[1][some], turns[some], ok[some] = *finer[0], *finer[1:]
     return q, turns, ok
 
 
-def followed(linkage, named, target, steps):
+def followed(linkage, named, target, steps, iterations=3):
     """Return the configuration [count dofs] with the named coordinates at the target, the turns of
     the virtual hinges without jumps, and whether it was reached.
 
     steps: of each of both legs, the one that closes the load pose and the one that moves names.
+    iterations: of Newton's method in each step of the second leg.
     """
     q0 = linkage.rest()
     c0, _, turns = linkage.loops(q0)
@@ -242,10 +244,12 @@ def followed(linkage, named, target, steps):
         ok &= step < 1e-6
     names[:, named] = True
     first = q[0].copy()
-    for s in np.arange(1, steps + 1) / steps:
+    # near a fold a configuration moves as the square root of s: small steps at both ends
+    u = np.arange(1, steps + 1) / steps
+    for s in u * u * (3 - 2 * u):
         before = q
         goal = np.where(names, first + s * (target - first), 0)
-        q, step = stationary(linkage, q0, q, names, goal, residual=0 * c0, iterations=3)
+        q, step = stationary(linkage, q0, q, names, goal, residual=0 * c0, iterations=iterations)
         turns = turns + np.angle(np.exp(1j * (linkage.loops(q)[2] - turns)))
         ok &= (step < 1e-6) & (np.max(np.abs(linkage.change(before, q)), 1) < 0.3)
     q, step = stationary(
