@@ -123,7 +123,9 @@ def defined_by_library(x) -> bool:
     """
     if isinstance(x, types.ModuleType):
         return is_library_module(vars(x))
-    scope = sys.modules.get(str(getattr(x, "__module__", None)))
+    # the ufuncs of NumPy 2.0 do not say their module
+    module = getattr(x, "__module__", "numpy" if isinstance(x, np.ufunc) else None)
+    scope = sys.modules.get(str(module))
     if scope is None or not (is_library_module(vars(scope)) or isinstance(x, JIT_FUNCTION_TYPE)):
         return False
     for name in str(getattr(x, "__qualname__", None) or getattr(x, "__name__", None)).split("."):
