@@ -1,7 +1,8 @@
 """svkc: structure-varying kinematic chains in JAX, after Nakamura and Yamane (2000)."""
 
-from typing import Any as _Any
+from importlib import import_module as _import_module
 from importlib.metadata import PackageNotFoundError as _Missing, version as _version
+from typing import Any as _Any
 
 from svkc import _deprecated
 
@@ -149,5 +150,8 @@ except _Missing:  # a source tree that is not installed
 
 
 def __getattr__(name: str) -> _Any:
-    """Return the object of a deprecated name, with a `DeprecationWarning`."""
+    """Return `svkc.scenes`, imported at its first use; or the object of a deprecated name, with a
+    `DeprecationWarning`."""
+    if name == "scenes":
+        return _import_module("svkc.scenes")
     return _deprecated.resolve(name)

@@ -137,3 +137,9 @@ def test_parts_of_results_have_names():
     ]
     position, quaternion = shapes[0]
     assert (position.shape, quaternion.shape) == ((4, 3), (4, 4))
+
+
+def test_scenes_are_imported_at_their_first_use():
+    code = "import sys, svkc; before = 'svkc.scenes' in sys.modules; svkc.scenes.high_bar; "
+    done = run("-W", "error", "-c", code + "print(before)")
+    assert done.stdout.strip() == "False", done.stderr
