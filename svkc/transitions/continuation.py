@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.batched_lapack import factor_general, solve_factored
-from svkc.loops.constraint import jacobian_scales, loop_kinematics
+from svkc.loops.constraint import LoopKinematics, jacobian_scales, loop_kinematics
 from svkc.loops.frames import LoopFrames
 from svkc.loops.pivoting import PivotedQR, pivoted_qr
 from svkc.model.chain import Chain, Structure, active_dofs
@@ -27,6 +27,7 @@ from svkc.transitions.stationarity import (
 )
 from svkc.tree.configuration import difference, integrate
 from svkc.tree.kinematics import Kinematics
+from svkc.tree.spatial import matvec, quat_conjugate, quat_matrix, skew
 
 # kinds of iterations, besides those of the search for the rank in `newton_state.py`: compute the
 # coordinates of virtual joints from the poses of their bodies; the leg that closes the start;
@@ -41,6 +42,10 @@ from svkc.tree.kinematics import Kinematics
     PROJECT_VELOCITY,
     DONE,
 ) = range(20, 27)
+
+# rotation (rad) below which the left Jacobian's quadratic term is that of its series, whose next
+# term is smaller by a factor of angle^2 / 60
+_SMALL_ANGLE = 1e-3
 
 
 class PathPoint(eqx.Module):
@@ -71,7 +76,7 @@ class PathState(eqx.Module):
     point: the last accepted point of the leg.
     kind: kind of the next iteration.
     corrections: number of Newton corrections since the last predictor step.
-    iterations: number of iterations of all kinds.
+    iterations: number of iterations of all kinds since the start of the path.
     s, step_size: parameter of the leg and its last step.
     correction_size: largest entry of the last correction.
     initial_gap, initial_offset: loop gaps and deviations of held coordinates at the start of the
@@ -171,6 +176,31 @@ class LinearSolution(eqx.Module):
     same_orientation: Bool[Array, ""]
 
 
+def _jacobian_and_gaps(loops: LoopKinematics):
+    """Return the scaled J_C and the scaled gaps, with angular rows in the frames of the real links.
+
+    In these frames the matrix is the derivative of the gaps of open loops too: that of a rotation
+    vector is the inverse of the left Jacobian of SO(3). In world axes J_C is the derivative of the
+    gaps of closed loops only.
+    """
+    count = len(loops.gap) // 6
+    J, gap = loops.J.reshape(count, 6, -1), loops.gap.reshape(count, 6)
+    vector = gap[:, :3]
+    squared = jnp.sum(vector * vector, 1)
+    half = jnp.sqrt(jnp.where(squared < _SMALL_ANGLE**2, 1, squared)) / 2
+    factor = jnp.where(
+        squared < _SMALL_ANGLE**2, 1 / 12, (1 - half / jnp.tan(half)) / (2 * half) ** 2
+    )
+    to_real = quat_matrix(quat_conjugate(loops.frames.real_quat))
+    across = skew(vector)
+    inverse = jnp.eye(3, dtype=gap.dtype)[None] - across / 2
+    inverse = inverse + factor[:, None, None] * (across @ across)
+    angular = to_real @ (inverse @ J[:, :3])
+    J = jnp.concatenate([angular, J[:, 3:]], 1).reshape(loops.J.shape)
+    gap = jnp.concatenate([matvec(to_real, vector), gap[:, 3:]], 1).ravel()
+    return J, gap
+
+
 def _neighbourhood(chain: Chain, structure: Structure, q):
     """Return loop kinematics, loop gaps and configurations at q and at a small step from q along
     each coordinate, and the size of these steps.
@@ -183,7 +213,7 @@ def _neighbourhood(chain: Chain, structure: Structure, q):
     def evaluate(step):
         q_step = integrate(chain, q, step)
         loops = loop_kinematics(chain, structure, q_step)
-        return loops.kin, loops.frames, loops.J, loops.gap, q_step
+        return loops.kin, loops.frames, *_jacobian_and_gaps(loops), q_step
 
     return (*jax.vmap(evaluate)(steps), size)
 

@@ -26,10 +26,16 @@ def velocity_after_impact(
     energy lost (J): the paper's (29)-(38) in one formula.
 
     v+ is the projection of v- onto the velocities that the structure allows, orthogonal in the
-    metric of the mass matrix. Redundant loops need no special case.
+    metric of the mass matrix. Redundant loops need no special case. Locked joints stop: the
+    momentum of their velocity in v- goes to the other joints.
     """
     solve = CompositeBodies().prepare(chain, structure, loops, qr)
-    delta_v = solve(jnp.zeros_like(v), loops.J @ (v / jacobian_scales(chain)[1]))
+    momentum, remaining = jnp.zeros_like(v), v
+    if structure.locked is not None:
+        stopped = jnp.where(structure.locked, v, 0)
+        momentum = pad_to_dofs(chain, mass_matrix_product(chain, loops.kin, stopped[: chain.nv]))
+        remaining = v - stopped
+    delta_v = solve(momentum, loops.J @ (remaining / jacobian_scales(chain)[1])) + remaining - v
     impulse = pad_to_dofs(chain, mass_matrix_product(chain, loops.kin, delta_v[: chain.nv]))
     # v+ - v- is orthogonal to v+, so the energy lost is a squared norm and cannot be negative
     return v + delta_v, -constraint_forces(chain, qr, loops.J, impulse), delta_v @ impulse / 2

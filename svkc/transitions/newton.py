@@ -126,7 +126,9 @@ def _iterate(
 
     all_row_steps: the number of first iterations that use all rows, whatever the rank.
     """
-    kinds, active = schedule.kinds, active_dofs(chain, structure)
+    kinds, unlocked = schedule.kinds, dataclasses.replace(structure, locked=None)
+    # locked joints have a velocity before the impact that stops them
+    v = jnp.where(active_dofs(chain, unlocked), v, 0)
     perturbation = rank_search_perturbation(chain, structure)
     iteration = _Iteration(chain, structure, perturbation=perturbation, kinds=kinds)
 
@@ -138,9 +140,7 @@ def _iterate(
         jnp.asarray(np.array(kinds, np.int32)),
         jnp.asarray(np.arange(len(kinds)) >= all_row_steps),
     )
-    return jax.lax.scan(
-        scan_body, NewtonState.init(chain, structure, q, jnp.where(active, v, 0)), xs
-    )[0]
+    return jax.lax.scan(scan_body, NewtonState.init(chain, structure, q, v), xs)[0]
 
 
 def _solve(chain: Chain, structure: Structure, q, v, schedule: Schedule) -> NewtonState:

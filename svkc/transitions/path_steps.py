@@ -40,6 +40,10 @@ from svkc.tree.configuration import difference, integrate
 
 # largest predictor step, and the smallest one before a leg is given up (rad, `chain.length`s)
 _LARGEST_STEP, _SMALLEST_STEP = 0.1, 1e-5
+# iterations after which a path is given up: 500, and 100 for each unit of the largest gap and
+# offset. Largest steps take three iterations each, so 30 for each unit that one coordinate moves;
+# a path that comes near a singular configuration takes ever smaller steps
+_ITERATIONS, _ITERATIONS_PER_UNIT = 500, 100
 
 
 class _StepDecision(eqx.Module):
@@ -47,7 +51,7 @@ class _StepDecision(eqx.Module):
 
     accept, reject: a point that is neither accepted nor rejected is corrected.
     leg_done: whether the leg has come to its end.
-    stuck: whether steps have become too small.
+    stuck: whether steps have become too small or too many.
     correction_size: largest entry of the correction.
     step_size: the next step of the leg's parameter.
     """
@@ -85,11 +89,16 @@ def _decide(path: PathState, linear: LinearSolution) -> _StepDecision:
     limit = _LARGEST_STEP / jnp.maximum(length, eps)
     step_size = jnp.minimum(jnp.minimum(grown, 1 - path.s), limit)
     too_small = (predicted < 2 * _SMALLEST_STEP) | (path.step_size < 1e-8)
+    far = jnp.max(jnp.abs(linear.initial_gap)) + jnp.max(
+        jnp.where(path.held, jnp.abs(linear.initial_offset), 0)
+    )
+    longest = _ITERATIONS + _ITERATIONS_PER_UNIT * far
+    too_long = on_leg & (path.iterations.astype(far.dtype) > longest)
     return _StepDecision(
         accept=accept,
         reject=reject,
         leg_done=accept & at_end,
-        stuck=reject & (~path.has_point | too_small),
+        stuck=too_long | (reject & (~path.has_point | too_small)),
         correction_size=size,
         step_size=jnp.where(reject, path.step_size / 2, step_size),
     )
@@ -188,14 +197,12 @@ def next_path_state(
     )
     return tree_where(
         failed & ~path.from_requested & jnp.any(targets.held_q & ~(path.held & path.rank_known)),
-        _restarted(chain, structure, targets, path, after),
+        _restarted(chain, structure, targets, path),
         after,
     )
 
 
-def _restarted(
-    chain: Chain, structure: Structure, targets: Targets, path: PathState, after: PathState
-) -> PathState:
+def _restarted(chain: Chain, structure: Structure, targets: Targets, path: PathState) -> PathState:
     """Return a path that starts at the requested coordinates.
 
     It is taken if the start cannot be closed, or if more coordinates are held than there are
@@ -206,7 +213,6 @@ def _restarted(
         first,
         newton=dataclasses.replace(first.newton, q=targets.requested, v=path.newton.v),
         from_requested=~first.from_requested,
-        iterations=after.iterations,
     )
 
 

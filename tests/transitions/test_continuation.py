@@ -1,5 +1,6 @@
 """`chain.state`: branches by continuation, names that are held, velocities that stay."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import linkages
@@ -89,6 +90,14 @@ def test_arrays_are_guesses_unless_held(four_bar):
     np.testing.assert_allclose(four_bar.state(state.q, hold=True).q, state.q, atol=ROUND_OFF)
     guess = {"crank": 0.71, "coupler": float(state.q[1]), "rocker": float(state.q[2])}
     assert float(four_bar.state(guess, hold=False).q[0]) != 0.71
+
+
+def test_a_loop_that_is_open_by_a_large_angle_closes():
+    """Seven hinges whose end is turned by two radians."""
+    chain, _ = linkages.linkage("seven hinges in space")
+    turned = jnp.array([[np.cos(1.0), 0, np.sin(1.0), 0]])
+    state = eqx.tree_at(lambda c: c.structure.quat, chain, turned).state()
+    assert np.abs(state.q - chain.q_load).max() > 1
 
 
 def test_a_state_to_start_from(four_bar):
