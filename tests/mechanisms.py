@@ -7,6 +7,8 @@ coordinates.
 
 import dataclasses
 import functools
+import os
+import time
 
 import equinox as eqx
 import jax
@@ -33,12 +35,30 @@ def _link(name, parent, real, joint, axis=(0, 0, 1), real_pos=(0, 0.1, 0.3)):
 
 PLANAR = _body("crank", Y, "0 0 0", _body("rod", Y, "0 0 0.4", _body("rocker", Y, "1 0 0.2")))
 SPATIAL = _body(
-    "arm", 'axis="0.2 1 0.3" pos="0.1 0.05 0.1" damping="0.3"', "0 0 0.5",
-    _body("ball", 'type="ball"', "0.5 0 0.2", _body("slide", 'type="slide" axis="1 0.2 0"', "0.1 0 0")),
-) + _body("plate", 'type="free"', "1 0.3 0.5", _body("flap", 'axis="1 0 0.4" stiffness="2"', "0.2 0 0"))
+    "arm",
+    'axis="0.2 1 0.3" pos="0.1 0.05 0.1" damping="0.3"',
+    "0 0 0.5",
+    _body(
+        "ball", 'type="ball"', "0.5 0 0.2", _body("slide", 'type="slide" axis="1 0.2 0"', "0.1 0 0")
+    ),
+) + _body(
+    "plate", 'type="free"', "1 0.3 0.5", _body("flap", 'axis="1 0 0.4" stiffness="2"', "0.2 0 0")
+)
 CUTTABLE = _body(
-    "base", 'axis="0 0 1"', "0 0 0",
-    _body("elbow", 'axis="1 0.3 0"', "0.4 0 0.1", _body("wrist", 'type="ball"', "0.3 0.1 0", _body("tool", 'type="slide" axis="0.3 0 1"', "0.2 0 0"))),
+    "base",
+    'axis="0 0 1"',
+    "0 0 0",
+    _body(
+        "elbow",
+        'axis="1 0.3 0"',
+        "0.4 0 0.1",
+        _body(
+            "wrist",
+            'type="ball"',
+            "0.3 0.1 0",
+            _body("tool", 'type="slide" axis="0.3 0 1"', "0.2 0 0"),
+        ),
+    ),
 )
 MECHANISMS = {
     "four-bar": (PLANAR, [_link("pin", "world", "rocker", "hinge", (0, 1, 0), (0.2, 0, -0.6))], {}),
@@ -49,7 +69,11 @@ MECHANISMS = {
     ),
     "joints": (
         SPATIAL,
-        [_link("table", "world", "flap", "planar"), _link("socket", "slide", "plate", "ball"), _link("rail", "arm", "plate", (True, False, True, True, True, False))],
+        [
+            _link("table", "world", "flap", "planar"),
+            _link("socket", "slide", "plate", "ball"),
+            _link("rail", "arm", "plate", (True, False, True, True, True, False)),
+        ],
         {},
     ),
     "cuttable": (
@@ -61,13 +85,29 @@ MECHANISMS = {
 
 
 ASSEMBLY = _body(
-    "a", 'type="free"', "0 0 1", _body("limb", Y, "0.3 0 0.1", _body("rod", 'type="slide" axis="1 0.2 0"', "0.2 0 0"))
+    "a",
+    'type="free"',
+    "0 0 1",
+    _body("limb", Y, "0.3 0 0.1", _body("rod", 'type="slide" axis="1 0.2 0"', "0.2 0 0")),
 ) + _body("b", 'type="free"', "1 0.3 0.5", _body("arm", 'type="ball" stiffness="1"', "0.2 0 0"))
 MECHANISMS["assembly"] = (
     ASSEMBLY,
-    [_link("weld", "a", "b", "weld"), _link("pin", "world", "rod", "hinge"), _link("table", "b", "arm", "planar")],
+    [
+        _link("weld", "a", "b", "weld"),
+        _link("pin", "world", "rod", "hinge"),
+        _link("table", "b", "arm", "planar"),
+    ],
     {"cuttable": ("limb",), "spare": 2},
 )
+
+
+REQUESTED = int(os.environ.get("SVKC_FUZZ", "0"))
+NOW = int(time.time()) % 10**6 * 1000
+
+
+def seeds(count):
+    """Return the seeds of a test: fixed ones, or new ones if SVKC_FUZZ says how many."""
+    return range(NOW, NOW + REQUESTED) if REQUESTED else range(count)
 
 
 @functools.cache
@@ -146,7 +186,11 @@ def closed(chain, q):
         base = R[real] @ there @ turn.T
         s.quat[i] = rigid_bodies.from_matrix(R[up].T @ base)
         s.pos[i] = R[up].T @ (p[real] + R[real] @ s.real_pos[i] - base @ slide - p[up])
-    placed = eqx.tree_at(lambda c: (c.structure.pos, c.structure.quat), chain, (jnp.asarray(s.pos), jnp.asarray(s.quat)))
+    placed = eqx.tree_at(
+        lambda c: (c.structure.pos, c.structure.quat),
+        chain,
+        (jnp.asarray(s.pos), jnp.asarray(s.quat)),
+    )
     return placed, q
 
 
@@ -156,3 +200,15 @@ def sample(name, rng, size=0.4):
     # the load pose of free bodies belongs to the model
     chain, q = closed(chain, random_q(chain, rng, size))
     return Sample(chain, rigid_bodies.Bodies(rigid_bodies.batched(chain)), q)
+
+
+def random_structure(chain, rng):
+    """Return the structure with some links cut and some coordinates locked, at times."""
+    connected = np.array(chain.structure.connected)
+    if rng.random() < 0.3:
+        connected &= rng.random(len(connected)) < 0.6
+    structure = eqx.tree_at(lambda s: s.connected, chain.structure, jnp.asarray(connected))
+    if rng.random() > 0.15:
+        return structure
+    locked = jnp.asarray(rng.random(chain.dofs) < 0.15)
+    return eqx.tree_at(lambda s: s.locked, structure, locked, is_leaf=lambda x: x is None)

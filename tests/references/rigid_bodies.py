@@ -150,7 +150,9 @@ class Bodies:
         """Return the mask of the coordinates that can move."""
         mask = np.ones((self.count, self.dofs), bool)
         for i, dofs in enumerate(self.top.links.dof):
-            free = np.asarray(structure.freedoms)[:, i] & np.asarray(structure.connected)[:, i, None]
+            free = (
+                np.asarray(structure.freedoms)[:, i] & np.asarray(structure.connected)[:, i, None]
+            )
             for k, d in enumerate(dofs):
                 if d < self.dofs:
                     mask[:, d] = free[:, k]
@@ -197,19 +199,21 @@ class Bodies:
         """Return the generalized forces without inertia: torques, gravity, springs, dampers, and
         the forces of the velocities."""
         N, active = self.number, self.active(structure)
-        centre, Jc, Jw, inertia = self.centres(q)
+        _, Jc, Jw, inertia = self.centres(q)
         stretch = self.change(N["q_spring"], q)
         f = tau - N["damping"] * v - N["stiffness"] * stretch
         f = np.where(active, f, 0)
         weight = N["mass"][:, :, None] * N["gravity"][:, None]
-        rates = self.along(lambda q: np.concatenate(self.centres(q)[1:3], 1) @ v[:, None, :, None], q, v)
+        rates = self.along(
+            lambda q: np.concatenate(self.centres(q)[1:3], 1) @ v[:, None, :, None], q, v
+        )
         linear, angular = rates[:, : self.rows, :, 0], rates[:, self.rows :, :, 0]
         w = rows_times(Jw, v[:, None])
         spin = np.cross(w, rows_times(inertia, w)) + rows_times(inertia, angular)
         f += np.einsum("nrij,nri->nj", Jc, weight - N["mass"][:, :, None] * linear)
         return f - np.einsum("nrij,nri->nj", Jw, spin)
 
-    def motions(self, structure, q, exclude=None):
+    def motions(self, structure, q):
         """Return an orthonormal basis [samples dofs dofs] of the velocities that the structure
         allows (unused columns are zero), and whether the rank is clear."""
         J = self.loops(structure, q)[1].reshape(len(q), -1, self.dofs)
