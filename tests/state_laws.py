@@ -40,10 +40,10 @@ def outside(J, x):
     return np.abs(x - basis @ (basis.T @ x)).max(initial=0)
 
 
-def violations(sample, state, *, start, v_given, named_q, named_v, target, v_target, fixed_q):
+def violations(sample, state, *, start, v_before, named_q, named_v, target, v_target, fixed_q):
     """Return a dict of what is wrong with a finite state: {} if it is right.
 
-    start: configuration from which the change is least. v_given: velocities before the projection.
+    start: configuration from which the change is least. v_before: velocities before the projection.
     named_q, named_v: masks of held coordinates; target, v_target: their values.
     fixed_q: whether the named coordinates are held while the change is made least.
     """
@@ -74,7 +74,7 @@ def violations(sample, state, *, start, v_given, named_q, named_v, target, v_tar
     size = 1 + np.abs(change).max()
     wrong["least change"] = outside(J[:, free], change[free]) / (1e-6 * size)
     free = active & ~named_v
-    change = weight * (v[0] - v_given) / unit
-    size = 1 + np.abs(v[0]).max() + np.abs(v_given).max()
+    change = weight * (v[0] - v_before) / unit
+    size = 1 + np.abs(v[0]).max() + np.abs(v_before).max()
     wrong["least change of v"] = outside(J[:, free], change[free]) / (1e-8 * size)
     return {key: value for key, value in wrong.items() if not value <= 1}

@@ -35,7 +35,7 @@ class Call:
         self.none = np.zeros(chain.dofs, bool)
         self.named_q = self.named_v = self.none
         self.q_argument, self.v_argument, self.hold = self.target, self.v, None
-        self.start, self.fixed, self.v_given = self.target, False, self.v
+        self.start, self.fixed, self.v_before = self.target, False, self.v
         if rng.random() < 0.75:
             self.name_some(rng)
         elif rng.random() < 0.3:
@@ -54,7 +54,7 @@ class Call:
         for name in rng.permutation(names)[: rng.integers(0, len(names) + 1)]:
             at = joint_slice(chain, name, V_SIZE, top.v_start)
             self.v_argument[str(name)], self.named_v[at] = self.v[at], True
-        self.v_given = np.where(self.named_v, self.v, 0)
+        self.v_before = np.where(self.named_v, self.v, 0)
         self.start, self.fixed = (self.sample.q, True) if fixed else (requested, False)
         if not fixed:
             self.hold, self.named_q, self.named_v = False, self.none, self.none
@@ -74,7 +74,7 @@ class Call:
             self.sample,
             state,
             start=self.start,
-            v_given=self.v_given,
+            v_before=self.v_before,
             named_q=self.named_q,
             named_v=self.named_v,
             target=self.target,
@@ -104,14 +104,13 @@ def test_states_of_a_planar_loop():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["spatial", "joints", "cuttable"])
 def test_states_of_loops_of_all_joints(name):
-    check(name, 60)
+    check(name, 40)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("poison", ["q", "mass", "place", "unreachable"])
 def test_a_poisoned_lane_leaves_the_others_bit_for_bit(poison):
     """States of a batch in which one lane has NaN, a negative mass or an unreachable target."""
-    chain = mechanisms.chain_of("four-bar")
     lanes = [mechanisms.sample("four-bar", np.random.default_rng(i), 0.2) for i in range(4)]
     chains, q = jax.tree.map(lambda *x: jnp.stack(x), *((s.chain, jnp.asarray(s.q)) for s in lanes))
 
@@ -140,4 +139,3 @@ def test_a_poisoned_lane_leaves_the_others_bit_for_bit(poison):
         np.testing.assert_array_equal(np.asarray(before)[[0, 2, 3]], np.asarray(after)[[0, 2, 3]])
     assert np.isfinite(np.asarray(clean[0])).all()
     assert np.isnan(np.asarray(poisoned[0])[1]).all() == (poison != "mass")
-    assert chain.dofs == 4
