@@ -161,16 +161,18 @@ def test_a_run_in_two_parts():
     """Events at the time of the split belong to the first part."""
     for _, arguments in batches(2):
         times, args, _, t1 = arguments[4:]
-        whole = in_order()(*arguments)
+        unsplit = in_order()(*arguments)
         middle = jnp.asarray(np.resize([0.1, 0.15, 0.17], LANES))
         first = in_order()(*arguments[:-1], middle)
         end, rest = first.final, jnp.where(times <= middle[:, None], jnp.inf, times)
-        second = in_order()(arguments[0], end.q, end.v, end.structure, rest, args, middle, t1)
-        np.testing.assert_array_equal(first.events.count + second.events.count, whole.events.count)
-        same = second.final.structure.connected == whole.final.structure.connected
+        second = in_order()(*(arguments[0], end.q, end.v, end.structure, rest, args, middle, t1))
+        np.testing.assert_array_equal(
+            first.events.count + second.events.count, unsplit.events.count
+        )
+        same = second.final.structure.connected == unsplit.final.structure.connected
         assert np.asarray(same).all()
         # steps of other sizes, each with an error of the order of 1e-9
-        np.testing.assert_allclose(second.final.q, whole.final.q, atol=1e-6)
+        np.testing.assert_allclose(second.final.q, unsplit.final.q, atol=1e-6)
 
 
 def test_the_order_of_the_list_does_not_matter():
