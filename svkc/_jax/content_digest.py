@@ -30,18 +30,18 @@ def content_digest(x) -> str:
     """Return the SHA-256 of the content of a function, a container, an array or another object.
 
     A function is its code (without line numbers), its defaults, and the values of its closure and
-    of the global variables that its code reads. Objects that a library defines, and modules that
-    are imported within a function, are their names. Other modules are their source files, other
-    objects what `pickle` would keep.
+    of the global variables that its code reads. An object that a library defines, or a module that
+    is imported within a function, is its name. Another module is its source files. A dataclass is
+    the fields that it compares, and any other object is what `pickle` would keep.
 
-    Raises TypeError if x holds an object without such a content, such as a lock or an open file.
+    Raises TypeError if x holds an object that `pickle` cannot keep, such as a lock or an open file.
     """
     return _Digests().of(x).hex()
 
 
 @functools.cache
 def _global_names(code: types.CodeType) -> tuple[str, ...]:
-    """Return the sorted names of the global variables that a code object and those in it read."""
+    """Return the sorted names of the globals that a code object, or a function inside it, reads."""
     names = {
         line.argval
         for line in dis.get_instructions(code)
@@ -55,7 +55,8 @@ class _Digests:
     """Digests of objects that hold each other.
 
     known: id -> (digest, object). The object is kept so that its id is not used again. While an
-        object is read, its digest is its position in the order of reading.
+        object is read, its position in the order of reading stands for its digest, which ends
+        cycles of references.
     """
 
     def __init__(self):
@@ -112,7 +113,7 @@ def _content(x: Any) -> tuple[Any, list]:
 def _array_content(name: str, x) -> tuple[Any, list]:
     """Return the description of an array, and its entries if these are objects."""
     if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jax.dtypes.extended):
-        # of random keys the numbers
+        # The content of random keys is their numbers.
         return (name, str(x.dtype)), [jax.random.key_data(x)]
     if np.asarray(x).dtype.hasobject:
         return (name, np.shape(x)), list(np.ravel(x))
@@ -141,7 +142,7 @@ def _class_parts(x: type) -> list:
             value = value.__func__
         elif isinstance(value, property | functools.cached_property):
             value = value.fget if isinstance(value, property) else value.func
-        # of Python's own entries the methods, such as __call__
+        # Of names with two underscores only methods are read, such as __call__.
         if callable(value) or not name.startswith(("__", "_abc_impl")):
             parts += [name, value]
     return parts

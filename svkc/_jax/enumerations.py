@@ -1,7 +1,7 @@
 """Enumerations of equinox, and members that have moved from one enumeration to another.
 
-equinox compares members of one enumeration only. The classes here let code that was written before
-members moved compare those of the new enumeration with those of the former one.
+equinox compares members of one enumeration only. With the metaclasses here, code that was written
+before a move may compare a member of the new enumeration with one of the former enumeration.
 """
 
 from collections.abc import Callable
@@ -33,7 +33,8 @@ def with_value(member, value):
 class MovedItem(EnumerationItem):
     """A member that is equal to the member of the same name in the former enumeration as well.
 
-    Python calls the methods of a subclass for both orders of the operands.
+    As this class is a subclass of that of the former members, Python calls its methods for both
+    orders of the operands.
     """
 
     def __eq__(self, other):
@@ -43,8 +44,11 @@ class MovedItem(EnumerationItem):
         return super().__ne__(self._translated(other))
 
     def _translated(self, other):
-        """Return a member of the former enumeration as one of this enumeration, with the value -1
-        if this enumeration has no member of that name."""
+        """Return a member of the former enumeration as that of the same name in this enumeration.
+
+        Its value is -1 if this enumeration has no member of that name. Other operands are returned
+        unchanged.
+        """
         own, former = self._enumeration, self._enumeration._former
         if not isinstance(other, EnumerationItem) or other._enumeration is not former:
             return other
@@ -69,7 +73,7 @@ class MovedMeta(EnumerationMeta):
 class FormerMeta(EnumerationMeta):
     """Metaclass of the enumeration from which members have moved.
 
-    Former names and the text of a moved member are still available.
+    The former enumeration still gives a moved member by its name, and its text, with a warning.
     """
 
     def __getattr__(cls, name: str):  # pyright: ignore

@@ -9,9 +9,10 @@ from svkc.integration.ode import ODEState
 
 
 class ProjectedInterpolation(diffrax.AbstractLocalInterpolation):
-    """The solver's dense output plus a linear part that ends at the projected state.
+    """The solver's dense output plus a linear term, so that it ends at the projected state.
 
-    shift: the change of the step's end by the projection.
+    inner: the solver's dense output.
+    shift: projected state less the solver's state, at the end of the step.
     """
 
     t0: Any
@@ -35,7 +36,8 @@ def make_interpolation(cls, *, t0, t1, inner, shift) -> ProjectedInterpolation:
     """Return the dense output of one step.
 
     cls: interpolation class of the solver.
-    inner: what the solver's step returned for the dense output.
+    inner: the `dense_info` that the solver's step returned.
+    shift: as in `ProjectedInterpolation`.
     """
     interpolation = cls(t0=t0, t1=t1, **inner)
     return ProjectedInterpolation(t0=t0, t1=t1, inner=interpolation, shift=shift)

@@ -1,6 +1,6 @@
 """Integrate one phase by `diffrax.diffeqsolve`, for the adjoints of diffrax.
 
-Separate from the stepping loop of svkc: this module alone adapts steps with projection to
+This module is separate from the stepping loop of svkc, as it alone adapts steps with projection to
 diffrax's solver interface.
 """
 
@@ -31,7 +31,7 @@ from svkc.integration.vector_field import VectorField, project_state
 class ProjectedSolver(diffrax.AbstractWrappedSolver[Any]):
     """A diffrax solver whose steps are projected onto the closed loops."""
 
-    # diffrax reads `scan_kind` from wrapped solvers too; this placeholder satisfies it.
+    # A placeholder: diffrax reads `scan_kind` of every solver, but the inner one's takes effect.
     scan_kind: ClassVar[str] = "inner"
 
     solver: diffrax.AbstractSolver[Any]
@@ -94,7 +94,7 @@ def integrate_with_diffrax(
     event: the event at the end, located beforehand. None: there are no guards.
     """
     t0, stop, save_ts = times
-    # diffrax sets `scan_kind` for these adjoints, but not through a wrapper.
+    # diffrax sets `scan_kind` of the solver for these adjoints, but not of a wrapped one.
     kind = {diffrax.ForwardMode: "lax", diffrax.DirectAdjoint: "bounded"}.get(type(adjoint))
     saveat = diffrax.SaveAt(subs=[diffrax.SubSaveAt(t1=True), diffrax.SubSaveAt(ts=save_ts)])
     solution = diffrax.diffeqsolve(
@@ -132,8 +132,9 @@ def integrate_with_diffrax(
 
 
 def _result_code(solution: diffrax.Solution, event: EventInfo | None):
-    """Return the result code of a phase. `FixedSteps` reports a non-finite state as internal."""
+    """Return the result code of a phase."""
     result = solution.result._value
+    # `FixedSteps` reports a non-finite state as an internal error.
     result = jnp.where(result == diffrax.RESULTS.internal_error._value, NON_FINITE, result)
     if event is None:
         return result

@@ -1,7 +1,7 @@
 """Event location: guards, the bracket about a root, and the search for the root.
 
-The search is a state machine that takes one evaluation of the guards per call. The stepping loop
-makes the evaluations, so that its program holds one step of the solver only.
+The search is a state machine that consumes one evaluation of the guards per call. The stepping
+loop evaluates the guards, so that the compiled loop contains one step of the solver only.
 """
 
 import equinox as eqx
@@ -16,8 +16,7 @@ from svkc.model.chain import State
 from svkc.model.validation import as_array, description
 from svkc.transitions.plan import Plan
 
-# the most iterations of the root finder
-MAX_ITERATIONS = 200
+MAX_ITERATIONS = 200  # of the root finder
 
 
 class Bracket(eqx.Module):
@@ -26,8 +25,8 @@ class Bracket(eqx.Module):
     The root finder is the Illinois method (Dowell and Jarratt, BIT 11 (1971), 168-174), with a
     bisection at every third iteration.
 
-    tol: the length at which the bracket has converged.
-    last_side: the end that moved last, 1 for b, -1 for a, 0 for neither.
+    fa, fb: values at a and b, halved by the Illinois rule. tol: length of a converged bracket.
+    last_side: the end that moved last, 1 for b, -1 for a, 0 for neither. count: iterations so far.
     """
 
     a: Float[Array, ""]
@@ -53,7 +52,7 @@ class Bracket(eqx.Module):
         return (self.b - self.a > self.tol) & (self.count < MAX_ITERATIONS)
 
     def next_point(self) -> Float[Array, ""]:
-        """Return the point of the next evaluation: by the secant, or the midpoint."""
+        """Return the point of the next evaluation: the root of the secant, or the midpoint."""
         weight = self.fb - self.fa
         secant = self.b - self.fb * (self.b - self.a) / jnp.where(weight == 0, 1, weight)
         bisect = (self.count % 3 == 2) | (weight == 0)
@@ -63,7 +62,7 @@ class Bracket(eqx.Module):
     def update(self, c: Float[Array, ""], fc: Float[Array, ""]) -> "Bracket":
         """Return the bracket shrunk by the value fc of the function at c."""
         right = fc >= 0
-        # Illinois weights: an end that stays twice in a row counts half.
+        # Illinois rule: halve the value at an end that has not moved twice in a row.
         fa = jnp.where(right & (self.last_side == 1), self.fa / 2, self.fa)
         fb = jnp.where(~right & (self.last_side == -1), self.fb / 2, self.fb)
         return Bracket(
@@ -78,7 +77,7 @@ class Bracket(eqx.Module):
 
 
 # A guard only touches zero (grazes) if, at its rate there, it would change over a step by less than
-# this fraction of its magnitude.
+# this fraction of its magnitude. A guard jumps only if it exceeds this fraction after the root.
 GRAZING_THRESHOLD = 1e-5
 
 
@@ -105,7 +104,7 @@ class GuardValues(eqx.Module):
 
 
 def _guard_value(event: int, value, dtype) -> Float[Array, ""]:
-    """Return what a guard returned as an array. Integers jump, and have no crossing of zero.
+    """Return a guard's value as an array. Integers are refused: they jump over zero.
 
     event: index of the guard's event in the list that `simulate` was given.
     """
@@ -212,7 +211,7 @@ class EventSearch(eqx.Module):
     def end_of_attempt(self, tnext) -> Float[Array, ""]:
         """Return the end of the next attempted step.
 
-        A search evaluates the guards in the bracket, then just after the bracket's right end.
+        A search evaluates guards in the bracket and, once converged, just after its right end.
 
         tnext: end of the next step if there is neither a search nor a shorter step to take.
         """
@@ -236,7 +235,8 @@ def update_search(
     """Advance the event search after an attempted step from t0 to t1.
 
     A search starts if a guard crosses zero in a step that is kept, narrows its bracket, and ends
-    with one evaluation after the root. Return the guards at t1 or, once done, at the root.
+    with one evaluation after the root. Return the guards and the search. The guards are those at t1
+    or, once the search is done, at the root.
 
     before, values: of the guards at t0 and t1.
     y: state at t1.
@@ -248,7 +248,7 @@ def update_search(
     starts = jnp.any(crossed)
     new_sides = jnp.where(crossed, jnp.where(values >= before, 1, -1), 0).astype(values.dtype)
     sides = jnp.where(starts, new_sides, old.sides)
-    # The largest of the guards that crossed is negative before the first crossing only.
+    # The largest of `sides * x` is negative until the first of these guards crosses zero.
     f0, f1 = (jnp.max(jnp.where(sides != 0, sides * x, -jnp.inf)) for x in (before, values))
     bracket = tree_where(old.narrowing, old.bracket.update(t1, f1), old.bracket)
     bracket = tree_where(starts, Bracket.around(t0, t1, f0, f1), bracket)

@@ -1,11 +1,11 @@
 """Guards within a step: crossings of zero that the values at the two ends of the step do not show.
 
-A guard that crosses zero twice within a step has one sign at both ends. `scan_step` evaluates the
-guards along the dense output of a kept step, closer where a guard may turn back to zero between two
-points. If a guard crosses zero more than once, the step is rejected and a shorter one is taken, to
-the first point past the first of these crossings. That step has one crossing left, which is located
-as any other: between states that the solver stepped to, so that the time of an event does not
-depend on the dense output.
+A guard that crosses zero twice within a step has one sign at both ends. `locate_event` scans the
+guards along the dense output of a kept step, by smaller intervals where a guard may turn back to
+zero between two points. If a guard crosses zero more than once, the step is rejected, and the next
+one ends at the first scanned point past the first of these crossings. That step has one crossing,
+which `EventSearch` locates between states that the solver stepped to, so that the time of an event
+does not depend on the dense output.
 """
 
 import dataclasses
@@ -33,15 +33,15 @@ from svkc.integration.solution import (
 )
 from svkc.tree.configuration import normalize
 
-# Intervals into which every kept step is divided; guards are evaluated at their ends and midpoints.
+# Intervals of a kept step before any is halved; guards are evaluated at their ends and midpoints.
 INTERVALS = 4
-# The same if a guard needs torques: such a guard costs an evaluation of the dynamics.
+# Their number if a guard needs torques, as such a guard costs an evaluation of the dynamics.
 INTERVALS_WITH_TORQUES = 1
-# Intervals in which a guard changes sign are at most this fraction of the step.
+# Largest fraction of the step within which a change of sign may count as one crossing.
 CROSSING_INTERVAL = 2.0**-6
-# Intervals are halved down to this fraction of the step ...
+# Intervals of this fraction of the step, or less, are not halved.
 SMALLEST_INTERVAL = 2.0**-17
-# ... until the guards were evaluated this often in one step. A parabola that touches zero takes 80.
+# Evaluations in a step after which no interval is halved. A parabola that touches zero takes 80.
 MAX_EVALUATIONS = 100
 
 
@@ -52,8 +52,8 @@ class GuardScan(eqx.Module):
 
     left, right: ends of the interval.
     at_left, at_right: guards there. `at_right` is valid if `has_right`.
-    middle, at_middle: midpoint of the interval before this one, and guards there. At the start of
-        the step and where an interval is looked at again `middle` is `left`.
+    middle, at_middle: midpoint of the interval before this one, and guards there. `middle` is
+        `left` at the start of the step and while an earlier interval is scanned again.
     at_end: guards at the end of the step.
     sides: sign of each guard at the last point at which it was not zero.
     changes: how often the sign of each guard has changed.
@@ -81,7 +81,7 @@ class GuardScan(eqx.Module):
         """Return the scan before its first interval.
 
         before, at_end: guards at the two ends of the step.
-        intervals: number of intervals.
+        intervals: number of intervals before any is halved.
         """
         zero = jnp.zeros((), at_end.dtype)
         return GuardScan(
@@ -116,7 +116,7 @@ class GuardScan(eqx.Module):
             (self.at_left, values, at_right), width, self.round_off()
         )
         may_halve = self.has_right & (width > SMALLEST_INTERVAL) & (self.count < MAX_EVALUATIONS)
-        # The interval before this one is looked at again, from its midpoint to its end.
+        # Scan the second half of the interval before this one again.
         back = may_halve & jnp.any(self._bends_behind(values, point) & armed)
         halve = may_halve & jnp.any(hides) & ~back
         advance = self.has_right & ~halve & ~back
@@ -147,9 +147,8 @@ class GuardScan(eqx.Module):
     def _bends_behind(self, values, point) -> Bool[Array, " guards"]:
         """Return which guards may cross zero between `middle` and `left` unseen.
 
-        The bend about `left` shows a kink whose bend about `middle` a curvature cancelled.
-
-        values: of the guards at `point`, the midpoint of this interval.
+        Where a kink and a curvature cancel in the second difference about `middle`, the one about
+        `left` shows the kink. values: of the guards at `point`, the midpoint of this interval.
         """
         width = self.left - self.middle
         slope = (self.at_left - self.at_middle) / jnp.where(width == 0, 1, width)
@@ -160,7 +159,7 @@ class GuardScan(eqx.Module):
         return wide & one_sign & (near < 2 * bend) & (bend > self.round_off())
 
     def round_off(self) -> Float[Array, " guards"]:
-        """Return the values of the guards that count as zero between the ends of the step."""
+        """Return the magnitudes below which guards count as zero between the ends of the step."""
         magnitudes = jnp.maximum(jnp.abs(self.at_end), jnp.abs(self.at_left))
         return jnp.finfo(magnitudes.dtype).eps ** 0.75 * magnitudes
 
@@ -187,11 +186,11 @@ def _signs(values: Float[Array, " guards"]) -> Int[Array, " guards"]:
 def _may_hide_crossings(values, width, round_off) -> Bool[Array, " guards"]:
     """Return which guards may cross zero unseen within an interval.
 
-    `bend`, the second difference, bounds how far a guard is below its chords: a parabola is below
-    them by an eighth of it, two straight lines with a kink by no more than all of it. A guard of
-    one sign hides no crossing if its least absolute value exceeds twice the bend, for guards whose
-    bend changes within the interval. A guard that changes sign hides none if it is monotonic, as a
-    parabola with twice this bend would still be.
+    The second difference, `bend`, bounds how far a guard departs from its chords: a parabola by an
+    eighth of `bend`, two straight lines with a kink by at most `bend`. A guard of one sign hides no
+    crossing if its least absolute value exceeds 2 `bend`; the factor 2 allows for a bend that
+    varies. A guard that changes sign hides none if the interval is short, and if a parabola with
+    twice this bend would still be monotonic.
 
     values: of the guards at the ends and at the midpoint of the interval.
     width: of the interval.
@@ -216,8 +215,8 @@ def _scan_step(
 ) -> GuardScan:
     """Return the scan of the guards along an attempted step to t1.
 
-    Guards are evaluated at t1 if the step is kept or a root is being located; along the step if it
-    is kept and no root is being located.
+    Guards are evaluated at t1 if the step is kept or a root is being located. They are evaluated
+    along the step if it is kept, no root is being located, and a guard is armed.
     """
     assert s.search is not None
     assert options.armed_guards is not None
@@ -227,7 +226,7 @@ def _scan_step(
     interpolation, field_args = attempt.interpolation, problem.field_args
     intervals = _intervals(guards.evaluate)
     along = attempt.keep_step & ~search.active & jnp.any(guards.armed)
-    # A guard at zero is armed once it has left zero by more than round-off.
+    # A guard at zero stays zero, and cannot cross, until it has left zero by more than round-off.
     round_off = jnp.finfo(before.dtype).eps ** 0.75
 
     def cond_fun(scan: GuardScan):
@@ -249,7 +248,7 @@ def _scan_step(
 
 
 def _intervals(guards: GuardValues) -> int:
-    """Return the number of intervals into which every kept step is divided."""
+    """Return the number of intervals of a kept step before any is halved."""
     needs_torques = any(g.needs_torques for g in guards.plan.guards)
     return INTERVALS_WITH_TORQUES if needs_torques else INTERVALS
 
@@ -265,9 +264,9 @@ def locate_event(
 ) -> tuple[StepAttempt, Array, EventSearch, Array]:
     """Evaluate the guards after an attempt to t1 and advance the event search.
 
-    Return the attempt as the loop takes it, the values of the guards, the search, and whether the
-    step that the controller proposed stands: while a root is being located, and while a step is
-    divided because a guard crosses zero several times.
+    Return the attempt with the decision of the search, the values of the guards, the search, and
+    whether the loop keeps the step size and the controller's state: while a root is being located,
+    and while a step is divided because a guard crosses zero several times.
     """
     assert s.search is not None
     assert s.guard_values is not None

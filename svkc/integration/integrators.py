@@ -33,7 +33,7 @@ class RodriguesEuler(diffrax.AbstractSolver[Any]):
     interpolation_cls: ClassVar[Any] = diffrax.LocalLinearInterpolation
 
     def _position_velocity(self, v0, v1):
-        """Return the velocity that moves q, given those at the start and at the end of a step."""
+        """Return the velocity that moves q: v0 at the start of the step, or v1 at its end."""
         return v0
 
     def order(self, terms: Any) -> int:
@@ -68,8 +68,8 @@ class SymplecticEuler(RodriguesEuler):
     Wanner, Geometric Numerical Integration). Where the mass matrix depends on q, as for a double
     pendulum, the energy drifts.
 
-    Joint damping is explicit, as this solver knows the vector field alone: a step equals one of
-    `svkc.step` with `implicit_damping=False`.
+    Joint damping is explicit, as this solver knows the vector field alone. Without closed loops, a
+    step equals one of `svkc.step` with `implicit_damping=False`.
 
     Use as `solver` of `svkc.simulate` together with `dt`: the solver estimates no error and
     handles the states of `svkc.simulate` alone.
@@ -87,7 +87,7 @@ class SimplifiedNewton(diffrax.VeryChord):
     Wanner, Solving Ordinary Differential Equations II, section IV.8).
 
     `diffrax.VeryChord` always takes a second update, and reports divergence where both updates are
-    round-off. On the high bar that takes five times as many steps.
+    round-off. With it, the model of the high bar takes five times as many steps.
     """
 
     def terminate(self, fn: Any, y: Any, args: Any, options: Any, state: Any, tags: Any) -> Any:
@@ -122,18 +122,19 @@ def step(
 ) -> State:
     """Take one step of symplectic Euler and return the new state.
 
-    v(t + dt) = v(t) + a dt, then q moves by v(t + dt) dt along the exponential map. For loops
-    of one's own, such as control or reinforcement learning. Springs, dampers and joint limits act.
-    The structure stays. First order; `svkc.simulate` has events, other solvers and error control.
+    v(t + dt) = v(t) + a dt, then q moves by v(t + dt) dt along the exponential map. Use `step` in a
+    simulation loop of your own, such as for control or reinforcement learning. Springs, dampers and
+    joint limits act; the structure is unchanged. The method is of first order; `svkc.simulate` has
+    events, other solvers and error control.
 
     The acceleration a solves (M + dt D) a = f(q(t), v(t)) under the loop constraints. D is the
     diagonal matrix of the joints' damping, so that dampers are stable with any step size: an open
     chain moves as by `mj_step` of MuJoCo's default integrator, Euler, which differs from its
-    `implicitfast`. Springs stay explicit, as in MuJoCo. Joint limits are explicit springs and
-    dampers of svkc's own law (paper, section VII-B), and so is the damping of virtual links that
-    are not cuttable joints: beyond a joint's range motions differ from those of MuJoCo.
+    `implicitfast`. Springs are explicit, as in MuJoCo. Joint limits are explicit springs and
+    dampers of svkc's own law (paper, section VII-B), so that motions beyond a joint's range differ
+    from those of MuJoCo. The damping of virtual links that are not cuttable joints is explicit.
 
-    Each step reduces the gaps of loops by a quarter (Baumgarte stabilization of rate 1 / (2 dt)).
+    Each step reduces the loop gaps by a quarter (Baumgarte stabilization of rate 1 / (2 dt)).
 
     tau: joint torques (N m, N), constant over the step; over all coordinates or over the tree's.
     dt: step size (s).

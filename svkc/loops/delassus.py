@@ -23,12 +23,12 @@ from svkc.tree.inverse_dynamics import mass_matrix_product, pad_to_dofs
 from svkc.tree.kinematics import Kinematics
 from svkc.tree.spatial import inverse_positive, matvec
 
-# Steps of iterative refinement. Each leaves 1e-4 (float64) of the forces' error along a row whose
-# inverse inertia is 1e-6 of the others'.
+# Steps of iterative refinement. In float64, each multiplies by 1e-4 the error of the force along a
+# row whose inverse inertia is 1e-6 of the others'.
 REFINEMENTS = 2
 BALL_FREEDOMS = (True, True, True, False, False, False)
-# Rows from which D is factored by LAPACK. Block inversion is compiled for each size, and its
-# operations grow with the rows.
+# Least number of rows for which LAPACK factors D. Smaller ones are inverted by blocks, in a program
+# that grows with the rows.
 LAPACK_MIN_ROWS = 36
 
 
@@ -36,7 +36,7 @@ class VirtualJoints(eqx.Module):
     """Motion subspaces of the virtual joints, padded to the d freedoms of the freest.
 
     S: motion subspace of each link. gram_inverse: (S^T S)^-1.
-    dof: index of each freedom among the virtual joints' coordinates (padding: `count`).
+    dof: index of each freedom among the virtual joints' coordinates (padding: `count` or more).
     count: number of these coordinates.
     """
 
@@ -76,10 +76,11 @@ class VirtualJoints(eqx.Module):
 
 
 class DelassusRows(NamedTuple):
-    """The rows of J that are in D: first six of each `full_links`, then three of each free ball.
+    """The rows of J that are in D: six of each of `full_links`, then the linear three of each ball.
 
-    full_links: links with all six rows in D. rows: index in J of each row of D.
-    position: of each row of J its index in D (not in D: the size of D).
+    full_links: links with all six rows in D. The others are unlocked declared balls.
+    rows: index in J of each row of D.
+    position: index in D of each row of J; the size of D for rows that are not in D.
     """
 
     full_links: np.ndarray
@@ -151,9 +152,10 @@ def loop_force_solver(
 ) -> Callable:
     """Return (force, loop_bias) -> (x, mu) with M x + J^T mu = force and J x = loop_bias.
 
-    Where M is singular, or nearly so, as loops alone hold massless bodies, D does not exist, or
-    one of its entries hides the others. An auxiliary inertia makes M regular; Woodbury's formula
-    takes the inertia off again, and one refinement by the residual restores the digits it costs.
+    Where loops alone hold massless bodies, M is singular, so that D does not exist, or nearly
+    singular, so that one entry of D swamps the others. An auxiliary inertia makes M regular;
+    Woodbury's formula subtracts this inertia again, and one step of iterative refinement restores
+    the digits that the subtraction costs.
 
     free: coordinates that are not locked (None: all).
     """
@@ -182,9 +184,9 @@ def _solver_of_regular_mass_matrix(
 ) -> Callable:
     """Return `loop_force_solver` of a chain whose mass matrix M is regular.
 
-    The rows of J may be dependent. D is regularized and factored, and the forces are refined
-    against D itself (the proximal form): forces of dependent rows stay finite, and the motion is
-    that of the independent ones.
+    The rows of J may be dependent. D is regularized and factored, and the forces are refined with
+    the residual of D itself (the proximal form). Forces of dependent rows stay finite, and the
+    motion is that of the independent rows.
 
     free: coordinates that are not locked (None: all).
     """

@@ -1,7 +1,7 @@
-"""Inertia added to, or taken off, the diagonal of the mass matrix.
+"""Inertia added to, or subtracted from, the diagonal of the mass matrix.
 
-For implicit joint damping, and for bodies without mass, which leave the tree's mass matrix singular
-where loops alone determine their motion.
+Implicit joint damping adds such an inertia. Massless bodies need one too: where loops alone
+determine their motion, the tree's mass matrix is singular.
 """
 
 from collections.abc import Callable
@@ -25,12 +25,13 @@ def with_armature(chain: Chain, added: Float[Array, " nv"]) -> Chain:
 def with_inertia(
     chain: Chain, solve: Callable, dofs: np.ndarray, inertia: Float[Array, " n"]
 ) -> Callable:
-    """Return `solve` for a mass matrix M + C, from that for M (Woodbury's formula).
+    """Return the solver of the mass matrix M + C from `solve`, that of M (Woodbury's formula).
 
-    With accelerations G f under forces f on `dofs`, the forces -C x of the added inertia change
-    x_0, the accelerations without them, to x = x_0 - G C x.
+    Let x_0 be the accelerations of `dofs` from `solve`, and G f those that forces f on `dofs` cause
+    there. The added inertia acts as the forces -C x, so that (1 + G C) x = x_0.
 
-    solve: (force [dofs], bias [rows]) -> x, or a tuple whose first entry is x.
+    solve: (force [dofs], bias [rows]) -> accelerations, or a tuple whose first entry they are.
+    dofs: the coordinates to which C adds inertia.
     inertia: diagonal of C on the coordinates `dofs`; may be negative.
     """
     no_bias = jnp.zeros(6 * len(chain.link_names), inertia.dtype)
@@ -50,10 +51,11 @@ def with_inertia(
 def auxiliary_inertia(chain: Chain) -> Float[Array, " nv"]:
     """Return an inertia of each massless body's joint coordinates, zero for other coordinates.
 
-    With it on the diagonal the tree's mass matrix is regular; `with_inertia` takes it off again. It
-    is eps^(1/4) (float64: 1.2e-4) of that of the largest mass at `chain.length`: a smaller one
-    leaves loop forces inexact by the regularization of Delassus' matrix, a larger one costs digits
-    where loops leave a massless body little inertia of its neighbours.
+    With this inertia on the diagonal the tree's mass matrix is regular; `with_inertia` subtracts it
+    again. Its size is eps^(1/4) (float64: 1.2e-4) of the largest mass, or of that mass times
+    `chain.length`^2 for angles. With a smaller one, the regularization of Delassus' matrix would
+    make loop forces inexact. A larger one costs digits where loops couple a massless body to little
+    inertia of its neighbours.
     """
     mask = np.isin(np.arange(chain.nv), chain.topology.massless_dofs)
     column = jacobian_scales(chain)[1][: chain.nv]

@@ -21,8 +21,11 @@ from svkc.transitions.transition import CONNECT_TOLERANCE, change_structure, rel
 
 
 def reevaluated_guards(plan: Plan) -> np.ndarray:
-    """Return which guards are re-evaluated after a change of structure: all but those that need
-    torques. A crossing is thus detected between two values of one structure."""
+    """Return the mask of guards that are re-evaluated after a change of structure.
+
+    They are all guards but those that need torques. The search for a crossing then compares two
+    values of the same structure.
+    """
     return np.array([not g.needs_torques for g in plan.guards], bool)
 
 
@@ -38,11 +41,13 @@ def apply_events(
 ) -> Any:
     """Apply the events that fired at the end of a phase, all in one change of structure.
 
-    Returns the state after the change, the records of events, and the result of the run so far. A
+    Return the state after the change, the records of events, and the result of the run so far. A
     change that fails is neither applied nor recorded: the run keeps the state before the events.
 
-    end_state: the state at the end of the phase. fired: which events of the plan fired.
-    gap_tolerance: largest loop gap that does not fail the change (rad, or in `chain.length`s).
+    end_state: the state at the end of the phase.
+    fired: mask of the plan's events that fired.
+    gap_tolerance: largest loop gap with which a change succeeds (rad, or multiples of
+        `chain.length`).
     """
     any_fired = jnp.any(fired)
     start, masks, any_no_slot = _prepare_change(chain, end_state, fired, plan)
@@ -78,7 +83,8 @@ def _failure(
 ) -> RESULTS:
     """Return why a change of structure cannot be made, or `RESULTS.successful`.
 
-    structure: before the change. connected: the links that the change leaves connected.
+    structure: the structure before the change.
+    connected: mask of the links that are connected after the change.
     """
     new = connected & ~structure.connected
     misplaced = change.initial_gap > CONNECT_TOLERANCE
@@ -97,18 +103,18 @@ def _failure(
 def _prepare_change(
     chain: Chain, end_state: State, fired: Bool[Array, " events"], plan: Plan
 ) -> tuple[State, dict, Bool[Array, ""]]:
-    """Return the state with the spare slots of these events cleared and bound, the arguments of
-    `change_structure`, and whether a grip had no free slot.
+    """Return the state with spare slots cleared and bound, masks, and whether a grip had no slot.
 
-    Links are cut and slots are cleared before grips are made, so that a grip may take a slot that
-    an event of the same instant cuts or clears.
+    The masks are the keyword arguments of `change_structure`. Links are cut and slots are cleared
+    before grips are made, so that a grip may take a slot that an event of the same instant cuts or
+    clears.
     """
     masks, structure = _new_masks(chain, end_state.structure, fired, plan), end_state.structure
     if not plan.has_binds:
         return end_state, masks, jnp.zeros((), bool)
     to_clear = jnp.any(fired[:, None] & plan.slots_to_unbind(chain, structure), 0)
     masks["connected"] = masks["connected"] & ~to_clear
-    # a slot that is cut and bound again is a new link
+    # A slot that is cut and bound again counts as a new link.
     structure = eqx.tree_at(
         lambda s: s.connected,
         cleared(structure, to_clear),
@@ -123,9 +129,11 @@ def _prepare_change(
 def _new_masks(
     chain: Chain, structure: Structure, fired: Bool[Array, " events"], plan: Plan
 ) -> dict:
-    """Return the arguments of `change_structure` after these events: the connected links, the
-    locked joints, and the new links made at the current poses of their bodies. None: no event of
-    the plan changes them."""
+    """Return the keyword arguments of `change_structure` for the events that fired.
+
+    These are masks: the connected links, the locked joints, and the new links placed at the current
+    poses of their bodies. The last two are None if no event of the plan changes them.
+    """
     any_of = lambda name: jnp.any(fired[:, None] & plan.action_mask(chain, name), 0)
     locked = at_current_pose = None
     if plan.has_locks:
@@ -156,7 +164,9 @@ def _write_events(
 ) -> Events:
     """Return the records with a row for each event that fired.
 
-    connects: the links that each event connects, whose impulses are written in the event's row.
+    The energy lost in the one impact of these events is in the first of their rows.
+
+    connects: the links that each event connects; their impulses are in the event's row.
     """
     r = events
     row = r.count + jnp.cumsum(fired, dtype=jnp.int32) - 1
@@ -181,12 +191,15 @@ def _write_events(
 def _bind_slots(
     chain: Chain, structure: Structure, fired: Bool[Array, " events"], plan: Plan
 ) -> tuple[Structure, Bool[Array, " links"], Bool[Array, ""]]:
-    """Return the structure with the spare slots bound by the events that fired, the mask of slots
-    to connect, and whether a grip had no free slot."""
+    """Return the structure with spare slots bound, the slots to connect, and if a slot was missing.
+
+    The last two are the mask of the slots that the events that fired have bound, and whether one of
+    their grips had no free slot.
+    """
     to_connect, any_no_slot = jnp.zeros(len(chain.link_names), bool), jnp.zeros((), bool)
     for event, grips in enumerate(plan.grips):
         for grip in grips:
-            # a slot that an earlier grip of this instant has bound is no longer free
+            # A slot that an earlier grip of this instant has bound is no longer free.
             occupied = eqx.tree_at(
                 lambda s: s.connected, structure, structure.connected | to_connect
             )

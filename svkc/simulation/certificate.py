@@ -1,5 +1,7 @@
-"""The certificate of a run: loop gaps, energy, momentum and rank margins, computed from the records
-after the run."""
+"""The certificate of a run: loop gaps, energy, momentum and rank margins of its records.
+
+These are computed after the run, from the states that it recorded.
+"""
 
 import dataclasses
 from typing import Any
@@ -26,10 +28,10 @@ class StateCheck(eqx.Module):
     """Quantities of the certificate at one state.
 
     gap, gap_rate: largest gaps of the loops (rad, m) and their rates (rad/s, m/s).
-    kinetic: kinetic energy (J), not differentiable.
+    kinetic: kinetic energy (J), not differentiated.
     energy: mechanical energy (J).
     linear, angular: linear momentum (N s), and angular momentum about the centre of mass (N m s).
-    margin: rank margin |R_mm| / |R_11|.
+    margin: rank margin |R_mm| / |R_11| (R of the loop Jacobian's pivoted QR, m its rank).
 
     Energy, momenta and margin are computed at the two ends of phases only; elsewhere they are zero,
     and the margin is one.
@@ -47,11 +49,13 @@ class StateCheck(eqx.Module):
 def certificate(
     chain: Chain, records: PhaseRecords, count: Int[Array, ""], saved: tuple, stages: int
 ) -> tuple[Phases, StateCheck, Int[Array, ""]]:
-    """Return the phases of a run, the checks of its saved states, and the index of the first phase
-    whose loops lose rank at one of its two ends (the number of rows if none does).
+    """Return the phases of a run, the checks of its saved states, and where loops first lose rank.
+
+    The last is the index of the first phase whose loops lose rank at one of its two ends. It is the
+    number of rows if no phase does.
 
     count: number of phases.
-    saved: the save times, and the states at these.
+    saved: the save times, and the states at these times.
     stages: evaluations of the vector field in one attempted step.
     """
     rows = records.start.shape[0]
@@ -73,8 +77,10 @@ def certificate(
 def _check_states(
     chain: Chain, records: PhaseRecords, saved: State
 ) -> tuple[StateCheck, StateCheck, StateCheck]:
-    """Return the checks of the states at the starts of phases, at their ends, and of the saved
-    states. One loop checks all states, so that kinematics and energy are compiled once."""
+    """Return the checks of the states at starts of phases, at ends of phases, and at save times.
+
+    One loop checks all states, so that kinematics and energy are compiled once.
+    """
     r, rows, join = records, records.start.shape[0], lambda *x: jnp.concatenate(x)
     states = State(
         join(r.q[:, 0], r.q[:, 1], saved.q),
@@ -108,7 +114,7 @@ def _phases(
     free, joint_freedoms = jax.vmap(
         lambda s: (_is_free(chain, s), jnp.sum(active_dofs(chain, s), dtype=jnp.int32))
     )(r.structure)
-    # the certificate's largest values are not differentiable
+    # These values of the certificate are not differentiated.
     margin, gap, gap_rate, drift = stop_gradient_tree(
         (
             jnp.minimum(first.margin, last.margin),
@@ -186,8 +192,11 @@ def _check_state(chain: Chain, state: State, is_phase_end: Bool[Array, ""]) -> S
 
 
 def _is_free(chain: Chain, s: Structure) -> Bool[Array, ""]:
-    """Return whether the bodies are free of the ground: every tree has a free joint at its root,
-    and no connected virtual link joins the ground."""
+    """Return whether the bodies are free of the ground.
+
+    They are if every tree has a free joint at its root, and no connected virtual link joins the
+    ground.
+    """
     top = chain.topology
     roots = [i for i in range(1, len(top.parent)) if top.parent[i] == 0]
     if not roots or any(top.kind[i] != FREE for i in roots):
@@ -198,8 +207,10 @@ def _is_free(chain: Chain, s: Structure) -> Bool[Array, ""]:
 def _momentum_drift(
     chain: Chain, first: StateCheck, last: StateCheck, span: Float[Array, " phases"]
 ) -> Float[Array, "phases 2"]:
-    """Return the norms of the change of linear momentum less the impulse of gravity (N s) and of
-    the change of angular momentum about the centre of mass (N m s).
+    """Return the norms of the linear and of the angular momentum drift of each phase.
+
+    The linear drift (N s) is the change of momentum less the impulse of gravity. The angular drift
+    (N m s) is the change of angular momentum about the centre of mass.
 
     span: durations of the phases (s).
     """
@@ -210,7 +221,9 @@ def _momentum_drift(
 
 
 def evaluations_per_step(solver: diffrax.AbstractSolver[Any]) -> int:
-    """Return the number of evaluations of the vector field in one attempted step. Newton iterations
-    of implicit stages are not counted."""
+    """Return the number of evaluations of the vector field in one attempted step.
+
+    Newton iterations of implicit stages are not counted.
+    """
     tableau = getattr(solver, "tableau", None)
     return len(np.asarray(tableau.b_sol)) if isinstance(tableau, diffrax.ButcherTableau) else 1

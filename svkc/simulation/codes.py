@@ -1,6 +1,6 @@
 """How a run ended (`RESULTS`), and whether the run has derivatives (`DERIVATIVE`).
 
-Files hold the names of the codes, so that codes may be added in any order.
+Saved runs hold the names of the codes, so that codes may be added in any order.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -89,5 +89,5 @@ class DERIVATIVE(eqx.Enumeration, metaclass=MovedMeta):  # pyright: ignore
 
 connect_enumerations(RESULTS, DERIVATIVE, _deprecated.warn_of_results)
 
-# fields of `Trajectory` and `Report` that hold a code, and their enumerations
+# Enumeration of each field of `Trajectory` and `Report` that holds a code.
 CODES: dict[str, Any] = {"result": RESULTS, "derivative": DERIVATIVE}

@@ -1,7 +1,7 @@
-"""What was not finite first, in a run that ended with `RESULTS.non_finite`.
+"""Diagnosis of a run that ended with `RESULTS.non_finite`: which numbers were not finite first.
 
-The numbers that enter the motion are evaluated again outside of the compiled run, at the last
-finite state and within a step after it.
+The numbers that determine the motion are evaluated again outside of the compiled run, at the last
+finite state and shortly after it.
 """
 
 import dataclasses
@@ -50,7 +50,7 @@ def trace_non_finite(traj, chain: Chain, lane: Callable | None, data, options: d
     """Return what was not finite first, one line for each lane that ended with `non_finite`.
 
     traj: a trajectory or a batch of trajectories.
-    lane, data: as in `rollout`.
+    lane, data: as in `rollout` (lane None: `options` hold for all lanes).
     options: control, events, args and dt of the run.
     """
     lines = []
@@ -67,7 +67,10 @@ def trace_non_finite(traj, chain: Chain, lane: Callable | None, data, options: d
 
 
 def run_end(traj, options: dict) -> RunEnd:
-    """Return the end of one run. options: chain, and control, events, args and dt if given."""
+    """Return the end of one run.
+
+    options: chain, and the options control, events, args and dt of the run.
+    """
     chain, dt = options["chain"], options.get("dt")
     span = float(traj.ts[-1] - traj.ts[0])
     return RunEnd(
@@ -77,8 +80,8 @@ def run_end(traj, options: dict) -> RunEnd:
         control=options.get("control"),
         plan=make_plan(chain, as_events(options.get("events") or ()), traj.final.q.dtype),
         args=options.get("args"),
-        # Adaptive steps shrink until the numbers are finite, but those in which a guard is not
-        # finite. The sizes of steps are not recorded.
+        # Step-size controllers shorten steps with numbers that are not finite, except where only a
+        # guard is not. Step sizes are not recorded, so that fractions of the run stand for them.
         probes=tuple(
             span * np.array([1e-6, 1e-3, 1e-2, 1e-1])
             if dt is None
@@ -90,8 +93,9 @@ def run_end(traj, options: dict) -> RunEnd:
 def find_non_finite(end: RunEnd) -> str:
     """Return what was not finite first, for a message.
 
-    The order is: chain, initial state, then at each instant control, guards, acceleration. The
-    functions below, one for each of these, return "" if all of their numbers are finite.
+    The order is: chain, initial state, then at each instant control, guards and acceleration. At
+    the last time, a change of structure by a timed event comes after these. The functions below,
+    such as `_in_chain`, return "" if all of their numbers are finite.
     """
     source = _in_chain(end.chain) or _in_state(end.chain, end.state)
     if source:
@@ -107,7 +111,7 @@ def find_non_finite(end: RunEnd) -> str:
 
 
 def _last(bad: np.ndarray) -> int:
-    """Return the last row with a true entry. Where all rows are bad, the first is the world's."""
+    """Return the last row with a true entry. Row 0 may be the world's, which no message names."""
     return int(np.flatnonzero(bad.reshape(len(bad), -1).any(1))[-1])
 
 
@@ -139,7 +143,7 @@ def _owner(chain: Chain, field: str, bad: np.ndarray) -> str:
 
 
 def _joint_of_coordinate(chain: Chain, bad: np.ndarray) -> str:
-    """Return the joint of the first bad entry of q, as messages name it."""
+    """Return text that names the joint of the first bad entry of q."""
     index = int(np.argmax(bad))
     for joint in chain.joint_names:
         coordinates = joint_slice(chain, joint, Q_SIZE, chain.topology.q_start)
@@ -158,7 +162,7 @@ def _in_structure(chain: Chain, structure: Structure, name: str) -> str:
 
 
 def _in_state(chain: Chain, state: State) -> str:
-    """Return what is not finite in the last state, which is then the initial one."""
+    """Return what is not finite in the last state: only an initial state is not finite."""
     q, v = ~np.isfinite(np.asarray(state.q)), ~np.isfinite(np.asarray(state.v))
     if q.any():
         return f"q of {_joint_of_coordinate(chain, q)} in the initial state"
@@ -172,7 +176,7 @@ def _torques(end: RunEnd, t: Array, state: State) -> Array:
     field = VectorField(end.control, NoStabilization(), default_dynamics(end.chain))
     field_args = FieldArgs(end.chain, state.structure, end.args)
     tau, _ = field.torques(t, ODEState(state.q, state.v), field_args)
-    # inside of jvp and grad the control may read traced values; its primal values are concrete
+    # Inside of jvp and grad the control may read traced values, whose primal values are concrete.
     return jax.lax.stop_gradient(tau)
 
 
@@ -188,7 +192,7 @@ def _advance(end: RunEnd, h: float) -> State:
 
 
 def _at_instant(end: RunEnd, t: float, state: State) -> str:
-    """Return what is not finite at a time and a finite state."""
+    """Return what is not finite at a time and a state; "" if the state itself is not finite."""
     dtype = state.q.dtype
     if not np.isfinite(np.concatenate([state.q, state.v])).all():
         return ""
@@ -210,7 +214,7 @@ def _at_instant(end: RunEnd, t: float, state: State) -> str:
     moments = np.linalg.eigvalsh(np.asarray(mass_matrix(end.chain, state)))
     singular = moments[0] <= 8 * np.finfo(dtype).eps * moments[-1]
     if t > end.t and not singular:
-        # the velocities have grown
+        # The acceleration overflows only because of large velocities: the motion itself is named.
         return ""
     reason = "the mass matrix is singular, so a joint moves no mass"
     return f"the acceleration of {name!r}; {reason if singular else _fastest(end.chain, state)}"
@@ -228,6 +232,6 @@ def _note_on_args(args) -> str:
 
 
 def _fastest(chain: Chain, state: State) -> str:
-    """Return a clause with the largest velocity."""
+    """Return a clause that names the fastest joint coordinate and its speed."""
     v = np.abs(np.asarray(state.v))
     return f"{chain.dof_names[int(np.argmax(v))]!r} moves at {np.max(v):.3g} rad/s or m/s"

@@ -12,15 +12,16 @@ from svkc._jax.pytrees import is_concrete
 from svkc.loops.constraint import gap_tolerance
 from svkc.simulation.codes import DERIVATIVE, RESULTS
 
-# Energy drift by the kinetic energy. Speeds are wrong by half of it: at a tenth by 5 %, so that the
-# motion is no longer that of the model; a hundredth is what a run of low accuracy has.
+# Energy drift divided by the kinetic energy. The relative error of speeds is half of it: 5 %
+# at 0.1, where the motion is no longer that of the model. A run of low accuracy has 0.01.
 DRIFT_TOO_LARGE, DRIFT_NOTABLE = 0.1, 0.01
-# Energy is a sum over bodies and steps: its round-off is some hundred times that of one number.
+# Round-off of the energy in eps. Energy is a sum over bodies and steps, whose round-off adds up.
 ROUND_OFF_DRIFT = 1e3
-# Errors of the steps by the size of the state: their sum is a bound where errors do not grow.
+# Sum of the errors of all steps divided by the size of the state. The sum bounds the final error if
+# errors do not grow.
 ERROR_NOTABLE = 0.1
-# Rejected steps for each accepted one. Controllers reject up to one for each at smooth forces. A
-# run of a few steps says nothing.
+# Rejected steps for each accepted one, and the least number of rejected steps that is judged. With
+# smooth forces, controllers reject at most about one step for each accepted one.
 REJECTED_NOTABLE, REJECTED_AT_LEAST = 2, 20
 
 
@@ -37,18 +38,18 @@ class Report(eqx.Module):
         momentum about the centre of mass (N m s).
     free: whether there is such a phase.
     error: sum of the estimated errors of all steps (inf: none from this solver or adjoint).
-    margin: least rank margin |R_mm| / |R_11|.
+    margin: least rank margin |R_mm| / |R_11| (R of the loop Jacobian's pivoted QR, m its rank).
     swaps: how often the choice of dependent coordinates changed (-1: not recorded).
     accepted, rejected: numbers of steps.
-    evaluations: of the vector field in steps.
-    drift_share: energy drifts of the phases, added without sign, by the largest kinetic energy at
-        the ends of phases and at save times; drift within round-off is zero.
-    error_share: `error` by the largest root mean square of q and v at save times, or by one (rad,
-        m, rad/s, m/s) if that is larger.
+    evaluations: number of evaluations of the vector field in steps.
+    drift_share: sum of the phases' absolute energy drifts, divided by the largest kinetic energy at
+        the ends of phases and at save times. Drift within round-off counts as zero.
+    error_share: `error` divided by the largest root mean square of q and v at save times, or by one
+        (rad, m, rad/s, m/s) if that is larger.
     loop: index of the loop that could not be closed (-1: none).
     phases: number of phases.
     t_final: end of the run (s).
-    result, derivative: of the trajectory.
+    result, derivative: codes of the trajectory.
     halved: result of `svkc.accuracy.estimate_error` (a finer run), if `report` was given it.
     """
 
@@ -77,9 +78,9 @@ class Report(eqx.Module):
     halved: Any = None
 
     def verdict(self) -> str:
-        """Return in words whether the run can be relied on; of a batch, that of the worst lane.
+        """Return in words whether the run can be relied on; for a batch, those of the worst lane.
 
-        What is judged, and the limits, are in docs/accuracy.md.
+        docs/accuracy.md lists what is judged, and the limits.
         """
         shape = np.shape(self.gap)
         gap = np.maximum(np.asarray(self.gap), np.asarray(self.angular_gap))
@@ -170,7 +171,9 @@ def _judge(
     accepted: int,
     rejected: int,
 ) -> tuple[tuple[int, float], list[str]]:
-    """Return how bad one run is, to compare lanes, and the verdict in words.
+    """Return a rank of how bad one run is, by which lanes are compared, and the verdict in words.
+
+    The rank is (level, drift). Levels: 3 failed, 2 drift too large, 1 another fault, 0 no fault.
 
     drift, error: `drift_share` and `error_share`.
     gap: largest loop gap (rad, m). is_open: whether the gap is above `gap_tolerance`.

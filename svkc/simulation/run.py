@@ -26,8 +26,10 @@ from svkc.transitions.plan import Plan, guard_round_off
 
 
 def with_lock_mask(chain: Chain, state: State, plan: Plan) -> State:
-    """Return the state with a mask of locked joints if an event locks or unlocks joints, so that
-    the structure has one pytree structure throughout the run."""
+    """Return the state with a mask of locked joints if an event locks or unlocks joints.
+
+    The state then has one pytree structure throughout the run.
+    """
     if not plan.has_locks or state.structure.locked is not None:
         return state
     return eqx.tree_at(
@@ -48,8 +50,8 @@ def initial_run_state(
     t0, _, ts = times
     links, rows, dtype = len(chain.link_names), options.max_events, state.q.dtype
     state = with_lock_mask(chain, state, plan)
-    # a link that is overloaded from the start breaks at once; guards that need no torques are
-    # re-evaluated at the start of the first phase, and are on no side of zero before
+    # A link that is overloaded at the start breaks at once, by its guard's initial value. Guards
+    # that need no torques are zero, on neither side, until the first phase re-evaluates them.
     initial = [g.initial_value if g.needs_torques else 0.0 for g in plan.guards]
     return RunState(
         t=t0,
@@ -68,11 +70,13 @@ def initial_run_state(
     )  # fmt: skip
 
 
-def _rearm_guards(chain: Chain, run: RunState, plan: Plan, options: Options, args) -> RunState:
+def _reevaluate_stale_guards(
+    chain: Chain, run: RunState, plan: Plan, options: Options, args
+) -> RunState:
     """Return the run with its stale guards re-evaluated at the start of a phase.
 
-    The sign of a value within round-off of zero is chance, and a guard that starts at zero has not
-    crossed zero. Such a guard keeps the value that `_guard_values_after` has carried over.
+    A value within round-off of zero has an arbitrary sign. Such a guard keeps the value that
+    `_guard_values_after` returned: usually zero, from which a guard cannot cross zero.
     """
     if not plan.guards or not reevaluated_guards(plan).any():
         return run
@@ -90,18 +94,19 @@ def _rearm_guards(chain: Chain, run: RunState, plan: Plan, options: Options, arg
 def _guard_values_after(
     chain: Chain, run: RunState, outcome: PhaseOutcome, fired: Bool[Array, " events"], plan: Plan
 ):
-    """Return the guards after a phase, and which of them are stale.
+    """Return the values of the guards after a phase, and which of them are stale.
 
-    A stale guard becomes zero, unless the guard is armed and may be about to cross zero: within
-    round-off of zero, on the side on which the phase started, or on either side if no guard ended
-    the phase. After the event of a guard, another one of the same function has just crossed zero.
+    The value of a stale guard becomes zero, unless the guard may be about to cross zero. Such a
+    guard is armed and within round-off of zero. If a guard ended the phase, it must also be on the
+    side of zero on which it started the phase: on the other side it has just crossed zero, as a
+    second guard does that has the same function as the guard that fired.
     """
     if not plan.guards:
         return None, None
     values, before = outcome.guard_values, run.guard_values
     assert values is not None
     assert before is not None
-    # a guard that is exactly zero after its event is not re-evaluated: it has not crossed again
+    # A guard that is exactly zero, as after its own event, remains zero without re-evaluation.
     stale = jnp.asarray(reevaluated_guards(plan)) & jnp.any(fired) & (values != 0)
     at_zero = jnp.abs(values) < guard_round_off(values.dtype)
     on_first_side = jnp.sign(values) == jnp.sign(before)
@@ -113,8 +118,8 @@ def _guard_values_after(
 def _next_stop(run: RunState, t1, plan: Plan):
     """Return the scheduled end of the next phase: the time of the next timed event, or t1.
 
-    Of two equal times the one taken receives the derivative: the event's where it coincides with
-    t1. A run that has ended keeps its time, so that its phases have zero length.
+    If the time of an event equals t1, derivatives are by the time of the event, not by t1. A run
+    that has ended keeps its time, so that its phases have zero length.
     """
     next_time = jnp.min(jnp.where(run.pending, plan.times, jnp.inf), initial=jnp.inf)
     stop = jnp.where(next_time <= t1, next_time, t1)
@@ -126,11 +131,11 @@ def run_phase(
 ) -> RunState:  # fmt: skip
     """Integrate one phase, apply the events at its end, and write the records of both.
 
-    index: of the phase.
+    index: index of the phase.
     times: end of the run, and the save times.
     """
     t1, ts = times
-    run = _rearm_guards(chain, run, plan, options, args)
+    run = _reevaluate_stale_guards(chain, run, plan, options, args)
     active = (run.t < t1) | jnp.any(run.pending & (plan.times <= t1))
     active = active & (run.result == RESULTS.successful)
     stop = _next_stop(run, t1, plan)
@@ -171,7 +176,7 @@ def run_phase(
 
 
 def _fired_events(run: RunState, outcome: PhaseOutcome, active, plan: Plan):
-    """Return which timed events, and which of all events, happened at the end of a phase."""
+    """Return the mask of the timed events, and that of all events, that fired after a phase."""
     reached = active & (outcome.result == RESULTS.successful)
     timed = run.pending & (plan.times <= outcome.t + event_tolerance(outcome.t)) & reached
     indices = np.array(plan.timed + plan.guarded, int)
@@ -182,11 +187,12 @@ def _fired_events(run: RunState, outcome: PhaseOutcome, active, plan: Plan):
 def _check_derivative(
     run: RunState, outcome: PhaseOutcome, active, timed: Bool[Array, " timed"], index
 ) -> tuple[DERIVATIVE, Int[Array, ""]]:
-    """Return the first reason why the run has no derivative, and the index of its phase. The
-    certificate checks ranks after the run.
+    """Return the run's first `DERIVATIVE` other than successful, and the index of its phase.
+
+    The rank of the loops is not checked here, but by the certificate after the run.
 
     active: whether the run had not ended before this phase.
-    timed: which timed events happened.
+    timed: mask of the timed events that fired.
     """
     code = DERIVATIVE.where(
         jnp.sum(outcome.fired) + jnp.sum(timed) > 1, DERIVATIVE.together, outcome.derivative
@@ -198,8 +204,11 @@ def _check_derivative(
 
 
 def _write_saved_states(run: RunState, end_state: State, outcome: PhaseOutcome, ts) -> State:
-    """Return the saved states with those of a phase written: at save times from its start to its
-    end, both included. Later save times hold the state at its end."""
+    """Return the saved states with those of a phase written.
+
+    They are at the save times from its start to its end, both included. Rows of later save times
+    hold the state at its end until a later phase overwrites them.
+    """
     within, later = ((ts >= run.t) & (ts <= outcome.t))[:, None], (ts > outcome.t)[:, None]
     q = jnp.where(within, outcome.ys.q, jnp.where(later, end_state.q[None], run.saved.q))
     v = jnp.where(within, outcome.ys.v, jnp.where(later, end_state.v[None], run.saved.v))

@@ -1,6 +1,6 @@
-"""Checks of the arguments of a run that are traced, compiled into the start of the run.
+"""Checks of traced arguments of a run, compiled into the start of the run.
 
-Concrete arguments raise ValueError instead (`option_checks`), and compile none of this.
+Invalid concrete arguments raise ValueError in `option_checks`, and compile none of these checks.
 """
 
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ from svkc.transitions.plan import Plan
 
 
 def initial_result(chain: Chain, times, plan: Plan, options: Options) -> RESULTS:
-    """Return the result of a run before its first phase: `successful`, or why nothing can be run.
+    """Return the result of a run before its first phase: `successful`, or why it cannot start.
 
     times: start, end and save times (s).
     """
@@ -28,8 +28,8 @@ def initial_result(chain: Chain, times, plan: Plan, options: Options) -> RESULTS
 def _check_times(times, plan: Plan) -> RESULTS:
     """Return `not_a_time` or `reversed` if the times of a run cannot be run, else `successful`.
 
-    The time of an event may be infinite: the event does not happen. Save times may lie before the
-    run by round-off, and past its end: lanes of one batch share save times and may end earlier.
+    The time of an event may be inf: such an event does not happen. Save times may be before t0 by
+    round-off. They may be past t1, as the lanes of a batch share save times and may end earlier.
 
     times: start, end and save times (s).
     """

@@ -14,9 +14,10 @@ def central_differences(
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return central differences extrapolated to step zero, and an estimate of their errors.
 
-    Ridders' method: eight halved steps fill a Neville tableau. For every entry, the estimate that
-    changed least between neighbours in the tableau is returned, with that change as its
-    uncertainty.
+    Ridders' method: differences with eight steps, each half of the one before, fill a Neville
+    tableau. For every entry, the estimate that differs least from its neighbours in the tableau is
+    returned, with that difference as its uncertainty. Both are NaN unless `value` is finite with
+    the last two steps.
 
     value: function of a pytree like `differentiable` that returns arrays by name.
     direction: a pytree like `differentiable`.
@@ -29,17 +30,17 @@ def central_differences(
     for h in step / 2.0 ** np.arange(8):
         after, before = evaluate(h), evaluate(-h)
         if not all(np.isfinite(x).all() for x in (*after.values(), *before.values())):
-            # f is not defined this far from x: restart with smaller steps
+            # The function is not defined this far away: restart with smaller steps.
             table, best, uncertainty = [], {}, {}
             continue
         row = [
             {name: (np.asarray(after[name]) - np.asarray(before[name])) / (2 * h) for name in after}
         ]
-        for k, before in enumerate(table[-1] if table else [], start=1):
+        for k, coarser in enumerate(table[-1] if table else [], start=1):
             row.append(
                 {
-                    name: row[-1][name] + (row[-1][name] - before[name]) / (4**k - 1)
-                    for name in before
+                    name: row[-1][name] + (row[-1][name] - coarser[name]) / (4**k - 1)
+                    for name in coarser
                 }
             )
         for k in range(1, len(row)):
@@ -51,6 +52,5 @@ def central_differences(
                 best[name] = np.where(better, new, best.get(name, new))
                 uncertainty[name] = np.where(better, change, uncertainty.get(name, change))
         table.append(row)
-    # NaN where f was not finite at every step
     undefined = {name: np.full(np.shape(leaf), np.nan) for name, leaf in after.items()}
     return undefined | best, undefined | uncertainty

@@ -12,7 +12,7 @@ import numpy as np
 from svkc.model.validation import check_function, integer, positive_scalar
 from svkc.tools.central_differences import central_differences
 
-# directions and weights of at most so many numbers are written out, as a line of text holds them
+# Most numbers of a direction, or of weights, that are written out in the text of a check.
 WRITTEN_OUT = 6
 
 
@@ -21,16 +21,17 @@ class GradientCheck(eqx.Module):
 
     The derivative is that of f(x + h direction) by h, where the direction is added to one leaf.
 
-    error: |derivative - difference|, relative to the largest entry of the output leaf in either
-        one.
+    error: |derivative - difference|, relative to the largest entry of either one over the output
+        leaf.
     output: path of the output leaf (and entry), such as "f(x)['a'][3]"; of several entries
         "sum(w * f(x)['a'])" in "reverse", which has one derivative for all of them.
     input: path of the input leaf, such as "x.q".
     derivative: of the output along the direction, by differentiation.
     difference: of the output along the direction, by central differences.
     uncertainty: estimated error of the difference, relative to the same number as `error`.
-    modes: largest difference between forward and reverse mode, of a random weighted sum of each
-        output leaf, relative to the norms of both factors. Zero unless `mode` is "both".
+    modes: largest difference between forward and reverse mode in the derivative of a random
+        weighted sum of each output leaf, relative to the norm of the weights times that of the
+        leaf's derivative. Zero unless `mode` is "both".
     direction: unit direction in the input leaf [shape of the leaf]; 1 for a single number.
     mode: the mode that was checked: "forward", "reverse" or "both".
     weights: the unit vector w of the sum [shape of the output leaf]; None: the output is one entry.
@@ -62,7 +63,7 @@ class GradientCheck(eqx.Module):
 
 
 def _written(numbers: np.ndarray, name: str) -> str:
-    """Return a few numbers as text, with four digits; of many numbers the name."""
+    """Return a few numbers as text with four digits, or the name of many numbers."""
     if numbers.size > WRITTEN_OUT:
         return name
     return f"[{', '.join(f'{x:.4g}' for x in np.ravel(numbers))}]"
@@ -121,7 +122,7 @@ def check_grad(
 
 
 def _unit(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-    """Return a random array of 2-norm 1; of a single number 1, so that its sign is no riddle."""
+    """Return a random array of 2-norm 1; for a single number 1, so that no sign changes."""
     x = rng.normal(size=shape)
     return np.ones(shape) if x.size == 1 else x / (np.linalg.norm(x) or 1.0)
 
@@ -144,7 +145,7 @@ def _partition(x):
         jax.tree.map(lambda leaf: jnp.asarray(leaf) if isinstance(leaf, float) else leaf, x),
         eqx.is_inexact_array,
     )
-    # weak types would compile the program again for every parameter
+    # Weakly typed numbers would compile the program once more.
     differentiable = jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype), differentiable)
     if not any(leaf.size for leaf in jax.tree.leaves(differentiable)):
         raise ValueError("check_grad: x has no floating-point arrays to differentiate by")
@@ -152,7 +153,7 @@ def _partition(x):
 
 
 def _finite_outputs(outputs) -> dict[str, np.ndarray]:
-    """Return the leaves as numpy arrays. Raise ValueError if there are none or not finite."""
+    """Return the leaves as numpy arrays. Raise ValueError if all are empty or one is not finite."""
     base = {name: np.asarray(leaf) for name, leaf in outputs.items()}
     for name, leaf in base.items():
         if not np.isfinite(leaf).all():
@@ -163,7 +164,7 @@ def _finite_outputs(outputs) -> dict[str, np.ndarray]:
 
 
 def _direction(differentiable, index: int, rng: np.random.Generator):
-    """Return a random direction in one leaf, as long as this leaf (one if the leaf is zero)."""
+    """Return a random direction in one leaf, with the 2-norm of this leaf (1 if that is zero)."""
     leaves, structure = jax.tree.flatten(differentiable)
     leaf = leaves[index]
     along = _unit(rng, leaf.shape) * (np.linalg.norm(leaf) or 1.0)
@@ -187,9 +188,10 @@ def _compare_leaf(
 
     forward: the leaf's derivative in forward mode, or None.
     reverse: sum of the derivative's entries times `weight`, in reverse mode, or None.
+    paths: of the output leaf and of the input leaf.
     """
     if forward is None:
-        # one pass of reverse mode gives one number for all entries of the leaf
+        # One pass of reverse mode gives one number for all entries of the leaf.
         weighted_sum = lambda x: np.asarray(np.sum(weight * x))
         sums = np.asarray(reverse), weighted_sum(difference), weighted_sum(uncertainty)
         if weight.size == 1:
@@ -207,7 +209,7 @@ def _compare_leaf(
     )
 
 
-# compiled once for a function, however many points it is checked at
+# Compiled once for each function, however many points it is checked at.
 @eqx.filter_jit
 def _outputs(f, differentiable, static):
     """Return the floating-point leaves of f(x), by path."""
@@ -250,7 +252,7 @@ def _worst_entry(
     scale = max(
         np.abs(x[np.isfinite(x)]).max(initial=0) for x in map(np.asarray, (derivative, difference))
     )
-    # where both are zero, the round-off of differences is no error
+    # Where both are about zero, round-off of the differences is not an error.
     scale = scale if scale > 1e-9 else 1.0
     errors = np.abs(derivative - difference)
     errors = np.where(np.isfinite(errors), errors, np.inf).ravel()

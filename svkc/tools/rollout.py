@@ -41,12 +41,13 @@ def rollout(
     lane: function (chain, data of one lane) that returns a dict of arguments of `simulate`, such as
         events, args, control, t1, or `chain` with other floats. Compared as in `simulate`, so that
         a lambda in the call is not compiled again.
-    cost: expected run time of each lane, no objective [lanes]. Lanes of similar cost share a chunk.
+    cost: expected run time of each lane [lanes], by which lanes are sorted into chunks.
     chunk: lanes that a device runs at once; memory grows with them. Default: 4096, on a CPU 64.
     out: folder for finished chunks (chunk_00000.npz and so on, readable by `svkc.load_trajectory`).
-        An equal call continues from it. All arguments are compared by content: functions by code
-        and by the values that they read, functions of installed packages by name.
-    devices: devices to use. Default: all of this process. For several CPU devices call
+        An equal call loads the finished chunks and runs the others. All arguments are compared by
+        content: functions by code and by the values that they read, functions of installed packages
+        by name.
+    devices: devices to use. Default: all devices of this process. For several CPU devices call
         `jax.config.update("jax_num_cpu_devices", n)` before the first use of jax.
     progress: whether to print progress.
     options: further arguments of `simulate`, for all lanes. `throw` is False by default: the result
@@ -95,7 +96,7 @@ def _prepare_devices(devices, chunk: Integer | None, lanes: int) -> tuple[list[A
 
 
 def _assign_chunks(order: np.ndarray, size: int) -> np.ndarray:
-    """Return the lanes of each chunk [chunks size]. The last lane fills up the last chunk.
+    """Return the lanes of each chunk [chunks size]. Copies of the last lane fill the last chunk.
 
     Raises ValueError if there are fewer chunks than processes.
     """
@@ -186,7 +187,7 @@ def _prepare_folder(out, inputs: dict[str, Any]) -> pathlib.Path | None:
     if out is None:
         return None
     folder = pathlib.Path(out)
-    # a progress meter changes no number
+    # A progress meter changes no result.
     compared = {name: x for name, x in inputs.items() if x is not None and name != "progress_meter"}
     description = {"inputs": {name: _digest(name, compared[name]) for name in sorted(compared)}}
     folder.mkdir(parents=True, exist_ok=True)
@@ -206,10 +207,10 @@ def _prepare_folder(out, inputs: dict[str, Any]) -> pathlib.Path | None:
 
 
 def _digest(name: str, value) -> str:
-    """Return the digest of an input. Raises ValueError if its content cannot be compared."""
+    """Return the digest of an input. Raise ValueError if its content cannot be compared."""
     try:
         return content_digest(value)
-    # an object of the user may raise any error when it is read
+    # An object of the user may raise any error when it is read.
     except Exception as error:
         raise ValueError(
             f"out: {name} cannot be compared with that of a later call ({error}); let it hold"
@@ -263,7 +264,7 @@ def _gather_chunks(done: dict[int, Trajectory], count: int) -> list[Trajectory]:
     processes, process = jax.process_count(), jax.process_index()
     chunks = []
     for first in range(0, count, processes):
-        # all processes take part in every round; one without a new chunk sends an old one
+        # All processes take part in every round. A process without a new chunk sends an old one.
         own_chunk = done.get(first + process, next(iter(done.values())))
         try:
             round_chunks = multihost_utils.process_allgather(own_chunk)

@@ -50,7 +50,7 @@ def articulated_factors(
     S = kin.S if free is None else jnp.where(free[:, None], kin.S, 0)
     armature = jnp.zeros(chain.nv, S.dtype) if chain.armature is None else chain.armature
     armature = armature if free is None else jnp.where(free, armature, 1)
-    # the last entry is that of the padding
+    # The last entry is the padding's.
     armature = jnp.concatenate([armature, jnp.ones(1, S.dtype)])
 
     def step(from_children, level_data):
@@ -102,7 +102,7 @@ def _inward_pass(top: Topology, bodies, f: Float[Array, "nv *k"]):
 def delassus_matrix(
     top: Topology, bodies: Any, J: Float[Array, "rows nv"]
 ) -> Float[Array, "rows rows"]:
-    """Return J M^-1 J^T.
+    """Return Delassus' matrix J M^-1 J^T from the factors of M, `bodies`.
 
     M = L^T D L with a block of D for each joint (Featherstone section 6.5), so that the inward
     pass, L^-T J^T, is enough.
