@@ -1,6 +1,7 @@
-"""Validation of masses, inertias and armatures: what makes a mass matrix positive semidefinite.
+"""Validation of masses, inertias and armatures, which make a mass matrix positive semidefinite.
 
-`svkc.load` refuses invalid models. These functions check chains whose arrays were replaced since.
+`svkc.load` refuses invalid models. These functions check chains whose arrays were replaced after
+loading.
 """
 
 import weakref
@@ -32,7 +33,7 @@ def _invalid_rows(mass, inertia, xp):
         + entry(0, 2) * (entry(1, 0) * entry(2, 1) - entry(1, 1) * entry(2, 0))
     )
     minors = [entry(i, i) for i in range(3)] + [minor(0, 1), minor(0, 2), minor(1, 2), determinant]
-    # rounding errors of inertias that were rotated into the axes of their rows
+    # for round-off in inertias that were rotated into the axes of their rows
     tolerance = 64 * np.finfo(inertia.dtype).eps
     # comparisons with NaN are False, and `unit` of an infinite inertia is NaN
     positive = xp.all(xp.stack(minors) >= -tolerance, axis=0)
@@ -40,7 +41,8 @@ def _invalid_rows(mass, inertia, xp):
 
 
 def has_invalid_inertial_parameters(chain: Chain) -> Bool[Array, ""]:
-    """Return whether a mass, an inertia or an armature of a traced chain is negative or not finite.
+    """Return whether a mass or an armature is negative or not finite, or an inertia is not positive
+    semidefinite; for traced chains too.
 
     Inertias that violate the triangle inequality of their principal moments are valid here: their
     mass matrix is positive semidefinite.
@@ -59,9 +61,11 @@ _MOST_CHECKED = 64
 
 
 def check_inertial_parameters(chain: Chain) -> None:
-    """Raise ValueError if a mass, an inertia or an armature is negative or not finite.
+    """Raise ValueError if a mass or an armature is negative or not finite, or an inertia is not
+    positive semidefinite.
 
-    Traced chains are not checked. A second check of the same arrays takes a microsecond.
+    Traced chains and batches of chains are not checked. A second check of the same arrays takes a
+    microsecond.
     """
     arrays = [x for x in (chain.mass, chain.inertia, chain.armature) if x is not None]
     key = tuple(map(id, arrays))
@@ -78,13 +82,13 @@ def check_inertial_parameters(chain: Chain) -> None:
 
 
 def _raise_if_invalid(chain: Chain) -> None:
-    """Raise ValueError if a concrete mass, inertia or armature is negative or not finite."""
+    """Raise ValueError for the invalid arrays of a concrete chain."""
     mass, inertia = np.asarray(chain.mass), np.asarray(chain.inertia)
     with np.errstate(all="ignore"):
         masks = _invalid_rows(mass, inertia, np)
     for name, values, mask in zip(("mass", "inertia"), (mass, inertia), masks, strict=True):
         if mask.any():
-            # the world's row is named only if no body's is invalid
+            # the last invalid row: row 0, the world's, only if every other one is valid
             row = int(np.flatnonzero(mask)[-1])
             raise ValueError(
                 f"chain.{name}: got {values[row].tolist()} for {row_name(chain, row)}, expected"

@@ -8,10 +8,10 @@ from svkc.model.topology import Topology
 def link_pointers(topology: Topology, link_parent, link_real) -> np.ndarray:
     """Return the table [4, bodies + links] of parent, child, brother and real link.
 
-    Rows of bodies come first, then rows of virtual links; -1: none. Spare links have no parent and
-    no real link.
+    Columns of bodies come first, then columns of virtual links; entries are column indices, and -1
+    is none. Spare links have no parent and no real link.
 
-    link_parent, link_real: topology rows of the two bodies of each virtual link.
+    link_parent, link_real: topology rows of the parent and of the real link of each virtual link.
     """
     bodies, count = len(topology.body_names), len(topology.body_names) + len(topology.link_names)
     body_of_row = np.full(len(topology.parent), -1)
@@ -20,6 +20,7 @@ def link_pointers(topology: Topology, link_parent, link_real) -> np.ndarray:
     table = np.full((4, count), -1)
     for body in range(1, bodies):
         row = topology.parent[topology.body_row[body]]
+        # a body with several joints has several rows, of which the last is the body's
         while body_of_row[row] < 0:
             row = topology.parent[row]
         table[0, body] = body_of_row[row]

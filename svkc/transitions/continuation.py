@@ -1,10 +1,11 @@
 """Paths of closed configurations: the state of a continuation and its linear systems.
 
-A continuation goes from a start along closed configurations to the requested coordinates, so that
-its end is on the branch that is connected with the start. The path has two legs, each with a
-parameter s from 0 to 1. The first leg closes the start: its loop gaps shrink as 1 - s. The second
-leg moves the held coordinates on a straight line. Every point of a leg is the stationary point of
-least change from the start (`stationarity.py`). `path_following.py` chooses the steps.
+A continuation first closes the loops at the start, then follows closed configurations to the
+requested coordinates, so that its end is on the branch that is connected with the start. These are
+the two legs of the path, each with a parameter s from 0 to 1. On the first leg the loop gaps shrink
+as 1 - s. On the second leg the gaps are zero and the held coordinates move on a straight line.
+Every point of a leg is a stationary point of the change from the start under the leg's constraints
+at s (`stationarity.py`). `path_steps.py` chooses the steps.
 """
 
 import equinox as eqx
@@ -29,34 +30,31 @@ from svkc.tree.configuration import difference, integrate
 from svkc.tree.kinematics import Kinematics
 from svkc.tree.spatial import matvec, quat_conjugate, quat_matrix, skew
 
-# kinds of iterations, besides those of the search for the rank in `newton_state.py`: compute the
-# coordinates of virtual joints from the poses of their bodies; the leg that closes the start;
-# select which coordinates to hold; the leg that moves them; project the velocity with and without
-# held velocities; the path has ended
+# kinds of iterations, numbered apart from those of the search for the rank in `newton_state.py`
 (
-    READ_COORDINATES,
-    CLOSE_START,
-    SELECT_HELD,
-    FOLLOW,
-    PROJECT_VELOCITY_HELD,
-    PROJECT_VELOCITY,
-    DONE,
+    READ_COORDINATES,  # compute the coordinates of virtual joints from the poses of their bodies
+    CLOSE_START,  # the first leg
+    SELECT_HELD,  # select the coordinates that the second leg moves
+    FOLLOW,  # the second leg
+    PROJECT_VELOCITY_HELD,  # project the velocity, held velocities fixed
+    PROJECT_VELOCITY,  # project every velocity
+    DONE,  # the path has ended or failed
 ) = range(20, 27)
 
-# rotation (rad) below which the left Jacobian's quadratic term is that of its series, whose next
-# term is smaller by a factor of angle^2 / 60
+# rotation (rad) below which the quadratic coefficient of the inverse left Jacobian is the first
+# term of its series, 1/12; the next term is smaller by a factor of angle^2 / 60
 _SMALL_ANGLE = 1e-3
 
 
 class PathPoint(eqx.Module):
     """An accepted point of a leg.
 
-    q: configuration before its last correction.
-    correction: that correction, without units (see `stationarity.py`).
-    tangent: derivative of the path by s.
+    q: configuration at which the point was accepted.
+    correction: Newton step at q, without units (see `stationarity.py`); the next predictor adds it.
+    tangent: derivative of the path by s, without units.
     multiplier, multiplier_rate: multipliers of the loop rows, and their derivative by s.
     s: parameter of the leg.
-    Q, P: the rows and the pivot columns selected at the point.
+    Q, P: the independent rows and the pivot columns at the point, as in `PivotedQR`.
     """
 
     q: Float[Array, " q"]
@@ -75,19 +73,20 @@ class PathState(eqx.Module):
     newton: configuration, velocity and rank.
     point: the last accepted point of the leg.
     kind: kind of the next iteration.
-    corrections: number of Newton corrections since the last predictor step.
+    corrections: number of Newton steps since the last predictor step or perturbation.
     iterations: number of iterations of all kinds since the start of the path.
-    s, step_size: parameter of the leg and its last step.
+    s, step_size: parameter of the leg, and its increment in the last predictor step.
     correction_size: largest entry of the last correction.
-    initial_gap, initial_offset: loop gaps and deviations of held coordinates at the start of the
-        leg.
-    held: coordinates that the second leg moves; the loops determine the others.
+    multiplier: multipliers of the loop rows.
+    initial_gap: loop gaps at the start of the first leg; zero on the second leg.
+    initial_offset: change without units from the start of the leg to the requested coordinates.
+    held: coordinates that the second leg moves: those to hold that the loops leave independent.
     origin: configuration at the start of the first leg.
-    closing_rows: number of independent rows at the end of the first leg.
+    closing_rows: number of independent loop rows at the end of the first leg.
     has_point: whether the leg has an accepted point.
     rank_known: whether the rank has been decided.
     from_requested: whether the path starts at the requested coordinates instead of the start.
-    reached: whether the path has reached its end.
+    reached: whether the path has come to its end without failing.
     """
 
     newton: NewtonState
@@ -114,7 +113,7 @@ class PathState(eqx.Module):
         """Return the state before the first iteration."""
         rows, dofs, dtype = 6 * len(chain.link_names), chain.dofs, targets.start.dtype
         steps, zero = min(rows, dofs), jnp.zeros((), dtype)
-        none, no = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
+        count, no = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
         y, multiplier = jnp.zeros(dofs, dtype), jnp.zeros(rows, dtype)
         v = jnp.where(active_dofs(chain, structure), targets.v, 0)
         point = PathPoint(
@@ -130,9 +129,9 @@ class PathState(eqx.Module):
         return cls(
             newton=NewtonState.init(chain, structure, targets.start, v),
             point=point,
-            kind=none + READ_COORDINATES,
-            corrections=none,
-            iterations=none,
+            kind=count + READ_COORDINATES,
+            corrections=count,
+            iterations=count,
             s=zero,
             step_size=zero,
             correction_size=zero,
@@ -141,7 +140,7 @@ class PathState(eqx.Module):
             initial_offset=y,
             held=jnp.zeros(dofs, bool),
             origin=targets.start,
-            closing_rows=none,
+            closing_rows=count,
             has_point=no,
             rank_known=no,
             from_requested=no,
@@ -153,13 +152,13 @@ class LinearSolution(eqx.Module):
     """The solutions of the linear systems of one iteration.
 
     kin, frames, gap: kinematics, frames of the virtual joints and loop gaps at the evaluated point.
-    all_pivots, selection: pivoted QR of the free columns, and the same without pivots too small to
-        divide by.
-    step, multiplier: Newton step and multipliers of the loop rows.
-    tangent, multiplier_rate: derivatives of the path by s.
+    all_pivots: pivoted QR of the columns of the loop Jacobian that are not fixed.
+    selection: `all_pivots` without the pivots that are too small to divide by.
+    step, multiplier: Newton step without units, and the multipliers of the loop rows after it.
+    tangent, multiplier_rate: derivatives of the path and of the multipliers by s.
     initial_gap, initial_offset: as in `PathState`.
-    same_orientation: whether the selected block of the Jacobian has the orientation that it had
-        at the last accepted point.
+    same_orientation: whether the determinant of the pivot block of the last accepted point has
+        kept its sign (see `_orientation_matrix`).
     """
 
     kin: Kinematics
@@ -177,11 +176,12 @@ class LinearSolution(eqx.Module):
 
 
 def _jacobian_and_gaps(loops: LoopKinematics):
-    """Return the scaled J_C and the scaled gaps, with angular rows in the frames of the real links.
+    """Return the scaled derivative of the loop gaps, and the scaled gaps, with angular rows in the
+    frames of the real links.
 
-    In these frames the matrix is the derivative of the gaps of open loops too: that of a rotation
-    vector is the inverse of the left Jacobian of SO(3). In world axes J_C is the derivative of the
-    gaps of closed loops only.
+    In these frames the rate of a gap's rotation vector is the inverse left Jacobian of SO(3) times
+    the relative angular velocity, for open loops too. J_C itself, in world axes, is the derivative
+    of the gaps of closed loops only.
     """
     count = len(loops.gap) // 6
     J, gap = loops.J.reshape(count, 6, -1), loops.gap.reshape(count, 6)
@@ -202,10 +202,10 @@ def _jacobian_and_gaps(loops: LoopKinematics):
 
 
 def _neighbourhood(chain: Chain, structure: Structure, q):
-    """Return loop kinematics, loop gaps and configurations at q and at a small step from q along
-    each coordinate, and the size of these steps.
+    """Return kinematics, joint frames, gap derivatives, gaps and configurations, each stacked over
+    q and a small step from q along each coordinate, and the size of these steps without units.
 
-    The derivatives of the loop Jacobian are differences of these.
+    `linearize` differentiates the gradient, and with it the loop Jacobian, by differences of these.
     """
     size, column = float(jnp.finfo(q.dtype).eps) ** 0.5, jacobian_scales(chain)[1]
     steps = size * jnp.eye(chain.dofs + 1, chain.dofs, k=-1, dtype=q.dtype) * column[None]
@@ -219,7 +219,10 @@ def _neighbourhood(chain: Chain, structure: Structure, q):
 
 
 def _initial_values(path: PathState, offset, gap):
-    """Return offset and gap at the start of the leg: these, if the leg has no accepted point."""
+    """Return the offset and the gap at the start of the leg.
+
+    offset, gap: values of this iteration, at the start of the leg if it has no accepted point.
+    """
     gap_to_close = jnp.where(path.kind == CLOSE_START, gap, 0)
     return (
         jnp.where(path.has_point, path.initial_offset, offset),
@@ -230,7 +233,7 @@ def _initial_values(path: PathState, offset, gap):
 def linearize(
     chain: Chain, structure: Structure, targets: Targets, path: PathState, q
 ) -> LinearSolution:
-    """Return the Newton step and the tangent of the path at q."""
+    """Return the Newton step (corrector) and the tangent of the path (predictor) at q."""
     kind, column, weight = path.kind, jacobian_scales(chain)[1], weights(chain, structure)
     kins, frames, Js, gaps, qs, size = _neighbourhood(chain, structure, q)
     kin, frames, J, gap = jax.tree.map(lambda x: x[0], (kins, frames, Js, gaps))
@@ -280,10 +283,11 @@ def linearize(
 
 
 def _orientation_matrix(point: PathPoint, J) -> Float[Array, "n n"]:
-    """Return a matrix whose determinant has the sign of that of the rows and pivot columns of J
-    selected at `point`.
+    """Return the block of J in the rows Q and pivot columns P of `point`, padded with the identity
+    to the size of the KKT matrix.
 
-    The sign was positive at `point`. It is negative on a branch that nearly crosses the path.
+    The determinant was positive at `point`. It is negative on a branch that nearly crosses the
+    path.
     """
     unused = jnp.diag(jnp.where(jnp.any(point.P > 0, 1), 0, 1).astype(J.dtype))
     steps, n = point.P.shape

@@ -28,10 +28,11 @@ from svkc.tree.spatial import quat_conjugate, quat_rotate
 class AbstractGuard(eqx.Module):
     """A real function of the motion; an event happens when the function crosses zero."""
 
-    # Whether `value` reads tau. Such a guard measures loads and is not re-evaluated after a change
-    # of structure, so that a link that is overloaded from the start of a phase breaks at once.
+    # Whether `value` reads tau. Such a guard measures loads. Its value from before a change of
+    # structure is kept as the first value of the next phase, so that a link that is overloaded from
+    # the start of that phase breaks at once. Other guards are re-evaluated after a change.
     needs_torques: eqx.AbstractClassVar[bool]
-    # the guard's value before the first phase; a guard that needs no torques is evaluated instead
+    # the first value in a run of a guard that needs torques; not used for other guards
     initial_value: eqx.AbstractClassVar[float]
 
     @abc.abstractmethod
@@ -53,7 +54,7 @@ class AbstractGuard(eqx.Module):
 
 
 class UserGuard(AbstractGuard):
-    """A guard that is a function (t, state, args) -> real number of the user."""
+    """A guard from the user's function (t, state, args) -> real number."""
 
     # a leaf, so that `simulate` can compare functions by their code and values
     function: Callable

@@ -40,6 +40,8 @@ def _full_vector(chain: Chain, quantity: str, value, default):
     """Return the full vector of a user's array or dict, and the mask of degrees of freedom whose
     values the user gives.
 
+    An array has the size of the model itself, of the tree, or of every coordinate.
+
     quantity: "q" or "v".
     default: values of the coordinates that the user does not give.
     """
@@ -98,7 +100,10 @@ def _check_quaternions(chain: Chain, q):
 
 
 class HeldMasks(eqx.Module):
-    """Masks of the coordinates and velocities that the result must have as given."""
+    """Masks of the coordinates and velocities that the result must have as given.
+
+    `Targets.held_q` is empty for an array with hold=True: the path then starts at the array.
+    """
 
     q: Bool[Array, " dofs"]
     v: Bool[Array, " dofs"]
@@ -106,7 +111,10 @@ class HeldMasks(eqx.Module):
 
 class Deviations(eqx.Module):
     """Deviations of held coordinates (rad, m) and velocities (rad/s, m/s) from the given values, 0
-    within the tolerance, and whether the state is not the requested one."""
+    within the tolerance.
+
+    failed: whether a value deviates, a loop is open, or the path failed.
+    """
 
     q: Float[Array, " dofs"]
     v: Float[Array, " dofs"]
@@ -117,7 +125,8 @@ class Deviations(eqx.Module):
 def _follow_and_compare(
     chain: Chain, structure: Structure, targets: Targets, held: HeldMasks
 ) -> tuple[State, Deviations]:
-    """Return the state at the end of the path from the start, and its deviations."""
+    """Return the state at the end of the path from the start, and its deviations, which have no
+    derivatives."""
     start, requested = normalize(chain, targets.start), normalize(chain, targets.requested)
     targets = eqx.tree_at(lambda t: (t.start, t.requested), targets, (start, requested))
     end, column = follow_path(chain, structure, targets), jacobian_scales(chain)[1]
@@ -180,7 +189,7 @@ def _tolerance(chain: Chain, tolerance) -> Float[Array, ""]:
 
 
 def _start(chain: Chain, near: State | None, connected) -> tuple[Array, Structure]:
-    """Return the configuration at which the path starts, and the structure of the state."""
+    """Return the load pose or the configuration of `near`, and the structure of the state."""
     if near is None:
         start, structure = chain.q_load, chain.structure
     else:
@@ -228,11 +237,16 @@ def _check_reached(chain: Chain, state: State, deviations: Deviations, throw: bo
                 " fewer joints, start from a State near them (near=), or give them as a guess"
                 " (hold=False)."
             )
+    # no held value deviates, so the path failed to close the loops: list every connected loop
     return check_closed(chain, state, jnp.where(state.structure.connected, jnp.inf, 0))
 
 
 def _describe_deviations(chain: Chain, deviation: np.ndarray, per: str) -> list[str]:
-    """Return name and deviation of each coordinate that was not reached."""
+    """Return the name and the deviation of each coordinate that was not reached.
+
+    per: "/s" for velocities, "" for coordinates.
+    """
+    # coordinates in m are those whose scale is `chain.length`
     doubled = eqx.tree_at(lambda c: c.length, chain, jnp.full_like(chain.length, 2))
     linear = np.asarray(jacobian_scales(doubled)[1]) == 2
     return [
@@ -242,7 +256,7 @@ def _describe_deviations(chain: Chain, deviation: np.ndarray, per: str) -> list[
 
 
 def check_closed(chain: Chain, state: State, residual_gaps: Float[Array, " links"]) -> State:
-    """Return the state.
+    """Return the state if its loops are closed.
 
     residual_gaps: largest gap of each loop (rad, or in `chain.length`s).
 

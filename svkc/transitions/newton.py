@@ -41,9 +41,9 @@ from svkc.tree.configuration import integrate
 
 
 class _Iteration(eqx.Module):
-    """The body of the scan: one iteration of one of `kinds`. Parts that none of `kinds` needs are
-    not compiled.
+    """The body of the scan: one iteration of one of `kinds`.
 
+    kinds: kinds of iterations in the schedule. Parts that none of them needs are not compiled.
     perturbation: the change of q by which the search for the rank starts.
     """
 
@@ -55,7 +55,7 @@ class _Iteration(eqx.Module):
     def __call__(self, current: NewtonState, kind, rank_known) -> NewtonState:
         """Return the state after one more iteration.
 
-        rank_known: whether to use as many rows as the rank of `current`, instead of all rows.
+        rank_known: whether the rank of `current` has been decided; if not, all rows are used.
         """
         chain, structure = self.chain, self.structure
         q_eval = current.q
@@ -92,20 +92,22 @@ class _Iteration(eqx.Module):
         )
 
     def _pivots(self, J, current: NewtonState, kind, rank_known) -> tuple[PivotedQR, PivotedQR]:
-        """Return the pivoted QR of J, and the same without pivots too small to divide by."""
+        """Return the pivoted QR of J, and this QR without the pivots too small to divide by."""
         independent, max_rank, dtype = None, min(J.shape), J.dtype
         if self.structure.independent is not None and IMPACT in self.kinds:
             independent = self.structure.independent & (kind == IMPACT)
         all_pivots = pivoted_qr(J, jnp.where(rank_known, current.rank, max_rank), independent)
         weak_threshold = jnp.where(rank_known, release_threshold(dtype) * current.margin, 0)
-        # along weaker pivots a gap is of second order, and dividing by them amplifies round-off
+        # along rows with weaker pivots a gap is of second order in the change of q, and dividing by
+        # these pivots amplifies round-off; an impact does not solve for gaps
         threshold = jnp.where(
             kind == IMPACT, weak_threshold, jnp.maximum(rank_tolerance(dtype), weak_threshold)
         )
         return all_pivots, drop_below(all_pivots, threshold)
 
     def _updated_configuration(self, q, kind, step) -> Float[Array, " q"]:
-        """Return the configuration after this iteration, from the one at which it evaluates."""
+        """Return q moved by the Newton step or by the perturbation, as the kind says; for other
+        kinds return q."""
         delta = jnp.where(is_any_of(kind, CLOSE, CLOSE_PERTURBED), step, 0)
         return integrate(self.chain, q, jnp.where(kind == PERTURB, self.perturbation, delta))
 
@@ -152,8 +154,11 @@ def _solve(chain: Chain, structure: Structure, q, v, schedule: Schedule) -> Newt
 
 
 def _solve_jvp(primals, tangents):
-    """Return the solution and its tangent: that of the iterations that change q or v, at the rank
-    of the solution. The search for the rank is not differentiated."""
+    """Return the solution and its tangent.
+
+    The tangent is that of the iterations which change q or v, at the rank of the solution. The
+    search for the rank is not differentiated.
+    """
     solution = solve_structure(*primals)
     chain, structure, q, v, schedule = primals
     with_rank = eqx.tree_at(
@@ -195,8 +200,8 @@ solve_structure = custom_primitive("solve_structure", _solve, _solve_jvp)
 def decide_rank(chain: Chain, structure: Structure, q: Float[Array, " q"]) -> Structure:
     """Return the structure with its rank and margin.
 
-    The rank is the larger one of those at q and at a closed configuration nearby, as q itself may
-    be singular.
+    The rank is the larger of the rank at q and the rank at a closed configuration nearby, as q
+    itself may be singular.
     """
     if not len(chain.topology.link_names):
         return structure

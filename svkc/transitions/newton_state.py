@@ -17,9 +17,10 @@ from svkc.tree.configuration import normalize
 
 # kinds of iterations
 CLOSE = 2  # a Newton step that closes the loops by the least change of scaled coordinates
-# record the pivots at q and perturb a copy of q by a few degrees; close the loops of the copy;
-# decide the rank
-PERTURB, CLOSE_PERTURBED, DECIDE_RANK = 3, 4, 5
+# the search for the rank
+PERTURB = 3  # record the pivots at q, and perturb a copy of q (the probe) by a few degrees
+CLOSE_PERTURBED = 4  # a Newton step that closes the loops of the probe
+DECIDE_RANK = 5  # record the pivots at the probe, and decide the rank
 IMPACT = 8  # project the velocity in the metric of the mass matrix
 
 RANK_SEARCH = (PERTURB, *(CLOSE_PERTURBED,) * 12, DECIDE_RANK)
@@ -47,8 +48,8 @@ class NewtonState(eqx.Module):
 
     rank, margin: rank m of the loop Jacobian, and |R_mm| / |R_11|.
     probe: the perturbed copy of q in the search for the rank.
-    search_diag_R: |R_kk| of the loop Jacobian at the start and at the end of the search.
-    search_gaps: largest gap of each loop there (rad, or in `chain.length`s).
+    search_diag_R: |R_kk| of the loop Jacobian at q and at the probe when the search ends.
+    search_gaps: largest gap of each loop at these two (rad, or in `chain.length`s).
     residual_gaps: largest gap of each loop at the last evaluation of the loops.
     spatial_impulse: impulse of each loop on its real link from the parent, at the joint, angular
         part first (N m s, N s).
@@ -104,9 +105,9 @@ class NewtonState(eqx.Module):
         )
 
     def rank_and_margin(self) -> tuple[Int[Array, ""], Float[Array, ""]]:
-        """Return the larger rank m of the two ends of the search, and |R_mm| / |R_11| there.
+        """Return the larger rank m of those at q and at the probe, and the larger |R_mm| / |R_11|.
 
-        The second end is left out if its loops are open.
+        The probe is left out if its loops are open.
         """
         diag_R, eps = self.search_diag_R, jnp.finfo(self.search_diag_R.dtype)
         closed = jnp.max(self.search_gaps[1]) < eps.eps**0.75

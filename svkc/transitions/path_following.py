@@ -1,8 +1,8 @@
 """The state at the end of a continuation, with its derivatives.
 
-One loop over one body does all iterations, so that kinematics, loop Jacobian and pivots are
-compiled once. The derivative is that of the stationary point (`stationarity.py`); it does not
-depend on the path.
+One while loop runs every kind of iteration with one body, so that kinematics, loop Jacobian and
+pivots are compiled once. The derivative is that of the stationary point at the end
+(`stationarity.py`); it does not depend on the path.
 """
 
 import dataclasses
@@ -27,9 +27,9 @@ _MAX_ITERATIONS = 20_000
 class PathEnd(eqx.Module):
     """The end of a path.
 
-    rank, margin: rank of the loop Jacobian, and its margin.
+    rank, margin: rank m of the loop Jacobian, and |R_mm| / |R_11|.
     residual_gaps: largest gap of each loop (rad, or in `chain.length`s).
-    reached: whether the path has reached its end.
+    reached: whether the path has come to its end without failing.
     held: coordinates that the path moved to their requested values.
     from_requested: whether the path started at the requested coordinates.
     """
@@ -49,6 +49,7 @@ def _follow(chain: Chain, structure: Structure, targets: Targets) -> PathEnd:
 
     def body(path: PathState) -> PathState:
         path = dataclasses.replace(path, iterations=path.iterations + 1)
+        # q may be singular, so the rank and the held coordinates are decided at the probe
         at_probe = is_any_of(path.kind, CLOSE_PERTURBED, DECIDE_RANK, SELECT_HELD)
         q = jnp.where(at_probe, path.newton.probe, path.newton.q)
         linear = linearize(chain, structure, targets, path, q)
@@ -77,13 +78,16 @@ def _path_end(path: PathState, q) -> PathEnd:
 
 
 def _follow_nothing(chain: Chain, structure: Structure, targets: Targets) -> PathEnd:
-    """Return a record with the shapes of the path's end."""
+    """Return a `PathEnd` of the right shapes, without following the path."""
     return _path_end(PathState.init(chain, structure, targets), targets.start)
 
 
 def _follow_jvp(primals, tangents):
-    """Return the end of the path and its tangent: that of the stationary point by the implicit
-    function theorem, and that of the velocity's projection there."""
+    """Return the end of the path and its tangent.
+
+    The tangent of q is that of the stationary point, by the implicit function theorem. The tangent
+    of v is that of the projection of the velocity at this point.
+    """
     end = follow_path(*primals)
     chain, structure, targets = primals
     rank = (end.rank, jax.lax.stop_gradient(end.margin))

@@ -38,22 +38,24 @@ from svkc.transitions.placement import joint_coordinates, with_coordinates
 from svkc.transitions.stationarity import Targets
 from svkc.tree.configuration import difference, integrate
 
-# largest predictor step, and the smallest one before a leg is given up (rad, `chain.length`s)
+# largest entry of a predictor step, and the smallest one before the path fails (rad, or in
+# `chain.length`s)
 _LARGEST_STEP, _SMALLEST_STEP = 0.1, 1e-5
-# iterations after which a path is given up: 500, and 100 for each unit of the largest gap and
-# offset. Largest steps take three iterations each, so 30 for each unit that one coordinate moves;
-# a path that comes near a singular configuration takes ever smaller steps
+# iterations after which a path fails: 500, and 100 for each unit of the largest gap and offset. A
+# predictor step of the largest size takes about three iterations, so that a coordinate takes 30 for
+# each unit that it moves. Near a singular configuration the steps become ever smaller.
 _ITERATIONS, _ITERATIONS_PER_UNIT = 500, 100
 
 
 class _StepDecision(eqx.Module):
     """The decision about the point that an iteration of a leg evaluated.
 
-    accept, reject: a point that is neither accepted nor rejected is corrected.
-    leg_done: whether the leg has come to its end.
-    stuck: whether steps have become too small or too many.
+    accept, reject: a point that is neither accepted nor rejected is corrected. After a rejection
+        the predictor starts at the last accepted point again, with half the step.
+    leg_done: whether the point is accepted and at the end of the leg.
+    stuck: whether the path fails: steps have become too small or too many.
     correction_size: largest entry of the correction.
-    step_size: the next step of the leg's parameter.
+    step_size: increment of s in the next predictor step.
     """
 
     accept: Bool[Array, ""]
@@ -65,14 +67,16 @@ class _StepDecision(eqx.Module):
 
 
 def _decide(path: PathState, linear: LinearSolution) -> _StepDecision:
-    """Accept a point whose correction is small; reject one whose corrections do not converge."""
+    """Return the decision: accept a point whose correction is small, reject a point whose
+    corrections do not converge."""
     eps = float(jnp.finfo(linear.step.dtype).eps)
     on_leg, rank_unknown = is_any_of(path.kind, CLOSE_START, FOLLOW), ~path.rank_known
     size, length = jnp.max(jnp.abs(linear.step)), jnp.max(jnp.abs(linear.tangent))
     at_end = path.s > 1 - 4 * eps
     small = size <= jnp.where(at_end, eps**0.5, eps ** (1 / 3))
-    # an over-constrained loop has a higher rank while it is open: its corrections converge slowly,
-    # and the orientation of its pivots has no meaning
+    # Until the rank is known the first leg uses all rows. An over-constrained loop has a higher
+    # rank while open: its corrections converge slowly, and the orientation of its pivot block has
+    # no meaning.
     same_branch = linear.same_orientation | ~path.has_point | rank_unknown
     accept = on_leg & small & same_branch
     predicted = path.step_size * jnp.max(jnp.abs(path.point.tangent))
@@ -107,7 +111,7 @@ def _decide(path: PathState, linear: LinearSolution) -> _StepDecision:
 def _advance(
     chain: Chain, structure: Structure, path: PathState, q, linear: LinearSolution, decision
 ) -> PathState:
-    """Return the path with its configuration, probe or velocity and the leg's parameter updated.
+    """Return the path after this iteration's change of q, probe or v; its kind stays.
 
     q: the configuration that the iteration evaluated.
     """
@@ -164,13 +168,13 @@ def _gap_norms(linear: LinearSolution) -> Float[Array, " links"]:
 def next_path_state(
     chain: Chain, structure: Structure, targets: Targets, path: PathState, q, linear: LinearSolution
 ) -> PathState:
-    """Return the path after an iteration that evaluated the configuration q."""
+    """Return the path after an iteration that evaluated the configuration q, with its next kind."""
     kind, decision = path.kind, _decide(path, linear)
     after = _advance(chain, structure, path, q, linear, decision)
     after = _read_coordinates(chain, structure, targets, after, kind, linear)
     start_closed = decision.leg_done & (kind == CLOSE_START)
     used_rows = jnp.sum(linear.selection.active, dtype=jnp.int32)
-    # coordinates that the loops leave independent can be held
+    # coordinates that are no pivots are independent, and can be held
     independent = targets.held_q & ~jnp.any(linear.all_pivots.P > 0, 0)
     after = dataclasses.replace(
         after,
@@ -182,7 +186,8 @@ def next_path_state(
     deviation = jnp.where(targets.held_q, jnp.abs(scaled_offset - linear.step), 0)
     missed = ~(jnp.max(deviation) <= targets.tolerance)
     failed = decision.stuck | (decision.leg_done & (kind == FOLLOW) & missed)
-    # an over-constrained loop was closed with more rows than its rank when closed: close it again
+    # An over-constrained loop was closed with more rows than its rank when closed. The closed point
+    # need not be stationary: close the loop again, with the rank known.
     close_again = (kind == SELECT_HELD) & (path.closing_rows != path.newton.rank)
     new_leg = decision.leg_done | close_again
     last_q = jnp.where(decision.stuck, path.point.q, after.newton.q)
@@ -205,8 +210,8 @@ def next_path_state(
 def _restarted(chain: Chain, structure: Structure, targets: Targets, path: PathState) -> PathState:
     """Return a path that starts at the requested coordinates.
 
-    It is taken if the start cannot be closed, or if more coordinates are held than there are
-    freedoms.
+    `next_path_state` restarts a path with coordinates to hold once, if it fails before the rank is
+    known or if not all of these are independent, as with more of them than freedoms.
     """
     first = PathState.init(chain, structure, targets)
     return dataclasses.replace(
@@ -241,7 +246,10 @@ def _read_coordinates(
     chain: Chain, structure: Structure, targets: Targets, path: PathState, kind, linear
 ) -> PathState:
     """Return the path with the coordinates of virtual joints computed from the poses of their
-    bodies, except where they close their loop already."""
+    bodies, except where they close their loop already, and with its origin.
+
+    A no-op for every other kind of iteration.
+    """
     q = path.newton.q
     is_open = ~(_gap_norms(linear) < gap_tolerance(q.dtype))
     links = targets.read_links & structure.connected & is_open

@@ -28,14 +28,15 @@ from svkc.transitions.spare_links import (
 class Plan(eqx.Module):
     """The events of a run as tables.
 
-    times: of the timed events (s).
-    guards: of the events with a guard.
-    max_steps: of the guards, the longest step while a guard is armed (s), inf where not given.
-        None: no event gives one.
+    times: time of each timed event (s).
+    guards: guard of each event with a guard.
+    max_steps: longest step while each guard is armed (s), inf where not given. None: no event gives
+        one.
     timed, guarded: indices of the timed events and of the events with a guard in the user's list.
-    directions: of the guards: True rising, False falling, None either.
-    actions: what each event changes, without its grips, which hold differentiable data.
-    grips: grips that each event makes.
+    directions: direction of each guard's crossing: True rising, False falling, None either.
+    actions: what each event in the user's list changes, without its grips, which hold
+        differentiable data.
+    grips: grips that each event in the user's list makes.
     """
 
     times: Float[Array, " timed"]
@@ -69,8 +70,10 @@ class Plan(eqx.Module):
         return jnp.stack(rows)
 
     def needs_impact(self, chain: Chain) -> bool:
-        """Return whether any event connects a link or locks a joint. If none does, no impact is
-        compiled."""
+        """Return whether any event connects a link, makes a grip or locks a joint.
+
+        If none does, no impact is compiled.
+        """
         return bool(
             any(self.grips)
             or self.action_mask(chain, "connect").any()
@@ -83,8 +86,8 @@ class Plan(eqx.Module):
         return any(a.lock or a.unlock for a in self.actions)
 
     def action_mask(self, chain: Chain, action_name: str) -> np.ndarray:
-        """Return the mask [events, links or dofs] of one field of `Action`: dofs for "lock" and
-        "unlock", links for the others. Raises ValueError for unknown names."""
+        """Return the mask of one field of `Action`: [events, dofs] for "lock" and "unlock",
+        [events, links] for "connect" and "cut". Raises ValueError for unknown names."""
         if action_name in ("lock", "unlock"):
             table = np.zeros((len(self.actions), chain.dofs), bool)
             for row, action in zip(table, self.actions, strict=True):
@@ -105,7 +108,7 @@ class Plan(eqx.Module):
 
     def armed(self, chain: Chain, structure: Structure) -> Bool[Array, " guards"]:
         """Return which guards are armed: those whose action would change the structure or stop the
-        run, and those without an action."""
+        run, and those without an action, which only record their events."""
         rows, connected = list(self.guarded), structure.connected[None]
         connect, cut = (self.action_mask(chain, name)[rows] for name in ("connect", "cut"))
         changes = jnp.any(connect & ~connected, 1) | jnp.any(cut & connected, 1)
@@ -140,8 +143,8 @@ class Plan(eqx.Module):
     def crossed(
         self, before: Float[Array, " guards"], after: Float[Array, " guards"]
     ) -> Bool[Array, " guards"]:
-        """Return which guards crossed zero in their direction between two values. A guard that
-        starts at zero has not crossed."""
+        """Return which guards crossed zero in their direction from `before` to `after`. A guard
+        that is zero before has not crossed."""
         rises, falls = (before < 0) & (after >= 0), (before > 0) & (after <= 0)
         either = np.array([d is None for d in self.directions], bool)
         rising = np.array([d is True for d in self.directions], bool)

@@ -30,9 +30,9 @@ class Grip(eqx.Module):
     """A joint that an event makes between two bodies with a spare slot (`bind=` of `svkc.at` and
     `svkc.when`).
 
-    The joint is made at the current poses of the bodies. A grip of two bodies that a connected slot
-    joins already changes nothing. The chain needs spare slots (`svkc.load(..., spare=n)`).
-    `simulate` raises ValueError for unknown names and invalid values.
+    The joint is made at the current poses of the bodies. A grip changes nothing if a connected slot
+    joins the same parent and real link already. The chain needs spare slots
+    (`svkc.load(..., spare=n)`). `simulate` raises ValueError for unknown names and invalid values.
 
     parent, real: names of the two bodies.
     joint: name of the joint, or six Booleans for its freedoms, as for `svkc.VirtualLink`; joints
@@ -93,8 +93,9 @@ def set_links(
 ) -> Structure:
     """Return the structure with new bodies, joint and placement of `links`.
 
-    rows: rows of the parent and of the real link among the bodies.
-    quat: orientation of the joint in the parent and in the real link (wxyz).
+    rows: topology rows of the parent and of the real link.
+    freedoms: six Booleans, as in `Structure`.
+    quat: orientation of the joint in the parent, and also in the real link (wxyz).
     pos, real_pos: position of the joint in the parent and in the real link (m).
     """
     dtype = structure.pos.dtype
@@ -116,7 +117,8 @@ def set_links(
 
 
 def unbound_slots(chain: Chain, structure: Structure) -> Bool[Array, " links"]:
-    """Return the mask of the spare slots that are bound to no bodies."""
+    """Return the mask of the spare slots that are bound to no bodies: both of their rows are the
+    world's, 0."""
     spare = jnp.asarray(np.array(chain.topology.link_spare, bool))
     return spare & (structure.parent == 0) & (structure.real == 0)
 
@@ -153,7 +155,10 @@ def check_bound(chain: Chain, state: State, to_connect: Any) -> State:
 def bound_between(
     chain: Chain, structure: Structure, parent: str, real: str
 ) -> Bool[Array, " links"]:
-    """Return the mask of the connected spare slots that are bound between two bodies."""
+    """Return the mask of the connected spare slots with this parent and this real link.
+
+    parent, real: names of bodies. Slots with the two exchanged are not in the mask.
+    """
     p, r = body_rows(chain, parent, real)
     return (
         jnp.asarray(np.array(chain.topology.link_spare, bool))
@@ -167,9 +172,9 @@ def bind_grip(
     chain: Chain, structure: Structure, grip: Grip
 ) -> tuple[Structure, Bool[Array, " links"], Bool[Array, ""]]:
     """Return the structure with a slot bound as the grip says, the mask of the slot to connect, and
-    whether no slot was free.
+    whether the grip failed for want of a slot: none is free, or the named one is connected.
 
-    The mask is empty if a connected slot joins the two bodies already.
+    The mask is empty if a connected slot joins the same parent and real link already.
     """
     spare = jnp.asarray(np.array(chain.topology.link_spare, bool))
     rows = body_rows(chain, grip.parent, grip.real)
@@ -229,8 +234,8 @@ def bind(
     joint: name of the joint, or six Booleans for its freedoms, as for `svkc.VirtualLink`; joints
         with two rotations, such as "universal", are refused, as a slot has no room for their
         coordinates.
-    axis: axis of the joint in the frame of the parent, and in that of the real link: the placement
-        given here is one at which the axes of the two frames are parallel.
+    axis: axis of the joint in the frame of the parent, and also in that of the real link. The two
+        frames are parallel where the loop is closed and the joint's rotations are zero.
     pos, real_pos: point of the joint in the frames of the parent and of the real link (m).
 
     Raises ValueError if `name` is not a spare slot, for unknown bodies, for an invalid joint, axis

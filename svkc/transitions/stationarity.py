@@ -1,9 +1,11 @@
 """The point of least change among closed configurations: its equations, its derivative, and the
 projection of a velocity.
 
-These equations are separate from the path that leads to the point (`continuation.py`), as
-derivatives need the equations alone. All changes are without units: y is dv divided by the column
-scales of the loop Jacobian (rad, or in `chain.length`s).
+The point is a stationary one: where the change has several stationary points, the path from the
+start decides among them. The equations are separate from this path (`continuation.py`), as
+derivatives need the equations alone. Changes are without units: y is a change of q as a tangent
+vector, with an entry for each velocity, divided by the `jacobian_scales` of the columns (rad, or in
+`chain.length`s).
 """
 
 import equinox as eqx
@@ -30,10 +32,12 @@ from svkc.tree.configuration import difference, integrate
 class Targets(eqx.Module):
     """The targets of a continuation.
 
-    start: configuration from which the change is least.
-    requested: the start with the user's coordinates in it.
-    v: velocities.
-    held_q, held_v: coordinates and velocities that must have their requested values.
+    start: configuration at which the path starts, and from which the change is least; a path that
+        is restarted uses `requested` instead.
+    requested: the load pose or `near`, with the user's coordinates in it.
+    v: requested velocities.
+    held_q: coordinates that the second leg of the path is to move to their requested values.
+    held_v: velocities that stay as requested where the loops allow it.
     read_links: links whose own coordinates are computed from the poses of their bodies, unless
         they close their loop already.
     tolerance: largest deviation of a held coordinate (rad, or in `chain.length`s).
@@ -52,9 +56,9 @@ def weights(chain: Chain, structure: Structure) -> Float[Array, " dofs"]:
     """Return the weight of each coordinate's change: 1 for the model's own joints, 0 for
     coordinates that follow from these.
 
-    While a cuttable joint is connected, its body follows from the joint. Coordinates of a virtual
-    link that closes a loop follow from the tree's. Hence the change does not depend on which joint
-    of a loop is the virtual link, nor on which joints may be cut.
+    While a cuttable joint is connected, the free coordinates of its body follow from the joint's.
+    Coordinates of a virtual link that closes a loop follow from the tree's. Hence the change does
+    not depend on which joint of a loop is the virtual link, nor on which joints may be cut.
     """
     top = chain.topology
     own = np.zeros(top.dofs)
@@ -72,9 +76,10 @@ def weights(chain: Chain, structure: Structure) -> Float[Array, " dofs"]:
 def independent_rows(
     structure: Structure, J, qr: PivotedQR, rank_known: bool | Bool[Array, ""] = True
 ) -> PivotedQR:
-    """Return the pivoted QR of J without pivots too small to divide by.
+    """Return the pivoted QR of J without the pivots that are too small to divide by.
 
-    rank_known: whether the margin of the structure is known.
+    qr: pivoted QR of J.
+    rank_known: whether the rank and the margin of the structure have been decided.
     """
     weak = jnp.where(rank_known, release_threshold(J.dtype) * structure.margin, 0)
     return drop_below(qr, jnp.maximum(rank_tolerance(J.dtype), weak))
@@ -86,8 +91,14 @@ def optimality_matrix(
     used: Bool[Array, " steps"],
     fixed: Bool[Array, " dofs"],
 ) -> Float[Array, "n n"]:
-    """Return the KKT matrix: stationarity of free coordinates, the identity for fixed ones, then
-    one row for each independent row of the loops and the identity for the others."""
+    """Return the KKT matrix, of the size n = dofs + steps.
+
+    Its first rows are stationarity for free coordinates and the identity for fixed ones. Its last
+    rows are the loop rows where used, and the identity elsewhere.
+
+    hessian: second derivative of the Lagrangian, or of the change alone for a velocity.
+    rows: independent loop rows, zero where not used.
+    """
     dtype = rows.dtype
     free = ~fixed[:, None]
     upper = jnp.concatenate([jnp.where(free, hessian, 0), jnp.where(free, rows.T, 0)], 1)
@@ -105,7 +116,10 @@ def gradient(chain: Chain, start, q, J, multiplier, weight) -> Float[Array, " do
 
 
 def _multiplier(J, selection: PivotedQR, gradient_of_change, fixed):
-    """Return the multipliers of the loop rows at a stationary point, by least squares."""
+    """Return the multipliers of the loop rows at a stationary point, by least squares.
+
+    fixed: coordinates without a condition of stationarity.
+    """
     rows = selection.Q @ jnp.where(fixed, 0, J)
     gram = rows @ rows.T + jnp.diag((~selection.active).astype(J.dtype))
     return -solve_positive(gram, rows @ jnp.where(fixed, 0, gradient_of_change)) @ selection.Q
@@ -118,7 +132,7 @@ def stationary_tangent(
 
     primals, tangents: chain, structure, start and requested coordinates, and their tangents.
     held: coordinates that have their requested values.
-    structure: the structure with the rank of the loops at q.
+    structure: the structure with the rank and the margin of the loops at q.
     """
     chain, _, start, _ = primals
     column, weight = jacobian_scales(chain)[1], weights(chain, structure)
@@ -150,8 +164,10 @@ def stationary_tangent(
 def projected_velocity(
     chain: Chain, structure: Structure, q, v, held: Bool[Array, " dofs"]
 ) -> Float[Array, " dofs"]:
-    """Return the velocity that keeps the loops, by the least change of the velocities of the
-    model's own joints; held velocities stay."""
+    """Return the velocity nearest to v that keeps the loops closed; held velocities stay.
+
+    The distance is that of the velocities of the model's own joints, without units.
+    """
     column, active = jacobian_scales(chain)[1], active_dofs(chain, structure)
     fixed = held | ~active
     J = loop_kinematics(chain, structure, q).J
