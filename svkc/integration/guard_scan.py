@@ -290,9 +290,9 @@ def locate_event(
         armed_guards=options.armed_guards,
     )
     locating = s.search.active | search.active
-    land = search.done
+    land = search.done & ~is_nan
     advance = (attempt.keep_step & ~is_nan & ~locating & ~divide) | land
-    hold = locating | divide | (jnp.isfinite(s.search.retry_time) & advance)
+    hold = (locating | divide | (jnp.isfinite(s.search.retry_time) & advance)) & ~is_nan
     t, y = tree_where(land, (search.bracket.b, search.y), (attempt.t, attempt.y))
     result = jnp.where(is_nan, NON_FINITE, attempt.result)
     attempt = dataclasses.replace(attempt, t=t, y=y, keep_step=advance, result=result)

@@ -231,13 +231,14 @@ class Chain(eqx.Module):
         The loops are closed by continuation from the load pose, or from the State `near`: the
         result is on the branch of closed configurations that is connected with this start. If the
         named coordinates leave freedoms, the result is the point of least change from the start on
-        that branch. The velocity is projected onto the closed loops; a velocity that keeps the
-        loops is returned unchanged.
+        that branch. If the start cannot be closed, a second path starts from the named coordinates.
+        The velocity is projected onto the closed loops; a velocity that keeps the loops is returned
+        to round-off.
 
         q: coordinates (m, rad, wxyz): a dict by joint name, or an array over the tree or over every
             coordinate. Named coordinates are held: they are returned as given. An array is a guess:
-            it is returned unchanged if it closes the loops, else with the least change that closes
-            them. None: the load pose.
+            it is returned to round-off if it closes the loops, else with the least change that
+            closes them. None: the load pose.
         v: velocities (m/s, rad/s), in the same forms. None: at rest.
         connected: names of the connected virtual links, or a mask [links]. None: as in `near`, or
             as in the model.

@@ -113,11 +113,13 @@ class Deviations(eqx.Module):
     """Deviations of held coordinates (rad, m) and velocities (rad/s, m/s) from the given values, 0
     within the tolerance.
 
+    is_open: mask of the loops that are open.
     failed: whether a value deviates, a loop is open, or the path failed.
     """
 
     q: Float[Array, " dofs"]
     v: Float[Array, " dofs"]
+    is_open: Bool[Array, " links"]
     failed: Bool[Array, ""]
 
 
@@ -141,6 +143,7 @@ def _follow_and_compare(
     deviations = Deviations(
         q=jnp.where(missed_q, deviation_q, 0),
         v=jnp.where(missed_v, deviation_v, 0),
+        is_open=is_open,
         failed=~last.reached | jnp.any(missed_q) | jnp.any(missed_v) | jnp.any(is_open),
     )
     # the given velocity itself, without the round-off of the projection
@@ -197,7 +200,8 @@ def _start(chain: Chain, near: State | None, connected) -> tuple[Array, Structur
         start, structure = near.q, near.structure
     if near is None or connected is not None:
         mask = connection_mask(chain, connected)
-        state = check_bound(chain, State(start, chain.q_load, structure), mask)
+        at_rest = jnp.zeros(chain.dofs, chain.q_load.dtype)
+        state = check_bound(chain, State(start, at_rest, structure), mask)
         start = state.q
         structure = eqx.tree_at(lambda s: s.connected, state.structure, jnp.asarray(mask))
     return start, structure
@@ -238,7 +242,10 @@ def _check_reached(chain: Chain, state: State, deviations: Deviations, throw: bo
                 " (hold=False)."
             )
     # no held value deviates, so the path failed to close the loops: list every connected loop
-    return check_closed(chain, state, jnp.where(state.structure.connected, jnp.inf, 0))
+    # a path that failed with closed loops failed in all of them
+    is_open = np.asarray(deviations.is_open)
+    is_open = is_open if is_open.any() else np.asarray(state.structure.connected)
+    return check_closed(chain, state, jnp.where(is_open, jnp.inf, 0))
 
 
 def _describe_deviations(chain: Chain, deviation: np.ndarray, per: str) -> list[str]:

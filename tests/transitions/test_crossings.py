@@ -244,3 +244,13 @@ def test_first_crossings_of_random_guards(ball):
             wrong.append((c, time, expected))
     # with values at the ends of steps alone 200 of them are wrong
     assert len(wrong) <= 1, wrong
+
+
+def test_a_guard_that_is_nan_where_its_root_is_sought_ends_the_run(ball):
+    guard = lambda t, state, args: jnp.where(jnp.abs(t - 0.05) < 0.01, jnp.nan, t - 0.05)
+    traj = svkc.simulate(
+        ball, ball.state(), 0.2, dt=0.1, events=[svkc.when(guard, lock="z")], throw=False
+    )
+    assert traj.result == svkc.RESULTS.non_finite
+    assert not bool(traj.final.structure.locked.any())
+    assert float(traj.t_final) == 0
