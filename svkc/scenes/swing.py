@@ -118,31 +118,24 @@ def seat_events(chain: Chain) -> list[When]:
 
 
 def _sitting_state(chain: Chain, angle: float) -> State:
-    """Return the state with thighs along the plate, trunk upright, hands on the rods."""
+    """Return the state with thighs along the plate, a leaning trunk, and hands on the rods."""
     c, s = np.cos(angle), np.sin(angle)
-    hips = np.array([-0.17, THIGH_ABOVE_PLATE - ROD_LENGTH])
+    hips = np.array([-0.31, THIGH_ABOVE_PLATE - ROD_LENGTH])
     position = [c * hips[0] + s * hips[1], 0, PIVOT_HEIGHT - s * hips[0] + c * hips[1]]
-    q = {"pivot": angle, "base": [*position, np.cos(angle / 2), 0, np.sin(angle / 2), 0]}
+    lean = 0.35  # rad
+    pitch = (angle - lean) / 2
+    seat = {"pivot": angle, "base": [*position, np.cos(pitch), 0, np.sin(pitch), 0]}
+    arms = {}
     for side in ("right", "left"):
-        q |= {
-            f"{side}_hip_flexion": np.pi / 2,
-            f"{side}_knee": np.pi / 2,
-            f"{side}_shoulder_flexion": 0.7,
+        seat |= {f"{side}_hip_flexion": np.pi / 2 - lean, f"{side}_knee": np.pi / 2}
+        arms |= {
+            f"{side}_shoulder_flexion": 0.9,
+            f"{side}_shoulder_abduction": 0.4,
+            f"{side}_elbow": 1.1,
         }
-        q |= {f"{side}_shoulder_abduction": 0.4, f"{side}_elbow": 1.0}
-    # named coordinates are kept, an array is a guess: closing the hands' loops moves the arms
-    seated = chain.state(
-        {k: x for k, x in q.items() if "shoulder" not in k and "elbow" not in k}, connected=()
-    )
-    full = np.array(seated.q[: chain.nq])
-    for name in ("shoulder_flexion", "shoulder_abduction", "elbow"):
-        for side in ("right", "left"):
-            full[
-                chain.topology.q_start[
-                    chain.topology.joint_row[chain.joint_names.index(f"{side}_{name}")]
-                ]
-            ] = q[f"{side}_{name}"]
-    return chain.state(full)
+    # the arms are not named, so that closing the hands' loops moves them
+    open_state = chain.state(seat | arms, connected=())
+    return chain.state(seat, connected=chain.link_names, near=open_state)
 
 
 def __getattr__(name: str) -> Any:

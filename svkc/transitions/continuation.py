@@ -245,8 +245,8 @@ def linearize(
     all_pivots = pivoted_qr(free_J, rank, targets.held_q & (kind == SELECT_HELD))
     with_margin = eqx.tree_at(lambda s: s.margin, structure, path.newton.margin)
     selection = independent_rows(with_margin, free_J, all_pivots, path.rank_known)
-    start = jnp.where(path.from_requested, targets.requested, targets.start)
-    gradients = jax.vmap(lambda q, J: gradient(chain, start, q, J, path.multiplier, weight))(qs, Js)
+    gradient_at = lambda q, J: gradient(chain, path.origin, q, J, path.multiplier, weight)
+    gradients = jax.vmap(gradient_at)(qs, Js)
     hessian_on_leg = (gradients[1:] - gradients[:1]).T / size
     diagonal = jnp.diag(jnp.where(kind == CLOSE_PERTURBED, 1, weight))
     gradient_of_change = gradients[0] - path.multiplier @ J

@@ -13,11 +13,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.primitive import custom_primitive
-from svkc.loops.constraint import jacobian_scales
+from svkc.loops.constraint import gap_tolerance, jacobian_scales, loop_kinematics
 from svkc.model.chain import Chain, Structure
 from svkc.transitions.continuation import DONE, SELECT_HELD, PathState, linearize
 from svkc.transitions.newton_state import CLOSE_PERTURBED, DECIDE_RANK, is_any_of
 from svkc.transitions.path_steps import next_path_state
+from svkc.transitions.placement import joint_coordinates, with_coordinates
 from svkc.transitions.stationarity import Targets, projected_velocity, stationary_tangent
 from svkc.tree.configuration import difference, integrate
 
@@ -82,6 +83,21 @@ def _follow_nothing(chain: Chain, structure: Structure, targets: Targets) -> Pat
     return _path_end(PathState.init(chain, structure, targets), targets.start)
 
 
+def _with_joint_coordinates(chain: Chain, structure: Structure, links, start):
+    """Return the start with the coordinates of virtual joints as the first iteration computes them.
+
+    Only coordinates of cuttable joints have a weight in the change from the start.
+    links: links whose coordinates are computed, unless they close their loop already.
+    """
+    if max(chain.topology.link_child, default=-1) < 0:
+        return start
+    loops = loop_kinematics(chain, structure, start)
+    gaps = jax.lax.stop_gradient(jnp.max(jnp.abs(loops.gap).reshape(-1, 6), 1))
+    links = links & structure.connected & ~(gaps < gap_tolerance(start.dtype))
+    coordinates = joint_coordinates(chain, structure, loops.kin, start, loops.frames)
+    return with_coordinates(chain, links, coordinates, start)
+
+
 def _follow_jvp(primals, tangents):
     """Return the end of the path and its tangent.
 
@@ -95,6 +111,7 @@ def _follow_jvp(primals, tangents):
 
     def inputs(chain, structure, targets):
         start = jnp.where(end.from_requested, targets.requested, targets.start)
+        start = _with_joint_coordinates(chain, structure, targets.read_links, start)
         return chain, structure, start, targets.requested
 
     y_dot = stationary_tangent(

@@ -54,6 +54,7 @@ class _StepDecision(eqx.Module):
         the predictor starts at the last accepted point again, with half the step.
     leg_done: whether the point is accepted and at the end of the leg.
     stuck: whether the path fails: steps have become too small or too many.
+    rank_drops: whether the leg is done because its loops are closed, though the step is not small.
     correction_size: largest entry of the correction.
     step_size: increment of s in the next predictor step.
     """
@@ -62,6 +63,7 @@ class _StepDecision(eqx.Module):
     reject: Bool[Array, ""]
     leg_done: Bool[Array, ""]
     stuck: Bool[Array, ""]
+    rank_drops: Bool[Array, ""]
     correction_size: Float[Array, ""]
     step_size: Float[Array, ""]
 
@@ -78,7 +80,10 @@ def _decide(path: PathState, linear: LinearSolution) -> _StepDecision:
     # rank while open: its corrections converge slowly, and the orientation of its pivot block has
     # no meaning.
     same_branch = linear.same_orientation | ~path.has_point | rank_unknown
-    accept = on_leg & small & same_branch
+    # where such a loop closes its rank drops, and the step leads far along its new freedoms
+    is_closed = jnp.max(jnp.abs(linear.gap)) < gap_tolerance(linear.gap.dtype)
+    closed = rank_unknown & at_end & is_closed
+    accept = on_leg & ((small & same_branch) | closed)
     predicted = path.step_size * jnp.max(jnp.abs(path.point.tangent))
     first = path.corrections == 0
     contraction = jnp.where(rank_unknown, 0.95, 0.5)
@@ -103,6 +108,7 @@ def _decide(path: PathState, linear: LinearSolution) -> _StepDecision:
         reject=reject,
         leg_done=accept & at_end,
         stuck=too_long | (reject & (~path.has_point | too_small)),
+        rank_drops=closed & ~small,
         correction_size=size,
         step_size=jnp.where(reject, path.step_size / 2, step_size),
     )
@@ -130,7 +136,7 @@ def _advance(
     point = tree_where(onward, accepted, path.point)
     predicts, on_leg = onward | decision.reject, is_any_of(kind, CLOSE_START, FOLLOW)
     corrects = on_leg | (kind == CLOSE_PERTURBED)
-    correction = jnp.where(corrects, linear.step, 0)
+    correction = jnp.where(corrects & ~decision.rank_drops, linear.step, 0)
     step = jnp.where(predicts, point.correction + h * point.tangent, correction)
     perturbation = rank_search_perturbation(chain, structure)
     change = column * step + jnp.where(kind == PERTURB, perturbation, 0)
@@ -174,6 +180,8 @@ def next_path_state(
     after = _read_coordinates(chain, structure, targets, after, kind, linear)
     start_closed = decision.leg_done & (kind == CLOSE_START)
     used_rows = jnp.sum(linear.selection.active, dtype=jnp.int32)
+    # no number of rows: the start is closed again once the rank is known
+    used_rows = jnp.where(decision.rank_drops, -1, used_rows)
     # coordinates that are no pivots are independent, and can be held
     independent = targets.held_q & ~jnp.any(linear.all_pivots.P > 0, 0)
     after = dataclasses.replace(

@@ -158,6 +158,9 @@ def stationary_tangent(
     hessian = jax.jacfwd(stationarity)(jnp.zeros_like(column))
     matrix = optimality_matrix(hessian, selection.Q @ J, selection.active, fixed)
     residual_dot = eqx.filter_jvp(residual, primals, tangents)[1]
+    # masses and inertias have no part in the equations
+    if residual_dot is None:
+        return jnp.zeros_like(column)
     return solve_general(matrix, -residual_dot)[: len(held)]
 
 

@@ -419,7 +419,8 @@ def test_a_robot_from_a_public_collection():
         chain = svkc.load(MINITAUR, virtual_links=feet[slide])
         assert (len(chain.body_names), chain.nv) == (28, 16)
         state = chain.state(
-            {name: sign(name) * angles[name.split("_")[0]] for name in chain.joint_names}
+            {name: sign(name) * angles[name.split("_")[0]] for name in chain.joint_names},
+            hold=False,
         )
         mobility = svkc.mobility(chain, state)
         assert int(mobility.freedoms) == freedoms

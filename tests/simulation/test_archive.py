@@ -4,6 +4,7 @@ saved/schema_4.npz and saved/schema_5.npz were written by `traj.save(path, chain
 schemas.
 """
 
+import dataclasses
 import json
 import pathlib
 
@@ -57,6 +58,11 @@ def test_stored_file_equals_a_new_run(run, tmp_path):
     chain, traj = run
     traj.save(tmp_path / "again.npz", chain)
     old, new = svkc.load_trajectory(FILE), svkc.load_trajectory(tmp_path / "again.npz")
+    # the stored file has no kinetic energies
+    without = lambda x: dataclasses.replace(
+        x, phases=dataclasses.replace(x.phases, kinetic_energy=None)
+    )
+    old, new, traj = map(without, (old, new, traj))
     assert jax.tree.structure(old) == jax.tree.structure(new) == jax.tree.structure(traj)
     for a, b, c in zip(*map(jax.tree.leaves, (old, new, traj)), strict=True):
         np.testing.assert_allclose(a, c, atol=REFERENCE)
