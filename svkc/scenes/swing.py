@@ -120,7 +120,7 @@ def seat_events(chain: Chain) -> list[When]:
 def _sitting_state(chain: Chain, angle: float) -> State:
     """Return the state with thighs along the plate, a leaning trunk, and hands on the rods."""
     c, s = np.cos(angle), np.sin(angle)
-    hips = np.array([-0.31, THIGH_ABOVE_PLATE - ROD_LENGTH])
+    hips = np.array([-0.28, THIGH_ABOVE_PLATE - ROD_LENGTH])
     position = [c * hips[0] + s * hips[1], 0, PIVOT_HEIGHT - s * hips[0] + c * hips[1]]
     lean = 0.35  # rad
     pitch = (angle - lean) / 2

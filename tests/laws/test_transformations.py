@@ -251,7 +251,7 @@ def test_where_there_is_no_derivative(pendulum):
     assert code(clock, rest, never, never) == svkc.types.DERIVATIVE.successful
     # a flat parallelogram, with its bars in line, is singular
     flat = models.parallelogram(middle=False)
-    in_line = {"leg0": np.pi / 2, "plate": -np.pi / 2, "leg1": np.pi / 2}
+    in_line = dict.fromkeys(("leg0", "leg1", "leg2"), np.pi / 2) | {"plate": -np.pi / 2}
     lost = svkc.simulate(flat, flat.state(in_line, {"leg0": 1.0}), 1e-3, throw=False)
     assert lost.derivative == svkc.types.DERIVATIVE.rank_lost
     assert float(lost.phases.margin[0]) < np.sqrt(np.finfo(float).eps)
