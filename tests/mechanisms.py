@@ -194,6 +194,33 @@ def closed(chain, q):
     return placed, q
 
 
+def with_cuttable_joints(sample, structure, q):
+    """Return q with the coordinates of connected cuttable joints computed from the poses of their
+    bodies."""
+    chain, bodies, q = sample.chain, sample.bodies, np.array(q)
+    top, s = chain.topology, jax.tree.map(np.array, structure)
+    p, R, *_ = (x[0] for x in bodies.poses(q[None]))
+    for i in np.flatnonzero((np.array(top.link_child) >= 0) & s.connected):
+        up, real, table = s.parent[i], s.real[i], top.links
+        base = R[up] @ matrix(s.quat[i])
+        turn = base.T @ R[real] @ matrix(s.real_quat[i])
+        x, y, z, *slides = top.link_freedoms[i]
+        place = base.T @ (p[real] + R[real] @ s.real_pos[i] - p[up] - R[up] @ s.pos[i])
+        if x and y and z:
+            q[table.quat[i]] = rigid_bodies.from_matrix(turn)
+        angles = (
+            np.arctan2(*((-turn[1, 2], turn[2, 2]) if z else (turn[2, 1], turn[1, 1]))),
+            np.arctan2(turn[0, 2], turn[2, 2] if z else turn[0, 0]),
+            np.arctan2(*((-turn[0, 1], turn[0, 0]) if x else (turn[1, 0], turn[1, 1]))),
+        )
+        for k, free in enumerate((x, y, z)):
+            if free and not (x and y and z):
+                q[table.angle[i, k]] = angles[k]
+        for k in np.flatnonzero(slides):
+            q[table.slide[i, k]] = place[k]
+    return q
+
+
 def sample(name, rng, size=0.4):
     """Return a random sample of a mechanism."""
     chain = randomized(chain_of(name), rng, planar=name == "four-bar")

@@ -40,6 +40,9 @@ class Call:
             self.name_some(rng)
         elif rng.random() < 0.3:
             self.hold, self.named_q, self.named_v = True, ~self.none, ~self.none
+        if self.q_argument is self.target:
+            # an array gives the poses of bodies; joints that may be cut are where these say
+            self.start = mechanisms.with_cuttable_joints(sample, self.structure, self.target)
 
     def name_some(self, rng):
         """Give random joints by name."""
