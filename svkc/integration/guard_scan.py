@@ -31,6 +31,7 @@ from svkc.integration.solution import (
     StepperOptions,
     StepperState,
 )
+from svkc.transitions.plan import guard_round_off
 from svkc.tree.configuration import normalize
 
 # Intervals of a kept step before any is halved; guards are evaluated at their ends and midpoints.
@@ -227,7 +228,7 @@ def _scan_step(
     intervals = _intervals(guards.evaluate)
     along = attempt.keep_step & ~search.active & jnp.any(guards.armed)
     # A guard at zero stays zero, and cannot cross, until it has left zero by more than round-off.
-    round_off = jnp.finfo(before.dtype).eps ** 0.75
+    round_off = guard_round_off(before.dtype)
 
     def cond_fun(scan: GuardScan):
         at_end = (scan.count == 0) & (attempt.keep_step | search.active)
