@@ -125,7 +125,7 @@ def _array_names(cls, prefix: str = "") -> set[str]:
     for field in dataclasses.fields(cls):
         if field.name in _NESTED:
             out |= _array_names(_NESTED[field.name], prefix + field.name + ".")
-        elif field.name not in (*CODES, "locked", "independent", "kinetic_energy"):
+        elif field.name not in (*CODES, "locked", "independent", "kinetic_energy", "work"):
             out.add(prefix + field.name)
     return out
 

@@ -157,6 +157,7 @@ def _with_certificate(
     return Trajectory(
         ts=ts,
         states=run.saved,
+        work=jnp.zeros((ts.shape[0], 3), ts.dtype) if run.saved_work is None else run.saved_work,
         gaps=saved.gap,
         gap_rates=saved.gap_rate,
         events=run.events,
