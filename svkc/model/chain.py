@@ -1,64 +1,17 @@
-"""The data types of a model, by lifetime: `Chain` (bodies, for the life of a scene), `Structure`
-(how the bodies are joined, for one phase), `State` (how they move, at one instant)."""
+"""The bodies of a scene and the joints between them (`Chain`)."""
 
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
+from svkc.model.chain_names import ChainNames, chain_names
 from svkc.model.link_pointers import link_pointers
+from svkc.model.state import State, Structure
 from svkc.model.topology import FREE, Topology
 from svkc.model.validation import real_array
-
-
-class Structure(eqx.Module):
-    """How the bodies are joined during one phase: one entry for each virtual link.
-
-    Every field may have leading batch axes.
-
-    connected: whether the virtual link is connected.
-    parent: row of `Topology` of the parent body.
-    real: row of `Topology` of the real link.
-    pos: origin of the joint's frame in the parent's frame (m).
-    quat: orientation of the joint's frame in the parent's frame (wxyz); the joint's axis is z.
-    real_pos: origin of the joint's frame in the real link's frame (m).
-    real_quat: orientation of the joint's frame in the real link's frame (wxyz).
-    freedoms: freedoms of the virtual joint: rotations about x, y, z, then translations along them.
-    rank: the rank m of the loop constraints, computed once for the phase.
-    margin: |R_mm| / |R_11| of the pivoted QR factorisation that gave the rank.
-    locked: joint coordinates that are locked; None if no joint can be locked.
-    independent: joint coordinates preferred as independent ones; None: no preference.
-    """
-
-    connected: Bool[Array, "... links"]
-    parent: Int[Array, "... links"]
-    real: Int[Array, "... links"]
-    pos: Float[Array, "... links 3"]
-    quat: Float[Array, "... links 4"]
-    real_pos: Float[Array, "... links 3"]
-    real_quat: Float[Array, "... links 4"]
-    freedoms: Bool[Array, "... links 6"]
-    rank: Int[Array, "..."]
-    margin: Float[Array, "..."]
-    locked: Bool[Array, "... dofs"] | None = None
-    independent: Bool[Array, "... dofs"] | None = None
-
-
-class State(eqx.Module):
-    """Positions and velocities at one instant, and the structure that holds there.
-
-    Every field may have leading batch axes.
-
-    q: the tree's coordinates (m, rad, wxyz; qpos if none is cuttable), then the virtual joints'.
-    v: the tree's velocities (m/s, rad/s; qvel if none is cuttable), then the virtual joints'.
-    structure: how the bodies are joined.
-    """
-
-    q: Float[Array, "... q"]
-    v: Float[Array, "... dofs"]
-    structure: Structure
 
 
 class Chain(eqx.Module):
@@ -118,6 +71,11 @@ class Chain(eqx.Module):
     left_out: tuple[str, ...] = eqx.field(static=True, default=())
 
     @property
+    def names(self) -> ChainNames:
+        """Names of the bodies, joints, virtual links and coordinates, as results keep them."""
+        return chain_names(self.topology)
+
+    @property
     def body_names(self) -> tuple[str, ...]:
         """Names of the bodies in the model's order; the first is the world."""
         return self.topology.body_names
@@ -138,7 +96,7 @@ class Chain(eqx.Module):
 
         A joint with several coordinates appends .x, .y, .z (translations) and .rx, .ry, .rz.
         """
-        return self.topology.dof_names
+        return self.names.v
 
     @property
     def nq(self) -> int:
