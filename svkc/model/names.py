@@ -3,6 +3,8 @@
 Raises ValueError, with the names that exist, for an unknown one.
 """
 
+import difflib
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -11,6 +13,23 @@ import numpy as np
 from svkc.model.chain import Chain
 from svkc.model.topology import V_SIZE
 from svkc.model.validation import as_array
+
+# an error lists as many of the known names
+_NAMES_LISTED = 20
+
+
+def unknown_name(kind: str, name: Any, known: Sequence[str]) -> ValueError:
+    """Return the ValueError for an unknown name, with the nearest names and the known ones.
+
+    kind: what is named, in the singular, as "body" or "body or site".
+    name: the unknown name.
+    known: the known names, of which the error lists the first twenty.
+    """
+    nearest = difflib.get_close_matches(str(name), known)
+    hint = f" did you mean {' or '.join(map(repr, nearest))}?" if nearest else ""
+    kinds = " or ".join(f"{k[:-1]}ies" if k[-1] == "y" else f"{k}s" for k in kind.split(" or "))
+    listed = [*known[:_NAMES_LISTED], *(["..."] if len(known) > _NAMES_LISTED else [])]
+    return ValueError(f"no {kind} {name!r};{hint} {kinds}: {', '.join(listed) or 'none'}")
 
 
 def connection_mask(chain: Chain, connected: Any) -> np.ndarray | jax.Array:
