@@ -11,11 +11,11 @@ import jax
 import numpy as np
 
 from svkc.model.chain import Chain
-from svkc.model.topology import V_SIZE
+from svkc.model.topology import V_SIZE, FixedFrame
 from svkc.model.validation import as_array
 
-# an error lists as many of the known names
-_NAMES_LISTED = 20
+# number of known names in an error
+_LONGEST_LIST = 20
 
 
 def unknown_name(kind: str, name: Any, known: Sequence[str]) -> ValueError:
@@ -28,8 +28,8 @@ def unknown_name(kind: str, name: Any, known: Sequence[str]) -> ValueError:
     nearest = difflib.get_close_matches(str(name), known)
     hint = f" did you mean {' or '.join(map(repr, nearest))}?" if nearest else ""
     kinds = " or ".join(f"{k[:-1]}ies" if k[-1] == "y" else f"{k}s" for k in kind.split(" or "))
-    listed = [*known[:_NAMES_LISTED], *(["..."] if len(known) > _NAMES_LISTED else [])]
-    return ValueError(f"no {kind} {name!r};{hint} {kinds}: {', '.join(listed) or 'none'}")
+    names = [*known[:_LONGEST_LIST], *(["..."] if len(known) > _LONGEST_LIST else [])]
+    return ValueError(f"no {kind} {name!r};{hint} {kinds}: {', '.join(names) or 'none'}")
 
 
 def connection_mask(chain: Chain, connected: Any) -> np.ndarray | jax.Array:
@@ -88,6 +88,17 @@ def joint_slice(chain: Chain, name: str, widths: Any, starts: Any) -> slice:
         raise ValueError(f"no joint {name!r}; joints: {', '.join(top.joint_names)}")
     row = top.joint_row[top.joint_names.index(name)]
     return slice(starts[row], starts[row] + widths[top.kind[row]])
+
+
+def body_or_site(chain: Chain, name: Any) -> FixedFrame:
+    """Return the frame of a body, or of a site of the model; the body's if both have the name."""
+    top = chain.topology
+    if isinstance(name, str) and name in top.body_names:
+        return FixedFrame(top.body_row[top.body_names.index(name)])
+    if isinstance(name, str) and name in top.site_names:
+        return top.site_frames[top.site_names.index(name)]
+    kind = "body or site" if top.site_names else "body"
+    raise unknown_name(kind, name, top.body_names + top.site_names)
 
 
 def body_rows(chain: Chain, *bodies: str) -> list[int]:
