@@ -37,6 +37,8 @@ class Topology:
     model_v: index in v of each entry of the model's qvel.
     link_actuated: whether a motor drives the coordinates of each virtual link.
     massless_dofs: the tree's coordinates along which the joint's own body has almost no inertia.
+    link_as_loaded: whether the place of each virtual link on its real link was not declared, but is
+        where its parent is in the load pose. (Without a place on a site it is the site's origin.)
     """
 
     body_names: tuple[str, ...]
@@ -58,6 +60,7 @@ class Topology:
     model_v: tuple[int, ...] = ()
     link_actuated: tuple[bool, ...] = ()
     massless_dofs: tuple[int, ...] = ()
+    link_as_loaded: tuple[bool, ...] = ()
 
     @functools.cached_property
     def _hash(self) -> int:
