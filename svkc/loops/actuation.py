@@ -67,7 +67,7 @@ class Actuation(Printed):
         round_off = np.finfo(tau.dtype).eps ** 0.5 * max(np.abs(tau).max(initial=0), 1)
         driven = np.any(tau != 0, tuple(range(len(shape))))
         missed = np.any(np.abs(residual) > round_off, tuple(range(len(shape))))
-        shown = np.flatnonzero(driven | missed).tolist()
+        shown = np.flatnonzero(np.logical_or(driven, missed)).tolist()
         others = f"no torque on {count(len(names.v) - len(shown), 'other joint coordinate')}"
         numbers = {
             "rank of S": self.rank,
@@ -76,7 +76,8 @@ class Actuation(Printed):
         }
         if not shape:
             counts = ", ".join(f"{name} {int(x)}" for name, x in numbers.items())
-            rows = [(names.v[i], units[i], number(tau[i]), number(residual[i])) for i in shown]
+            rest = np.where(missed, residual, 0)
+            rows = [(names.v[i], units[i], number(tau[i]), number(rest[i])) for i in shown]
             titles = "joint", "unit", "torque or force", "residual"
             return [f"Actuation: {counts}", *[Table(titles, rows)] * bool(rows), others]
         numbers |= {"largest residual (N m, N)": np.abs(residual).max(-1)}

@@ -16,11 +16,16 @@ _FREEDOMS = ("rx", "ry", "rz", "x", "y", "z")
 def chain_summary(chain: Any) -> str:
     """Return one line: how many bodies, joints, virtual links and freedoms a chain has."""
     top = chain.topology
-    return (
-        f"Chain: {len(top.body_names) - 1} bodies, {count(len(top.joint_names), 'joint')},"
-        f" {count(len(top.link_names), 'virtual link')}; {top.nv} joint freedoms in the tree,"
-        f" {top.dofs} with every virtual link; {count(chain.gear.shape[-2], 'actuator')}"
-    )
+    bodies = len(top.body_names) - 1
+    parts = [
+        f"{bodies} {'body' if bodies == 1 else 'bodies'}",
+        count(len(top.joint_names), "joint"),
+        count(len(top.link_names), "virtual link"),
+        count(chain.gear.shape[-2], "actuator"),
+        f"{count(top.nv, 'joint freedom')} in the tree",
+        f"{top.dofs} with every virtual link",
+    ]
+    return f"Chain: {', '.join(parts)}"
 
 
 def chain_blocks(chain: Any) -> list[Block]:

@@ -33,8 +33,11 @@ class Table:
 
     @property
     def columns_of_numbers(self) -> list[bool]:
-        """Whether each column has numbers only."""
-        return [all(map(_is_number, column)) for column in zip(*self.rows, strict=True)]
+        """Whether each column has numbers only; "" and "-" stand for none."""
+        return [
+            any(map(_is_number, column)) and all(x in ("", "-") or _is_number(x) for x in column)
+            for column in zip(*self.rows, strict=True)
+        ]
 
     def as_text(self) -> str:
         """Return the table as lines of text."""
@@ -180,11 +183,12 @@ def ranges(values: dict[str, Any], most: int = 40) -> Table:
 
 
 def _is_number(cell: str) -> bool:
-    """Return whether a cell has a number, or stands for none."""
+    """Return whether a cell has a number."""
     try:
-        return cell in ("", "-") or float(cell) is not None
+        float(cell)
     except ValueError:
         return False
+    return True
 
 
 def _escape(text: str) -> str:

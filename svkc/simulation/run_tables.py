@@ -92,7 +92,9 @@ def joint_table(traj: Any) -> Table:
             continue
         k = names.v.index(name)
         ends = q[0, i], q[-1, i], q[:, i].min(), q[:, i].max(), np.abs(v[:, k]).max()
-        rows.append((name, "rad" if names.angular[k] else "m", *map(number, ends)))
+        # without the round-off of coordinates that are zero
+        numbers = (number(np.round(x, 9) + 0.0) for x in ends)
+        rows.append((name, "rad" if names.angular[k] else "m", *numbers))
     titles = "joint", "unit", "at the first\nsave time", "at the last", "min", "max"
     return Table((*titles, "largest speed\nunit/s"), rows, MOST_ROWS)
 
