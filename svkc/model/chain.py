@@ -1,4 +1,4 @@
-"""The bodies of a scene and the joints between them (`Chain`)."""
+"""The bodies of a scene and the joints between them (`Chain`, for the life of the scene)."""
 
 from typing import Any
 
@@ -7,16 +7,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from svkc.model.chain_names import ChainNames, chain_names
 from svkc.model.chain_tables import chain_blocks, chain_summary
 from svkc.model.link_pointers import link_pointers
+from svkc.model.named_access import NamedAccess
+from svkc.model.parameters import BodyParameters, body_parameters, with_parameters
 from svkc.model.state import State, Structure
 from svkc.model.tables import Block, Printed, is_readable
-from svkc.model.topology import FREE, Topology
+from svkc.model.topology import FREE
 from svkc.model.validation import real_array
 
 
-class Chain(Printed):
+class Chain(Printed, NamedAccess):
     """The bodies of a scene and the joints between them, made by `svkc.load`.
 
     Floats are differentiable leaves. There is one row for each joint or fixed body of the tree
@@ -48,7 +49,6 @@ class Chain(Printed):
     left_out: one line for each kind of element of the model that svkc cannot simulate.
     """
 
-    topology: Topology = eqx.field(static=True)
     pos: Float[Array, "rows 3"]
     quat: Float[Array, "rows 4"]
     axis: Float[Array, "rows 3"]
@@ -79,47 +79,8 @@ class Chain(Printed):
         return f"<{chain_summary(self)}>" if is_readable(self) else super().__repr__()
 
     @property
-    def names(self) -> ChainNames:
-        """Names of the bodies, joints, virtual links and coordinates, as results keep them."""
-        return chain_names(self.topology)
-
-    @property
-    def body_names(self) -> tuple[str, ...]:
-        """Names of the bodies in the model's order; the first is the world."""
-        return self.topology.body_names
-
-    @property
-    def joint_names(self) -> tuple[str, ...]:
-        """Names of the tree's joints in the model's order."""
-        return self.topology.joint_names
-
-    @property
-    def link_names(self) -> tuple[str, ...]:
-        """Names of the virtual links, in the order of `Structure`'s entries."""
-        return self.topology.link_names
-
-    @property
-    def dof_names(self) -> tuple[str, ...]:
-        """Names of the joint coordinates, in the order of `State.v`.
-
-        A joint with several coordinates appends .x, .y, .z (translations) and .rx, .ry, .rz.
-        """
-        return self.names.v
-
-    @property
-    def nq(self) -> int:
-        """Number of the tree's coordinates q: MuJoCo's nq if no joint is cuttable."""
-        return self.topology.nq
-
-    @property
-    def nv(self) -> int:
-        """Number of the tree's velocities v: MuJoCo's nv if no joint is cuttable."""
-        return self.topology.nv
-
-    @property
-    def dofs(self) -> int:
-        """Number of all joint coordinates: the tree's, then the virtual links'; the length of v."""
-        return self.topology.dofs
+    def _dtype(self) -> np.dtype:
+        return self.q_load.dtype
 
     @property
     def symmetric_inertia(self) -> Float[Array, "rows 3 3"]:
@@ -164,6 +125,27 @@ class Chain(Printed):
             driven = jnp.asarray(np.append(not_free, np.zeros(top.dofs - top.nv, bool)))
             driven = driven | top.link_dof_mask(np.array(top.link_child, int) >= 0)
         return driven | top.link_dof_mask(np.array(top.link_actuated, bool))
+
+    def body(self, name: str) -> BodyParameters:
+        """Return the mass, centre of mass, inertia and placement of a body, by its name.
+
+        Raises ValueError, with the nearest names, if there is no such body.
+        """
+        return body_parameters(self, name)
+
+    def replace(self, *, scale_inertia: bool = False, **parameters: Any) -> "Chain":
+        """Return the chain with other parameters, each given by name or as the whole array.
+
+        parameters: `mass={"ball": 2.0}` sets the entries of the bodies or joints named, and
+            `gravity=[0, 0, -1.6]` a whole array. By body name: `mass` (kg), `com` (m), `inertia`
+            (kg m^2, [3 3], or [3] on the diagonal), `pos` (m), `quat` (wxyz). By joint name:
+            `axis`, `armature`, `damping`, `stiffness`, `q_spring`, `limit` (lower and upper end).
+            Any other array of the chain as a whole. All values may be traced.
+        scale_inertia: scale the inertia of each body named in `mass` by the ratio of its masses.
+
+        Raises ValueError if a name is unknown, a shape is wrong, or a number is not finite.
+        """
+        return with_parameters(self, parameters, scale_inertia)
 
     def motors(self, u: Any) -> Float[Array, " dofs"]:
         """Return the joint torques (N m, N) of the model's actuators: gear times clipped controls.

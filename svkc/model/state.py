@@ -1,5 +1,5 @@
-"""How bodies are joined, for one phase (`Structure`), and how they move, at one instant
-(`State`)."""
+"""How the bodies are joined (`Structure`, for one phase) and how they move (`State`, at one
+instant)."""
 
 import equinox as eqx
 from jaxtyping import Array, Bool, Float, Int

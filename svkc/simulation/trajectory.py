@@ -40,6 +40,8 @@ class Trajectory(Printed):
     events: records of the events.
     phases: records of the phases.
     final, t_final: state and time at the end of the run.
+    work: done from the start to each save time by control, by dampers and by joint limits (J). None
+        in files of older versions.
     result: how the run ended.
     derivative: `svkc.types.DERIVATIVE.successful` if the run has derivatives; otherwise why not: a
         guard that grazed zero or jumped, simultaneous events, or a loss of rank.
@@ -56,6 +58,7 @@ class Trajectory(Printed):
     t_final: Float[Array, ""]
     result: RESULTS
     derivative: DERIVATIVE
+    work: Float[Array, "times 3"] | None = None
     names: ChainNames | None = eqx.field(static=True, default=None)
 
     def _blocks(self) -> list[Block]:

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import svkc
-from svkc.model.names import joint_slice
 from svkc.model.topology import Q_SIZE, V_SIZE
 
 TREE = (
@@ -53,11 +52,13 @@ def test_ranges_are_those_of_the_joints(chain):
         (names.v_ranges, V_SIZE, top.v_start),
     ):
         ranges = {name: slice(start, stop) for name, start, stop in ranges}
-        for joint in (*chain.joint_names, "bend", "turn"):
-            assert ranges[joint] == joint_slice(chain, joint, widths, starts)
+        for joint, row in zip(chain.joint_names, top.joint_row, strict=True):
+            width = widths[top.kind[row]]
+            assert ranges[joint] == slice(starts[row], starts[row] + width), joint
         assert ranges["weld"].start == ranges["weld"].stop
     labels = {name: names.q[start:stop] for name, start, stop in names.q_ranges}
     assert labels["cylinder"] == ("cylinder.rz", "cylinder.z")
+    assert (labels["bend"], labels["turn"]) == (("bend",), ("turn",))
 
 
 def test_names_are_static_and_equal_for_equal_chains(chain):
