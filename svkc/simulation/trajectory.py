@@ -15,7 +15,7 @@ from svkc.model.annotations import Function, Path, Scalar
 from svkc.model.chain import Chain
 from svkc.model.chain_names import ChainNames
 from svkc.model.state import State
-from svkc.model.tables import Block, Printed, is_readable, lane_index
+from svkc.model.tables import Block, Printed, is_readable, lane_index, number
 from svkc.model.validation import scalar
 from svkc.simulation.codes import DERIVATIVE, RESULTS
 from svkc.simulation.non_finite import trace_non_finite
@@ -70,6 +70,9 @@ class Trajectory(Printed):
             blocks.append(event_table(self))
         if self.names and np.size(self.ts):
             blocks.append(joint_table(self))
+        if self.work is not None and np.any(self.work):
+            control, dampers, limits = map(number, np.asarray(self.work)[-1])
+            blocks.append(f"work (J): control {control}, dampers {dampers}, joint limits {limits}")
         return [*blocks, report.verdict()]
 
     def __repr__(self) -> str:
