@@ -162,6 +162,11 @@ def plot_without_matplotlib(s):
         s.short().plot()
 
 
+def batch_of(traj):
+    """Return a batch of two equal runs."""
+    return jax.tree.map(lambda x: jnp.stack([x, x]), traj)
+
+
 CASES = {
     "pictures need": plot_without_matplotlib,
     "... holds no model": load_chain_without_model,
@@ -178,6 +183,9 @@ CASES = {
     "... has the ...": lambda s: s.file(
         metadata=np.array('{"schema": 6, "result": "exploded", "derivative": "successful"}')
     ),
+    "traj[...]: expected": lambda s: batch_of(s.short())[...],
+    "traj[...]: no such": lambda s: batch_of(s.short())[2],
+    "traj[...]: this is": lambda s: s.short()[0],
     "... has schema": lambda s: s.file(metadata=np.array('{"schema": 99}')),
     "... is not a complete trajectory": lambda s: s.file(metadata=None),
     "... lacks": lambda s: s.file(ts=None),
