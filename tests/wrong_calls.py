@@ -277,6 +277,13 @@ CASES = {
     "...: expected a path": lambda s: svkc.load_trajectory(3),
     "leaves: axis": lambda s: svkc.leaves(s.four, "pin", axis=(0, 0, 0)),
     "mode: got": lambda s: svkc.check_grad(lambda x: x, jnp.asarray(1.0), mode="sideways"),
+    "after: expected": lambda s: svkc.at(0.1, cut="pin", after=0.2),
+    "after: the event": lambda s: s.simulate(
+        events=svkc.at(0.1, cut="pin", after=svkc.at(0.1, stop=True))
+    ),
+    "at: got time ... after": lambda s: s.simulate(
+        events=[first := svkc.at(0.1, cut="pin"), svkc.at(-0.1, stop=True, after=first)]
+    ),
     "...: ... is a cuttable": lambda s: s.load(cuttable="rocker").replace(
         axis={"rocker": [0, 0, 1]}
     ),
