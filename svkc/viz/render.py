@@ -10,6 +10,7 @@ from svkc.model.checked_jit import check_chain
 from svkc.model.validation import integer, names, positive_scalar, scalar, vector
 from svkc.simulation.trajectory import Trajectory
 from svkc.viz.html_page import write_page
+from svkc.viz.meshes import MIN_FACES
 from svkc.viz.shapes import check_single_run
 
 
@@ -28,7 +29,7 @@ def render(
     chain: Chain, traj: Trajectory, path: Path, *, fps: Scalar = 25, frames: Integer = 10,
     size: Numbers = (640, 480), trails: Names = (), camera: str | None = None,
     lookat: Numbers | None = None, distance: Scalar | None = None, azimuth: Scalar = 90,
-    elevation: Scalar = -8,
+    elevation: Scalar = -8, max_faces: Integer = 20_000,
 ) -> pathlib.Path:  # fmt: skip
     """Write a picture of a run in the format of the path's suffix, and return the path.
 
@@ -45,34 +46,34 @@ def render(
     lookat: point at which the free camera looks (m, ground frame). None: the middle of the motion.
     distance: distance of the free camera from `lookat` (m). None: the whole motion is in view.
     azimuth, elevation: direction of the free camera (degrees), as in MuJoCo.
+    max_faces: meshes with more faces are drawn in a page with at most this number, as `svkc.show`
+        does; at least 100.
 
     Raises ValueError if the suffix is unknown, `traj` is a batch, a name does not exist, or a
     number is invalid. Raises RuntimeError, which names the missing packages, if a GL library,
     matplotlib, Pillow or imageio-ffmpeg is not installed.
     """
-    from svkc.viz import animation, plots
+    from svkc.viz import animation
+    from svkc.viz.strobe import strobe
 
     check_chain(chain)
     check_single_run(traj)
     frames, rate = integer("frames", frames, 1), float(positive_scalar("fps", fps))
     path = pathlib.Path(os.fspath(path))
     size = tuple(integer("size", n, 16, 8192) for n in vector("size", size, 2))
-    trails = names("trails", trails)
-    camera_options = {"camera": camera, **_free_camera(lookat, distance, azimuth, elevation)}
-    if path.suffix != ".html":
-        _require_packages()
-    if path.suffix == ".png":
-        return plots.strobe(chain, traj, path, frames)
-    if path.suffix == ".html":
-        return write_page(chain, traj, path)
-    writer = {".gif": animation.write_gif, ".mp4": animation.write_mp4}.get(path.suffix)
-    if writer is None:
+    trails, max_faces = names("trails", trails), integer("max_faces", max_faces, MIN_FACES)
+    view = {"camera": camera, **_free_camera(lookat, distance, azimuth, elevation)}
+    if path.suffix not in (".png", ".gif", ".mp4", ".html"):
         raise ValueError(f"render: {path.name} should end in .png, .gif, .mp4 or .html")
-    writer(
-        path,
-        animation.frames(chain, traj, fps=rate, size=size, trails=trails, **camera_options),
-        rate,
-    )
+    if path.suffix == ".html":
+        return write_page(chain, traj, path, max_faces)
+    _require_packages()
+    if path.suffix == ".png":
+        strobe(chain, traj, frames).savefig(path, dpi=110, bbox_inches="tight")
+    else:
+        images = animation.frames(chain, traj, fps=rate, size=size, trails=trails, **view)
+        write = animation.write_gif if path.suffix == ".gif" else animation.write_mp4
+        write(path, images, rate)
     return path
 
 
