@@ -32,12 +32,19 @@ def _nodes(kind):
 
 
 def messages() -> set[str]:
-    """Return the message of every raised exception, on one line."""
-    raised = (node.exc for node in _nodes(ast.Raise))
+    """Return the message of every exception that is raised or returned, on one line.
+
+    `unknown_name` returns one, of which the arguments are no messages.
+    """
+    raised = [node.exc for node in _nodes(ast.Raise)]
+    returned = [node.value for node in _nodes(ast.Return)]
+    name = lambda call: ast.unparse(call.func)
     return {
         " ".join(_text(call.args[0]).split())
-        for call in raised
-        if isinstance(call, ast.Call) and call.args
+        for call in [*raised, *returned]
+        if isinstance(call, ast.Call)
+        and call.args
+        and (name(call).endswith("Error") if call in returned else name(call) != "unknown_name")
     }
 
 

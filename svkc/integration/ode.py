@@ -14,14 +14,14 @@ Times: TypeAlias = tuple[Float[Array, ""], Float[Array, ""], Float[Array, " time
 
 
 class ODEState(eqx.Module):
-    """The integrated state: q, v and the work (J) done by control, joint limits and dampers.
+    """The integrated state: q, v and the work (J) done by control, by dampers and by joint limits.
 
-    work: None where the scene has neither control nor joint limits nor dampers.
+    work: None where the scene has neither control nor dampers nor joint limits.
     """
 
     q: Float[Array, " q"]
     v: Float[Array, " dofs"]
-    work: Float[Array, ""] | None = None
+    work: Float[Array, "3"] | None = None
 
 
 class FieldArgs(eqx.Module):

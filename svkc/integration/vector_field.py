@@ -1,6 +1,6 @@
 """The vector field of one phase, and the projection of its states onto closed loops."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -97,13 +97,13 @@ class VectorField(eqx.Module):
 
     def torques(
         self, t: Scalar, y: ODEState, field_args: FieldArgs
-    ) -> tuple[Float[Array, " dofs"], Float[Array, ""] | None]:
-        """Return the joint torques (N m, N) of control and joint limits, and their power (W).
+    ) -> tuple[Float[Array, " dofs"], Float[Array, "3"] | None]:
+        """Return the joint torques (N m, N) of control and joint limits, and the power (W).
 
-        The power is that of control, joint limits and dampers, None where `y.work` is None.
+        The power is that of control, of dampers and of joint limits, None where `y.work` is None.
         """
         chain = field_args.chain
-        tau = jnp.zeros_like(y.v)
+        tau = at_limits = jnp.zeros_like(y.v)
         if self.control is not None:
             # The jit makes all call sites share one trace.
             controlled = eqx.filter_jit(self.control)(
@@ -111,20 +111,23 @@ class VectorField(eqx.Module):
             )
             tau = tau + _control_torques(chain, controlled, y.v.dtype)
         if chain.limit is not None:
-            tau = tau + limit_forces(chain, y.q, y.v)
+            at_limits = limit_forces(chain, y.q, y.v)
         if y.work is None:
-            return tau, None
+            return tau + at_limits, None
         v = jnp.where(active_dofs(chain, field_args.structure), y.v, 0)
-        return tau, tau @ v if chain.damping is None else tau @ v - jnp.sum(chain.damping * v * v)
+        of_dampers = jnp.zeros_like(v) if chain.damping is None else -chain.damping * v
+        return tau + at_limits, jnp.stack([tau, of_dampers, at_limits]) @ v
 
 
 def _control_torques(chain: Chain, value, dtype) -> Float[Array, " dofs"]:
     """Return what the user's control returned as torques over every coordinate."""
+    if isinstance(value, Mapping):
+        return chain.torques(value).astype(dtype)
     tau = as_array(value)
     if not is_real(tau) or tau.shape not in ((chain.dofs,), (chain.nv,)):
         raise ValueError(
             f"control: expected control(t, state, args) to return {chain.dofs} joint torques (or"
-            f" {chain.nv}, the tree's), got {description(value)}"
+            f" {chain.nv}, the tree's), or a dict by joint name, got {description(value)}"
         )
     return torques_over_dofs(chain, jnp.asarray(tau, dtype))
 

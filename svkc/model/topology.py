@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from typing import NamedTuple
 
 import numpy as np
 
@@ -9,6 +10,19 @@ import numpy as np
 FIXED, HINGE, SLIDE, BALL, FREE = range(5)
 Q_SIZE = (0, 1, 1, 4, 7)
 V_SIZE = (0, 1, 1, 3, 6)
+
+
+class FixedFrame(NamedTuple):
+    """A frame fixed in a row: of a site of the model, or of a body.
+
+    row: the row.
+    pos: origin in the row's frame (m).
+    quat: orientation in the row's frame (wxyz).
+    """
+
+    row: int
+    pos: tuple[float, ...] = (0.0, 0.0, 0.0)
+    quat: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,6 +51,8 @@ class Topology:
     model_v: index in v of each entry of the model's qvel.
     link_actuated: whether a motor drives the coordinates of each virtual link.
     massless_dofs: the tree's coordinates along which the joint's own body has almost no inertia.
+    site_names: names of the model's sites.
+    site_frames: frame of each site.
     """
 
     body_names: tuple[str, ...]
@@ -58,6 +74,8 @@ class Topology:
     model_v: tuple[int, ...] = ()
     link_actuated: tuple[bool, ...] = ()
     massless_dofs: tuple[int, ...] = ()
+    site_names: tuple[str, ...] = ()
+    site_frames: tuple[FixedFrame, ...] = ()
 
     @functools.cached_property
     def _hash(self) -> int:
@@ -139,28 +157,6 @@ class Topology:
         table, mask = self.links.dof[links], np.zeros(self.dofs, bool)
         mask[table[table < self.dofs]] = True
         return mask
-
-    @functools.cached_property
-    def dof_names(self) -> tuple[str, ...]:
-        """Names of the joint coordinates; see `Chain.dof_names`."""
-        names = [""] * self.dofs
-        rotations, translations = (".rx", ".ry", ".rz"), (".x", ".y", ".z")
-        suffixes = {HINGE: ("",), SLIDE: ("",), BALL: rotations, FREE: translations + rotations}
-        for name, row in zip(self.joint_names, self.joint_row, strict=True):
-            for k, suffix in enumerate(suffixes[self.kind[row]]):
-                names[self.v_start[row] + k] = name + suffix
-        for name, dofs in zip(self.link_names, self.links.dof, strict=True):
-            own = [
-                (d, suffix)
-                for d, suffix in zip(dofs, rotations + translations, strict=True)
-                if d < self.dofs
-            ]
-            for d, suffix in own:
-                names[d] = name + (suffix if len(own) > 1 else "")
-        for name, link, freedom in self.cuttable_joints:
-            if sum(self.link_freedoms[link]) < 3:
-                names[self.links.dof[link, freedom]] = name
-        return tuple(names)
 
     @functools.cached_property
     def scalar_coordinates(self) -> tuple[np.ndarray, np.ndarray]:

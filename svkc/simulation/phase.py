@@ -37,19 +37,19 @@ from svkc.transitions.plan import Plan
 class RunState(eqx.Module):
     """The state of a run between two phases.
 
-    work: done so far by control, joint limits and dampers (J).
+    work: done so far by control, by dampers and by joint limits (J).
     guard_values: at the end of the last phase.
     stale: which guard values are re-evaluated at the start of the next phase.
     pending: which timed events have not happened yet.
     count: number of phases so far.
-    saved: states at the save times.
+    saved, saved_work: states and work at the save times.
     derivative, invalid_from: why the run has no derivative, and the index of the first phase for
         which this is so.
     """
 
     t: Float[Array, ""]
     state: State
-    work: Float[Array, ""] | None
+    work: Float[Array, "3"] | None
     guard_values: Float[Array, " guards"] | None
     stale: Bool[Array, " guards"] | None
     pending: Bool[Array, " timed"]
@@ -57,6 +57,7 @@ class RunState(eqx.Module):
     records: PhaseRecords
     count: Int[Array, ""]
     saved: State
+    saved_work: Float[Array, "times 3"] | None
     result: RESULTS
     derivative: DERIVATIVE
     invalid_from: Int[Array, ""]

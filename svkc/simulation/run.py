@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.pytrees import stop_gradient_tree
 from svkc.integration.event_location import GuardValues, event_tolerance
@@ -56,7 +56,7 @@ def initial_run_state(
     return RunState(
         t=t0,
         state=state,
-        work=jnp.zeros((), dtype) if options.has_work else None,
+        work=jnp.zeros(3, dtype) if options.has_work else None,
         guard_values=jnp.asarray(initial, dtype) if plan.guards else None,
         stale=jnp.asarray(reevaluated_guards(plan)) if plan.guards else None,
         pending=jnp.ones(len(plan.timed), bool),
@@ -64,6 +64,7 @@ def initial_run_state(
         records=empty_phase_records(rows + 1, state),
         count=jnp.asarray(0, jnp.int32),
         saved=jax.tree.map(lambda x: jnp.broadcast_to(x[None], (ts.shape[0], *x.shape)), state),
+        saved_work=jnp.zeros((ts.shape[0], 3), dtype) if options.has_work else None,
         result=initial_result(chain, times, plan, options),
         derivative=DERIVATIVE.successful,
         invalid_from=jnp.asarray(rows + 1, jnp.int32),
@@ -142,11 +143,11 @@ def run_phase(
     outcome = solve_phase(run, stop, ts, plan, options, FieldArgs(chain, run.state.structure, args))
     timed, fired = _fired_events(run, outcome, active, plan)
     end_state = State(outcome.y.q, outcome.y.v, run.state.structure)
-    saved = _write_saved_states(run, end_state, outcome, ts)
+    saved, saved_work = _write_saved_states(run, end_state, outcome, ts)
     row = (jnp.arange(run.records.start.shape[0]) == index) & active
     work = jnp.zeros_like(run.t)
     if run.work is not None and outcome.y.work is not None:
-        work = outcome.y.work - run.work
+        work = jnp.sum(outcome.y.work - run.work)
     records = write_phase_row(
         run.records, row, (run.t, run.state), (outcome.t, end_state), work, outcome.solution
     )
@@ -169,6 +170,7 @@ def run_phase(
         records=records,
         count=run.count + active.astype(jnp.int32),
         saved=saved,
+        saved_work=saved_work,
         result=result,
         derivative=derivative,
         invalid_from=invalid_from,
@@ -203,17 +205,25 @@ def _check_derivative(
     )
 
 
-def _write_saved_states(run: RunState, end_state: State, outcome: PhaseOutcome, ts) -> State:
-    """Return the saved states with those of a phase written.
+def _write_saved_states(
+    run: RunState, end_state: State, outcome: PhaseOutcome, ts
+) -> tuple[State, Float[Array, "times 3"] | None]:
+    """Return the saved states, and the saved work, with those of a phase written.
 
     They are at the save times from its start to its end, both included. Rows of later save times
-    hold the state at its end until a later phase overwrites them.
+    hold the state and the work at its end until a later phase overwrites them.
     """
     within, later = ((ts >= run.t) & (ts <= outcome.t))[:, None], (ts > outcome.t)[:, None]
-    q = jnp.where(within, outcome.ys.q, jnp.where(later, end_state.q[None], run.saved.q))
-    v = jnp.where(within, outcome.ys.v, jnp.where(later, end_state.v[None], run.saved.v))
+    rows = lambda at_saves, at_end, old: jnp.where(
+        within, at_saves, jnp.where(later, at_end[None], old)
+    )
+    q = rows(outcome.ys.q, end_state.q, run.saved.q)
+    v = rows(outcome.ys.v, end_state.v, run.saved.v)
+    work = None
+    if run.saved_work is not None:
+        work = rows(outcome.ys.work, outcome.y.work, run.saved_work)
 
     def write(new, old):
         return jnp.where((ts >= run.t).reshape(-1, *(1,) * new.ndim), new[None], old)
 
-    return State(q, v, jax.tree.map(write, end_state.structure, run.saved.structure))
+    return State(q, v, jax.tree.map(write, end_state.structure, run.saved.structure)), work

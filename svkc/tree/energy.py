@@ -1,5 +1,6 @@
 """Energy and momentum of the tree. Virtual links have no mass and take no part."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -42,7 +43,9 @@ def _energies(
     potential = -jnp.sum(chain.mass * jnp.sum((kin.root_position + c) * chain.gravity[None], -1))
     if chain.stiffness is not None:
         stretch = difference(chain, chain.q_spring, state.q)
-        stretch = jnp.where(active_dofs(chain, state.structure), stretch, 0)
+        # the springs of cut joints are gone; those of locked joints stay stretched
+        existing = active_dofs(chain, replace(state.structure, locked=None))
+        stretch = jnp.where(existing, stretch, 0)
         potential = potential + jnp.sum(chain.stiffness * stretch**2) / 2
     return kinetic, potential
 
