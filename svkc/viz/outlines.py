@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from svkc.mjcf.bodies import rotation_matrix
+from svkc.model.chain import Chain
 from svkc.viz.meshes import cluster, load_mesh, mesh_key
 
 # directions in the x-z plane in which an outline is computed, counter-clockwise
@@ -166,3 +167,32 @@ def bounds(shapes: list[Shape], positions: np.ndarray, R: np.ndarray) -> np.ndar
         find(np.stack([find(x.reshape(-1, 3), 0) for x in corners]), 0) for find in (np.min, np.max)
     )
     return np.stack([low, high])
+
+
+def ground_and_bodies(chain: Chain, cell: float) -> tuple[list[Shape], list[Shape]]:
+    """Return the visible shapes that are fixed to the ground, and those of moving bodies.
+
+    cell: as in `shapes`.
+    """
+    model = chain.model.model
+    ground, bodies = [], []
+    for shape in shapes(model, cell):
+        (ground if model.body_weldid[shape.body] == 0 else bodies).append(shape)
+    return ground, bodies
+
+
+def motion_box(ground: list[Shape], bodies: list[Shape], positions, R) -> np.ndarray:
+    """Return the lowest and the highest coordinates [2 3] of what a picture of the run shows (m).
+
+    The ground counts up to a quarter of the bodies' largest extent beyond the bodies: a long floor
+    would make the bodies small.
+
+    positions, R: result of `positions_and_rotations`.
+    """
+    low, high = bounds(bodies, positions, R)
+    if ground:
+        margin = (high - low).max() / 4
+        lowest, highest = bounds(ground, positions[:1], R[:1]).clip(low - margin, high + margin)
+        low, high = np.minimum(low, lowest), np.maximum(high, highest)
+    # a body that is a point at rest has no extent
+    return np.stack([low, high]) if np.any(high > low) else np.stack([low - 1, high + 1])

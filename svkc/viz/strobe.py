@@ -7,7 +7,7 @@ import numpy as np
 
 from svkc.model.chain import Chain
 from svkc.simulation.trajectory import Trajectory
-from svkc.viz.outlines import Shape, bounds, outlines, shapes
+from svkc.viz.outlines import Shape, ground_and_bodies, motion_box, outlines
 from svkc.viz.shapes import (
     color,
     connected_link_positions,
@@ -38,9 +38,11 @@ def strobe(chain: Chain, traj: Trajectory, frames: int) -> Any:
     colors = {s: color(n) for n, s in enumerate(dict.fromkeys(structures))}
     figure = Figure(figsize=(10, 7.5))
     axes = figure.add_subplot(aspect="equal", xlabel="x (m)", ylabel="z (m)")
-    ground, bodies = _ground_and_bodies(chain)
-    low, high = _axis_limits(ground, bodies, positions, R)
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    # meshes are clustered to about a pixel
+    ground, bodies = ground_and_bodies(chain, float(chain.length) / 100)
+    box = motion_box(ground, bodies, positions, R)[:, [0, 2]]
+    margin = 0.06 * np.ptp(box, axis=0).max() * np.array([[-1], [1]])
+    axes.set(xlim=(box + margin)[:, 0], ylim=(box + margin)[:, 1])
     for shape in ground:
         # the edge shows planes, which are seen edge-on
         _draw(axes, [shape], positions[0][shape.body], R[0][shape.body], GROUND_COLOR, edge=1.5)
@@ -69,33 +71,6 @@ def _structures(traj: Trajectory) -> tuple[np.ndarray, list[tuple[int, ...]]]:
     if links[-1] == links[-2]:
         return starts, links[:-1]
     return np.append(starts, float(traj.t_final)), links
-
-
-def _ground_and_bodies(chain: Chain) -> tuple[list[Shape], list[Shape]]:
-    """Return the shapes that are fixed to the ground, and those of moving bodies."""
-    model = chain.model.model
-    # meshes are clustered to about a pixel
-    everything = shapes(model, float(chain.length) / 100)
-    fixed = [model.body_weldid[shape.body] == 0 for shape in everything]
-    return (
-        [shape for shape, at_rest in zip(everything, fixed, strict=True) if at_rest],
-        [shape for shape, at_rest in zip(everything, fixed, strict=True) if not at_rest],
-    )
-
-
-def _axis_limits(ground, bodies, positions, R) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lower and the upper limits of x and z (m).
-
-    The ground counts up to a quarter of the bodies' largest extent beyond the bodies: a long floor
-    would make the bodies small.
-    """
-    low, high = bounds(bodies, positions, R)[:, [0, 2]]
-    largest = (high - low).max()
-    if ground:
-        ends = bounds(ground, positions[:1], R[:1])[:, [0, 2]]
-        ends = ends.clip(low - largest / 4, high + largest / 4)
-        low, high = np.minimum(low, ends[0]), np.maximum(high, ends[1])
-    return low - 0.06 * largest, high + 0.06 * largest
 
 
 def _pale(hexadecimal: str, opacity: float) -> np.ndarray:
