@@ -250,7 +250,7 @@ def _write_results(
     written, failures = [out / f"{stem}.npz"], []
     traj.save(written[0], chain, **options)
     curves = lambda path: traj.plot(chain).savefig(path, dpi=110)
-    draw = lambda path: svkc.render(chain, traj, path, azimuth=90)
+    draw = lambda path: svkc.render(chain, traj, path)
     pictures = [
         (f"{stem}.png", draw),
         (f"{stem}_curves.png", curves),

@@ -11,42 +11,33 @@ from svkc.mjcf.bodies import rotation_matrix
 from svkc.model.annotations import Checked, Names
 from svkc.model.chain import Chain
 from svkc.simulation.trajectory import Trajectory
+from svkc.viz.offscreen import add_line, add_sphere, offscreen
+from svkc.viz.outlines import ground_and_bodies, motion_box
 from svkc.viz.shapes import (
     color,
     connected_link_positions,
     event_descriptions,
     positions_and_rotations,
+    saved_states,
 )
 
-GL_PACKAGES = "libegl1 libgl1"
 FLASH_DURATION = 0.3  # s after an event during which connected links are drawn large
-
-
-def _use_offscreen_context():
-    """Make MuJoCo's renderer use the first offscreen GL context whose library is installed.
-
-    Raises RuntimeError, which names the missing packages, if there is none.
-    """
-    import importlib
-
-    for module in ("mujoco.egl", "mujoco.osmesa"):
-        try:
-            context = importlib.import_module(module).GLContext
-        except (ImportError, AttributeError, RuntimeError, OSError, TypeError):
-            continue
-        importlib.import_module("mujoco.rendering.classic.gl_context").GLContext = context
-        return
-    raise RuntimeError(
-        f"no library to draw with: install the packages {GL_PACKAGES} (apt-get install"
-        f" --no-install-recommends {GL_PACKAGES})"
-    )
+# color of trails, of links and of the grid on the ground: red, green, blue, opacity
+RED, GREY = (0.9, 0.1, 0.1, 1), (0.6, 0.65, 0.71, 1)
 
 
 def write_gif(path: pathlib.Path, images: Iterator[Any], fps: float) -> None:
-    """Write a repeating gif with 96 colors a frame."""
+    """Write a repeating gif whose frames share 256 colors, with the error diffused."""
     from PIL import Image
 
-    first, *others = (image.quantize(96, Image.Quantize.MAXCOVERAGE) for image in images)
+    every = list(images)
+    # the colors are those of eight frames
+    some = [every[i] for i in np.linspace(0, len(every) - 1, 8).astype(int)]
+    sheet = Image.new("RGB", (some[0].width, 8 * some[0].height))
+    for k, image in enumerate(some):
+        sheet.paste(image, (0, k * image.height))
+    palette = sheet.quantize(256, Image.Quantize.MEDIANCUT)
+    first, *others = (image.quantize(palette=palette) for image in every)
     first.save(path, save_all=True, append_images=others, duration=round(1000 / fps), loop=0)
 
 
@@ -83,57 +74,52 @@ def write_mp4(path: pathlib.Path, images: Iterator[Any], fps: float) -> None:
 
 def frames(
     chain: Chain, traj: Trajectory, *, fps: float, size: Checked[Sequence[int]], trails: Names,
-    **camera_options: Any,
+    **view: Any,
 ) -> Iterator[Any]:  # fmt: skip
-    """Yield PIL images `1/fps` s apart, each of the saved state nearest in time.
+    """Yield PIL images `1/fps` s apart up to the end of the run, each of the nearest saved state.
 
     Connected virtual links are drawn as spheres. A strip below the image shows the time, the
-    connected links, the last event and a time line.
+    connected links, the last event and a time line. If the model has no plane, a grid shows the
+    ground.
 
     size: (width, height) of the image without its strip (pixels).
     trails: names of bodies whose paths up to the image's time are drawn.
-    view: arguments of `_choose_camera`.
+    view: arguments of `choose_camera`.
 
     Raises ValueError if a body or camera does not exist, RuntimeError if no GL library is
     installed.
     """
     import mujoco
-    from PIL import Image
 
     model = chain.model.model
     unknown = [name for name in trails if name not in chain.body_names]
     if unknown:
         raise ValueError(f"trails: no body {unknown[0]!r}; bodies: {', '.join(chain.body_names)}")
-    _configure_offscreen(model, size)
-    data = mujoco.MjData(model)
-    ts, (positions, R) = np.asarray(traj.ts), positions_and_rotations(chain, traj.states)
-    link_positions, events = (
-        connected_link_positions(chain, traj.states, positions, R),
-        event_descriptions(traj, chain),
-    )
-    camera = _choose_camera(model, positions, **camera_options)
-    _use_offscreen_context()
+    ts, _, states = saved_states(traj)
+    positions, R = positions_and_rotations(chain, states)
+    links = connected_link_positions(chain, states, positions, R)
+    events, data = event_descriptions(traj, chain), mujoco.MjData(model)
+    box = _box_of_run(chain, positions, R)
+    camera = choose_camera(model, box, size[0] / size[1], **view)
+    grid = [] if any(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) else _grid_lines(box)
     mujoco.mj_forward(model, data)
-    with mujoco.Renderer(model, height=size[1], width=size[0]) as renderer:
+    size_of_link = float(chain.length)
+    with offscreen(model, (size[0], size[1])) as draw:
         for t in np.arange(ts[0], ts[-1] + 0.5 / fps, 1 / fps):
             i = int(np.argmin(np.abs(ts - t)))
             _set_poses(model, data, positions[i], R[i])
-            renderer.update_scene(data, camera)
+            paths = [positions[: i + 1, chain.body_names.index(name)] for name in trails]
             just_changed = any(0 <= t - time < FLASH_DURATION for time, _ in events)
-            _draw_links(renderer.scene, link_positions[i], large=just_changed)
-            for k, name in enumerate(trails):
-                trail = positions[: i + 1, chain.body_names.index(name)]
-                _draw_trail(renderer.scene, trail, color(k))
-            image = Image.fromarray(renderer.render())
-            links = [chain.link_names[k] for k in link_positions[i]]
-            yield _add_caption(image, ts[i], ts[0], ts[-1], links, events)
 
+            def decorate(scene, i=i, paths=paths, just_changed=just_changed):
+                for start, stop in grid:
+                    add_line(scene, start, stop, GREY)
+                _draw_links(scene, links[i], (0.24 if just_changed else 0.13) * size_of_link)
+                _draw_trails(scene, paths, 0.02 * size_of_link)
 
-def _configure_offscreen(model, size):
-    """Make MuJoCo's offscreen buffer at least `size` pixels; disable shadows and multisampling."""
-    model.vis.quality.shadowsize = model.vis.quality.offsamples = 0
-    buffer = model.vis.global_
-    buffer.offwidth, buffer.offheight = np.maximum(size, (buffer.offwidth, buffer.offheight))
+            held_by = [chain.link_names[k] for k in links[i]]
+            image = draw(data, camera, decorate)
+            yield _add_caption(image, ts[i], ts[0], ts[-1], held_by, events)
 
 
 def _set_poses(model, data, positions: np.ndarray, R: np.ndarray):
@@ -149,74 +135,74 @@ def _set_poses(model, data, positions: np.ndarray, R: np.ndarray):
             xmat[k] = (R[body] @ rotation_matrix(quat[k])).ravel()
 
 
-def _choose_camera(model, positions, *, camera, lookat, distance, azimuth, elevation):
-    """Return the name of the model's camera, or a free camera that sees all body positions.
+def _box_of_run(chain: Chain, positions: np.ndarray, R: np.ndarray) -> np.ndarray:
+    """Return the lowest and the highest coordinates [2 3] of the bodies and the ground near (m)."""
+    some = np.unique(np.linspace(0, len(positions) - 1, 40).round().astype(int))
+    ground, bodies = ground_and_bodies(chain, float(chain.length) / 5)
+    return motion_box(ground, bodies, positions[some], R[some])
+
+
+def choose_camera(model, box, aspect: float, *, camera, lookat, distance, azimuth, elevation):
+    """Return the model's camera of a name, or a free camera that sees the whole box.
 
     Raises ValueError if the model has no camera of that name.
     """
     import mujoco
 
+    result = mujoco.MjvCamera()
     if camera is not None:
-        names = [model.camera(i).name for i in range(model.ncam)]
-        if camera not in names:
+        cameras = [model.camera(i).name for i in range(model.ncam)]
+        if camera not in cameras:
             raise ValueError(
-                f"camera: no camera {camera!r} in the model; cameras: {', '.join(names) or 'none'}"
+                f"camera: no camera {camera!r} in the model; cameras:"
+                f" {', '.join(cameras) or 'none'}"
             )
-        return camera
-    points = positions[:, 1:].reshape(-1, 3)
-    low, high = points.min(0), points.max(0)
-    free_camera = mujoco.MjvCamera()
-    free_camera.lookat[:] = (low + high) / 2 if lookat is None else lookat
-    free_camera.distance = float(np.linalg.norm(high - low)) + 1 if distance is None else distance
-    free_camera.azimuth, free_camera.elevation = azimuth, elevation
-    return free_camera
+        result.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        result.fixedcamid = cameras.index(camera)
+        return result
+    center = box.mean(0) if lookat is None else np.asarray(lookat, float)
+    a, e = np.deg2rad([float(azimuth), float(elevation)])
+    forward = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+    right = np.array([np.sin(a), -np.cos(a), 0])
+    corners = np.stack(np.meshgrid(*box.T), -1).reshape(-1, 3) - center
+    slope = np.tan(np.deg2rad(float(model.vis.global_.fovy)) / 2)
+    beside = np.maximum(abs(corners @ np.cross(right, forward)), abs(corners @ right) / aspect)
+    needed = np.max(1.02 * beside / slope - corners @ forward)
+    result.lookat[:] = center
+    result.distance = needed if distance is None else float(distance)
+    result.azimuth, result.elevation = float(azimuth), float(elevation)
+    return result
 
 
-def _rgba(hexadecimal: str, alpha: float):
-    """Return red, green, blue and opacity in [0, 1] for a color #rrggbb."""
-    return np.array(
-        [int(hexadecimal[k : k + 2], 16) / 255 for k in (1, 3, 5)] + [alpha], np.float32
-    )
+def _grid_lines(box: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the ends of the lines of a grid below the box, a power of ten (m) apart.
+
+    The grid is at z = 0, or at the lowest point of bodies that move below z = 0.
+    """
+    (x, y, _), radius = box.mean(0), float(np.linalg.norm(box[1] - box[0])) / 2
+    spacing = 10 ** np.floor(np.log10(radius))
+    number = np.arange(-np.ceil(3 * radius / spacing), np.ceil(3 * radius / spacing) + 1)
+    # full multiples of the spacing
+    x, y = (spacing * (np.round(center / spacing) + number) for center in (x, y))
+    z = min(0.0, float(box[0, 2]))
+    return [(np.array([a, y[0], z]), np.array([a, y[-1], z])) for a in x] + [
+        (np.array([x[0], b, z]), np.array([x[-1], b, z])) for b in y
+    ]
 
 
-def _draw_links(scene, positions: dict[int, np.ndarray], large: bool):
-    """Add a red sphere at each connected virtual link, larger just after an event."""
-    import mujoco
-
+def _draw_links(scene, positions: dict[int, np.ndarray], radius: float):
+    """Add a red sphere at each connected virtual link."""
     for position in positions.values():
-        if scene.ngeom < scene.maxgeom:
-            size, rgba = (
-                np.full(3, 0.07 if large else 0.04),
-                np.array([0.9, 0.1, 0.1, 1], np.float32),
-            )
-            mujoco.mjv_initGeom(
-                scene.geoms[scene.ngeom],
-                mujoco.mjtGeom.mjGEOM_SPHERE,
-                size,
-                position,
-                np.eye(3).ravel(),
-                rgba,
-            )
-            scene.ngeom += 1
+        add_sphere(scene, position, radius, RED)
 
 
-def _draw_trail(scene, path: np.ndarray, hexadecimal: str):
-    """Add the path of a body's origin as a thin line."""
-    import mujoco
-
-    for a, b in zip(path, path[1:], strict=False):
-        if scene.ngeom < scene.maxgeom:
-            geom = scene.geoms[scene.ngeom]
-            mujoco.mjv_initGeom(
-                geom,
-                mujoco.mjtGeom.mjGEOM_CAPSULE,
-                np.zeros(3),
-                np.zeros(3),
-                np.eye(3).ravel(),
-                _rgba(hexadecimal, 0.9),
-            )
-            mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_CAPSULE, 0.006, a, b)
-            scene.ngeom += 1
+def _draw_trails(scene, paths: list[np.ndarray], radius: float):
+    """Add paths of bodies' origins as thin lines."""
+    for k, path in enumerate(paths):
+        hexadecimal = color(k)
+        rgba = [int(hexadecimal[c : c + 2], 16) / 255 for c in (1, 3, 5)] + [0.9]
+        for a, b in zip(path, path[1:], strict=False):
+            add_line(scene, a, b, rgba, radius=radius)
 
 
 def _add_caption(image, t: float, start: float, end: float, links: list[str], events):

@@ -14,11 +14,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from svkc.loops.constraint import largest_gaps
+from svkc.model.annotations import Integer
 from svkc.model.chain import Chain, State, Structure, active_dofs
+from svkc.model.validation import integer
 from svkc.simulation.trajectory import Trajectory
 from svkc.tree.energy import energy
 from svkc.tree.kinematics import poses
-from svkc.viz.shapes import check_single_run, event_descriptions
+from svkc.viz.meshes import MIN_FACES, Mesh, decimate, load_mesh, mesh_key
+from svkc.viz.outlines import geom_color, geom_kind, visible_geoms
+from svkc.viz.shapes import check_single_run, event_descriptions, saved_states
 
 FOLDER = pathlib.Path(__file__).parent / "web"
 
@@ -42,7 +46,10 @@ class Page:
         )
 
 
-def show(chain: Chain, traj: Trajectory, *, title: str = "svkc", height: int = 480) -> Page:
+def show(
+    chain: Chain, traj: Trajectory, *, title: str = "svkc", height: int = 480,
+    max_faces: Integer = 20_000,
+) -> Page:  # fmt: skip
     """Return the HTML page of a run.
 
     A notebook displays the page below a cell whose last line is this call. `svkc.render(chain,
@@ -52,25 +59,29 @@ def show(chain: Chain, traj: Trajectory, *, title: str = "svkc", height: int = 4
     traj: one run, not a batch.
     title: title of the page.
     height: height of the notebook's frame (pixels).
+    max_faces: meshes with more faces are drawn with at most this number, by vertex clustering;
+        at least 100. The page holds each mesh once, whatever the length of the run.
 
-    Raises ValueError if `traj` is a batch of runs.
+    Raises ValueError if `traj` is a batch of runs or `max_faces` is not such a number.
     """
+    max_faces = integer("max_faces", max_faces, MIN_FACES)
     text = _read_web_file("page.html")
     # the run is inserted last, so that no placeholder is replaced inside its strings
     placeholders = {
         "three": _read_web_file("three.min.js"),
         "page": _read_web_file("page.js"),
         "title": html.escape(title),
-        "run": _script_json(_run_data(chain, traj)),
+        "run": _script_json(_run_data(chain, traj, max_faces)),
     }
     for name, value in placeholders.items():
         text = text.replace("{{" + name + "}}", value)
     return Page(text, height)
 
 
-def write_page(chain: Chain, traj: Trajectory, path: pathlib.Path) -> pathlib.Path:
+def write_page(chain: Chain, traj: Trajectory, path: pathlib.Path, max_faces: int) -> pathlib.Path:
     """Write the page of a run to a file, with the file's stem as title, and return the path."""
-    path.write_text(show(chain, traj, title=path.stem).text, encoding="utf-8")
+    text = show(chain, traj, title=path.stem, max_faces=max_faces).text
+    path.write_text(text, encoding="utf-8")
     return path
 
 
@@ -99,15 +110,18 @@ def _base64(x, dtype) -> str:
     ).decode()
 
 
-def _run_data(chain: Chain, traj: Trajectory) -> dict:
+def _run_data(chain: Chain, traj: Trajectory, max_faces: int) -> dict:
     """Return what the page's script reads of a run, as JSON data."""
     check_single_run(traj)
-    ts, states, gaps = _saved_frames(chain, traj)
+    ts, numbers, states = saved_states(traj)
+    gaps = np.asarray(traj.gaps)[numbers]
+    if len(gaps) < len(ts):
+        gaps = np.concatenate([gaps, jax.jit(largest_gaps)(chain, traj.final)[0][None]])
     positions, quats, energies = jax.jit(jax.vmap(lambda s: (*poses(chain, s), energy(chain, s))))(
         states
     )
     phases = _phase_rows(chain, traj, ts, states)
-    geoms, meshes = _geoms(chain.model.model)
+    geoms, meshes = _geoms(chain.model.model, max_faces)
     return {
         "bodies": chain.body_names,
         "times": _json_numbers(ts),
@@ -120,28 +134,6 @@ def _run_data(chain: Chain, traj: Trajectory) -> dict:
         "meshes": meshes,
         "size": float(chain.length),
     }
-
-
-def _saved_frames(chain: Chain, traj: Trajectory) -> tuple[np.ndarray, State, np.ndarray]:
-    """Return save times (s), states and largest gaps (rad, m) up to the end of the run.
-
-    A run may end before the last save time. The final state is appended if no save time is the end.
-    """
-    ts, end = np.asarray(traj.ts, float), float(traj.t_final)
-    keep = np.flatnonzero(ts <= end)
-    ts, states, gaps = (
-        ts[keep],
-        jax.tree.map(lambda x: x[keep], traj.states),
-        np.asarray(traj.gaps)[keep],
-    )
-    if len(ts) and ts[-1] == end:
-        return ts, states, gaps
-    last, _ = jax.jit(largest_gaps)(chain, traj.final)
-    return (
-        np.append(ts, end),
-        jax.tree.map(lambda x, y: jnp.concatenate([x, y[None]]), states, traj.final),
-        np.concatenate([gaps, last[None]]),
-    )
 
 
 def _phase_rows(chain: Chain, traj: Trajectory, ts: np.ndarray, states: State) -> list[dict]:
@@ -224,73 +216,38 @@ def _event_rows(chain: Chain, traj: Trajectory, start: float) -> list[dict]:
     ]
 
 
-def _geoms(model) -> tuple[list[dict], list[dict]]:
+def _geoms(model, max_faces: int) -> tuple[list[dict], list[dict]]:
     """Return the visible geoms, and each mesh or height field among them once."""
-    import mujoco
-
-    geom_types = mujoco.mjtGeom
-    geoms, meshes, mesh_numbers = [], [], {}
-    for g in range(model.ngeom):
-        kind, data, material = (
-            geom_types(int(model.geom_type[g])),
-            int(model.geom_dataid[g]),
-            int(model.geom_matid[g]),
-        )
-        rgba = model.geom_rgba[g]
-        if material >= 0 and np.array_equal(rgba, np.array([0.5, 0.5, 0.5, 1], np.float32)):
-            # MuJoCo's rule: the material's color, unless the geom has one of its own
-            rgba = model.mat_rgba[material]
-        if model.geom_group[g] > 2 or rgba[3] == 0:
-            continue
+    geoms, meshes, numbers = [], [], {}
+    for g in visible_geoms(model):
         geom = {
             "body": int(model.geom_bodyid[g]),
-            "kind": kind.name.removeprefix("mjGEOM_").lower(),
-            "rgba": _json_numbers(rgba.round(4)),
-        }
-        geom |= {
+            "kind": geom_kind(model, g),
+            "rgba": _json_numbers(geom_color(model, g).round(4)),
             "size": _json_numbers(model.geom_size[g]),
             "pos": _json_numbers(model.geom_pos[g]),
             "quat": _json_numbers(model.geom_quat[g]),
         }
-        if data >= 0:
-            source = (kind == geom_types.mjGEOM_HFIELD, data)
-            if source not in mesh_numbers:
-                mesh_numbers[source] = len(meshes)
-                vertices, faces = _heightfield(model, data) if source[0] else _mesh(model, data)
-                meshes.append(
-                    {"vertices": _base64(vertices, np.float32), "faces": _base64(faces, np.uint32)}
-                )
-            geom |= {"kind": "mesh", "mesh": mesh_numbers[source]}
+        if (key := mesh_key(model, g)) is not None:
+            if key not in numbers:
+                numbers[key] = len(meshes)
+                meshes.append(_packed(decimate(load_mesh(model, key), max_faces)))
+            geom |= {"kind": "mesh", "mesh": numbers[key]}
         geoms.append(geom)
     return geoms, meshes
 
 
-def _mesh(model, i: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices and faces of a mesh."""
-    first_vertex, vertices, first_face, faces = (
-        int(x[i])
-        for x in (model.mesh_vertadr, model.mesh_vertnum, model.mesh_faceadr, model.mesh_facenum)
-    )
-    return model.mesh_vert[first_vertex : first_vertex + vertices], model.mesh_face[
-        first_face : first_face + faces
-    ]
+def _packed(mesh: Mesh) -> dict:
+    """Return a mesh for the page's script.
 
-
-def _heightfield(model, i: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices and faces of a height field's upper surface."""
-    rows, columns, first = (
-        int(x[i]) for x in (model.hfield_nrow, model.hfield_ncol, model.hfield_adr)
-    )
-    half_width, half_depth, height, _ = model.hfield_size[i]
-    x, y = np.meshgrid(
-        np.linspace(-half_width, half_width, columns), np.linspace(-half_depth, half_depth, rows)
-    )
-    vertex = np.arange(rows * columns).reshape(rows, columns)
-    a, b, c, d = (
-        part.ravel()
-        for part in (vertex[:-1, :-1], vertex[:-1, 1:], vertex[1:, 1:], vertex[1:, :-1])
-    )
-    z = height * model.hfield_data[first : first + rows * columns]
-    return np.stack([x.ravel(), y.ravel(), z], -1), np.concatenate(
-        [np.stack([a, b, c], -1), np.stack([a, c, d], -1)]
-    )
+    Coordinates are 16-bit fractions of the bounding box; vertex numbers have 16 bits if 65,536
+    vertices are enough, otherwise 32.
+    """
+    low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+    fractions = (mesh.vertices - low) / np.where(high > low, high - low, 1)
+    return {
+        "low": _json_numbers(low),
+        "high": _json_numbers(high),
+        "vertices": _base64(np.rint(fractions * 65535), np.uint16),
+        "faces": _base64(mesh.faces, np.uint16 if len(mesh.vertices) <= 65536 else np.uint32),
+    }

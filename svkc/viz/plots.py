@@ -1,7 +1,5 @@
-"""Plots of a run by matplotlib: a strobe, and curves over time."""
+"""Curves of a run over time, by matplotlib."""
 
-import functools
-import pathlib
 from typing import Any
 
 import jax
@@ -10,123 +8,7 @@ import numpy as np
 from svkc.model.chain import Chain
 from svkc.simulation.trajectory import Trajectory
 from svkc.tree.energy import kinetic_energy, potential_energy
-from svkc.viz.shapes import (
-    color,
-    connected_link_positions,
-    event_descriptions,
-    positions_and_rotations,
-    segments,
-)
-
-
-def strobe(chain: Chain, traj: Trajectory, path: pathlib.Path, frames: int) -> pathlib.Path:
-    """Draw several poses of a run in the x-z plane, save the picture, and return its path.
-
-    Each structure has a color. Connected virtual links are rings. Later poses are more opaque.
-    """
-    from matplotlib.figure import Figure
-
-    ts = np.asarray(traj.ts)
-    frame_indices = np.unique(
-        np.searchsorted(ts, np.linspace(ts[0], ts[-1], frames)).clip(0, len(ts) - 1)
-    )
-    states = jax.tree.map(lambda x: x[frame_indices], traj.states)
-    positions, R = positions_and_rotations(chain, states)
-    link_positions = connected_link_positions(chain, states, positions, R)
-    starts, structures = _structures(traj)
-    colors = {s: color(n) for n, s in enumerate(dict.fromkeys(structures))}
-    figure = Figure(figsize=(10, 7.5))
-    axes = figure.add_subplot(aspect="equal", xlabel="x (m)", ylabel="z (m)")
-    shapes = segments(chain)
-    ground_shapes, body_shapes = [s for s in shapes if s[0] == 0], [s for s in shapes if s[0] != 0]
-    low, high = _axis_limits(ground_shapes, positions)
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-    # points per metre
-    scale = 72 * min(9 / (high[0] - low[0]), 6.7 / (high[1] - low[1]))
-    draw = functools.partial(_draw_shapes, axes, scale=scale)
-    draw(ground_shapes, positions[0], R[0], color="#9a9aa2", alpha=0.8)
-    for frame, i in enumerate(frame_indices):
-        structure = structures[max(int(np.sum(starts <= ts[i])) - 1, 0)]
-        shade = 0.2 + 0.7 * (frame + 1) / len(frame_indices)
-        draw(body_shapes, positions[frame], R[frame], color=colors[structure], alpha=shade)
-        rings = np.array([place[[0, 2]] for place in link_positions[frame].values()]).reshape(-1, 2)
-        axes.plot(*rings.T, "o", color="#202020", alpha=shade, markersize=7, fillstyle="none")
-    _add_legend(axes, chain, starts, structures, colors)
-    axes.grid(alpha=0.2)
-    axes.set_title(
-        f"{len(frame_indices)} poses, {ts[frame_indices[0]]:.2f} s to {ts[frame_indices[-1]]:.2f} s"
-    )
-    figure.savefig(path, dpi=110, bbox_inches="tight")
-    return path
-
-
-def _structures(traj: Trajectory) -> tuple[np.ndarray, list[tuple[int, ...]]]:
-    """Return the start (s) and the connected links of each phase.
-
-    Phases of zero duration, which lie between events at one instant, are left out.
-    """
-    p = traj.phases
-    phases = [i for i in range(int(p.count)) if p.stop[i] > p.start[i]] or [0]
-    links = [tuple(np.flatnonzero(p.connected[i]).tolist()) for i in phases]
-    return np.asarray(p.start)[phases], links
-
-
-def _axis_limits(ground_shapes, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lower and the upper limits of x and z (m).
-
-    Shapes on the ground count up to a metre beyond the bodies: a long floor would make the bodies
-    small.
-    """
-    points = positions[:, 1:, [0, 2]].reshape(-1, 2)
-    ends = np.array([end for _, *ends, _ in ground_shapes for end in ends]).reshape(-1, 3)[
-        :, [0, 2]
-    ]
-    visible = np.concatenate([points, ends.clip(points.min(0) - 1, points.max(0) + 1)])
-    return visible.min(0) - 0.3, visible.max(0) + 0.3
-
-
-def _draw_shapes(axes, shapes, positions, R, *, scale: float, color: str, alpha: float):
-    """Draw shapes as thick lines at the poses of their bodies.
-
-    scale: printer's points per metre.
-    """
-    for body, a, b, radius in shapes:
-        ends = np.array([positions[body] + R[body] @ x for x in (a, b)])
-        if np.hypot(*(ends[1] - ends[0])[[0, 2]]) * scale < 1:
-            # seen end-on: matplotlib does not draw a line of zero length
-            ends[1, 0] = ends[0, 0] + 1 / scale
-        axes.plot(
-            ends[:, 0],
-            ends[:, 2],
-            color=color,
-            alpha=alpha,
-            solid_capstyle="round",
-            # two thirds of the true thickness, so that poses can be told apart
-            linewidth=max(1.0, 1.3 * radius * scale),
-        )
-
-
-def _add_legend(axes, chain: Chain, starts, structures, colors: dict):
-    """Name each structure by its connected links and the times at which it starts."""
-    from matplotlib.transforms import ScaledTranslation
-
-    for structure, structure_color in colors.items():
-        start_times = [
-            f"{t:.2f}" for t, s in zip(starts, structures, strict=True) if s == structure
-        ]
-        times = ", ".join(start_times[:6]) + ", ..." * (len(start_times) > 6)
-        links = ", ".join(chain.link_names[k] for k in structure) or "nothing"
-        axes.plot([], [], color=structure_color, linewidth=5, label=f"{links} from {times} s")
-    # below the picture: inside, the legend would hide limbs
-    below = axes.transAxes + ScaledTranslation(0, -0.6, axes.figure.dpi_scale_trans)
-    axes.legend(
-        loc="upper center",
-        bbox_to_anchor=(0.5, 0),
-        bbox_transform=below,
-        ncols=2,
-        fontsize=9,
-        title="held (rings) by",
-    )
+from svkc.viz.shapes import event_descriptions
 
 
 def curves(traj: Trajectory, chain: Chain | None = None) -> Any:

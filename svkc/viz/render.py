@@ -10,6 +10,7 @@ from svkc.model.checked_jit import check_chain
 from svkc.model.validation import integer, names, positive_scalar, scalar, vector
 from svkc.simulation.trajectory import Trajectory
 from svkc.viz.html_page import write_page
+from svkc.viz.meshes import MIN_FACES
 from svkc.viz.shapes import check_single_run
 
 
@@ -27,8 +28,8 @@ def _require_packages() -> None:
 def render(
     chain: Chain, traj: Trajectory, path: Path, *, fps: Scalar = 25, frames: Integer = 10,
     size: Numbers = (640, 480), trails: Names = (), camera: str | None = None,
-    lookat: Numbers | None = None, distance: Scalar | None = None, azimuth: Scalar = 90,
-    elevation: Scalar = -8,
+    lookat: Numbers | None = None, distance: Scalar | None = None, azimuth: Scalar = 120,
+    elevation: Scalar = -15, max_faces: Integer = 20_000,
 ) -> pathlib.Path:  # fmt: skip
     """Write a picture of a run in the format of the path's suffix, and return the path.
 
@@ -44,41 +45,41 @@ def render(
     camera: name of a camera of the model, for an animation. None: a free camera, as follows.
     lookat: point at which the free camera looks (m, ground frame). None: the middle of the motion.
     distance: distance of the free camera from `lookat` (m). None: the whole motion is in view.
-    azimuth, elevation: direction of the free camera (degrees), as in MuJoCo.
+    azimuth, elevation: direction in which the free camera looks (degrees), as in MuJoCo: along y
+        with 90 and 0. The default sees the x-z plane at three quarters, from slightly above.
+    max_faces: meshes with more faces have at most this number in a page, as in `svkc.show`.
 
     Raises ValueError if the suffix is unknown, `traj` is a batch, a name does not exist, or a
     number is invalid. Raises RuntimeError, which names the missing packages, if a GL library,
     matplotlib, Pillow or imageio-ffmpeg is not installed.
     """
-    from svkc.viz import animation, plots
+    from svkc.viz import animation
+    from svkc.viz.strobe import strobe
 
     check_chain(chain)
     check_single_run(traj)
     frames, rate = integer("frames", frames, 1), float(positive_scalar("fps", fps))
     path = pathlib.Path(os.fspath(path))
     size = tuple(integer("size", n, 16, 8192) for n in vector("size", size, 2))
-    trails = names("trails", trails)
-    camera_options = {"camera": camera, **_free_camera(lookat, distance, azimuth, elevation)}
-    if path.suffix != ".html":
-        _require_packages()
-    if path.suffix == ".png":
-        return plots.strobe(chain, traj, path, frames)
-    if path.suffix == ".html":
-        return write_page(chain, traj, path)
-    writer = {".gif": animation.write_gif, ".mp4": animation.write_mp4}.get(path.suffix)
-    if writer is None:
+    trails, max_faces = names("trails", trails), integer("max_faces", max_faces, MIN_FACES)
+    view = _view(camera, lookat, distance, azimuth, elevation)
+    if path.suffix not in (".png", ".gif", ".mp4", ".html"):
         raise ValueError(f"render: {path.name} should end in .png, .gif, .mp4 or .html")
-    writer(
-        path,
-        animation.frames(chain, traj, fps=rate, size=size, trails=trails, **camera_options),
-        rate,
-    )
+    if path.suffix == ".html":
+        return write_page(chain, traj, path, max_faces)
+    _require_packages()
+    if path.suffix == ".png":
+        strobe(chain, traj, frames).savefig(path, dpi=110, bbox_inches="tight")
+        return path
+    images = animation.frames(chain, traj, fps=rate, size=size, trails=trails, **view)
+    (animation.write_gif if path.suffix == ".gif" else animation.write_mp4)(path, images, rate)
     return path
 
 
-def _free_camera(lookat, distance, azimuth, elevation) -> dict:
-    """Validate the placement of the free camera and return it by argument name."""
+def _view(camera, lookat, distance, azimuth, elevation) -> dict:
+    """Validate the placement of the free camera and return the view by argument name."""
     return {
+        "camera": camera,
         "lookat": lookat if lookat is None else vector("lookat", lookat, 3),
         "distance": distance if distance is None else positive_scalar("distance", distance),
         "azimuth": scalar("azimuth", azimuth),

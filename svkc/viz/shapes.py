@@ -1,11 +1,11 @@
-"""Poses, shapes, link positions and descriptions of events, which all pictures of a run use."""
+"""Saved states, poses, link positions and descriptions of events, which all pictures use."""
 
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from svkc.mjcf.bodies import rotation_matrix
 from svkc.model.chain import Chain, State
 from svkc.simulation.trajectory import Trajectory
 from svkc.tree.kinematics import poses
@@ -30,40 +30,19 @@ def color(i: int) -> str:
     return COLORS[i % len(COLORS)]
 
 
-def segments(chain: Chain) -> list[tuple[int, np.ndarray, np.ndarray, float]]:
-    """Return (body, end, other end, radius) for each geom, drawn as a thick line.
+def saved_states(traj: Trajectory) -> tuple[np.ndarray, np.ndarray, State]:
+    """Return the save times up to the end of the run, their numbers, and states.
 
-    Ends and radius are in m, in the body's frame. Planes and height fields are left out.
+    A run may end before its last save time. Times (s) and states, but not numbers, have one more
+    entry, the end of the run, if no save time is the end.
     """
-    import mujoco
-
-    model, lines = chain.model.model, []
-    for g in range(model.ngeom):
-        geom_type, size = mujoco.mjtGeom(int(model.geom_type[g])), model.geom_size[g]
-        R = rotation_matrix(model.geom_quat[g])
-        axis = R[:, 2]
-        if geom_type in (mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER):
-            half_axis, radius = axis * size[1], size[0]
-        elif geom_type in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_ELLIPSOID):
-            half_axis, radius = (
-                axis * 1e-3,
-                float(np.mean(size)) if geom_type == mujoco.mjtGeom.mjGEOM_ELLIPSOID else size[0],
-            )
-        elif geom_type in (mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_MESH):
-            # along the longest side, as thick as the shortest; `size` of a mesh is half its box
-            longest = int(np.argmax(size))
-            half_axis, radius = R[:, longest] * size[longest], float(np.min(size))
-        else:
-            continue
-        lines.append(
-            (
-                int(model.geom_bodyid[g]),
-                model.geom_pos[g] - half_axis,
-                model.geom_pos[g] + half_axis,
-                float(radius),
-            )
-        )
-    return lines
+    ts, end = np.asarray(traj.ts, float), float(traj.t_final)
+    numbers = np.flatnonzero(ts <= end)
+    ts, states = ts[numbers], jax.tree.map(lambda x: x[numbers], traj.states)
+    if len(ts) and ts[-1] == end:
+        return ts, numbers, states
+    append = lambda x, last: jnp.concatenate([x, last[None]])
+    return np.append(ts, end), numbers, jax.tree.map(append, states, traj.final)
 
 
 def positions_and_rotations(chain: Chain, states: State) -> tuple[np.ndarray, np.ndarray]:

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from pages import CUTS, NAME, run_of_every_geom, static_run
+from pages import CUTS, NAME, run_of_every_geom, sphere_of_faces, static_run
 from tolerances import ROUND_OFF
 
 import svkc
@@ -147,12 +147,39 @@ def test_every_kind_of_geom(tmp_path):
     # a geom has its material's color; a mesh that is used twice is stored once
     assert run["geoms"][2]["rgba"] == [0, 1, 0, 1]
     assert [g.get("mesh") for g in run["geoms"]].count(1) == 2
-    hill = np.frombuffer(base64.b64decode(run["meshes"][0]["vertices"]), "<f4").reshape(-1, 3)
-    np.testing.assert_allclose(hill.min(0), [-1, -2, 0], atol=1e-6)
-    np.testing.assert_allclose(hill.max(0), [1, 2, 0.5], atol=1e-6)
-    faces = np.frombuffer(base64.b64decode(run["meshes"][1]["faces"]), "<u4").reshape(-1, 3)
+    hill, wedge = run["meshes"]
+    assert (hill["low"], hill["high"]) == ([-1, -2, pytest.approx(-0.1)], [1, 2, 0.5])
+    assert decoded(wedge["vertices"]).reshape(-1, 3).max(0).tolist() == [65535] * 3
+    faces = decoded(wedge["faces"]).reshape(-1, 3)
     assert len(faces) == 4
     assert faces.max() == 3
+
+
+def decoded(text: str) -> np.ndarray:
+    """Return the 16-bit numbers of a mesh."""
+    return np.frombuffer(base64.b64decode(text), "<u2")
+
+
+@pytest.mark.slow
+def test_meshes_are_stored_once_and_decimated(tmp_path):
+    """The length of the run adds nothing to the meshes; each mesh is within the limit of faces."""
+    chain = svkc.load(sphere_of_faces(40_000))
+    short, long = (
+        page_data(
+            svkc.render(
+                chain, svkc.simulate(chain, chain.state(), 0.1, ts=np.linspace(0, 0.1, n)), path
+            )
+        )
+        for n, path in ((2, tmp_path / "short.html"), (201, tmp_path / "long.html"))
+    )
+    assert [len(run["times"]) for run in (short, long)] == [2, 201]
+    assert short["meshes"] == long["meshes"]
+    assert len(short["meshes"]) == 1
+    assert [geom["mesh"] for geom in short["geoms"]] == [0, 0]
+    assert 10_000 < len(decoded(short["meshes"][0]["faces"])) / 3 <= 20_000
+    assert (tmp_path / "long.html").stat().st_size < 1.2e6
+    few = svkc.show(chain, static_run(chain), max_faces=500).text
+    assert len(few) < 6.1e5
 
 
 def test_the_page_files_are_read_lazily():

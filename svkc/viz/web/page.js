@@ -52,10 +52,13 @@ const SHAPES = {
   cylinder: (r, half) => new THREE.CylinderGeometry(r, r, 2 * half, 32).rotateX(Math.PI / 2),
   box: (x, y, z) => new THREE.BoxGeometry(2 * x, 2 * y, 2 * z),
 };
-const meshes = run.meshes.map(({ vertices, faces }) => {
+const meshes = run.meshes.map(({ low, high, vertices, faces }) => {
+  // coordinates are fractions of the bounding box, in 65535ths
+  const fractions = decodeArray(vertices, Uint16Array), Index = fractions.length / 3 > 65536 ? Uint32Array : Uint16Array;
+  const positions = Float32Array.from(fractions, (x, i) => low[i % 3] + x / 65535 * (high[i % 3] - low[i % 3]));
   const geometry = new THREE.BufferGeometry();
-  geometry.setAttribute("position", new THREE.BufferAttribute(decodeArray(vertices, Float32Array), 3));
-  geometry.setIndex(new THREE.BufferAttribute(decodeArray(faces, Uint32Array), 1));
+  geometry.setAttribute("position", new THREE.BufferAttribute(positions, 3));
+  geometry.setIndex(new THREE.BufferAttribute(decodeArray(faces, Index), 1));
   // separate vertices for each face give sharp edges
   const flat = geometry.toNonIndexed();
   flat.computeVertexNormals();
