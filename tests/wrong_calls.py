@@ -166,7 +166,6 @@ CASES = {
     "camera: no": lambda s: s.drawn(camera="nobody's"),
     "mp4 needs": render_without_ffmpeg,
     "run: no scene": lambda s: commands._load_scene("nowhere", ()),
-    "run: no virtual": lambda s: commands._requested_events(s.four, [("release", "nobody", 0.1)]),
     "trails: no": lambda s: s.drawn(trails=("nobody",)),
     "... is not linear": lambda s: jax.linear_transpose(
         custom_primitive("odd", jnp.sin, lambda p, t: (p[0], t[0])), jnp.ones(2)
@@ -214,7 +213,6 @@ CASES = {
     "bind: a spare slot has no": lambda s: s.bound("world", "rocker", joint="universal"),
     "bind: axis": lambda s: s.bound("world", "rocker", joint="hinge", axis=(0, 0, 0)),
     "bind: expected": lambda s: svkc.at(0.5, bind="rocker"),
-    "bind: no body": lambda s: s.bound("world", "nobody"),
     "bind: ...: expected three": lambda s: s.simulate(
         s.spare, events=[svkc.at(0.5, bind=[svkc.Grip("world", "rocker", real_pos=jnp.zeros(2))])]
     ),
@@ -251,7 +249,6 @@ CASES = {
         models.MJCF.format(models.bar("arm", 'type="hinge" armature="0.1"', "0 0 -1")),
         cuttable="arm",
     ),
-    "cuttable: no joint": lambda s: s.load(cuttable="nobody"),
     "data: got": lambda s: svkc.interop.to_mujoco(
         s.four, s.state, type("Data", (), {"qpos": np.zeros(1), "qvel": np.zeros(1)})()
     ),
@@ -264,17 +261,23 @@ CASES = {
     "events: expected": lambda s: s.simulate(events=["pin"]),
     "here: ...": lambda s: svkc.at(0.5, connect="pin", here="other"),
     "ignore: got": lambda s: s.load(ignore=("nothing",)),
-    "ignore_armature: no joint": lambda s: s.load(ignore_armature="nobody"),
     "joint: got": lambda s: link(joint="screw"),
     "lane: expected a dict": lambda s: s.rollout(lane=lambda chain, data: 3),
     "...: expected a path": lambda s: svkc.load_trajectory(3),
     "leaves: axis": lambda s: svkc.leaves(s.four, "pin", axis=(0, 0, 0)),
     "mode: got": lambda s: svkc.check_grad(lambda x: x, jnp.asarray(1.0), mode="sideways"),
-    "no joint ...": lambda s: s.four.state({"nobody": 1.0}),
-    "no joint coordinate": lambda s: svkc.with_independent(s.four, s.state, "nobody"),
+    "...: ... is a cuttable": lambda s: s.load(cuttable="rocker").replace(
+        axis={"rocker": [0, 0, 1]}
+    ),
+    "...: got names": lambda s: s.four.replace(gravity={"crank": 1.0}),
+    "limit: the model": lambda s: s.four.replace(limit={"crank": [0, 1]}),
+    "scale_inertia: body": lambda s: s.four.replace(mass={"world": 1.0}, scale_inertia=True),
+    "scale_inertia: give": lambda s: s.four.replace(scale_inertia=True),
+    "...: got an array": lambda s: s.four.replace(gravity=[0, 0]),
+    "tau[...]: got": lambda s: s.four.torques({"crank": [1.0, 2.0]}),
+    "no ... ...;": lambda s: s.four.state({"nobody": 1.0}),
     "source: no such file": lambda s: s.load("nowhere.xml"),
     "no virtual link ..., but": lambda s: svkc.cut(s.four, s.state, "crank"),
-    "no virtual link": lambda s: svkc.cut(s.four, s.state, "nobody"),
     "out: ... cannot": rollout_with_a_lock,
     "overload: give": lambda s: svkc.overload(s.four, "pin"),
     "q: the quaternion": (
@@ -494,5 +497,25 @@ ALSO = [
     ("whole number", lambda s: s.load(spare=[[1.0], [1.0, 2.0]])),
     ("'base' belongs to body 'base'", lambda s: s.load(FREE, cuttable="base")),
     ("no joint 'nose'; joints: crank", lambda s: s.load(cuttable="nose")),
+    ("no joint 'nose'", lambda s: s.load(ignore_armature="nose")),
+    (
+        "no virtual link 'nobody'",
+        lambda s: commands._requested_events(s.four, [("release", "nobody", 0.1)]),
+    ),
+    ("no virtual link 'nobody'", lambda s: svkc.cut(s.four, s.state, "nobody")),
+    ("no body 'nobody'", lambda s: s.bound("world", "nobody")),
+    ("no joint coordinate 'x'", lambda s: svkc.with_independent(s.four, s.state, "x")),
+    (r"no joint 'cranc'; did you mean 'crank'\?", lambda s: s.four.q_index("cranc")),
+    (r"no joint 'cranc'; did you mean 'crank'\?", lambda s: s.four.v_index("cranc")),
+    (r"no body 'cranc'; did you mean 'crank'\?", lambda s: s.four.body_index("cranc")),
+    ("no body 'nobody'", lambda s: s.four.replace(mass={"nobody": 1.0})),
+    (r"no parameter 'masses'; did you mean 'mass'\?", lambda s: s.four.replace(masses=1.0)),
+    ("no joint 'nobody'", lambda s: svkc.forward_dynamics(s.four, s.state, {"nobody": 1.0})),
+    ("no joint 'nobody'", lambda s: s.simulate(control=lambda t, state, args: {"nobody": 1.0})),
+    (
+        r"mass\['crank'\]: got an array of shape \(2,\)",
+        lambda s: s.four.replace(mass={"crank": [1, 2]}),
+    ),
+    ("scale_inertia: got 1", lambda s: s.four.replace(mass={"crank": 1.0}, scale_inertia=1)),
     ("chin", lambda s: s.load(cuttable=["rocker", "chin"])),
 ]

@@ -226,13 +226,11 @@ def _load_scene(name: str, ignore):
 def _requested_events(chain, events):
     """Return the events that `--release` and `--catch` describe."""
     import svkc
+    from svkc.model.names import unknown_name
 
     for _, link, _ in events:
         if link not in chain.link_names:
-            raise ValueError(
-                f"run: no virtual link {link!r}; virtual links:"
-                f" {', '.join(chain.link_names) or 'none'}"
-            )
+            raise unknown_name("virtual link", link, chain.link_names)
     return tuple(
         svkc.at(t, cut=link) if kind == "release" else svkc.at(t, connect=link, here=True)
         for kind, link, t in events

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from svkc._jax.lanes_last import with_lanes_last
 from svkc.loops.constrained_dynamics import ArticulatedBodies
 from svkc.loops.forward_dynamics import velocity_and_acceleration
-from svkc.model.annotations import Checked
+from svkc.model.annotations import Checked, Torques
 from svkc.model.chain import Chain, State, active_dofs
 from svkc.model.checked_jit import checked_jit, torques_over_dofs
 from svkc.model.validation import boolean, scalar
@@ -115,7 +115,7 @@ class SimplifiedNewton(diffrax.VeryChord):
 def step(
     chain: Chain,
     state: State,
-    tau: Float[Array, " torques"],
+    tau: Torques,
     dt: Float[Array, ""] | float,
     *,
     implicit_damping: Checked[bool] = True,
@@ -136,13 +136,14 @@ def step(
 
     Each step reduces the loop gaps by a quarter (Baumgarte stabilization of rate 1 / (2 dt)).
 
-    tau: joint torques (N m, N), constant over the step; over all coordinates or over the tree's.
+    tau: joint torques (N m, N), constant over the step: over all coordinates, over the tree's, or
+        by joint name.
     dt: step size (s).
     implicit_damping: whether joint damping is implicit. False: a = vdot(t), as in a step of
         `svkc.integrators.SymplecticEuler`, and of MuJoCo without its flag `eulerdamp`.
 
-    Raises ValueError if `tau` has neither of these sizes, if `dt` is not one real number, or if
-    `implicit_damping` is neither True nor False.
+    Raises ValueError if `tau` has neither of these sizes or an unknown name, if `dt` is not one
+    real number, or if `implicit_damping` is neither True nor False.
     """
     return _step(
         chain,

@@ -1,6 +1,6 @@
 """The vector field of one phase, and the projection of its states onto closed loops."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -121,11 +121,13 @@ class VectorField(eqx.Module):
 
 def _control_torques(chain: Chain, value, dtype) -> Float[Array, " dofs"]:
     """Return what the user's control returned as torques over every coordinate."""
+    if isinstance(value, Mapping):
+        return chain.torques(value).astype(dtype)
     tau = as_array(value)
     if not is_real(tau) or tau.shape not in ((chain.dofs,), (chain.nv,)):
         raise ValueError(
             f"control: expected control(t, state, args) to return {chain.dofs} joint torques (or"
-            f" {chain.nv}, the tree's), got {description(value)}"
+            f" {chain.nv}, the tree's), or a dict by joint name, got {description(value)}"
         )
     return torques_over_dofs(chain, jnp.asarray(tau, dtype))
 

@@ -13,6 +13,7 @@ from svkc.loops.constraint import LoopKinematics, constraint_bias, jacobian_scal
 from svkc.loops.pivoting import PivotedQR, pivot_blocks, select_pivots, solve_pivot_block
 from svkc.model.chain import Chain, State, Structure, active_dofs
 from svkc.model.checked_jit import check_state, checked_jit
+from svkc.model.names import unknown_name
 from svkc.tree.kinematics import twists
 
 
@@ -153,9 +154,7 @@ def with_independent(chain: Chain, state: State, *names: str) -> State:
             ]
         )
         if not named.any():
-            raise ValueError(
-                f"no joint coordinate {name!r}; coordinates: {', '.join(chain.dof_names)}"
-            )
+            raise unknown_name("joint coordinate", name, chain.dof_names)
         mask |= named
     independent = jnp.asarray(mask) if names else None
     return eqx.tree_at(

@@ -27,6 +27,7 @@ from svkc.loops.pivoting import (
     select_pivots,
     solve_pivot_block,
 )
+from svkc.model.annotations import Torques
 from svkc.model.chain import Chain, State, Structure, active_dofs
 from svkc.model.checked_jit import checked_jit, torques_over_dofs
 from svkc.tree.inverse_dynamics import pad_to_dofs, passive_forces, rnea
@@ -128,16 +129,14 @@ def acceleration(
 
 
 @checked_jit
-def forward_dynamics(
-    chain: Chain, state: State, tau: Float[Array, " torques"]
-) -> Float[Array, " dofs"]:
+def forward_dynamics(chain: Chain, state: State, tau: Torques) -> Float[Array, " dofs"]:
     """Return the acceleration of every joint coordinate (rad/s^2, m/s^2), with loops kept closed.
 
     The forces of the joints' springs and dampers are added to tau. Computed by articulated bodies
     on chains without virtual links, and by composite rigid bodies otherwise (paper, section III-B).
 
-    tau: joint torques (N m, N) over every coordinate, or over the tree's.
-    Raises ValueError if tau has neither length.
+    tau: joint torques (N m, N) over every coordinate, over the tree's, or by joint name.
+    Raises ValueError if tau has neither length, or a name is unknown.
     """
     tau = torques_over_dofs(chain, tau)
     return acceleration(chain, state.structure, state.q, state.v, tau, default_dynamics(chain))
@@ -177,11 +176,11 @@ class LoopForces(eqx.Module):
 
 
 @checked_jit(eager=True)
-def loop_forces(chain: Chain, state: State, tau: Float[Array, " torques"]) -> LoopForces:
+def loop_forces(chain: Chain, state: State, tau: Torques) -> LoopForces:
     """Return the wrench that each connected virtual link transmits for the joint torques tau.
 
-    tau: joint torques (N m, N) over every coordinate, or over the tree's.
-    Raises ValueError if tau has neither length.
+    tau: joint torques (N m, N) over every coordinate, over the tree's, or by joint name.
+    Raises ValueError if tau has neither length, or a name is unknown.
     """
     tau = torques_over_dofs(chain, tau)
     if not len(chain.link_names):

@@ -7,6 +7,7 @@ import numpy as np
 
 from svkc.mjcf.unsupported import is_torque_motor
 from svkc.model.annotations import MuJoCo, Numbers
+from svkc.model.names import unknown_name
 from svkc.model.topology import BALL, FIXED, FREE, HINGE, Q_SIZE, SLIDE, V_SIZE, Topology
 
 # rad/s: outside of its range, a joint with its inertia in the load pose is a critically damped
@@ -235,8 +236,7 @@ def joint_armature(model: MuJoCo, ignored: Collection[str], without: tuple[str, 
     armature = np.zeros(model.nv) if "armature" in ignored else np.array(model.dof_armature)
     for name in without:
         if name not in names:
-            known = ", ".join(names) or "none"
-            raise ValueError(f"ignore_armature: no joint {name!r}; joints: {known}")
+            raise unknown_name("joint", name, names)
         armature[model.dof_jntid == names.index(name)] = 0
     return armature
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from svkc.mjcf.bodies import JOINT_KINDS, name_of, rotation_matrix
 from svkc.model.annotations import MuJoCo, Names
+from svkc.model.names import unknown_name
 from svkc.model.topology import BALL, FREE, HINGE, SLIDE, V_SIZE, Topology
 from svkc.model.virtual_link import VirtualLink
 
@@ -42,7 +43,7 @@ def cuttable_joints(model: MuJoCo, cuttable: Names) -> list[CuttableJoint]:
     cuts: dict[int, CuttableJoint] = {}
     for name in cuttable:
         if name not in names:
-            raise ValueError(f"cuttable: no joint {name!r}; joints: {', '.join(names) or 'none'}")
+            raise unknown_name("joint", name, names)
         body = int(model.jnt_bodyid[names.index(name)])
         cuts.setdefault(body, _cuttable_joint(model, name, body))
     return list(cuts.values())

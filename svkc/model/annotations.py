@@ -5,7 +5,7 @@ value gets svkc's ValueError, which names the argument, even where annotations a
 """
 
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, TypeVar
 
 import numpy as np
@@ -31,6 +31,8 @@ Scalar: TypeAlias = Checked[float | np.number[Any] | np.ndarray | Array]
 Numbers: TypeAlias = Checked[np.ndarray | Array | Sequence[Any]]
 # one name or several
 Names: TypeAlias = Checked[str | Iterable[str]]
+# joint torques: an array, or numbers by joint name
+Torques: TypeAlias = Checked[np.ndarray | Array | Sequence[Any] | Mapping[str, Any]]
 # a whole number
 Integer: TypeAlias = Checked[int | np.integer[Any]]
 Function: TypeAlias = Checked[Callable[..., Any]]

@@ -1,67 +1,21 @@
-"""The data types of a model, by lifetime: `Chain` (bodies, for the life of a scene), `Structure`
-(how the bodies are joined, for one phase), `State` (how they move, at one instant)."""
+"""The bodies of a scene and the joints between them (`Chain`, for the life of the scene)."""
 
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from svkc.model.link_pointers import link_pointers
-from svkc.model.topology import FREE, Topology
+from svkc.model.named_access import NamedAccess
+from svkc.model.parameters import BodyParameters, body_parameters, with_parameters
+from svkc.model.state import State, Structure
+from svkc.model.topology import FREE
 from svkc.model.validation import real_array
 
 
-class Structure(eqx.Module):
-    """How the bodies are joined during one phase: one entry for each virtual link.
-
-    Every field may have leading batch axes.
-
-    connected: whether the virtual link is connected.
-    parent: row of `Topology` of the parent body.
-    real: row of `Topology` of the real link.
-    pos: origin of the joint's frame in the parent's frame (m).
-    quat: orientation of the joint's frame in the parent's frame (wxyz); the joint's axis is z.
-    real_pos: origin of the joint's frame in the real link's frame (m).
-    real_quat: orientation of the joint's frame in the real link's frame (wxyz).
-    freedoms: freedoms of the virtual joint: rotations about x, y, z, then translations along them.
-    rank: the rank m of the loop constraints, computed once for the phase.
-    margin: |R_mm| / |R_11| of the pivoted QR factorisation that gave the rank.
-    locked: joint coordinates that are locked; None if no joint can be locked.
-    independent: joint coordinates preferred as independent ones; None: no preference.
-    """
-
-    connected: Bool[Array, "... links"]
-    parent: Int[Array, "... links"]
-    real: Int[Array, "... links"]
-    pos: Float[Array, "... links 3"]
-    quat: Float[Array, "... links 4"]
-    real_pos: Float[Array, "... links 3"]
-    real_quat: Float[Array, "... links 4"]
-    freedoms: Bool[Array, "... links 6"]
-    rank: Int[Array, "..."]
-    margin: Float[Array, "..."]
-    locked: Bool[Array, "... dofs"] | None = None
-    independent: Bool[Array, "... dofs"] | None = None
-
-
-class State(eqx.Module):
-    """Positions and velocities at one instant, and the structure that holds there.
-
-    Every field may have leading batch axes.
-
-    q: the tree's coordinates (m, rad, wxyz; qpos if none is cuttable), then the virtual joints'.
-    v: the tree's velocities (m/s, rad/s; qvel if none is cuttable), then the virtual joints'.
-    structure: how the bodies are joined.
-    """
-
-    q: Float[Array, "... q"]
-    v: Float[Array, "... dofs"]
-    structure: Structure
-
-
-class Chain(eqx.Module):
+class Chain(NamedAccess):
     """The bodies of a scene and the joints between them, made by `svkc.load`.
 
     Floats are differentiable leaves. There is one row for each joint or fixed body of the tree
@@ -93,7 +47,6 @@ class Chain(eqx.Module):
     left_out: one line for each kind of element of the model that svkc cannot simulate.
     """
 
-    topology: Topology = eqx.field(static=True)
     pos: Float[Array, "rows 3"]
     quat: Float[Array, "rows 4"]
     axis: Float[Array, "rows 3"]
@@ -118,42 +71,8 @@ class Chain(eqx.Module):
     left_out: tuple[str, ...] = eqx.field(static=True, default=())
 
     @property
-    def body_names(self) -> tuple[str, ...]:
-        """Names of the bodies in the model's order; the first is the world."""
-        return self.topology.body_names
-
-    @property
-    def joint_names(self) -> tuple[str, ...]:
-        """Names of the tree's joints in the model's order."""
-        return self.topology.joint_names
-
-    @property
-    def link_names(self) -> tuple[str, ...]:
-        """Names of the virtual links, in the order of `Structure`'s entries."""
-        return self.topology.link_names
-
-    @property
-    def dof_names(self) -> tuple[str, ...]:
-        """Names of the joint coordinates, in the order of `State.v`.
-
-        A joint with several coordinates appends .x, .y, .z (translations) and .rx, .ry, .rz.
-        """
-        return self.topology.dof_names
-
-    @property
-    def nq(self) -> int:
-        """Number of the tree's coordinates q: MuJoCo's nq if no joint is cuttable."""
-        return self.topology.nq
-
-    @property
-    def nv(self) -> int:
-        """Number of the tree's velocities v: MuJoCo's nv if no joint is cuttable."""
-        return self.topology.nv
-
-    @property
-    def dofs(self) -> int:
-        """Number of all joint coordinates: the tree's, then the virtual links'; the length of v."""
-        return self.topology.dofs
+    def _dtype(self) -> np.dtype:
+        return self.q_load.dtype
 
     @property
     def symmetric_inertia(self) -> Float[Array, "rows 3 3"]:
@@ -198,6 +117,27 @@ class Chain(eqx.Module):
             driven = jnp.asarray(np.append(not_free, np.zeros(top.dofs - top.nv, bool)))
             driven = driven | top.link_dof_mask(np.array(top.link_child, int) >= 0)
         return driven | top.link_dof_mask(np.array(top.link_actuated, bool))
+
+    def body(self, name: str) -> BodyParameters:
+        """Return the mass, centre of mass, inertia and placement of a body, by its name.
+
+        Raises ValueError, with the nearest names, if there is no such body.
+        """
+        return body_parameters(self, name)
+
+    def replace(self, *, scale_inertia: bool = False, **parameters: Any) -> "Chain":
+        """Return the chain with other parameters, each given by name or as the whole array.
+
+        parameters: `mass={"ball": 2.0}` sets the entries of the bodies or joints named, and
+            `gravity=[0, 0, -1.6]` a whole array. By body name: `mass` (kg), `com` (m), `inertia`
+            (kg m^2, [3 3], or [3] on the diagonal), `pos` (m), `quat` (wxyz). By joint name:
+            `axis`, `armature`, `damping`, `stiffness`, `q_spring`, `limit` (lower and upper end).
+            Any other array of the chain as a whole. All values may be traced.
+        scale_inertia: scale the inertia of each body named in `mass` by the ratio of its masses.
+
+        Raises ValueError if a name is unknown, a shape is wrong, or a number is not finite.
+        """
+        return with_parameters(self, parameters, scale_inertia)
 
     def motors(self, u: Any) -> Float[Array, " dofs"]:
         """Return the joint torques (N m, N) of the model's actuators: gear times clipped controls.

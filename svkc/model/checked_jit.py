@@ -3,7 +3,7 @@ traces, so that a compiled call pays nothing for the validation."""
 
 import functools
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, TypeVar, overload
 
 import jax
@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from svkc._jax.eager import eager_jit
+from svkc.model.annotations import Torques
 from svkc.model.chain import Chain, State, Structure
 from svkc.model.inertial_parameters import check_inertial_parameters
 from svkc.model.validation import real_array
@@ -64,7 +65,9 @@ def _validated(arguments: dict, static: tuple[str, ...] = ()) -> dict:
         check_state(chain, arguments["state"])
     lengths = dict.fromkeys(("q", "q1", "q2"), chain.topology.nq_all) | {"dv": chain.dofs}
     return arguments | {
-        name: float_vector(chain, name, arguments[name], lengths.get(name))
+        name: chain.torques(arguments[name])
+        if name == "tau" and isinstance(arguments[name], Mapping)
+        else float_vector(chain, name, arguments[name], lengths.get(name))
         for name in arguments.keys() - {"chain", "state", *static}
     }
 
@@ -136,11 +139,14 @@ def checked_jit(
     return call
 
 
-def torques_over_dofs(chain: Chain, tau: Array) -> Float[Array, " dofs"]:
+def torques_over_dofs(chain: Chain, tau: Torques) -> Float[Array, " dofs"]:
     """Return torques [dofs] over every coordinate, with zeros for virtual joints if tau is [nv].
 
-    Raises ValueError if tau has another length.
+    Raises ValueError if tau has another length, or is a dict with unknown names.
     """
+    if isinstance(tau, Mapping):
+        return chain.torques(tau)
+    tau = jnp.asarray(tau)
     if tau.shape == (chain.dofs,):
         return tau
     if tau.shape == (chain.nv,):

@@ -10,12 +10,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from svkc.model.chain import Chain
-from svkc.model.topology import V_SIZE
+from svkc.model.topology import Q_SIZE, V_SIZE, Topology
 from svkc.model.validation import as_array
 
 # an error lists as many of the known names
-_NAMES_LISTED = 20
+_MOST_NAMES = 20
 
 
 def unknown_name(kind: str, name: Any, known: Sequence[str]) -> ValueError:
@@ -28,81 +27,115 @@ def unknown_name(kind: str, name: Any, known: Sequence[str]) -> ValueError:
     nearest = difflib.get_close_matches(str(name), known)
     hint = f" did you mean {' or '.join(map(repr, nearest))}?" if nearest else ""
     kinds = " or ".join(f"{k[:-1]}ies" if k[-1] == "y" else f"{k}s" for k in kind.split(" or "))
-    listed = [*known[:_NAMES_LISTED], *(["..."] if len(known) > _NAMES_LISTED else [])]
-    return ValueError(f"no {kind} {name!r};{hint} {kinds}: {', '.join(listed) or 'none'}")
+    shown = [*known[:_MOST_NAMES], *(["..."] if len(known) > _MOST_NAMES else [])]
+    return ValueError(f"no {kind} {name!r};{hint} {kinds}: {', '.join(shown) or 'none'}")
 
 
-def connection_mask(chain: Chain, connected: Any) -> np.ndarray | jax.Array:
-    """Return the mask [links] of connected virtual links from names, a mask, or None (the model's).
+def connection_mask(
+    top: Topology, connected: Any, default: np.ndarray | jax.Array
+) -> np.ndarray | jax.Array:
+    """Return the mask [links] of connected virtual links from names, a mask, or None (the default).
 
     Raises ValueError if `connected` is neither names nor a Boolean mask of this length.
     """
     if connected is None:
-        return chain.structure.connected
+        return default
     names = (connected,) if isinstance(connected, str) else connected
     if isinstance(names, (tuple, list, set, frozenset)) and all(isinstance(n, str) for n in names):
-        return np.isin(chain.link_names, [chain.link_names[link_index(chain, n)] for n in names])
+        return np.isin(np.arange(len(top.link_names)), [link_index(top, n) for n in names])
     mask = as_array(connected)
-    if mask.shape != (len(chain.link_names),) or mask.dtype != bool:
+    if mask.shape != (len(top.link_names),) or mask.dtype != bool:
         raise ValueError(
-            f"connected: expected names of virtual links or {len(chain.link_names)} Booleans, got"
+            f"connected: expected names of virtual links or {len(top.link_names)} Booleans, got"
             f" {mask.dtype} of shape {mask.shape}"
         )
     return mask
 
 
-def link_index(chain: Chain, name: str) -> int:
+def _is_among(name: Any, known: Sequence[str]) -> bool:
+    """Return whether a value is one of these names."""
+    return isinstance(name, str) and name in known
+
+
+def link_index(top: Topology, name: str) -> int:
     """Return the index of a virtual link in `Structure`'s entries."""
-    if isinstance(name, str) and name in chain.joint_names:
+    if _is_among(name, top.joint_names):
         raise ValueError(
             f"no virtual link {name!r}, but a joint of the tree; to cut it, load the chain with"
             f" svkc.load(..., cuttable={name!r})"
         )
-    if not isinstance(name, str) or name not in chain.link_names:
-        raise ValueError(
-            f"no virtual link {name!r}; virtual links: {', '.join(chain.link_names) or 'none'}"
-        )
-    return chain.link_names.index(name)
+    if not _is_among(name, top.link_names):
+        raise unknown_name("virtual link", name, top.link_names)
+    return top.link_names.index(name)
 
 
-def joint_slice(chain: Chain, name: str, widths: Any, starts: Any) -> slice:
-    """Return the slice of a joint in q or v, for a joint of the tree or a cuttable one.
+def q_slice(top: Topology, joint: str, *, links: bool = False) -> slice:
+    """Return the slice in q of a joint of the tree or of a cuttable joint.
 
-    widths: number of coordinates by joint kind: `Q_SIZE` for q, `V_SIZE` for v.
-    starts: first index of each row: `Topology.q_start` or `Topology.v_start`.
+    links: whether the name may also be that of a virtual link.
     """
-    top = chain.topology
-    for joint, link, freedom in top.cuttable_joints:
-        if joint == name:
-            ball = sum(top.link_freedoms[link][:3]) == 3
-            if widths is V_SIZE:
-                first = top.links.dof[link, freedom]
-                return slice(int(first), int(first) + (3 if ball else 1))
-            first = (
-                top.links.quat[link, 0]
-                if ball
-                else np.concatenate([top.links.angle, top.links.slide], 1)[link, freedom]
-            )
-            return slice(int(first), int(first) + (4 if ball else 1))
-    if not isinstance(name, str) or name not in top.joint_names:
-        raise ValueError(f"no joint {name!r}; joints: {', '.join(top.joint_names)}")
-    row = top.joint_row[top.joint_names.index(name)]
-    return slice(starts[row], starts[row] + widths[top.kind[row]])
+    for name, link, freedom in top.cuttable_joints:
+        if name == joint:
+            if _is_ball(top, link):
+                return _as_slice(top.links.quat[link])
+            of_freedoms = np.concatenate([top.links.angle, top.links.slide], 1)
+            return _as_slice(of_freedoms[link, freedom : freedom + 1])
+    if _is_among(joint, top.joint_names):
+        row = top.joint_row[top.joint_names.index(joint)]
+        return slice(top.q_start[row], top.q_start[row] + Q_SIZE[top.kind[row]])
+    if not links or not _is_among(joint, top.link_names):
+        raise unknown_name("joint", joint, top.joint_names + top.link_names * links)
+    link = top.link_names.index(joint)
+    freedoms = np.array(top.link_freedoms[link])
+    rotations = top.links.quat[link] if _is_ball(top, link) else top.links.angle[link][freedoms[:3]]
+    return _as_slice(np.concatenate([rotations, top.links.slide[link][freedoms[3:]]]))
 
 
-def body_rows(chain: Chain, *bodies: str) -> list[int]:
+def v_slice(top: Topology, joint: str, *, links: bool = False) -> slice:
+    """Return the slice in v of a joint of the tree or of a cuttable joint.
+
+    links: whether the name may also be that of a virtual link.
+    """
+    for name, link, freedom in top.cuttable_joints:
+        if name == joint:
+            width = 3 if _is_ball(top, link) else 1
+            return _as_slice(top.links.dof[link, freedom : freedom + width])
+    if _is_among(joint, top.joint_names):
+        row = top.joint_row[top.joint_names.index(joint)]
+        return slice(top.v_start[row], top.v_start[row] + V_SIZE[top.kind[row]])
+    if not links or not _is_among(joint, top.link_names):
+        raise unknown_name("joint", joint, top.joint_names + top.link_names * links)
+    link = top.link_names.index(joint)
+    return _as_slice(top.links.dof[link][np.array(top.link_freedoms[link])])
+
+
+def _is_ball(top: Topology, link: int) -> bool:
+    """Return whether a virtual joint has three rotations, for which q holds a quaternion."""
+    return sum(top.link_freedoms[link][:3]) == 3
+
+
+def _as_slice(indices: np.ndarray) -> slice:
+    """Return successive indices as a slice, of length zero if there are none."""
+    return slice(int(indices[0]), int(indices[-1]) + 1) if len(indices) else slice(0, 0)
+
+
+def body_index(top: Topology, name: str) -> int:
+    """Return the index of a body."""
+    if not _is_among(name, top.body_names):
+        raise unknown_name("body", name, top.body_names)
+    return top.body_names.index(name)
+
+
+def body_rows(top: Topology, *bodies: str) -> list[int]:
     """Return the rows of bodies."""
-    for body in bodies:
-        if not isinstance(body, str) or body not in chain.body_names:
-            raise ValueError(f"bind: no body {body!r}; bodies: {', '.join(chain.body_names)}")
-    return [chain.topology.body_row[chain.body_names.index(b)] for b in bodies]
+    return [top.body_row[body_index(top, body)] for body in bodies]
 
 
-def spare_slot(chain: Chain, name: str) -> int:
+def spare_slot(top: Topology, name: str) -> int:
     """Return the index of a spare slot; raise ValueError for any other virtual link."""
-    slot = link_index(chain, name)
-    if not chain.topology.link_spare[slot]:
-        spare = [n for n, s in zip(chain.link_names, chain.topology.link_spare, strict=True) if s]
+    slot = link_index(top, name)
+    if not top.link_spare[slot]:
+        spare = [n for n, s in zip(top.link_names, top.link_spare, strict=True) if s]
         raise ValueError(
             f"bind: {name!r} is not a spare slot; spare slots:"
             f" {', '.join(spare) or 'none; load with spare=n'}"

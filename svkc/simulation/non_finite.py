@@ -20,8 +20,7 @@ from svkc.loops.constrained_dynamics import default_dynamics
 from svkc.loops.forward_dynamics import forward_dynamics
 from svkc.model.chain import Chain, State, Structure
 from svkc.model.inertial_parameters import row_name
-from svkc.model.names import joint_slice
-from svkc.model.topology import Q_SIZE
+from svkc.model.names import q_slice
 from svkc.simulation.codes import RESULTS
 from svkc.transitions.events import as_events
 from svkc.transitions.plan import Plan, make_plan
@@ -146,7 +145,7 @@ def _joint_of_coordinate(chain: Chain, bad: np.ndarray) -> str:
     """Return text that names the joint of the first bad entry of q."""
     index = int(np.argmax(bad))
     for joint in chain.joint_names:
-        coordinates = joint_slice(chain, joint, Q_SIZE, chain.topology.q_start)
+        coordinates = q_slice(chain.topology, joint)
         if coordinates.start <= index < coordinates.stop:
             return f"joint {joint!r}"
     return f"the virtual joint at q[{index}]"

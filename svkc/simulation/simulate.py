@@ -53,7 +53,7 @@ def simulate(
     ts: save times (s), which steps meet exactly; None: t0 and t1. A state saved at the time of an
         event is the state after the event. Times past the end of a lane hold its last state.
     events: `svkc.at(...)`, `svkc.when(...)`, or several.
-    control: function (t, state, args) -> torques (N m, N) over every coordinate, or the tree's.
+    control: function (t, state, args) -> torques (N m, N): [dofs], the tree's [nv], or by joint.
     args: passed to `control` and to guards.
     dt: fixed step size (s). dtmax: longest adaptive step (s); `stepsize_controller` has its own.
     rtol, atol: tolerances of adaptive steps; by default 1e-7 (float32: 1e-4) and a hundredth of

@@ -163,7 +163,7 @@ def touch(chain: Chain, link: str, distance: Scalar = 0.01, axes: str | None = N
     are not distinct letters of "xyz".
     """
     check_chain(chain)
-    slot = link_index(chain, link)
+    slot = link_index(chain.topology, link)
     if axes is None:
         axes = (
             "".join(
@@ -205,7 +205,9 @@ def leaves(chain: Chain, link: str, axis: Numbers = (0.0, 0.0, 1.0)) -> Leaves:
     norm = float(np.linalg.norm(axis))
     if axis.shape != (3,) or not 0 < norm < np.inf:
         raise ValueError(f"leaves: axis: expected three numbers that are not all zero, got {axis}")
-    return Leaves(chain, link_index(chain, link), jnp.asarray(axis / norm, chain.q_load.dtype))
+    return Leaves(
+        chain, link_index(chain.topology, link), jnp.asarray(axis / norm, chain.q_load.dtype)
+    )
 
 
 def overload(
@@ -230,4 +232,4 @@ def overload(
         jnp.asarray(np.inf if x is None else positive_scalar(name, x), chain.q_load.dtype)
         for name, x in (("overload: force", force), ("overload: torque", torque))
     ]
-    return Overload(chain, link_index(chain, link), *limits)
+    return Overload(chain, link_index(chain.topology, link), *limits)

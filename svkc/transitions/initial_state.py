@@ -15,8 +15,7 @@ from svkc._jax.pytrees import is_concrete
 from svkc.loops.constraint import gap_tolerance, jacobian_scales, loop_gaps
 from svkc.model.chain import Chain, State, Structure
 from svkc.model.checked_jit import check_state
-from svkc.model.names import connection_mask, joint_slice
-from svkc.model.topology import Q_SIZE, V_SIZE
+from svkc.model.names import connection_mask, q_slice, v_slice
 from svkc.model.validation import boolean, finite_array, positive_scalar
 from svkc.transitions.path_following import follow_path
 from svkc.transitions.spare_links import check_bound
@@ -46,10 +45,8 @@ def _full_vector(chain: Chain, quantity: str, value, default):
     default: values of the coordinates that the user does not give.
     """
     top = chain.topology
-    tree_size, widths, start, model_entries = (
-        (top.nq, Q_SIZE, top.q_start, top.model_q)
-        if quantity == "q"
-        else (top.nv, V_SIZE, top.v_start, top.model_v)
+    tree_size, slice_of, model_entries = (
+        (top.nq, q_slice, top.model_q) if quantity == "q" else (top.nv, v_slice, top.model_v)
     )
     named = np.zeros(top.dofs, bool)
     if value is None:
@@ -57,7 +54,7 @@ def _full_vector(chain: Chain, quantity: str, value, default):
     if isinstance(value, dict):
         out = default
         for name, number in value.items():
-            at = joint_slice(chain, name, widths, start)
+            at = slice_of(top, name)
             number = finite_array(f"{quantity}[{name!r}]", number, default.dtype)
             if number.size != at.stop - at.start:
                 raise ValueError(
@@ -65,7 +62,7 @@ def _full_vector(chain: Chain, quantity: str, value, default):
                     f" {at.stop - at.start}"
                 )
             out = _set_values(out, at, number.reshape(-1))
-            named[joint_slice(chain, name, V_SIZE, top.v_start)] = True
+            named[v_slice(top, name)] = True
         return out, named
     value = finite_array(quantity, value, default.dtype)
     if top.cuttable_joints and value.shape == (len(model_entries),):
@@ -199,7 +196,7 @@ def _start(chain: Chain, near: State | None, connected) -> tuple[Array, Structur
         check_state(chain, near)
         start, structure = near.q, near.structure
     if near is None or connected is not None:
-        mask = connection_mask(chain, connected)
+        mask = connection_mask(chain.topology, connected, chain.structure.connected)
         at_rest = jnp.zeros(chain.dofs, chain.q_load.dtype)
         state = check_bound(chain, State(start, at_rest, structure), mask)
         start = state.q

@@ -12,8 +12,7 @@ from jaxtyping import Array, Bool, Float
 from svkc._jax.pytrees import is_concrete
 from svkc.model.annotations import DType
 from svkc.model.chain import Chain, Structure
-from svkc.model.names import body_rows, joint_slice, link_index, spare_slot
-from svkc.model.topology import V_SIZE
+from svkc.model.names import body_rows, link_index, spare_slot, v_slice
 from svkc.transitions.events import Action, At, When
 from svkc.transitions.guards import AbstractGuard, UserGuard
 from svkc.transitions.spare_links import (
@@ -92,11 +91,11 @@ class Plan(eqx.Module):
             table = np.zeros((len(self.actions), chain.dofs), bool)
             for row, action in zip(table, self.actions, strict=True):
                 for name in getattr(action, action_name):
-                    row[joint_slice(chain, name, V_SIZE, chain.topology.v_start)] = True
+                    row[v_slice(chain.topology, name)] = True
             return table
         table = np.zeros((len(self.actions), len(chain.link_names)), bool)
         for row, action in zip(table, self.actions, strict=True):
-            row[[link_index(chain, name) for name in getattr(action, action_name)]] = True
+            row[[link_index(chain.topology, name) for name in getattr(action, action_name)]] = True
         return table
 
     def grip_mask(self, chain: Chain) -> np.ndarray:
@@ -207,9 +206,9 @@ def _check_names(chain: Chain, plan: Plan) -> None:
     for action in plan.actions:
         for slot_or_pair in action.unbind:
             if isinstance(slot_or_pair, str):
-                spare_slot(chain, slot_or_pair)
+                spare_slot(chain.topology, slot_or_pair)
             else:
-                body_rows(chain, *slot_or_pair)
+                body_rows(chain.topology, *slot_or_pair)
 
 
 def _as_guard(guard: Callable) -> AbstractGuard:
@@ -219,11 +218,11 @@ def _as_guard(guard: Callable) -> AbstractGuard:
 
 def _validate_grip(chain: Chain, grip: Grip, dtype) -> Grip:
     """Return the grip with its point as an array. Raises ValueError for an invalid grip."""
-    body_rows(chain, grip.parent, grip.real)
+    body_rows(chain.topology, grip.parent, grip.real)
     spare_link_freedoms(grip.joint)
     rotation_to_axis(grip.axis)
     if grip.slot is not None:
-        spare_slot(chain, grip.slot)
+        spare_slot(chain.topology, grip.slot)
     elif not any(chain.topology.link_spare):
         raise ValueError("bind: the chain has no spare slots; load it with spare=n")
     return dataclasses.replace(grip, real_pos=as_placement("real_pos", grip.real_pos, dtype))

@@ -159,7 +159,7 @@ def bound_between(
 
     parent, real: names of bodies. Slots with the two exchanged are not in the mask.
     """
-    p, r = body_rows(chain, parent, real)
+    p, r = body_rows(chain.topology, parent, real)
     return (
         jnp.asarray(np.array(chain.topology.link_spare, bool))
         & structure.connected
@@ -177,12 +177,14 @@ def bind_grip(
     The mask is empty if a connected slot joins the same parent and real link already.
     """
     spare = jnp.asarray(np.array(chain.topology.link_spare, bool))
-    rows = body_rows(chain, grip.parent, grip.real)
+    rows = body_rows(chain.topology, grip.parent, grip.real)
     if grip.slot is None:
         free = unbound_slots(chain, structure) & ~structure.connected
         slot = free & (jnp.cumsum(free, dtype=jnp.int32) == 1)
     else:
-        slot = (jnp.arange(spare.shape[0]) == spare_slot(chain, grip.slot)) & ~structure.connected
+        slot = (
+            jnp.arange(spare.shape[0]) == spare_slot(chain.topology, grip.slot)
+        ) & ~structure.connected
     already_bound = jnp.any(bound_between(chain, structure, grip.parent, grip.real))
     slot = slot & ~already_bound
     bound = set_links(
@@ -242,7 +244,7 @@ def bind(
     or point, and, as a runtime error under jit, if the slot is connected.
     """
     check_state(chain, state)
-    index = spare_slot(chain, name)
+    index = spare_slot(chain.topology, name)
     state = _check_not_connected(state, index, name)
     slot = jnp.asarray(np.arange(len(chain.link_names)) == index)
     pos, real_pos = (
@@ -251,7 +253,7 @@ def bind(
     structure = set_links(
         state.structure,
         slot,
-        rows=body_rows(chain, parent, real),
+        rows=body_rows(chain.topology, parent, real),
         freedoms=spare_link_freedoms(joint),
         quat=rotation_to_axis(axis),
         pos=pos,

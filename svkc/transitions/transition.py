@@ -17,8 +17,7 @@ from svkc.loops.constraint import gap_tolerance
 from svkc.model.annotations import Names, Numbers
 from svkc.model.chain import Chain, State, Structure
 from svkc.model.checked_jit import check_state
-from svkc.model.names import connection_mask, joint_slice, link_index, spare_slot
-from svkc.model.topology import V_SIZE
+from svkc.model.names import connection_mask, link_index, spare_slot, v_slice
 from svkc.model.validation import boolean
 from svkc.transitions.impact import StructureChange, lock_projection
 from svkc.transitions.initial_state import check_closed
@@ -158,7 +157,7 @@ def transition(chain: Chain, state: State, connected: Names | Numbers) -> State:
     is not bound, if bodies are too far from the placement, and if a loop cannot be closed.
     """
     check_state(chain, state)
-    mask = connection_mask(chain, connected)
+    mask = connection_mask(chain.topology, connected, chain.structure.connected)
     state = check_bound(chain, state, mask)
     return _check_connected(chain, change_structure(chain, state, jnp.asarray(mask)))
 
@@ -188,7 +187,7 @@ def connect(chain: Chain, state: State, *names: str, here: bool = False) -> Stat
 
 def _link_mask(chain: Chain, names: tuple[str, ...]) -> np.ndarray:
     """Return the mask of these virtual links. Raises ValueError for unknown names."""
-    return np.isin(np.arange(len(chain.link_names)), [link_index(chain, n) for n in names])
+    return np.isin(np.arange(len(chain.link_names)), [link_index(chain.topology, n) for n in names])
 
 
 def _check_connected(chain: Chain, change: StructureChange) -> State:
@@ -240,7 +239,7 @@ def _set_locked(chain: Chain, state: State, joints, value: bool) -> State:
         jnp.zeros(chain.dofs, bool) if state.structure.locked is None else state.structure.locked
     )
     for name in joints:
-        locked = locked.at[joint_slice(chain, name, V_SIZE, chain.topology.v_start)].set(value)
+        locked = locked.at[v_slice(chain.topology, name)].set(value)
     return (change_structure if value else release_constraints)(
         chain, state, state.structure.connected, locked
     ).state
@@ -272,6 +271,8 @@ def unbind(chain: Chain, state: State, *names: str) -> State:
     names: spare slots. Raises ValueError for names that are not spare slots.
     """
     check_state(chain, state)
-    slots = np.isin(np.arange(len(chain.link_names)), [spare_slot(chain, n) for n in names])
+    slots = np.isin(
+        np.arange(len(chain.link_names)), [spare_slot(chain.topology, n) for n in names]
+    )
     after = release_constraints(chain, state, state.structure.connected & ~jnp.asarray(slots)).state
     return State(after.q, after.v, cleared(after.structure, jnp.asarray(slots)))

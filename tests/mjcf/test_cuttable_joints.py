@@ -260,7 +260,7 @@ def test_armature_is_left_out_joint_by_joint():
     chain = svkc.load(ROTORS, cuttable="a", ignore_armature=["a"])
     assert chain.armature.tolist() == [0, 0, 0, 0, 0, 0, 0.2]
     assert svkc.load(ROTORS, cuttable="a", ignore="armature").armature is None
-    with pytest.raises(ValueError, match="ignore_armature: no joint 'nose'; joints: a, b"):
+    with pytest.raises(ValueError, match="no joint 'nose'; joints: a, b"):
         svkc.load(ROTORS, ignore_armature="nose")
 
 

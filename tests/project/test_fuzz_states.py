@@ -14,8 +14,7 @@ import state_laws
 from references import rigid_bodies
 
 import svkc
-from svkc.model.names import joint_slice
-from svkc.model.topology import Q_SIZE, V_SIZE
+from svkc.model.names import q_slice, v_slice
 
 
 class Call:
@@ -51,11 +50,11 @@ class Call:
         self.named_q, self.named_v = self.none.copy(), self.none.copy()
         self.q_argument, self.v_argument, requested = {}, {}, self.sample.q.copy()
         for name in rng.permutation(names)[: rng.integers(0, len(names) + 1)]:
-            at = joint_slice(chain, name, Q_SIZE, top.q_start)
+            at = q_slice(top, name)
             self.q_argument[str(name)] = requested[at] = self.target[at]
-            self.named_q[joint_slice(chain, name, V_SIZE, top.v_start)] = True
+            self.named_q[v_slice(top, name)] = True
         for name in rng.permutation(names)[: rng.integers(0, len(names) + 1)]:
-            at = joint_slice(chain, name, V_SIZE, top.v_start)
+            at = v_slice(top, name)
             self.v_argument[str(name)], self.named_v[at] = self.v[at], True
         self.v_before = np.where(self.named_v, self.v, 0)
         self.start, self.fixed = (self.sample.q, True) if fixed else (requested, False)

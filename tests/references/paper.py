@@ -44,7 +44,7 @@ def velocity_by_impulse(
     state: a state in which the link is not connected and its gap is zero.
     name: name of the virtual link.
     """
-    slot, nv = link_index(chain, name), chain.nv
+    slot, nv = link_index(chain.topology, name), chain.nv
     loops = loop_kinematics(chain, state.structure, state.q)
     kin = loops.kin
     before = closed_coordinates(chain, state.structure, state.v, loops, twists(chain, kin, state.v))
