@@ -174,7 +174,7 @@ CASES = {
     "state and chain are float64": simulate_without_x64,
     "states: ... lanes": rollout_with_nine_processes,
     "... has the ...": lambda s: s.file(
-        metadata=np.array('{"schema": 5, "result": "exploded", "derivative": "successful"}')
+        metadata=np.array('{"schema": 6, "result": "exploded", "derivative": "successful"}')
     ),
     "... has schema": lambda s: s.file(metadata=np.array('{"schema": 99}')),
     "... is not a complete trajectory": lambda s: s.file(metadata=None),

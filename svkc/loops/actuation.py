@@ -20,6 +20,7 @@ from svkc.loops.least_squares import least_cost_solution, solve_bounded
 from svkc.loops.pivoting import PivotedQR, pivoted_qr, pivoted_qr_with_rank
 from svkc.model.annotations import Checked, Numbers, Scalar
 from svkc.model.chain import Chain, State
+from svkc.model.chain_names import ChainNames
 from svkc.model.checked_jit import check_state
 from svkc.model.validation import as_array, real_array
 from svkc.tree.inverse_dynamics import pad_to_dofs, passive_forces, rnea
@@ -42,6 +43,7 @@ class Actuation(eqx.Module):
     undriven: columns are joint velocities on which no actuator does work.
     rank: rank of S. redundancy: number of actuators that the loops let move, less the rank.
     deficiency: number of freedoms beyond the rank.
+    names: names of the chain's bodies, joints, links and coordinates.
     """
 
     tau: Float[Array, " dofs"]
@@ -55,6 +57,7 @@ class Actuation(eqx.Module):
     rank: Int[Array, ""]
     redundancy: Int[Array, ""]
     deficiency: Int[Array, ""]
+    names: ChainNames | None = eqx.field(static=True, default=None)
 
 
 def actuation(
@@ -209,5 +212,6 @@ def _solve_unbounded(chain: Chain, state: State, vdot_G, weight, actuated: Bool[
         rank=rank,
         redundancy=count(reachable) - rank,
         deficiency=count(co.independent) - rank,
+        names=chain.names,
     )
     return result, (B, column * target_force, column)

@@ -11,6 +11,7 @@ from svkc.loops.constraint import loop_kinematics
 from svkc.loops.coordinates import coordinates
 from svkc.loops.pivoting import count_rank, pivot_ratio, pivoted_qr
 from svkc.model.chain import Chain, State, active_dofs
+from svkc.model.chain_names import ChainNames
 from svkc.model.checked_jit import checked_jit
 
 
@@ -22,6 +23,7 @@ class Mobility(eqx.Module):
     independent: mask of theta_G.
     margin: |R_mm| / |R_11| of the pivoted QR of J_C, the distance from a lower rank.
     connected: which virtual links are connected.
+    names: names of the chain's bodies, joints, links and coordinates.
     """
 
     freedoms: Int[Array, ""]
@@ -31,8 +33,17 @@ class Mobility(eqx.Module):
     independent: Bool[Array, " dofs"]
     margin: Float[Array, ""]
     connected: Bool[Array, " links"]
-    link_names: tuple[str, ...] = eqx.field(static=True)
-    dof_names: tuple[str, ...] = eqx.field(static=True)
+    names: ChainNames = eqx.field(static=True)
+
+    @property
+    def link_names(self) -> tuple[str, ...]:
+        """Names of the virtual links."""
+        return self.names.links
+
+    @property
+    def dof_names(self) -> tuple[str, ...]:
+        """Names of the joint coordinates; see `Chain.dof_names`."""
+        return self.names.v
 
     def __str__(self) -> str:
         if not is_concrete(self.rank) or self.rank.ndim:
@@ -71,8 +82,7 @@ def mobility(chain: Chain, state: State) -> Mobility:
             independent=active,
             margin=unit_margin,
             connected=none > 0,
-            link_names=(),
-            dof_names=chain.dof_names,
+            names=chain.names,
         )
     J = loop_kinematics(chain, state.structure, state.q).J
     # ranks of the rows of the first loop, of the first two loops, and so on
@@ -94,6 +104,5 @@ def mobility(chain: Chain, state: State) -> Mobility:
         independent=coordinates(chain, state).independent,
         margin=pivot_ratio(pivoted_qr(J, rank)),
         connected=state.structure.connected,
-        link_names=chain.link_names,
-        dof_names=chain.dof_names,
+        names=chain.names,
     )

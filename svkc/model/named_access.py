@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from svkc.model.chain_names import ChainNames, chain_names
 from svkc.model.names import body_index, q_slice, v_slice
 from svkc.model.state import State
 from svkc.model.topology import Topology
@@ -42,6 +43,11 @@ class NamedAccess(eqx.Module):
         """The floating-point type of the chain's arrays."""
 
     @property
+    def names(self) -> ChainNames:
+        """Names of the bodies, joints, virtual links and coordinates, as results keep them."""
+        return chain_names(self.topology)
+
+    @property
     def body_names(self) -> tuple[str, ...]:
         """Names of the bodies in the model's order; the first is the world."""
         return self.topology.body_names
@@ -62,7 +68,7 @@ class NamedAccess(eqx.Module):
 
         A joint with several coordinates appends .x, .y, .z (translations) and .rx, .ry, .rz.
         """
-        return self.topology.dof_names
+        return self.names.v
 
     @property
     def nq(self) -> int:

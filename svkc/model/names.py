@@ -4,13 +4,14 @@ Raises ValueError, with the names that exist, for an unknown one.
 """
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import jax
 import numpy as np
 
-from svkc.model.topology import Q_SIZE, V_SIZE, Topology
+from svkc.model.chain_names import chain_names
+from svkc.model.topology import Topology
 from svkc.model.validation import as_array
 
 # an error lists as many of the known names
@@ -52,7 +53,7 @@ def connection_mask(
     return mask
 
 
-def _is_among(name: Any, known: Sequence[str]) -> bool:
+def _is_among(name: Any, known: Collection[str]) -> bool:
     """Return whether a value is one of these names."""
     return isinstance(name, str) and name in known
 
@@ -74,21 +75,7 @@ def q_slice(top: Topology, joint: str, *, links: bool = False) -> slice:
 
     links: whether the name may also be that of a virtual link.
     """
-    for name, link, freedom in top.cuttable_joints:
-        if name == joint:
-            if _is_ball(top, link):
-                return _as_slice(top.links.quat[link])
-            of_freedoms = np.concatenate([top.links.angle, top.links.slide], 1)
-            return _as_slice(of_freedoms[link, freedom : freedom + 1])
-    if _is_among(joint, top.joint_names):
-        row = top.joint_row[top.joint_names.index(joint)]
-        return slice(top.q_start[row], top.q_start[row] + Q_SIZE[top.kind[row]])
-    if not links or not _is_among(joint, top.link_names):
-        raise unknown_name("joint", joint, top.joint_names + top.link_names * links)
-    link = top.link_names.index(joint)
-    freedoms = np.array(top.link_freedoms[link])
-    rotations = top.links.quat[link] if _is_ball(top, link) else top.links.angle[link][freedoms[:3]]
-    return _as_slice(np.concatenate([rotations, top.links.slide[link][freedoms[3:]]]))
+    return _joint_slice(top, chain_names(top).q_ranges, joint, links)
 
 
 def v_slice(top: Topology, joint: str, *, links: bool = False) -> slice:
@@ -96,27 +83,16 @@ def v_slice(top: Topology, joint: str, *, links: bool = False) -> slice:
 
     links: whether the name may also be that of a virtual link.
     """
-    for name, link, freedom in top.cuttable_joints:
-        if name == joint:
-            width = 3 if _is_ball(top, link) else 1
-            return _as_slice(top.links.dof[link, freedom : freedom + width])
-    if _is_among(joint, top.joint_names):
-        row = top.joint_row[top.joint_names.index(joint)]
-        return slice(top.v_start[row], top.v_start[row] + V_SIZE[top.kind[row]])
-    if not links or not _is_among(joint, top.link_names):
-        raise unknown_name("joint", joint, top.joint_names + top.link_names * links)
-    link = top.link_names.index(joint)
-    return _as_slice(top.links.dof[link][np.array(top.link_freedoms[link])])
+    return _joint_slice(top, chain_names(top).v_ranges, joint, links)
 
 
-def _is_ball(top: Topology, link: int) -> bool:
-    """Return whether a virtual joint has three rotations, for which q holds a quaternion."""
-    return sum(top.link_freedoms[link][:3]) == 3
-
-
-def _as_slice(indices: np.ndarray) -> slice:
-    """Return successive indices as a slice, of length zero if there are none."""
-    return slice(int(indices[0]), int(indices[-1]) + 1) if len(indices) else slice(0, 0)
+def _joint_slice(top: Topology, ranges: Any, joint: str, links: bool) -> slice:
+    """Return the slice of a joint among the ranges (name, start, stop) of all."""
+    cuttable = tuple(name for name, _, _ in top.cuttable_joints)
+    known = dict.fromkeys(top.joint_names + cuttable + top.link_names * links)
+    if not _is_among(joint, known):
+        raise unknown_name("joint", joint, tuple(known))
+    return next(slice(start, stop) for name, start, stop in ranges if name == joint)
 
 
 def body_index(top: Topology, name: str) -> int:

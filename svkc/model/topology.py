@@ -141,28 +141,6 @@ class Topology:
         return mask
 
     @functools.cached_property
-    def dof_names(self) -> tuple[str, ...]:
-        """Names of the joint coordinates; see `Chain.dof_names`."""
-        names = [""] * self.dofs
-        rotations, translations = (".rx", ".ry", ".rz"), (".x", ".y", ".z")
-        suffixes = {HINGE: ("",), SLIDE: ("",), BALL: rotations, FREE: translations + rotations}
-        for name, row in zip(self.joint_names, self.joint_row, strict=True):
-            for k, suffix in enumerate(suffixes[self.kind[row]]):
-                names[self.v_start[row] + k] = name + suffix
-        for name, dofs in zip(self.link_names, self.links.dof, strict=True):
-            own = [
-                (d, suffix)
-                for d, suffix in zip(dofs, rotations + translations, strict=True)
-                if d < self.dofs
-            ]
-            for d, suffix in own:
-                names[d] = name + (suffix if len(own) > 1 else "")
-        for name, link, freedom in self.cuttable_joints:
-            if sum(self.link_freedoms[link]) < 3:
-                names[self.links.dof[link, freedom]] = name
-        return tuple(names)
-
-    @functools.cached_property
     def scalar_coordinates(self) -> tuple[np.ndarray, np.ndarray]:
         """(index in q, index in v) of every coordinate that is not part of a quaternion.
 

@@ -18,8 +18,10 @@ import numpy as np
 from svkc._jax.enumerations import member_names, with_value
 from svkc.mjcf.load import load
 from svkc.model.annotations import Path
-from svkc.model.chain import Chain, State, Structure
+from svkc.model.chain import Chain
+from svkc.model.chain_names import ChainNames
 from svkc.model.checked_jit import check_chain
+from svkc.model.state import State, Structure
 from svkc.model.virtual_link import VirtualLink
 from svkc.simulation.codes import CODES
 from svkc.simulation.records import Events, Phases
@@ -27,9 +29,9 @@ from svkc.simulation.trajectory import Trajectory
 
 # Increase the schema whenever a stored array is added, renamed or changes its meaning: files of
 # schemas that are not readable are refused.
-SCHEMA = 5
-# Schema 4 differs from schema 5 in its result codes only: integers, the indices of these names.
-READABLE = (4, SCHEMA)
+SCHEMA = 6
+# Schema 5 lacks the names. Schema 4 stores result codes as integers, the indices of these names.
+READABLE = (4, 5, SCHEMA)
 _CODES_OF_SCHEMA_4 = (
     "successful", "stopped", "max_events", "max_steps", "step_too_small", "not_in_place",
     "loop_open", "non_finite", "grazing", "jump", "together", "rank_lost", "no_slot",
@@ -44,13 +46,13 @@ _NESTED = {
 
 
 def _flatten(node, prefix: str = "") -> dict[str, np.ndarray]:
-    """Return {"states.q": array, ...}. Fields that are None are left out."""
+    """Return {"states.q": array, ...}. Codes, names and fields that are None are left out."""
     out = {}
     for field in dataclasses.fields(node):
         value, name = getattr(node, field.name), prefix + field.name
         if field.name in _NESTED:
             out |= _flatten(value, name + ".")
-        elif field.name not in CODES and value is not None:
+        elif field.name not in (*CODES, "names") and value is not None:
             out[name] = np.asarray(value)
     return out
 
@@ -75,8 +77,8 @@ def save(
 ) -> None:
     """Write one .npz file; see `Trajectory.save`.
 
-    The metadata are the schema, the results, the versions, the certificate and the options, and the
-    names and the model of the chain.
+    The metadata are the schema, the results, the versions, the certificate, the options, the names,
+    and the model of the chain.
     """
     import svkc
 
@@ -99,12 +101,12 @@ def save(
     meta["certificate"] = {
         f.name: np.asarray(getattr(report, f.name)).tolist()
         for f in dataclasses.fields(report)
-        if f.name not in CODES
+        if f.name not in (*CODES, "names")
     }
     meta["options"] = options or {}
+    meta["names"] = traj.names and dataclasses.asdict(traj.names)
     arrays: dict[str, Any] = _flatten(traj)
     if chain is not None:
-        meta |= {"bodies": chain.body_names, "joints": chain.joint_names, "links": chain.link_names}
         meta |= {"model": chain.model.text, "arguments": _as_json(chain.model.arguments)}
         arrays |= {f"chain.{i}": np.asarray(x) for i, x in enumerate(jax.tree.leaves(chain))}
     path = pathlib.Path(path)
@@ -120,12 +122,12 @@ def save(
 
 
 def _array_names(cls, prefix: str = "") -> set[str]:
-    """Return the names of all arrays that `_build` needs; fields that may be None are left out."""
+    """Return the names of all arrays that `_build` needs; fields with a default are left out."""
     out = set()
     for field in dataclasses.fields(cls):
         if field.name in _NESTED:
             out |= _array_names(_NESTED[field.name], prefix + field.name + ".")
-        elif field.name not in (*CODES, "locked", "independent", "kinetic_energy", "work"):
+        elif field.name not in CODES and field.default is dataclasses.MISSING:
             out.add(prefix + field.name)
     return out
 
@@ -183,11 +185,11 @@ def load_trajectory(path: Path) -> Trajectory:
     Raises ValueError if the file is not one of svkc, is incomplete, or has another schema;
     FileNotFoundError if there is no file.
     """
-    arrays, _, codes = _read("load_trajectory", path)
-    codes = _as_codes(path, codes)
+    arrays, meta, codes = _read("load_trajectory", path)
+    codes, names = _as_codes(path, codes), meta["names"]
     arrays = {name: x for name, x in arrays.items() if not name.startswith("chain.")}
     _check_complete(path, arrays, _array_names(Trajectory))
-    build = lambda arrays, codes: _build(Trajectory, arrays, **codes)
+    build = lambda arrays, codes: _build(Trajectory, arrays, names=names, **codes)
     for _ in range(arrays["ts"].ndim - 1):
         # a batch of runs
         build = jax.vmap(build)
@@ -197,6 +199,11 @@ def load_trajectory(path: Path) -> Trajectory:
         raise ValueError(
             f"{path} is not a complete trajectory file written by svkc: {error}"
         ) from error
+
+
+def _as_tuple(value) -> Any:
+    """Return nested lists as nested tuples."""
+    return tuple(map(_as_tuple, value)) if isinstance(value, list) else value
 
 
 def _as_codes(path, codes: dict[str, np.ndarray]) -> dict[str, Any]:
@@ -230,6 +237,9 @@ def _read(caller: str, path) -> tuple[dict[str, np.ndarray], dict, dict[str, np.
         schema = int(meta["schema"])
         as_names = (lambda code: np.take(_CODES_OF_SCHEMA_4, code)) if schema == 4 else np.asarray
         codes = {name: np.asarray(as_names(meta[name])) for name in CODES if schema in READABLE}
+        # files of schemas below 6 have no names
+        names = meta.get("names")
+        meta["names"] = names and ChainNames(**{k: _as_tuple(x) for k, x in names.items()})
     except FileNotFoundError:
         raise
     # the readers of zip, npy and JSON raise exceptions of many types for a damaged file

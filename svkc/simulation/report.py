@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.pytrees import is_concrete
 from svkc.loops.constraint import gap_tolerance
+from svkc.model.chain_names import ChainNames
 from svkc.simulation.codes import DERIVATIVE, RESULTS
 
 # Energy drift divided by the kinetic energy. The relative error of speeds is half of it: 5 %
@@ -51,6 +52,7 @@ class Report(eqx.Module):
     t_final: end of the run (s).
     result, derivative: codes of the trajectory.
     halved: result of `svkc.accuracy.estimate_error` (a finer run), if `report` was given it.
+    names: names of the chain's bodies, joints, links and coordinates, if the trajectory has them.
     """
 
     gap: Float[Array, "*lanes"]
@@ -76,6 +78,7 @@ class Report(eqx.Module):
     result: RESULTS
     derivative: DERIVATIVE
     halved: Any = None
+    names: ChainNames | None = eqx.field(static=True, default=None)
 
     def verdict(self) -> str:
         """Return in words whether the run can be relied on; for a batch, those of the worst lane.

@@ -166,6 +166,7 @@ def _with_certificate(
         t_final=run.t,
         result=result,
         derivative=derivative,
+        names=chain.names,
     )
 
 

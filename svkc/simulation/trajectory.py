@@ -12,7 +12,9 @@ from jaxtyping import Array, Bool, Float
 from svkc._jax.eager import eager_jit
 from svkc._jax.pytrees import is_concrete
 from svkc.model.annotations import Function, Path, Scalar
-from svkc.model.chain import Chain, State
+from svkc.model.chain import Chain
+from svkc.model.chain_names import ChainNames
+from svkc.model.state import State
 from svkc.model.validation import scalar
 from svkc.simulation.codes import DERIVATIVE, RESULTS
 from svkc.simulation.non_finite import trace_non_finite
@@ -35,6 +37,7 @@ class Trajectory(eqx.Module):
     result: how the run ended.
     derivative: `svkc.types.DERIVATIVE.successful` if the run has derivatives; otherwise why not: a
         guard that grazed zero or jumped, simultaneous events, or a loss of rank.
+    names: names of the chain's bodies, joints, links and coordinates; None in files of schema 5.
     """
 
     ts: Float[Array, " times"]
@@ -48,6 +51,7 @@ class Trajectory(eqx.Module):
     result: RESULTS
     derivative: DERIVATIVE
     work: Float[Array, "times 3"] | None = None
+    names: ChainNames | None = eqx.field(static=True, default=None)
 
     def __str__(self) -> str:
         """Return two lines: the extent of the run or of the batch, and the report's verdict."""
@@ -165,6 +169,7 @@ def _report(traj: Trajectory) -> "Report":
         t_final=traj.t_final,
         result=traj.result,
         derivative=traj.derivative,
+        names=traj.names,
     )
 
 

@@ -21,7 +21,7 @@ from svkc.model.annotations import Checked, Function, Integer, Numbers, Path, Sc
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import check_chain
 from svkc.model.validation import check_function, finite_array, integer, scalar
-from svkc.simulation.archive import load_trajectory
+from svkc.simulation.archive import SCHEMA, load_trajectory
 from svkc.simulation.simulate import simulate
 from svkc.simulation.trajectory import Trajectory
 
@@ -65,7 +65,7 @@ def rollout(
     chunks = _assign_chunks(order, size)
     run = _chunk_runner(chain, jnp.asarray(t1, states.q.dtype), lane, options, devices)
     inputs = {"chain": chain, "states": states, "t1": t1, "data": data, "lane": lane, **options}
-    folder = _prepare_folder(out, inputs | {"cost": order, "chunk": size})
+    folder = _prepare_folder(out, inputs | {"cost": order, "chunk": size, "schema": SCHEMA})
     own_chunks = range(jax.process_index(), len(chunks), jax.process_count())
     done, start = {}, time.perf_counter()
     for count, i in enumerate(own_chunks, 1):

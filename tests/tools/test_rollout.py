@@ -116,6 +116,8 @@ def assert_equal_to_single_runs(traj, single_runs):
         assert float(traj.t_final[i]) == pytest.approx(float(one.t_final))
     assert np.all(traj.result == svkc.RESULTS.successful)
     assert traj.states.q.shape[:2] == (LANES, 2)
+    assert traj.names == single_runs[0].names
+    assert traj.names.links == ("grip",)
 
 
 def test_lanes_equal_single_runs(case, single_runs, capsys):
