@@ -89,9 +89,13 @@ def public_names() -> dict[str, object]:
         members = vars(getattr(svkc, space)).items()
         names |= {f"{space}.{n}": x for n, x in members if n[0] != "_" and not inspect.ismodule(x)}
     for path in OBJECTS_IN_EXAMPLES:
-        cls = names[path]
-        members = [*getattr(cls, "__annotations__", ()), *vars(cls)]
-        names |= {f"{path}.{n}": inspect.getattr_static(cls, n, None) for n in members if n[0] != "_"}
+        bases = [base for base in names[path].__mro__ if base.__module__.startswith("svkc.")]
+        members = [name for base in bases for name in [*base.__annotations__, *vars(base)]]
+        names |= {
+            f"{path}.{name}": inspect.getattr_static(names[path], name, None)
+            for name in members
+            if name[0] != "_"
+        }
     return names
 
 
