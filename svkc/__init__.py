@@ -29,6 +29,12 @@ from svkc.simulation.archive import load_chain as load_chain, load_trajectory as
 
 # bodies: how they are placed and move
 from svkc.tree.kinematics import poses as poses, velocities as velocities
+from svkc.tree.points import (
+    center_of_mass as center_of_mass,
+    jacobian as _jacobian,
+    point_velocity as point_velocity,
+    apply_force as apply_force,
+)
 from svkc.tree.configuration import integrate as integrate, difference as difference
 from svkc.tree.energy import (
     energy as energy,
@@ -84,6 +90,8 @@ from svkc.tree.configuration import tangent_gradient as tangent_gradient
 from svkc.viz.render import render as render, plot as plot
 from svkc.viz.html_page import show as show
 
+jacobian = _deprecated.or_loop_jacobian(_jacobian)
+
 __all__ = [
     "Chain",
     "State",
@@ -97,6 +105,10 @@ __all__ = [
     "load_trajectory",
     "poses",
     "velocities",
+    "center_of_mass",
+    "jacobian",
+    "point_velocity",
+    "apply_force",
     "integrate",
     "difference",
     "energy",

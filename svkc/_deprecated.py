@@ -1,7 +1,12 @@
 """Names of version 0.1, kept for one release. Each warns and names its replacement."""
 
+import functools
 import importlib
 import warnings
+from collections.abc import Callable
+from typing import TypeVar, cast
+
+_Function = TypeVar("_Function", bound=Callable)
 
 # the old name, below `svkc.`: the new one
 RENAMED = {
@@ -20,7 +25,6 @@ RENAMED = {
     "error_between": "accuracy.configuration_error",
     "from_mujoco": "interop.from_mujoco",
     "halved": "accuracy.estimate_error",
-    "jacobian": "loop_jacobian",
     "page.show": "show",
     "prefer": "with_independent",
     "scenes.GRIP": "scenes.HALF_GRIP_WIDTH",
@@ -78,6 +82,20 @@ def warn_of_results(name: str, stacklevel: int) -> None:
         _warn(f"RESULTS.{name}", f"svkc.{RENAMED[f'RESULTS.{name}']}", stacklevel + 1)
     else:
         _warn("RESULTS for traj.derivative", "svkc.types.DERIVATIVE", stacklevel + 1)
+
+
+def or_loop_jacobian(jacobian: _Function) -> _Function:
+    """Wrap `svkc.jacobian` so that a call without `body`, which returned the loop Jacobian, still
+    does, with a `DeprecationWarning`."""
+
+    @functools.wraps(jacobian)
+    def call(*args, **options):
+        if len(args) > 2 or {"body", "point"} & options.keys():
+            return jacobian(*args, **options)
+        _warn("jacobian without a body", "svkc.loop_jacobian", stacklevel=3)
+        return importlib.import_module("svkc").loop_jacobian(*args, **options)
+
+    return cast(_Function, call)
 
 
 def resolve(name: str):

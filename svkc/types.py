@@ -13,3 +13,4 @@ from svkc.tools.gradient_check import GradientCheck as GradientCheck
 from svkc.transitions.guards import AbstractGuard as AbstractGuard
 from svkc.tree.energy import Momentum as Momentum
 from svkc.tree.kinematics import Jacobian as Jacobian, Poses as Poses, Velocities as Velocities
+from svkc.tree.points import CenterOfMass as CenterOfMass

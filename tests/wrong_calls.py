@@ -16,6 +16,7 @@ from svkc._jax.primitive import custom_primitive
 from svkc.cli import run as commands
 from svkc.loops.constrained_dynamics import Dynamics
 
+SITE = models.MJCF.format(models.bar("b", models.Y, "0 0 1", inside='<site name="s"/>'))
 FREE = models.MJCF.format(models.bar("base", 'type="free"', "0 0 1"))
 
 
@@ -32,6 +33,7 @@ class Setting:
             "</mujoco>", '<actuator><motor joint="arm"/></actuator></mujoco>'
         )
         self.free = svkc.load(FREE)
+        self.site = svkc.load(SITE)
         self.data = mujoco.MjData(svkc.load(self.motor).model.model)
 
     def simulate(self, chain=None, **kw):
@@ -221,6 +223,7 @@ CASES = {
     ),
     "bounds: expected (": lambda s: s.actuation(bounds=3),
     "bounds: expected lower": lambda s: s.actuation(bounds=(1.0, -1.0)),
+    "center_of_mass: the bodies": lambda s: svkc.center_of_mass(s.four, s.state, "world"),
     "chain: expected": lambda s: svkc.poses(3, s.state),
     "chain....: got": lambda s: svkc.poses(
         eqx.tree_at(lambda c: c.mass, s.four, -s.four.mass), s.state
@@ -463,6 +466,23 @@ ALSO = [
     ("got 1 qpos and 1 qvel.* has 3 and 3", lambda s: svkc.interop.from_mujoco(s.four, s.data)),
     ("no virtual link 'pins'", lambda s: svkc.touch(s.four, "pins")),
     ("axes", lambda s: svkc.touch(s.four, "pin", axes="xx")),
+    # points of bodies
+    (
+        "no body 'rockr'; did you mean 'rocker'. bodies: world, crank",
+        lambda s: svkc.apply_force(s.four, s.state, "rockr", jnp.zeros(3)),
+    ),
+    (
+        "no body or site 3; bodies or sites: world, b, s",
+        lambda s: svkc.point_velocity(s.site, s.site.state(), 3),
+    ),
+    ("no body 's'; bodies: world, b", lambda s: svkc.center_of_mass(s.site, s.site.state(), "s")),
+    ("bodies: expected names, got 3", lambda s: svkc.center_of_mass(s.four, s.state, 3)),
+    ("the bodies have no mass: none", lambda s: svkc.center_of_mass(s.four, s.state, ())),
+    (
+        r"point: got shape \(2,\), expected \(3,\)",
+        lambda s: svkc.jacobian(s.four, s.state, "crank", (1, 2)),
+    ),
+    (r"force: expected real", lambda s: svkc.apply_force(s.four, s.state, "crank", "up")),
     # states
     ("got 3 numbers, the joint has 7", lambda s: s.free.state(q={"base": np.zeros(3)})),
     ("norm 2", lambda s: s.free.state(q={"base": [0, 0, 0, 2, 0, 0, 0]})),

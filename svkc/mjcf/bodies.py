@@ -8,7 +8,17 @@ import numpy as np
 from svkc.mjcf.unsupported import is_torque_motor
 from svkc.model.annotations import MuJoCo, Numbers
 from svkc.model.names import unknown_name
-from svkc.model.topology import BALL, FIXED, FREE, HINGE, Q_SIZE, SLIDE, V_SIZE, Topology
+from svkc.model.topology import (
+    BALL,
+    FIXED,
+    FREE,
+    HINGE,
+    Q_SIZE,
+    SLIDE,
+    V_SIZE,
+    FixedFrame,
+    Topology,
+)
 
 # rad/s: outside of its range, a joint with its inertia in the load pose is a critically damped
 # oscillator of this angular frequency
@@ -98,6 +108,7 @@ def tree_rows(
     rank = np.argsort(depth, kind="stable")
     new = np.argsort(rank)
     own_in_rows = [own[int(i)] for i in rank]
+    body_row = tuple(int(new[last[i]]) for i in range(model.nbody))
     row_of = {joint.name: int(new[i]) for i, joint in own.items() if joint is not None}
     topology = Topology(
         body_names=tuple(name_of(model, "body", i) for i in range(model.nbody)),
@@ -109,13 +120,23 @@ def tree_rows(
         v_start=tuple(0 if joint is None else joint.v for joint in own_in_rows),
         nq=sum(Q_SIZE[j.kind] for j in joints),
         nv=sum(V_SIZE[j.kind] for j in joints),
-        body_row=tuple(int(new[last[i]]) for i in range(model.nbody)),
+        body_row=body_row,
         joint_row=tuple(row_of[j.name] for j in joints),
         link_freedoms=(),
         link_spare=(),
         massless_dofs=_massless_dofs(model, joints),
+        site_names=tuple(name_of(model, "site", i) for i in range(model.nsite)),
+        site_frames=_site_frames(model, body_row),
     )
     return [order[i][:2] for i in rank], topology
+
+
+def _site_frames(model, body_row: tuple[int, ...]) -> tuple[FixedFrame, ...]:
+    """Return the frame of each site in the row of its body."""
+    placements = zip(model.site_bodyid, model.site_pos, model.site_quat, strict=True)
+    return tuple(
+        FixedFrame(body_row[b], tuple(p.tolist()), tuple(q.tolist())) for b, p, q in placements
+    )
 
 
 def _massless_dofs(model: MuJoCo, joints: list[TreeJoint]) -> tuple[int, ...]:

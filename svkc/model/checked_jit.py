@@ -64,6 +64,7 @@ def _validated(arguments: dict, static: tuple[str, ...] = ()) -> dict:
     if "state" in arguments:
         check_state(chain, arguments["state"])
     lengths = dict.fromkeys(("q", "q1", "q2"), chain.topology.nq_all) | {"dv": chain.dofs}
+    lengths |= dict.fromkeys(("point", "force", "torque"), 3)
     return arguments | {
         name: chain.torques(arguments[name])
         if name == "tau" and isinstance(arguments[name], Mapping)

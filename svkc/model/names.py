@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from svkc.model.chain_names import chain_names
-from svkc.model.topology import Topology
+from svkc.model.topology import FixedFrame, Topology
 from svkc.model.validation import as_array
 
 # an error lists as many of the known names
@@ -100,6 +100,16 @@ def body_index(top: Topology, name: str) -> int:
     if not _is_among(name, top.body_names):
         raise unknown_name("body", name, top.body_names)
     return top.body_names.index(name)
+
+
+def body_or_site(top: Topology, name: str) -> FixedFrame:
+    """Return the frame of a body, or of a site of the model; the body's if both have the name."""
+    if _is_among(name, top.body_names):
+        return FixedFrame(top.body_row[top.body_names.index(name)])
+    if _is_among(name, top.site_names):
+        return top.site_frames[top.site_names.index(name)]
+    kind = "body or site" if top.site_names else "body"
+    raise unknown_name(kind, name, top.body_names + top.site_names)
 
 
 def body_rows(top: Topology, *bodies: str) -> list[int]:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from typing import NamedTuple
 
 import numpy as np
 
@@ -9,6 +10,19 @@ import numpy as np
 FIXED, HINGE, SLIDE, BALL, FREE = range(5)
 Q_SIZE = (0, 1, 1, 4, 7)
 V_SIZE = (0, 1, 1, 3, 6)
+
+
+class FixedFrame(NamedTuple):
+    """A frame fixed in a row: of a site of the model, or of a body.
+
+    row: the row.
+    pos: origin in the row's frame (m).
+    quat: orientation in the row's frame (wxyz).
+    """
+
+    row: int
+    pos: tuple[float, ...] = (0.0, 0.0, 0.0)
+    quat: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,6 +51,8 @@ class Topology:
     model_v: index in v of each entry of the model's qvel.
     link_actuated: whether a motor drives the coordinates of each virtual link.
     massless_dofs: the tree's coordinates along which the joint's own body has almost no inertia.
+    site_names: names of the model's sites.
+    site_frames: frame of each site.
     """
 
     body_names: tuple[str, ...]
@@ -58,6 +74,8 @@ class Topology:
     model_v: tuple[int, ...] = ()
     link_actuated: tuple[bool, ...] = ()
     massless_dofs: tuple[int, ...] = ()
+    site_names: tuple[str, ...] = ()
+    site_frames: tuple[FixedFrame, ...] = ()
 
     @functools.cached_property
     def _hash(self) -> int:

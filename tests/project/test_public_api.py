@@ -56,7 +56,7 @@ def test_the_flat_names_are_those_of_all():
         name for name in vars(svkc) if name[0] != "_" and not inspect.ismodule(vars(svkc)[name])
     }
     assert names | set(NAMESPACES) == set(svkc.__all__)
-    assert len(svkc.__all__) == len(set(svkc.__all__)) <= 60
+    assert len(svkc.__all__) == len(set(svkc.__all__)) <= 65
 
 
 @pytest.mark.parametrize("name", public_objects())
@@ -108,11 +108,22 @@ def test_every_old_name_warns_and_works(name):
         assert callable(old)
 
 
+def test_the_jacobian_without_a_body_warns_and_is_that_of_the_loops():
+    chain = models.four_bar()
+    state = chain.state()
+    with pytest.warns(DeprecationWarning, match=r"svkc.jacobian without a body.*loop_jacobian"):
+        old = svkc.jacobian(chain, state)
+    assert (old.linear == svkc.loop_jacobian(chain, state).linear).all()
+
+
 def test_warnings_point_at_the_line_that_uses_an_old_name():
     """In a process of its own: the tests' type checks add frames to the stack."""
-    uses = ("svkc.prefer", "svkc.page.show", "svkc.RESULTS.jump", "svkc.RESULTS[d]",
-            "d == svkc.RESULTS.successful", "svkc.RESULTS.successful != d")  # fmt: skip
-    code = "\n".join(["import svkc; d = svkc.types.DERIVATIVE.jump", *uses])
+    uses = ("svkc.prefer", "svkc.jacobian(c, c.state())", "svkc.page.show", "svkc.RESULTS.jump",
+            "svkc.RESULTS[d]", "d == svkc.RESULTS.successful",
+            "svkc.RESULTS.successful != d")  # fmt: skip
+    code = "\n".join(
+        [f"import svkc; d = svkc.types.DERIVATIVE.jump; c = svkc.load({models.ARM!r})", *uses]
+    )
     done = run("-W", "always::DeprecationWarning", "-c", code)
     lines = re.findall(r"^<string>:(\d+): DeprecationWarning: svkc", done.stderr, re.M)
     assert lines == [str(2 + i) for i in range(len(uses))], done.stderr
@@ -127,12 +138,19 @@ def test_unknown_names_are_attribute_errors():
 
 def test_parts_of_results_have_names():
     chain = models.four_bar()
-    functions = (svkc.poses, svkc.velocities, svkc.momentum, svkc.loop_jacobian)
+    functions = (
+        svkc.poses,
+        svkc.velocities,
+        svkc.momentum,
+        svkc.center_of_mass,
+        svkc.loop_jacobian,
+    )
     shapes = jax.eval_shape(lambda state: [f(chain, state) for f in functions], chain.state())
     assert [(type(x).__name__, *x._fields) for x in shapes] == [
         ("Poses", "position", "quaternion"),
         ("Velocities", "linear", "angular"),
         ("Momentum", "linear", "angular"),
+        ("CenterOfMass", "position", "velocity", "mass"),
         ("Jacobian", "linear", "angular"),
     ]
     position, quaternion = shapes[0]
