@@ -38,6 +38,7 @@ nitpick_ignore = [
     ("py:class", name)
     for name in """
     Any Array Bool Callable Float Int MuJoCo Sequence pathlib.Path At When Touch Leaves Overload Page
+    BodyParameters JointState
     """.split()
 ]
 autodoc_typehints = "none"  # `format_signature` writes annotations as the sources have them
@@ -52,9 +53,9 @@ PAGES_OF_FILES = {
 NAMESPACES = ("accuracy", "dynamics", "integrators", "interop", "stabilization", "types")
 # classes whose methods and properties have entries, and the names of their objects in examples
 OBJECTS_IN_EXAMPLES = {
-    "Chain": ("chain", "heavy"),
+    "Chain": ("chain",),
     "State": ("state",),
-    "Trajectory": ("traj", "lanes", "loaded"),
+    "Trajectory": ("traj", "lanes"),
     "types.Report": ("report",),
 }
 # classes that users do not construct; their entries have no signature
@@ -64,9 +65,13 @@ GIVEN_BY = {
     "State": "Chain.state",
     "Structure": "State.structure",
     "accuracy.Tuning": "accuracy.tune",
+    "Chain": "load",
+    "Trajectory": "simulate",
     "types.AbstractDynamics": "dynamics.CompositeBodies",
     "types.AbstractGuard": "touch",
     "types.Actuation": "actuation",
+    "types.CenterOfMass": "center_of_mass",
+    "types.ChainNames": "Chain.names",
     "types.Coordinates": "coordinates",
     "types.DERIVATIVE": "Trajectory.derivative",
     "types.Events": "Trajectory.events",

@@ -33,10 +33,12 @@ def public_objects() -> dict[str, object]:
             for name, x in vars(module).items()
             if name[0] != "_" and not inspect.ismodule(x)
         }
-    for cls in CLASSES:
-        for name, x in vars(cls).items():
+    for cls, base in ((cls, base) for cls in CLASSES for base in cls.__mro__):
+        if not base.__module__.startswith("svkc."):
+            continue
+        for name, x in vars(base).items():
             if name[0] != "_" and (inspect.isfunction(x) or isinstance(x, property)):
-                out[f"{cls.__name__}.{name}"] = x
+                out.setdefault(f"{cls.__name__}.{name}", x)
     return out
 
 
