@@ -1,8 +1,7 @@
 """The pages of the documentation: their code runs, the reference is complete, the site is whole."""
 
-import importlib.util
-import os
 import re
+import runpy
 import shutil
 
 import jax
@@ -15,13 +14,8 @@ DOCS = ROOT / "docs"
 FAST = ("reference/bodies", "reference/derivatives", "reference/interop")
 
 
-@pytest.fixture(scope="module")
-def conf():
-    """Return the module docs/conf.py."""
-    spec = importlib.util.spec_from_file_location("conf", DOCS / "conf.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+conf = runpy.run_path(str(DOCS / "conf.py"))
+docstrings = conf["docstrings"]
 
 
 def pages_with_code() -> list:
@@ -36,7 +30,7 @@ def pages_with_code() -> list:
 
 
 @pytest.mark.parametrize("name", pages_with_code())
-def test_the_code_of_a_page_runs(name, conf, tmp_path, monkeypatch):
+def test_the_code_of_a_page_runs(name, tmp_path, monkeypatch):
     """The Python blocks of a page run one after another, with JAX's own settings but float64.
 
     The models of docs/models are in the working directory.
@@ -46,14 +40,14 @@ def test_the_code_of_a_page_runs(name, conf, tmp_path, monkeypatch):
     namespace = {"__name__": "page"}
     page = DOCS / f"{name}.md"
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-        for line, code in conf.python_blocks(page):
+        for line, code in docstrings.python_blocks(page):
             # errors name the line of the page
             exec(compile("\n" * line + code, page, "exec"), namespace)
     if "plt" in namespace:
         namespace["plt"].close("all")
 
 
-def test_every_public_name_has_an_entry_with_an_example(conf):
+def test_every_public_name_has_an_entry_with_an_example():
     text = "\n".join(page.read_text() for page in (DOCS / "reference").glob("*.md"))
     entries = re.findall(r"^\.\. auto\w+:: svkc\.([\w.]+)(\n +:members:)?", text, re.M)
     assert len(entries) == len(dict(entries)), "a name has two entries"
@@ -65,7 +59,7 @@ def test_every_public_name_has_an_entry_with_an_example(conf):
     }
     assert not without_entry
     paths = {name: re.sub(r"^Report\.", "types.Report.", name) for name in public_objects()}
-    without_example = {name for name, path in paths.items() if not conf.EXAMPLES.get(path)}
+    without_example = {name for name, path in paths.items() if not docstrings.EXAMPLES.get(path)}
     assert not without_example
 
 
@@ -78,13 +72,13 @@ def test_the_site_is_built_without_warnings(tmp_path):
     assert 'id="svkc.poses"' in (tmp_path / "reference" / "bodies.html").read_text()
 
 
-def test_broken_links_are_found(conf, tmp_path):
+def test_broken_links_are_reported(tmp_path):
     (tmp_path / "b.html").write_text('<h1 id="here">b</h1><a name="there"></a>')
     (tmp_path / "a.html").write_text(
         '<a href="b.html#here">1</a><a href="b.html#there">2</a><a href="https://x.y/z">3</a>'
         '<a href="b.html#nowhere">4</a><img src="c.png"><a href="#missing">5</a><a href="#">6</a>'
     )
-    assert conf.broken_links(tmp_path) == [
+    assert conf["broken_links"](tmp_path) == [
         "a.html: b.html#nowhere",
         "a.html: c.png",
         "a.html: #missing",

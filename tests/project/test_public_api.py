@@ -33,12 +33,12 @@ def public_objects() -> dict[str, object]:
             for name, x in vars(module).items()
             if name[0] != "_" and not inspect.ismodule(x)
         }
-    for cls, base in ((cls, base) for cls in CLASSES for base in cls.__mro__):
-        if not base.__module__.startswith("svkc."):
-            continue
-        for name, x in vars(base).items():
+    for cls in CLASSES:
+        bases = [base for base in cls.__mro__ if base.__module__.startswith("svkc.")]
+        for name in sorted({name for base in bases for name in vars(base)}):
+            x = inspect.getattr_static(cls, name)
             if name[0] != "_" and (inspect.isfunction(x) or isinstance(x, property)):
-                out.setdefault(f"{cls.__name__}.{name}", x)
+                out[f"{cls.__name__}.{name}"] = x
     return out
 
 
