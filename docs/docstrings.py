@@ -127,153 +127,141 @@ def examples() -> dict[str, list[str]]:
 EXAMPLES = examples()
 
 
+class _Plain(ast.NodeTransformer):
+    """Replace `Checked[X]`, whose values svkc validates itself, by X."""
+
+    def visit_Subscript(self, node):
+        self.generic_visit(node)
+        return node.slice if ast.unparse(node.value) == "Checked" else node
+
+
+def _annotation(node) -> str:
+    """Return an annotation as text: shapes in double quotes, forward references in none."""
+    if node is None:
+        return ""
+    node = _Plain().visit(node)
+    text = node.value if isinstance(node, ast.Constant) and node.value else ast.unparse(node)
+    return text.replace("' ", "'").replace("'", '"')
+
+
 def parameters(thing) -> dict[str, str]:
     """Return the annotation of each parameter of a function, or field of a class, as written.
 
     Functions have their return annotation under "return".
     """
-    if inspect.isclass(thing):
-        bases = [
-            parameters(base) for base in thing.__bases__ if base.__module__.startswith("svkc.")
-        ]
-        body = ast.parse(textwrap.dedent(inspect.getsource(thing))).body[0].body
-        found = {
-            node.target.id: node.annotation
-            for node in body
-            if isinstance(node, ast.AnnAssign) and node.target.id[0] != "_"
+    definition = ast.parse(textwrap.dedent(inspect.getsource(inspect.unwrap(thing)))).body[0]
+    found = {}
+    if isinstance(definition, ast.ClassDef):
+        for base in thing.__bases__:
+            found |= parameters(base) if base.__module__.startswith("svkc.") else {}
+        fields = [node for node in definition.body if isinstance(node, ast.AnnAssign)]
+        return found | {
+            field.target.id: _annotation(field.annotation)
+            for field in fields
+            if field.target.id[0] != "_"
         }
-    else:
-        bases = []
-        function = ast.parse(textwrap.dedent(inspect.getsource(inspect.unwrap(thing)))).body[0]
-        every = [
-            *function.args.posonlyargs,
-            *function.args.args,
-            *function.args.kwonlyargs,
-        ]
-        every += [x for x in (function.args.vararg, function.args.kwarg) if x]
-        found = {x.arg: x.annotation for x in every} | {"return": function.returns}
-    own = {name: _annotation(node) for name, node in found.items()}
-    return {name: text for base in bases for name, text in base.items()} | own
+    every = [node for node in ast.walk(definition.args) if isinstance(node, ast.arg)]
+    found = {node.arg: _annotation(node.annotation) for node in every}
+    return found | {"return": _annotation(definition.returns)}
 
 
-def _annotation(node) -> str:
-    """Return an annotation as text, without the marker `Checked` and quotation marks."""
-    if node is None:
-        return ""
-    text = ast.unparse(node)
-    if isinstance(node, ast.Constant) and isinstance(node.value, str):
-        text = node.value
-    while match := re.search(r"\bChecked\[", text):
-        depth, end = 1, match.end()
-        while depth:
-            depth += {"[": 1, "]": -1}.get(text[end], 0)
-            end += 1
-        text = text[: match.start()] + text[match.end() : end - 1] + text[end:]
-    return text.replace("' ", "'").replace("'", '"')
+def _linked(annotation: str) -> str:
+    """Return an annotation in which result types have the paths of their entries."""
+    results = "|".join(name.removeprefix("types.") for name in PUBLIC if name.startswith("types."))
+    return re.sub(rf"(?<![\w.])({results})\b", r"~svkc.types.\1", annotation)
 
 
 def format_signature(app, what, path, thing, options, signature, returned):
     """Return the signature of an entry with the annotations of the source."""
     name = path.removeprefix("svkc.")
     if name in MADE_BY_FUNCTIONS or name.startswith("types."):
-        return "", ""
-    if what not in ("function", "method", "class") or not callable(thing):
+        return ("", "") if what == "class" else None
+    if what not in ("function", "method", "class"):
         return None
     annotations = parameters(thing)
-    parts, keyword_only = [], False
-    for parameter in inspect.signature(thing).parameters.values():
-        if parameter.name == "self":
+    parts, star = [], False
+    for x in inspect.signature(thing).parameters.values():
+        if x.name == "self":
             continue
-        if parameter.kind is parameter.KEYWORD_ONLY and not keyword_only:
-            keyword_only = True
+        if x.kind is x.KEYWORD_ONLY and not star:
             parts.append("*")
-        stars = {parameter.VAR_POSITIONAL: "*", parameter.VAR_KEYWORD: "**"}.get(parameter.kind, "")
-        keyword_only |= stars == "*"
-        text = stars + parameter.name
-        if annotations.get(parameter.name):
-            text += f": {_linked(annotations[parameter.name])}"
-        if parameter.default is not parameter.empty:
-            text += f" = {parameter.default!r}"
+        star |= x.kind in (x.KEYWORD_ONLY, x.VAR_POSITIONAL)
+        text = {x.VAR_POSITIONAL: "*", x.VAR_KEYWORD: "**"}.get(x.kind, "") + x.name
+        text += f": {_linked(annotations[x.name])}" if annotations.get(x.name) else ""
+        text += f" = {x.default!r}" if x.default is not x.empty else ""
         parts.append(text)
     return f"({', '.join(parts)})", _linked(annotations.get("return", ""))
 
 
-def _linked(annotation: str) -> str:
-    """Return an annotation in which result types have the paths of their entries."""
-    results = "|".join(name.split(".")[1] for name in PUBLIC if "." in name and "types." in name)
-    return re.sub(rf"(?<![\w.])({results})\b", r"~svkc.types.\1", annotation)
+# fields of results are described in the entries of their classes
+FIELDS = {f"{path}.{field}" for path in OBJECTS_IN_EXAMPLES for field in parameters(PUBLIC[path])}
+
+
+def _link(code: str, own: set[str]) -> str:
+    """Return a piece of code as a link to its entry, or as a literal if it has none.
+
+    own: parameters of the object described, which are no links.
+    """
+    name = re.sub(r"\(.*\)$", "", code).removeprefix("svkc.")
+    first, _, rest = name.partition(".")
+    for cls, variables in OBJECTS_IN_EXAMPLES.items():
+        name = f"{cls}.{rest}" if rest and first in (*variables, cls.split(".")[-1]) else name
+    # classes of namespaces are linked by their names alone
+    matches = [path for path in PUBLIC if name[:1].isupper() and path.endswith(f".{name}")]
+    path = name if name in PUBLIC else matches[0] if len(matches) == 1 else ""
+    linked = path and name not in own and path not in FIELDS
+    return f":py:obj:`{code} <svkc.{path}>`" if linked else f"``{code}``"
 
 
 def _text(line: str, own: set[str]) -> str:
-    """Return a line of a docstring as reStructuredText; names in backticks become links.
-
-    own: parameters of the object, which are no links.
-    """
+    """Return a line of a docstring as reStructuredText; names in backticks become links."""
     parts = re.split(r"`([^`]*)`", line)
-    for i, part in enumerate(parts):
-        if i % 2 == 0:
-            text = re.sub(r"([*|\\])|(?<=\w)_(?=\W|$)", r"\\\g<0>", part)
-            parts[i] = re.sub(r"^(?=\w)", r"\\ ", text) if i else text  # a role ends at a space
-            continue
-        name = re.sub(r"\(.*\)$", "", part).removeprefix("svkc.")
-        first, _, rest = name.partition(".")
-        for cls, variables in OBJECTS_IN_EXAMPLES.items():
-            name = f"{cls}.{rest}" if first in variables and rest else name
-        matches = [path for path in PUBLIC if path == name or path.endswith(f".{name}")]
-        role = (
-            "func" if matches and inspect.isfunction(inspect.unwrap(PUBLIC[matches[0]])) else "obj"
-        )
-        exists = len(matches) == 1 and name not in own and "." + matches[0] not in FIELDS
-        parts[i] = f":py:{role}:`{part} <svkc.{matches[0]}>`" if exists else f"``{part}``"
+    for i in range(0, len(parts), 2):
+        parts[i] = re.sub(r"([*|\\])|(?<=\w)_(?=\W|$)", r"\\\g<0>", parts[i])
+        if i:  # a link ends at a space
+            parts[i] = re.sub(r"^(?=\w)", r"\\ ", parts[i])
+    parts[1::2] = [_link(code, own) for code in parts[1::2]]
     return "".join(parts)
 
 
-# fields of results are described in the entries of their classes
-FIELDS = {f".{path}.{field}" for path in OBJECTS_IN_EXAMPLES for field in parameters(PUBLIC[path])}
+def _rows(text: str, own: set[str]) -> list[tuple[list[str], list[str]]]:
+    """Return (names described, lines) of each part of a docstring; text has no names.
+
+    A description ends at an empty line, or at a line that starts with "Raises".
+    """
+    name = rf"`?(?:{'|'.join(own) or '(?!)'})`?"
+    text = re.sub(rf"(?<=[.;]) (?={name}: )", "\n", text)  # several descriptions on one line
+    rows: list[tuple[list[str], list[str]]] = [([], [])]
+    for line in text.split("\n"):
+        if head := re.match(rf"({name}(?:, {name})*): ?", line):
+            names = head[1].replace("`", "").split(", ")
+            rows.append((names, [line[head.end() :].strip()]))
+        elif rows[-1][0] and (not line.strip() or line.startswith("Raises ")):
+            rows.append(([], ["", line]))
+        else:
+            rows[-1][1].append(line.strip() if rows[-1][0] else line)
+    return rows
 
 
 def format_docstring(app, what, path, thing, options, lines):
     """Replace a docstring's lines `name: description` by a list of parameters or fields.
 
-    Lines that follow are part of a description up to an empty line or a line that starts with
-    "Raises". An entry ends with links to pages that use the name.
+    An entry ends with links to pages that use the name.
     """
-    described = thing.fget if isinstance(thing, property) else thing
-    own = {}
-    if what != "module" and (inspect.isclass(thing) or callable(described)):
-        own = parameters(described)
+    is_property, is_class = isinstance(thing, property), inspect.isclass(thing)
+    own = parameters(thing.fget if is_property else thing)
     returned = own.pop("return", "")
-    name = re.compile(rf"`?({'|'.join(own) or '(?!)'})`?(?=[:,])")
-    rows: list[tuple[str | None, list[str]]] = [(None, [])]
-    text = "\n".join(lines)
-    # several descriptions on one line
-    text = re.sub(rf"(?<=[.;]) (?={name.pattern}:)", "\n", text)
-    for line in text.split("\n"):
-        head = re.match(rf"({name.pattern}(, {name.pattern})*): ?", line)
-        if head:
-            rows.append((head[1].replace("`", ""), [line[head.end() :].strip()]))
-        elif rows[-1][0] and (not line.strip() or line.startswith("Raises ")):
-            rows.append((None, ["", line]))
-        else:
-            rows[-1][1].append(line.strip() if rows[-1][0] else line)
-    is_class = inspect.isclass(thing)
     heading = ["", f".. rubric:: {'Fields' if is_class else 'Parameters'}", ""]
-    result = [f"``{returned}``", ""] if isinstance(thing, property) else []
-    for names, description in rows:
+    result = [f"``{returned}``", ""] if is_property else []
+    for names, description in _rows("\n".join(lines), set(own)):
         content = [_text(line, set(own)) for line in description]
-        if names is None:
+        if not names:
             result += content
             continue
-        types = {own[name] for name in names.split(", ")}
-        shape = f" : ``{types.pop()}``" if is_class else ""
-        term = ", ".join(f"``{name}``" for name in names.split(", "))
-        result += [*heading, term + shape, *(f"    {line}" for line in content), ""]
+        shape = f" : ``{own[names[0]]}``" if is_class else ""
+        term = ", ".join(f"``{name}``" for name in names) + shape
+        result += [*heading, term, *(f"    {line}" for line in content), ""]
         heading = []
     pages = EXAMPLES.get(path.removeprefix("svkc."), [])[:3]
-    if pages:
-        result += [
-            "",
-            "*Examples:* " + ", ".join(f":doc:`/{page}`" for page in pages),
-            "",
-        ]
-    lines[:] = result
+    links = ", ".join(f":doc:`/{page}`" for page in pages)
+    lines[:] = [*result, "", f"*Examples:* {links}", ""] if pages else result
