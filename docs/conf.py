@@ -32,6 +32,7 @@ highlight_language = "none"
 maximum_signature_line_length = 88
 html_copy_source = False
 myst_heading_anchors = 4
+myst_enable_extensions = ["alert"]
 myst_links_external_new_tab = False
 nitpicky = True
 nitpick_ignore = [
