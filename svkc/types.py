@@ -6,6 +6,8 @@ from svkc.loops.coordinates import Coordinates as Coordinates
 from svkc.loops.forward_dynamics import LoopForces as LoopForces
 from svkc.loops.mobility import Mobility as Mobility
 from svkc.model.chain_names import ChainNames as ChainNames
+from svkc.model.named_access import JointState as JointState
+from svkc.model.parameters import BodyParameters as BodyParameters
 from svkc.simulation.codes import DERIVATIVE as DERIVATIVE
 from svkc.simulation.records import Events as Events, Phases as Phases
 from svkc.simulation.report import Report as Report

@@ -162,6 +162,11 @@ def plot_without_matplotlib(s):
         s.short().plot()
 
 
+def batch_of(traj):
+    """Return a batch of two equal runs."""
+    return jax.tree.map(lambda x: jnp.stack([x, x]), traj)
+
+
 CASES = {
     "pictures need": plot_without_matplotlib,
     "... holds no model": load_chain_without_model,
@@ -178,6 +183,9 @@ CASES = {
     "... has the ...": lambda s: s.file(
         metadata=np.array('{"schema": 6, "result": "exploded", "derivative": "successful"}')
     ),
+    "traj[...]: expected": lambda s: batch_of(s.short())[...],
+    "traj[...]: no such": lambda s: batch_of(s.short())[2],
+    "traj[...]: this is": lambda s: s.short()[0],
     "... has schema": lambda s: s.file(metadata=np.array('{"schema": 99}')),
     "... is not a complete trajectory": lambda s: s.file(metadata=None),
     "... lacks": lambda s: s.file(ts=None),
@@ -269,6 +277,13 @@ CASES = {
     "...: expected a path": lambda s: svkc.load_trajectory(3),
     "leaves: axis": lambda s: svkc.leaves(s.four, "pin", axis=(0, 0, 0)),
     "mode: got": lambda s: svkc.check_grad(lambda x: x, jnp.asarray(1.0), mode="sideways"),
+    "after: expected": lambda s: svkc.at(0.1, cut="pin", after=0.2),
+    "after: the event": lambda s: s.simulate(
+        events=svkc.at(0.1, cut="pin", after=svkc.at(0.1, stop=True))
+    ),
+    "at: got time ... after": lambda s: s.simulate(
+        events=[first := svkc.at(0.1, cut="pin"), svkc.at(-0.1, stop=True, after=first)]
+    ),
     "...: ... is a cuttable": lambda s: s.load(cuttable="rocker").replace(
         axis={"rocker": [0, 0, 1]}
     ),

@@ -1,4 +1,5 @@
-"""Enumerations of equinox, and members that have moved from one enumeration to another.
+"""Enumerations of equinox whose members print by name, and members that have moved from one
+enumeration to another.
 
 equinox compares members of one enumeration only. With the metaclasses here, code that was written
 before a move may compare a member of the new enumeration with one of the former enumeration.
@@ -8,7 +9,9 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 
 
 class _Probe(eqx.Enumeration):
@@ -30,7 +33,44 @@ def with_value(member, value):
     return eqx.tree_at(lambda item: item._value, member, value)
 
 
-class MovedItem(EnumerationItem):
+class NamedItem(EnumerationItem):
+    """A member that prints its name, and for a batch the number of lanes with each name."""
+
+    def __str__(self) -> str:
+        values = self._value
+        if not isinstance(values, np.ndarray | np.generic | jax.Array) or self.is_traced():
+            return repr(self)
+        values, names = np.asarray(values), member_names(self._enumeration)
+        if not values.ndim:
+            return names[int(values)]
+        codes, first, counts = np.unique(values, return_index=True, return_counts=True)
+        lane = lambda i: ", ".join(map(str, np.unravel_index(i, values.shape)))
+        return ", ".join(
+            f"{names[codes[i]]}: {counts[i]}" + (f" (first lane {lane(first[i])})" if k else "")
+            for k, i in enumerate(np.argsort(-counts, kind="stable"))
+        )
+
+    def __repr__(self) -> str:
+        if not isinstance(self._value, np.ndarray | np.generic | jax.Array) or self.is_traced():
+            return super().__repr__()
+        return f"{self._enumeration.__name__}<{self}>"
+
+
+class NamedMeta(EnumerationMeta):
+    """Metaclass of enumerations whose members are of the class `item_class`."""
+
+    item_class: type = NamedItem
+
+    def __new__(mcs, cls_name, bases, namespace):  # pyright: ignore
+        cls = super().__new__(mcs, cls_name, bases, namespace)
+        where = cls.where
+        for name, item in cls._name_to_item.items():
+            cls._name_to_item[name] = mcs.item_class(item._value, cls)
+        cls.where = staticmethod(lambda pred, a, b: mcs.item_class(where(pred, a, b)._value, cls))
+        return cls
+
+
+class MovedItem(NamedItem):
     """A member that is equal to the member of the same name in the former enumeration as well.
 
     As this class is a subclass of that of the former members, Python calls its methods for both
@@ -58,19 +98,13 @@ class MovedItem(EnumerationItem):
         return with_value(self, jnp.asarray(values, jnp.int32)[other._value])
 
 
-class MovedMeta(EnumerationMeta):
+class MovedMeta(NamedMeta):
     """Metaclass of the enumeration to which members have moved: all members are `MovedItem`."""
 
-    def __new__(mcs, cls_name, bases, namespace):  # pyright: ignore
-        cls = super().__new__(mcs, cls_name, bases, namespace)
-        where = cls.where
-        for name, item in cls._name_to_item.items():
-            cls._name_to_item[name] = MovedItem(item._value, cls)
-        cls.where = staticmethod(lambda pred, a, b: MovedItem(where(pred, a, b)._value, cls))
-        return cls
+    item_class = MovedItem
 
 
-class FormerMeta(EnumerationMeta):
+class FormerMeta(NamedMeta):
     """Metaclass of the enumeration from which members have moved.
 
     The former enumeration still gives a moved member by its name, and its text, with a warning.

@@ -25,13 +25,7 @@ def info(path: str, ignore: tuple[str, ...] = ()) -> int:
             return 1
         chain = svkc.load(path, ignore="all")
     state = chain.state() if not len(chain.link_names) else _load_state(chain)
-    print(f"{len(chain.body_names) - 1} bodies: {', '.join(chain.body_names[1:])}")
-    print(f"{len(chain.joint_names)} joints: {', '.join(chain.joint_names)}")
-    print(f"{len(chain.link_names)} virtual links: {', '.join(chain.link_names) or 'none'}")
-    print(
-        f"{chain.nv} joint freedoms in the tree, {chain.dofs} with every virtual link;"
-        f" {chain.gear.shape[0]} actuators"
-    )
+    print(chain)
     if state is not None:
         print(f"as loaded:\n{svkc.mobility(chain, state)}")
     for line in chain.left_out:
@@ -103,7 +97,7 @@ def view(path: pathlib.Path, show: bool) -> int:
     except (ValueError, OSError) as error:
         print(error)
         return 1
-    print_report(chain, traj)
+    print_report(traj)
     written, failures = [], []
     for target, write in (
         (path.with_suffix(".html"), lambda p: svkc.render(chain, traj, p)),

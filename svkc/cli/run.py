@@ -114,7 +114,7 @@ def run(
     written, failures = _write_results(chain, traj, out, pathlib.Path(name).stem, video, options)
     _next_stage(progress, "done")
     progress.close()
-    print_report(chain, traj)
+    print_report(traj)
     _print_times(clock, cache_folder)
     _print_files(written, failures)
     # a run that ended early is written as well; the exit status tells the shell

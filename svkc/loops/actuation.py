@@ -22,12 +22,13 @@ from svkc.model.annotations import Checked, Numbers, Scalar
 from svkc.model.chain import Chain, State
 from svkc.model.chain_names import ChainNames
 from svkc.model.checked_jit import check_state
+from svkc.model.tables import Block, Printed, Table, count, number, ranges
 from svkc.model.validation import as_array, real_array
 from svkc.tree.inverse_dynamics import pad_to_dofs, passive_forces, rnea
 from svkc.tree.kinematics import kinematics, twists
 
 
-class Actuation(eqx.Module):
+class Actuation(Printed):
     """Torques of the actuators for an acceleration, and bases of what they leave undetermined.
 
     Bases are padded with zero columns.
@@ -57,7 +58,32 @@ class Actuation(eqx.Module):
     rank: Int[Array, ""]
     redundancy: Int[Array, ""]
     deficiency: Int[Array, ""]
-    names: ChainNames | None = eqx.field(static=True, default=None)
+    names: ChainNames = eqx.field(static=True)
+
+    def _blocks(self) -> list[Block]:
+        names, shape = self.names, np.shape(self.rank)
+        tau, residual = np.asarray(self.tau), np.asarray(self.residual)
+        units = ["N m" if angular else "N" for angular in names.angular]
+        round_off = np.finfo(tau.dtype).eps ** 0.5 * max(np.abs(tau).max(initial=0), 1)
+        driven = np.any(tau != 0, tuple(range(len(shape))))
+        missed = np.any(np.abs(residual) > round_off, tuple(range(len(shape))))
+        shown = np.flatnonzero(np.logical_or(driven, missed)).tolist()
+        others = f"no torque on {count(len(names.v) - len(shown), 'other joint coordinate')}"
+        numbers = {
+            "rank of S": self.rank,
+            "redundant actuators": self.redundancy,
+            "freedoms that no actuator drives": self.deficiency,
+        }
+        if not shape:
+            counts = ", ".join(f"{name} {int(x)}" for name, x in numbers.items())
+            rest = np.where(missed, residual, 0)
+            rows = [(names.v[i], units[i], number(tau[i]), number(rest[i])) for i in shown]
+            titles = "joint", "unit", "torque or force", "residual"
+            return [f"Actuation: {counts}", *[Table(titles, rows)] * bool(rows), others]
+        numbers |= {"largest residual (N m, N)": np.abs(residual).max(-1)}
+        torques = {f"{names.v[i]} ({units[i]})": tau[..., i] for i in shown}
+        heading = f"Actuation of {'x'.join(map(str, shape))} lanes"
+        return [heading, ranges(numbers), ranges(torques, most=12), others]
 
 
 def actuation(

@@ -6,17 +6,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from svkc._jax.pytrees import is_concrete
 from svkc.loops.constraint import loop_kinematics
 from svkc.loops.coordinates import coordinates
 from svkc.loops.pivoting import count_rank, pivot_ratio, pivoted_qr
 from svkc.model.chain import Chain, State, active_dofs
 from svkc.model.chain_names import ChainNames
 from svkc.model.checked_jit import checked_jit
+from svkc.model.tables import Block, Printed, Table, ranges
 
 
-class Mobility(eqx.Module):
-    """Mobility of a structure. `str` gives a table with the names of links and coordinates.
+class Mobility(Printed):
+    """Mobility of a structure. `print` shows it with the names of links and coordinates.
 
     freedoms: mobility N_F = N_J - m (paper (13)). joint_freedoms: N_J. rank: m of the phase.
     redundant: number of rows of each loop that depend, at q, on its others and on earlier loops.
@@ -45,24 +45,41 @@ class Mobility(eqx.Module):
         """Names of the joint coordinates; see `Chain.dof_names`."""
         return self.names.v
 
-    def __str__(self) -> str:
-        if not is_concrete(self.rank) or self.rank.ndim:
-            return repr(self)
-        independent = ", ".join(
-            n for n, on in zip(self.dof_names, self.independent, strict=True) if on
-        )
-        lines = [
-            f"joint freedoms (N_J)      {int(self.joint_freedoms):4d}",
-            f"rank of the loops (m)     {int(self.rank):4d}   margin {float(self.margin):.2e}",
-            f"mobility (N_F = N_J - m)  {int(self.freedoms):4d}",
-            f"independent coordinates: {independent or 'none'}",
+    def _blocks(self) -> list[Block]:
+        if np.ndim(self.rank):
+            return self._blocks_of_lanes()
+        independent = [n for n, on in zip(self.names.v, self.independent, strict=True) if on]
+        numbers = [
+            ("joint freedoms (N_J)", str(self.joint_freedoms), ""),
+            ("rank of the loops (m)", str(self.rank), f" margin {float(self.margin):.2e}"),
+            ("mobility (N_F = N_J - m)", str(self.freedoms), ""),
         ]
-        for name, on, rows in zip(self.link_names, self.connected, self.redundant, strict=True):
-            lines.append(
-                f"  {name}: "
-                + (f"6 rows, {int(rows)} of them redundant" if on else "not connected")
-            )
-        return "\n".join(lines)
+        loops = [
+            (f"  {name}:", f"6 rows, {int(rows)} of them redundant" if on else "not connected")
+            for name, on, rows in zip(self.names.links, self.connected, self.redundant, strict=True)
+        ]
+        line = f"independent coordinates: {', '.join(independent) or 'none'}"
+        return [Table((), numbers), line, *[Table((), loops)] * bool(loops)]
+
+    def _blocks_of_lanes(self) -> list[Block]:
+        """Return the ranges over the lanes of a batch, and how many lanes close each loop."""
+        values = {
+            "joint freedoms (N_J)": self.joint_freedoms,
+            "rank of the loops (m)": self.rank,
+            "mobility (N_F = N_J - m)": self.freedoms,
+            "margin of the rank": self.margin,
+        }
+        links = len(self.names.links)
+        lanes = np.size(self.rank)
+        counts = np.asarray(self.connected).reshape(lanes, links).sum(0).tolist()
+        redundant = np.asarray(self.redundant).reshape(lanes, links)
+        rows = [
+            (name, str(counts[i]), str(redundant[:, i].min()), str(redundant[:, i].max()))
+            for i, name in enumerate(self.names.links)
+        ]
+        titles = "loop", "lanes in which\nit is connected", "redundant rows\nmin", "max"
+        heading = f"Mobility of {'x'.join(map(str, np.shape(self.rank)))} lanes"
+        return [heading, ranges(values), *[Table(titles, rows, 12)] * bool(rows)]
 
 
 @checked_jit(eager=True)

@@ -126,6 +126,7 @@ def _with_virtual_links(topology: Topology, links: list[VirtualLink], spare: int
         link_freedoms=tuple(joint_freedoms(link.joint) for link in links),
         link_spare=tuple(i >= len(links) - spare for i in range(len(links))),
         link_actuated=tuple(bool(link.actuated) for link in links),
+        link_as_loaded=tuple(x.real_pos is None and x.real in topology.body_names for x in links),
     )
 
 

@@ -7,15 +7,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from svkc.model.chain_tables import chain_blocks, chain_summary
 from svkc.model.link_pointers import link_pointers
 from svkc.model.named_access import NamedAccess
 from svkc.model.parameters import BodyParameters, body_parameters, with_parameters
 from svkc.model.state import State, Structure
+from svkc.model.tables import Block, Printed, is_readable
 from svkc.model.topology import FREE
 from svkc.model.validation import real_array
 
 
-class Chain(NamedAccess):
+class Chain(Printed, NamedAccess):
     """The bodies of a scene and the joints between them, made by `svkc.load`.
 
     Floats are differentiable leaves. There is one row for each joint or fixed body of the tree
@@ -69,6 +71,12 @@ class Chain(NamedAccess):
     limit_spring: Float[Array, "2 dofs"] | None = None
     model: Any = eqx.field(static=True, default=None)
     left_out: tuple[str, ...] = eqx.field(static=True, default=())
+
+    def _blocks(self) -> list[Block]:
+        return chain_blocks(self)
+
+    def __repr__(self) -> str:
+        return f"<{chain_summary(self)}>" if is_readable(self) else super().__repr__()
 
     @property
     def _dtype(self) -> np.dtype:

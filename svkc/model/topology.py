@@ -51,6 +51,8 @@ class Topology:
     model_v: index in v of each entry of the model's qvel.
     link_actuated: whether a motor drives the coordinates of each virtual link.
     massless_dofs: the tree's coordinates along which the joint's own body has almost no inertia.
+    link_as_loaded: whether the place of each virtual link on its real link was not declared, but is
+        where its parent is in the load pose. (Without a place on a site it is the site's origin.)
     site_names: names of the model's sites.
     site_frames: frame of each site.
     """
@@ -74,6 +76,7 @@ class Topology:
     model_v: tuple[int, ...] = ()
     link_actuated: tuple[bool, ...] = ()
     massless_dofs: tuple[int, ...] = ()
+    link_as_loaded: tuple[bool, ...] = ()
     site_names: tuple[str, ...] = ()
     site_frames: tuple[FixedFrame, ...] = ()
 

@@ -33,6 +33,7 @@ class RunEnd:
     """The end of a run, and the arguments of the run.
 
     t, state: last time (s) and state.
+    change_times: when timed events happen (s).
     probes: times after t at which the numbers are evaluated as well (s).
     """
 
@@ -41,6 +42,7 @@ class RunEnd:
     state: State
     control: Any
     plan: Plan
+    change_times: np.ndarray
     args: Any
     probes: tuple[float, ...]
 
@@ -72,12 +74,14 @@ def run_end(traj, options: dict) -> RunEnd:
     """
     chain, dt = options["chain"], options.get("dt")
     span = float(traj.ts[-1] - traj.ts[0])
+    plan = make_plan(chain, as_events(options.get("events") or ()), traj.final.q.dtype)
     return RunEnd(
         chain=chain,
         t=float(traj.t_final),
         state=jax.tree.map(jnp.asarray, traj.final),
         control=options.get("control"),
-        plan=make_plan(chain, as_events(options.get("events") or ()), traj.final.q.dtype),
+        plan=plan,
+        change_times=_change_times(traj, plan),
         args=options.get("args"),
         # Step-size controllers shorten steps with numbers that are not finite, except where only a
         # guard is not. Step sizes are not recorded, so that fractions of the run stand for them.
@@ -87,6 +91,16 @@ def run_end(traj, options: dict) -> RunEnd:
             else float(dt) * np.array([0.5, 1.0])
         ),
     )
+
+
+def _change_times(traj, plan: Plan) -> np.ndarray:
+    """Return the times (s) at which timed events happen, after recorded events too."""
+    recorded, which = np.asarray(traj.events.time), np.asarray(traj.events.which)
+    times = [
+        np.asarray(time) + (0 if plan.after[i] is None else recorded[which == plan.after[i]])
+        for i, time in zip(plan.timed, plan.times, strict=True)
+    ]
+    return np.concatenate([np.ravel(t) for t in times]) if times else np.zeros(0)
 
 
 def find_non_finite(end: RunEnd) -> str:
@@ -102,7 +116,7 @@ def find_non_finite(end: RunEnd) -> str:
     for h in (0.0, *end.probes):
         t, state = end.t + h, _advance(end, h)
         source = _at_instant(end, t, state)
-        if not source and h == 0 and np.any(np.asarray(end.plan.times) == end.t):
+        if not source and h == 0 and np.any(end.change_times == end.t):
             source = "the change of structure"
         if source:
             return f"{source}, at t = {t:.9g} s"

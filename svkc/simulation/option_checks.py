@@ -87,6 +87,11 @@ def check_times(t0: Any, t1: Any, ts: Any, events: Any) -> None:
         if (
             isinstance(event, At)
             and is_concrete(event.time)
-            and not np.all((np.asarray(event.time) >= t0) & np.isfinite(np.asarray(event.time)))
+            and not np.all(
+                (np.asarray(event.time) >= (t0 if event.after is None else 0))
+                & np.isfinite(np.asarray(event.time))
+            )
         ):
+            if event.after is not None:
+                raise ValueError(f"at: got time {event.time} after an event, expected 0 or more")
             raise ValueError(f"at: got time {event.time}, before the start of the run at {t0}")

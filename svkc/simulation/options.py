@@ -31,6 +31,7 @@ from svkc.simulation.option_checks import (
 )
 from svkc.transitions.events import as_events
 from svkc.transitions.plan import Plan, make_plan
+from svkc.transitions.schedule import event_capacity
 
 
 class Options(eqx.Module):
@@ -265,10 +266,9 @@ def _resolve_adjoint(adjoint, controller) -> diffrax.AbstractAdjoint | Replay:
 
 
 def _resolve_max_events(max_events, plan: Plan) -> int:
-    """Return the capacity for events, by default one for each timed event and four for each
-    guard."""
+    """Return the capacity for events."""
     if max_events is None:
-        return len(plan.timed) + 4 * len(plan.guarded)
+        return event_capacity(plan)
     capacity = integer("max_events", max_events, 0)
     return capacity if plan.actions else 0
 

@@ -32,6 +32,7 @@ from svkc.simulation.codes import DERIVATIVE, RESULTS
 from svkc.simulation.options import Options
 from svkc.simulation.records import Events, PhaseRecords
 from svkc.transitions.plan import Plan
+from svkc.transitions.schedule import Schedule, armed_guards
 
 
 class RunState(eqx.Module):
@@ -40,7 +41,7 @@ class RunState(eqx.Module):
     work: done so far by control, by dampers and by joint limits (J).
     guard_values: at the end of the last phase.
     stale: which guard values are re-evaluated at the start of the next phase.
-    pending: which timed events have not happened yet.
+    schedule: when the timed events happen, and which events have happened.
     count: number of phases so far.
     saved, saved_work: states and work at the save times.
     derivative, invalid_from: why the run has no derivative, and the index of the first phase for
@@ -52,7 +53,7 @@ class RunState(eqx.Module):
     work: Float[Array, "3"] | None
     guard_values: Float[Array, " guards"] | None
     stale: Bool[Array, " guards"] | None
-    pending: Bool[Array, " timed"]
+    schedule: Schedule
     events: Events
     records: PhaseRecords
     count: Int[Array, ""]
@@ -99,7 +100,7 @@ def solve_phase(
     guards = GuardValues(plan, options.field) if plan.guards else None
     armed = None
     if guards is not None:
-        mask = plan.armed(field_args.chain, field_args.structure)
+        mask = armed_guards(field_args.chain, field_args.structure, plan, run.schedule)
         assert run.guard_values is not None
         armed = stop_gradient_tree(ArmedGuards(guards, run.guard_values, mask))
     y0 = ODEState(run.state.q, run.state.v, run.work)

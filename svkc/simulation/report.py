@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from svkc._jax.pytrees import is_concrete
 from svkc.loops.constraint import gap_tolerance
 from svkc.model.chain_names import ChainNames
+from svkc.model.tables import Block, Printed, Table, lane_name, ranges
 from svkc.simulation.codes import DERIVATIVE, RESULTS
 
 # Energy drift divided by the kinetic energy. The relative error of speeds is half of it: 5 %
@@ -26,7 +26,7 @@ ERROR_NOTABLE = 0.1
 REJECTED_NOTABLE, REJECTED_AT_LEAST = 2, 20
 
 
-class Report(eqx.Module):
+class Report(Printed):
     """The certificate of a run: how far the numbers of the run can be relied on.
 
     gap, angular_gap: largest loop gaps at the ends of steps and at save times (m, rad).
@@ -105,14 +105,28 @@ class Report(eqx.Module):
         if failed.flat[worst]:
             result = jax.tree.map(lambda x: jnp.ravel(x)[worst], self.result)
             words = [f"the run did not reach its end: {RESULTS[result]}", *words]
-        lane = ", ".join(map(str, np.unravel_index(worst, shape)))
+        lane = lane_name(worst, shape) if shape else ""
         return f"worst of {len(lanes)} lanes, lane {lane}: " * bool(shape) + "; ".join(words)
 
-    def __str__(self) -> str:
-        if not is_concrete(self.gap):
-            return repr(self)
-        if np.ndim(self.gap):
-            return f"verdict                 {self.verdict()}"
+    def _blocks(self) -> list[Block]:
+        if not np.ndim(self.gap):
+            return [Table((), self._rows())]
+        values = {
+            "end (s)": self.t_final,
+            "steps": self.accepted,
+            "rejected steps": self.rejected,
+            "energy drift, without sign (J)": np.abs(self.energy_drift),
+            "energy lost in impacts (J)": self.energy_lost,
+            "largest loop gap (m)": self.gap,
+            "largest loop gap (rad)": self.angular_gap,
+            "errors of steps, summed": self.error,
+            "rank margin": self.margin,
+        }
+        rows = [("ended", str(self.result)), ("derivatives", str(self.derivative))]
+        return [ranges(values), Table((), [*rows, ("verdict", self.verdict())])]
+
+    def _rows(self) -> list[tuple[str, str]]:
+        """Return the names and the values of the certificate of one run."""
         balance = (
             f"{float(self.momentum_drift):.2e} N s, {float(self.angular_momentum_drift):.2e} N m s"
             if self.free
@@ -120,7 +134,7 @@ class Report(eqx.Module):
         )
         error = (
             f"{float(self.error):.2e}"
-            if jnp.isfinite(self.error)
+            if np.isfinite(self.error)
             else "not estimated by this solver"
         )
         swaps = (
@@ -130,33 +144,30 @@ class Report(eqx.Module):
         )
         if self.halved is not None:
             error += f"; by a finer run {float(self.halved):.2e} rad, m"
-        lines = [
+        gap = f"{float(self.gap):.2e} m, {float(self.angular_gap):.2e} rad"
+        rate = f"{float(self.gap_rate):.2e} m/s, {float(self.angular_gap_rate):.2e} rad/s"
+        energy = (
+            f"{float(self.energy_drift):.2e} J, lost in impacts {float(self.energy_lost):.4g} J"
+        )
+        work = f"{int(self.accepted)} steps, {int(self.rejected)} rejected"
+        rows = [
+            ("largest loop gap", f"{gap}; rate {rate}"),
+            ("energy", f"drift {energy}"),
+            ("momentum where free", balance),
+            ("errors of steps, summed", error),
+            ("rank margin", f"{float(self.margin):.2e}; {swaps}"),
+            ("work", f"{work}, {int(self.evaluations)} evaluations, {int(self.phases)} phases"),
             (
-                f"largest loop gap        {float(self.gap):.2e} m, {float(self.angular_gap):.2e}"
-                f" rad; rate {float(self.gap_rate):.2e} m/s, {float(self.angular_gap_rate):.2e}"
-                " rad/s"
-            ),
-            (
-                f"energy                  drift {float(self.energy_drift):.2e} J, lost in impacts"
-                f" {float(self.energy_lost):.4g} J"
-            ),
-            f"momentum where free     {balance}",
-            f"errors of steps, summed {error}",
-            f"rank margin             {float(self.margin):.2e}; {swaps}",
-            (
-                f"work                    {int(self.accepted)} steps, {int(self.rejected)}"
-                f" rejected, {int(self.evaluations)} evaluations, {int(self.phases)} phases"
-            ),
-            (
-                f"ended                   at {float(self.t_final):.9g} s:"
-                f" {RESULTS[self.result] or 'successful'}"
+                "ended",
+                f"at {float(self.t_final):.9g} s: {RESULTS[self.result] or 'successful'}",
             ),
         ]
         if self.loop >= 0:
-            lines.append(f"could not be closed     loop {int(self.loop)}, counted from 0")
+            loop = self.names.links[int(self.loop)] if self.names else f"link {int(self.loop)}"
+            rows.append(("could not be closed", f"loop {loop}"))
         if self.derivative != DERIVATIVE.successful:
-            lines.append(f"derivatives             {DERIVATIVE[self.derivative]}")
-        return "\n".join([*lines, f"verdict                 {self.verdict()}"])
+            rows.append(("derivatives", DERIVATIVE[self.derivative]))
+        return [*rows, ("verdict", self.verdict())]
 
 
 def _percent(share: float) -> str:

@@ -23,6 +23,7 @@ from svkc.simulation.phase import PhaseOutcome, RunState, solve_phase
 from svkc.simulation.records import empty_events, empty_phase_records, write_phase_row
 from svkc.simulation.traced_checks import initial_result
 from svkc.transitions.plan import Plan, guard_round_off
+from svkc.transitions.schedule import Schedule, armed_guards
 
 
 def with_lock_mask(chain: Chain, state: State, plan: Plan) -> State:
@@ -59,7 +60,7 @@ def initial_run_state(
         work=jnp.zeros(3, dtype) if options.has_work else None,
         guard_values=jnp.asarray(initial, dtype) if plan.guards else None,
         stale=jnp.asarray(reevaluated_guards(plan)) if plan.guards else None,
-        pending=jnp.ones(len(plan.timed), bool),
+        schedule=Schedule.at_start(plan),
         events=empty_events(rows, links, dtype),
         records=empty_phase_records(rows + 1, state),
         count=jnp.asarray(0, jnp.int32),
@@ -112,17 +113,17 @@ def _guard_values_after(
     at_zero = jnp.abs(values) < guard_round_off(values.dtype)
     on_first_side = jnp.sign(values) == jnp.sign(before)
     may_cross = at_zero & (on_first_side | ~jnp.any(outcome.fired))
-    may_cross = may_cross & plan.armed(chain, run.state.structure)
+    may_cross = may_cross & armed_guards(chain, run.state.structure, plan, run.schedule)
     return jnp.where(stale & ~may_cross, 0, values), stale
 
 
-def _next_stop(run: RunState, t1, plan: Plan):
+def _next_stop(run: RunState, t1):
     """Return the scheduled end of the next phase: the time of the next timed event, or t1.
 
     If the time of an event equals t1, derivatives are by the time of the event, not by t1. A run
     that has ended keeps its time, so that its phases have zero length.
     """
-    next_time = jnp.min(jnp.where(run.pending, plan.times, jnp.inf), initial=jnp.inf)
+    next_time = run.schedule.next_time()
     stop = jnp.where(next_time <= t1, next_time, t1)
     return jnp.where((stop < run.t) | (run.result != RESULTS.successful), run.t, stop)
 
@@ -137,9 +138,9 @@ def run_phase(
     """
     t1, ts = times
     run = _reevaluate_stale_guards(chain, run, plan, options, args)
-    active = (run.t < t1) | jnp.any(run.pending & (plan.times <= t1))
+    active = (run.t < t1) | jnp.any(run.schedule.until(t1))
     active = active & (run.result == RESULTS.successful)
-    stop = _next_stop(run, t1, plan)
+    stop = _next_stop(run, t1)
     outcome = solve_phase(run, stop, ts, plan, options, FieldArgs(chain, run.state.structure, args))
     timed, fired = _fired_events(run, outcome, active, plan)
     end_state = State(outcome.y.q, outcome.y.v, run.state.structure)
@@ -165,7 +166,7 @@ def run_phase(
         work=outcome.y.work,
         guard_values=guard_values,
         stale=stale,
-        pending=run.pending & ~timed,
+        schedule=run.schedule.after(plan, outcome.t, fired, timed),
         events=events,
         records=records,
         count=run.count + active.astype(jnp.int32),
@@ -180,7 +181,7 @@ def run_phase(
 def _fired_events(run: RunState, outcome: PhaseOutcome, active, plan: Plan):
     """Return the mask of the timed events, and that of all events, that fired after a phase."""
     reached = active & (outcome.result == RESULTS.successful)
-    timed = run.pending & (plan.times <= outcome.t + event_tolerance(outcome.t)) & reached
+    timed = run.schedule.until(outcome.t + event_tolerance(outcome.t)) & reached
     indices = np.array(plan.timed + plan.guarded, int)
     fired = jnp.concatenate([timed, outcome.fired & reached])
     return timed, jnp.zeros(len(plan.actions), bool).at[indices].set(fired)

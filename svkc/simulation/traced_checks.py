@@ -4,6 +4,7 @@ Invalid concrete arguments raise ValueError in `option_checks`, and compile none
 """
 
 import jax.numpy as jnp
+import numpy as np
 
 from svkc._jax.pytrees import stop_gradient_tree
 from svkc.model.chain import Chain
@@ -35,11 +36,13 @@ def _check_times(times, plan: Plan) -> RESULTS:
     """
     t0, t1, ts = stop_gradient_tree(times)
     event_times = stop_gradient_tree(plan.times)
+    # the delay of an event after another may not be negative
+    waits = np.array([plan.after[i] is not None for i in plan.timed], bool)
     # the rounding error of t0 + n dt is a few eps of the largest time
     slack = 8 * jnp.finfo(ts.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
     in_order = (
         (t0 <= t1)
-        & jnp.all(event_times >= t0)
+        & jnp.all(event_times >= jnp.where(waits, 0, t0))
         & jnp.all(ts >= t0 - slack)
         & jnp.all(ts[1:] >= ts[:-1])
     )

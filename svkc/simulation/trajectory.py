@@ -5,25 +5,33 @@ import functools
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from svkc._jax.eager import eager_jit
-from svkc._jax.pytrees import is_concrete
 from svkc.model.annotations import Function, Path, Scalar
 from svkc.model.chain import Chain
 from svkc.model.chain_names import ChainNames
 from svkc.model.state import State
+from svkc.model.tables import Block, Printed, is_readable, lane_index, number
 from svkc.model.validation import scalar
 from svkc.simulation.codes import DERIVATIVE, RESULTS
 from svkc.simulation.non_finite import trace_non_finite
 from svkc.simulation.option_checks import EventList
 from svkc.simulation.records import Events, Phases
 from svkc.simulation.report import ROUND_OFF_DRIFT, Report
+from svkc.simulation.run_tables import (
+    batch_event_table,
+    event_table,
+    extent,
+    joint_table,
+    phase_table,
+)
 
 
-class Trajectory(eqx.Module):
+class Trajectory(Printed):
     """The result of a run of `simulate`.
 
     ts: save times (s).
@@ -53,23 +61,32 @@ class Trajectory(eqx.Module):
     work: Float[Array, "times 3"] | None = None
     names: ChainNames | None = eqx.field(static=True, default=None)
 
-    def __str__(self) -> str:
-        """Return two lines: the extent of the run or of the batch, and the report's verdict."""
-        if not is_concrete(self.t_final):
-            return repr(self)
-        lanes = "x".join(map(str, np.shape(self.t_final)))
-        runs = f"Trajectories of {lanes} lanes" if lanes else "Trajectory"
-        many = lambda number, noun: f"{number} {noun}" + "s" * (number != 1)
-        most = lambda counts: int(np.max(np.asarray(counts), initial=0))
-        extent = ", ".join(
-            [
-                f"t = {np.min(self.ts):.6g} to {np.max(self.t_final):.6g} s",
-                many(np.shape(self.ts)[-1], "save time"),
-                many(most(self.phases.count), "phase"),
-                many(most(self.events.count), "event"),
-            ]
-        )
-        return f"{runs}: {extent}\n{self.report().verdict()}"
+    def _blocks(self) -> list[Block]:
+        report, events = self.report(), bool(np.any(self.events.count))
+        if np.ndim(self.t_final):
+            return [extent(self), *[batch_event_table(self)] * events, *report._blocks()]
+        blocks = [extent(self), phase_table(self.phases, self.names)]
+        if events:
+            blocks.append(event_table(self))
+        if self.names and np.size(self.ts):
+            blocks.append(joint_table(self))
+        if self.work is not None and np.any(self.work):
+            control, dampers, limits = map(number, np.asarray(self.work)[-1])
+            blocks.append(f"work (J): control {control}, dampers {dampers}, joint limits {limits}")
+        return [*blocks, report.verdict()]
+
+    def __repr__(self) -> str:
+        return f"<{extent(self)}: {self.result}>" if is_readable(self) else super().__repr__()
+
+    def __getitem__(self, lane: Any) -> "Trajectory":
+        """Return one lane of a batch, or a smaller batch.
+
+        lane: index, slice, array of indices or mask over the lanes; a tuple of these over several
+            axes of lanes.
+
+        Raises ValueError for a single run, IndexError if there is no such lane.
+        """
+        return jax.tree.map(lambda x: x[lane_index(lane, np.shape(self.t_final))], self)
 
     @property
     def connected(self) -> Bool[Array, "... times links"]:

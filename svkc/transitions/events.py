@@ -48,10 +48,14 @@ class Action(eqx.Module):
 
 
 class At(eqx.Module):
-    """An event at a given time (s). The time is differentiable."""
+    """An event at a given time (s). The time is differentiable.
+
+    after: the event from which the time counts. None: the time counts from zero.
+    """
 
     time: Any
     action: Action
+    after: "At | When | None" = None
 
 
 class When(eqx.Module):
@@ -59,12 +63,18 @@ class When(eqx.Module):
 
     direction: True for rising crossings only, False for falling ones only, None for either.
     max_step: the longest step while the guard is armed (s). None: any.
+    after: the event before which the guard is not armed. None: the guard waits for no event.
     """
 
     guard: Callable
     action: Action
     direction: bool | None = eqx.field(static=True, default=None)
     max_step: Any = None
+    after: "At | When | None" = None
+
+
+# an event, as `after` takes it
+AnyEvent: TypeAlias = Checked[At | When]
 
 
 def _as_tuple(value) -> tuple[Any, ...]:
@@ -120,17 +130,10 @@ def _check_no_contradiction(**arguments) -> None:
 
 
 def at(
-    time: Scalar,
-    connect: Names = (),
-    cut: Names = (),
-    *,
-    lock: Names = (),
-    unlock: Names = (),
-    here: bool | Names = False,
-    stop: Checked[bool] = False,
-    bind: Grips = (),
-    unbind: SlotsOrPairs = (),
-) -> At:
+    time: Scalar, connect: Names = (), cut: Names = (), *, lock: Names = (), unlock: Names = (),
+    here: bool | Names = False, stop: Checked[bool] = False, bind: Grips = (),
+    unbind: SlotsOrPairs = (), after: AnyEvent | None = None,
+) -> At:  # fmt: skip
     """Return an event that changes the structure at a given time.
 
     All events of one instant make one change: links are cut and slots cleared first, then grips
@@ -138,7 +141,8 @@ def at(
     connects and another one cuts is cut, and a joint that one locks and another unlocks is free.
     A grip may take a slot that the same instant cuts or clears.
 
-    time: when the event happens (s). The time is differentiable.
+    time: when the event happens (s), with `after` from the time of that event on. The time is
+        differentiable.
     connect, cut: name or names of virtual links.
     lock, unlock: name or names of joints of the tree.
     here: make new joints at the current poses of the bodies instead of at their declared
@@ -149,6 +153,8 @@ def at(
         stays connected.
     unbind: spare slots to cut and clear: names of slots, or pairs (parent, real) of body names for
         all slots between two bodies.
+    after: another event of the run, from which the time counts: `at(0.4, cut="hand", after=catch)`
+        lets go 0.4 s after the event `catch`. If that event happens again, the time counts anew.
 
     Raises ValueError if an argument has another type, if `here` names a link that `connect` does
     not name, or if `connect` and `cut`, `connect` and `unbind`, or `lock` and `unlock` have a name
@@ -156,34 +162,26 @@ def at(
     `not_bound` if `connect` names a spare slot that is bound to no bodies.
     """
     real_array("time", time)
+    _check_after(after)
     action = _make_action(
         connect=connect, cut=cut, lock=lock, unlock=unlock, here=here, stop=stop, bind=bind,
         unbind=unbind,
     )  # fmt: skip
-    return At(time, action)
+    return At(time, action, after)
 
 
 def when(
-    guard: Function,
-    connect: Names = (),
-    cut: Names = (),
-    direction: Checked[bool | None] = None,
-    *,
-    lock: Names = (),
-    unlock: Names = (),
-    here: bool | Names = False,
-    stop: Checked[bool] = False,
-    bind: Grips = (),
-    unbind: SlotsOrPairs = (),
-    max_step: Scalar | None = None,
-) -> When:
+    guard: Function, connect: Names = (), cut: Names = (),
+    direction: Checked[bool | None] = None, *, lock: Names = (), unlock: Names = (),
+    here: bool | Names = False, stop: Checked[bool] = False, bind: Grips = (),
+    unbind: SlotsOrPairs = (), max_step: Scalar | None = None, after: AnyEvent | None = None,
+) -> When:  # fmt: skip
     """Return an event that changes the structure when a guard crosses zero.
 
     The time of the event is located to round-off and is differentiable if the guard is smooth.
 
-    A guard is armed while its action would change the structure. A guard whose event stops the run,
-    or has no action, is always armed.
-
+    A guard is armed while its action would change the structure; one whose event stops the run, or
+    has no action, is always armed.
     A guard that starts the run within round-off of zero (eps^(3/4): 1.8e-12 in float64, 6.4e-6 in
     float32) has not crossed zero, whatever its sign and `direction`. It fires at its first crossing
     after it has left zero. The same holds after an event, for the guard that fired and for a guard
@@ -191,28 +189,36 @@ def when(
     another event does fire.
     The event of a discontinuous guard is at the jump; derivatives treat its time as constant.
     Of several crossings within a step the first is located: guards are evaluated at seven points of
-    its dense output (one if a guard needs torques), and closer where needed. Missed are jumps there
-    and back, faster oscillations, and pairs closer than 1e-5 of the step or the output's error.
+    its dense output (one if a guard needs torques). Missed are jumps there and back, faster
+    oscillations, and pairs closer than 1e-5 of the step or the output's error.
 
     guard: function (t, state, args) -> real number, or a guard such as `svkc.touch` returns.
     connect, cut, lock, unlock, here, stop, bind, unbind: as for `svkc.at`.
     direction: True for rising crossings only, False for falling ones only, None for either.
     max_step: the longest step while this guard is armed (s); None: any.
+    after: another event of the run, before which this guard is not armed.
 
-    Raises ValueError if the guard is no function of these arguments, the direction is not True,
-    False or None, `max_step` is not positive and finite, or `svkc.at` refuses an argument.
+    Raises ValueError if the guard is no function of these arguments, `max_step` is not positive and
+    finite, or an argument has another type.
     """
     check_function("when: guard", guard, "t", "state", "args")
     if direction is not None and not isinstance(direction, bool | np.bool_):
         raise ValueError(f"when: direction must be True, False or None, got {direction!r}")
     direction = None if direction is None else bool(direction)
+    if max_step is not None:
+        positive_scalar("when: max_step", finite_array("when: max_step", max_step))
+    _check_after(after)
     action = _make_action(
         connect=connect, cut=cut, lock=lock, unlock=unlock, here=here, stop=stop, bind=bind,
         unbind=unbind,
     )  # fmt: skip
-    if max_step is not None:
-        positive_scalar("when: max_step", finite_array("when: max_step", max_step))
-    return When(guard=guard, action=action, direction=direction, max_step=max_step)
+    return When(guard=guard, action=action, direction=direction, max_step=max_step, after=after)
+
+
+def _check_after(event: Any) -> None:
+    """Raise ValueError unless the argument `after` is an event or None."""
+    if not isinstance(event, At | When | None):
+        raise ValueError(f"after: expected svkc.at(...) or svkc.when(...), got {event!r}")
 
 
 def as_events(events: Any) -> tuple[Any, ...]:

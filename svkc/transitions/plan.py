@@ -27,7 +27,7 @@ from svkc.transitions.spare_links import (
 class Plan(eqx.Module):
     """The events of a run as tables.
 
-    times: time of each timed event (s).
+    times: time of each timed event (s); the delay of one that is after another event.
     guards: guard of each event with a guard.
     max_steps: longest step while each guard is armed (s), inf where not given. None: no event gives
         one.
@@ -36,6 +36,7 @@ class Plan(eqx.Module):
     actions: what each event in the user's list changes, without its grips, which hold
         differentiable data.
     grips: grips that each event in the user's list makes.
+    after: for each event in the user's list, the index of the event that it is after.
     """
 
     times: Float[Array, " timed"]
@@ -46,6 +47,7 @@ class Plan(eqx.Module):
     directions: tuple[bool | None, ...] = eqx.field(static=True)
     actions: tuple[Action, ...] = eqx.field(static=True)
     grips: tuple[tuple[Grip, ...], ...] = ()
+    after: tuple[int | None, ...] = eqx.field(static=True, default=())
 
     @property
     def has_binds(self) -> bool:
@@ -183,9 +185,23 @@ def make_plan(chain: Chain, events: tuple[Any, ...], dtype: DType) -> Plan:
             dataclasses.replace(e.action, bind=()) if e.action.bind else e.action for e in events
         ),
         grips=tuple(tuple(_validate_grip(chain, g, dtype) for g in e.action.bind) for e in events),
+        after=tuple(_index_of(e.after, events) for e in events),
     )
     _check_names(chain, plan)
     return plan
+
+
+def _index_of(event, events: tuple[Any, ...]) -> int | None:
+    """Return the index of an event among all. Raises ValueError if it is not one of them."""
+    if event is None:
+        return None
+    for i, other in enumerate(events):
+        if other is event:
+            return i
+    raise ValueError(
+        "after: the event is not among the events of the run; give simulate both, and make both on"
+        " the same side of jit and vmap"
+    )
 
 
 def _stack(numbers: list, dtype) -> Float[Array, " numbers"]:

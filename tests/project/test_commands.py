@@ -1,5 +1,7 @@
 """The command line, in separate processes."""
 
+import re
+
 import pytest
 from processes import looks_drawn, run
 
@@ -60,7 +62,8 @@ def test_run_and_view_of_a_model_file(tmp_path):
         "run --t1 0.3 --release pin@0.1 --catch pin@0.2 --mp4 --out", out, tmp_path / "rod.xml"
     )
     assert done.returncode == 0, done.stderr
-    assert "events at 0.100000 s, 0.200000 s" in done.stdout, done.stdout
+    assert re.search(r"^0\.100000 +0  - +pin ", done.stdout, re.M), done.stdout
+    assert re.search(r"^0\.200000 +1  pin +- ", done.stdout, re.M), done.stdout
     assert {"rod.npz", "rod.png", "rod_curves.png"} <= {path.name for path in out.iterdir()}
     traj = svkc.load_trajectory(out / "rod.npz")
     assert traj.phases.freedoms[:3].tolist() == [0, 2, 0]
@@ -111,9 +114,9 @@ def test_main_job(tmp_path):
     done = run("-m", "svkc", "--out", tmp_path)
     assert done.returncode == 0, done.stderr
     for word in (
-        "24     12        12",
-        "23      6        17",
-        "22      0        22",
+        "24    12        12",
+        "23     6        17",
+        "22     0        22",
         "largest loop gap",
         "energy drift",
         "compilation",
@@ -139,7 +142,7 @@ def test_the_swing_from_the_command_line(tmp_path):
     """`python -m svkc swing` prints 31 joint freedoms, and 29 after the seat is lost."""
     done = run("-m", "svkc", "swing", "--out", tmp_path, optimized=False)
     assert done.returncode == 0, done.stderr
-    for word in ("31     21        10", "29     12        17", "largest loop gap", "wrote"):
+    for word in ("31    21        10", "29    12        17", "largest loop gap", "wrote"):
         assert word in done.stdout, done.stdout
     looks_drawn(tmp_path / "swing.png")
     assert svkc.load_trajectory(tmp_path / "swing.npz").phases.joint_freedoms[:2].tolist() == [
@@ -166,8 +169,8 @@ def test_info(tmp_path):
     assert f"compiled programs: {tmp_path / 'kept'}" in done.stdout
     assert list(tmp_path.glob("kept/jaxlib-*/*-cache"))
     assert "friction" in done.stdout
-    assert "1 joint freedoms in the tree" in done.stdout
-    assert "mobility (N_F = N_J - m)     1" in done.stdout
+    assert "1 body, 1 joint, 0 virtual links, 0 actuators, 1 joint freedom in" in done.stdout
+    assert "mobility (N_F = N_J - m)  1" in done.stdout
     assert "independent coordinates: j" in done.stdout
     rod = (
         '<body name="{0}"{2}><joint name="{0}" axis="0 1 0"/><geom type="capsule" fromto="0 0 0'
@@ -182,8 +185,8 @@ def test_info(tmp_path):
     (tmp_path / "m.xml").write_text(f"<mujoco><worldbody>{bars}</worldbody>{pin}</mujoco>")
     told = run("-m", "svkc", "info", tmp_path / "m.xml").stdout
     for line in (
-        "1 virtual links: pin", "rank of the loops (m)        5",
-        "pin: 6 rows, 1 of them redundant", "left out: collision",
+        "3 bodies, 3 joints, 1 virtual link,", "place on real, from", "rank of the loops (m)     5",
+        "pin:  6 rows, 1 of them redundant", "left out: collision",
         "joints that can be cut, load(..., cuttable=[...]): crank, coupler, rocker",
         "ends of the tree, which could be held: coupler, rocker",
     ):  # fmt: skip

@@ -1,0 +1,94 @@
+"""When the timed events of a run happen, and which of its events have happened."""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from svkc.model.chain import Chain, Structure
+from svkc.transitions.plan import Plan
+
+
+class Schedule(eqx.Module):
+    """The state of the events of a run.
+
+    times: of each timed event (s); inf for one that waits for another event.
+    pending: which timed events have not happened yet.
+    happened: which events have happened. None: no guard waits for an event.
+    """
+
+    times: Float[Array, " timed"]
+    pending: Bool[Array, " timed"]
+    happened: Bool[Array, " events"] | None
+
+    @classmethod
+    def at_start(cls, plan: Plan) -> "Schedule":
+        """Return the schedule before the first phase."""
+        waits = np.array([plan.after[i] is not None for i in plan.timed], bool)
+        guard_waits = any(plan.after[i] is not None for i in plan.guarded)
+        return cls(
+            times=jnp.where(waits, jnp.inf, plan.times),
+            pending=jnp.ones(len(plan.timed), bool),
+            happened=jnp.zeros(len(plan.actions), bool) if guard_waits else None,
+        )
+
+    def next_time(self) -> Float[Array, ""]:
+        """Return the time of the next timed event (s), inf if there is none."""
+        return jnp.min(jnp.where(self.pending, self.times, jnp.inf), initial=jnp.inf)
+
+    def until(self, t) -> Bool[Array, " timed"]:
+        """Return which timed events are pending and happen up to the time t (s)."""
+        return self.pending & (self.times <= t)
+
+    def after(
+        self, plan: Plan, t, fired: Bool[Array, " events"], timed: Bool[Array, " timed"]
+    ) -> "Schedule":
+        """Return the schedule after the events that fired at the time t (s).
+
+        An event that is `after` one of them is scheduled from t on, anew if it was before.
+
+        timed: which timed events fired.
+        """
+        new = replace(self, pending=self.pending & ~timed)
+        if self.happened is not None:
+            new = replace(new, happened=self.happened | fired)
+        rows = [k for k, i in enumerate(plan.timed) if plan.after[i] is not None]
+        if not rows:
+            return new
+        starts = np.zeros((len(plan.timed), len(plan.actions)), bool)
+        for k in rows:
+            starts[k, plan.after[plan.timed[k]]] = True
+        started = jnp.any(starts & fired[None], 1)
+        return replace(
+            new,
+            times=jnp.where(started, t + plan.times, new.times),
+            pending=new.pending | started,
+        )
+
+
+def armed_guards(
+    chain: Chain, structure: Structure, plan: Plan, schedule: Schedule
+) -> Bool[Array, " guards"]:
+    """Return which guards are armed: those whose action would change the structure, and that wait
+    for no event that has not happened."""
+    armed = plan.armed(chain, structure)
+    if schedule.happened is None:
+        return armed
+    waits_for = [plan.after[i] for i in plan.guarded]
+    free = np.array([j is None for j in waits_for], bool)
+    events = np.array([0 if j is None else j for j in waits_for])
+    return armed & (free | schedule.happened[events])
+
+
+def event_capacity(plan: Plan) -> int:
+    """Return the default capacity for events: four for each guard, one for each timed event, and
+    for an event after another as many as for that one."""
+
+    def capacity(i: int) -> int:
+        if i in plan.guarded:
+            return 4
+        return 1 if plan.after[i] is None else capacity(plan.after[i])
+
+    return sum(capacity(i) for i in range(len(plan.actions)))
