@@ -11,7 +11,6 @@ import jax
 
 jax.config.update("jax_enable_x64", True)
 
-import diffrax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import optax
@@ -21,57 +20,47 @@ from svkc.scenes import high_bar
 
 # without joint ranges, whose steep torques would make the differences of check_grad inaccurate
 chain, start = high_bar(ignore="limit")
-limb_inertia = jnp.diag(svkc.mass_matrix(chain, start))  # kg m^2
-DRIVEN = [
-    f"{s}_{j}" for s in ("right", "left") for j in ("shoulder_flexion", "hip_flexion", "knee")
-]
+limb = jnp.diag(svkc.mass_matrix(chain, start))  # kg m^2
+DRIVEN = [s + j for s in ("right_", "left_") for j in ("shoulder_flexion", "hip_flexion", "knee")]
 PULSES = jnp.linspace(0.1, 0.9, 5)  # s: maximum of each torque pulse
-# height of the centre of mass on landing (m); m per (100 N m)^2; optimizer steps; end time (s)
-MAT_HEIGHT, TORQUE_COST, STEPS, END = 1.0, 0.3, 25, 1.9
-ARTICULATED = svkc.dynamics.ArticulatedBodies()
-OPTIONS = {"solver": diffrax.Dopri8(), "rtol": 1e-9, "atol": 1e-11, "dynamics": ARTICULATED}
+# height of the centre of mass on landing (m); m per (100 N m)^2; optimizer steps
+MAT_HEIGHT, TORQUE_COST, STEPS = 1.0, 0.3, 25
+OPTIONS = {"rtol": 1e-9, "atol": 1e-11, "dynamics": svkc.dynamics.ArticulatedBodies()}
 
 
 def control(t, state, torques):
-    """Return joint torques (N m): weak springs to the initial pose, and pulses of driven joints.
-
-    torques: amplitudes of the pulses in units of 100 N m, [driven joints, pulses].
-    """
+    """Return torques (N m): weak springs to the initial pose, and pulses [driven, 5] of 100 N m."""
     tau = {}
     for joint in chain.joint_names[1:]:  # all but the base
         (q, v), rest = chain.joint(state, joint), chain.joint(start, joint).q
-        tau[joint] = limb_inertia[chain.v_index(joint)] * (25.0 * (rest - q) - 10.0 * v)
+        tau[joint] = limb[chain.v_index(joint)] * (25.0 * (rest - q) - 10.0 * v)
     pulses = 100.0 * torques @ jnp.exp(-(((t - PULSES) / 0.15) ** 2))
     return tau | {joint: tau[joint] + pulses[i] for i, joint in enumerate(DRIVEN)}
 
 
-def swing(x, t1=END, ts=None):
-    """Return the run: torques x["torques"], and release times by the sigmoid of x["times"]."""
-    # the right hand releases before 1.4 s, the left hand at most 0.4 s later
+def swing(x, t1=1.9, ts=None):
+    """Return the run: the right hand releases before 1.4 s, the left hand up to 0.4 s later."""
     right, delay = jax.nn.sigmoid(x["times"]) * jnp.array([1.4, 0.4])
     release = svkc.at(right, cut="right_hand_grip")
     events = [release, svkc.at(delay, cut="left_hand_grip", after=release)]
-    options = OPTIONS | {"control": control, "args": x["torques"], "throw": False}
-    return svkc.simulate(chain, start, t1, ts=ts, events=events, **options)
+    options = OPTIONS | {"control": control, "args": x["torques"], "throw": False, "ts": ts}
+    return svkc.simulate(chain, start, t1, events=events, **options)
 
 
 def loss(x):
-    """Return the cost of torques minus the distance of the flight, and the distance (m).
-
-    The distance is x of the centre of mass at the height of the mat, on its parabola.
-    """
+    """Return a cost of torques minus the distance of the flight, and the distance (m)."""
+    # x of the centre of mass at the height of the mat, on its parabola
     (px, _, pz), (vx, _, vz), _ = svkc.center_of_mass(chain, swing(x).final)
     distance = px + vx * (vz + jnp.sqrt(vz**2 + 2 * 9.81 * (pz - MAT_HEIGHT))) / 9.81
     return TORQUE_COST * jnp.mean(x["torques"] ** 2) - distance, distance
 
 
 times = jax.scipy.special.logit(jnp.array([0.9 / 1.4, 0.25 / 0.4]))
-first = x = {"torques": jnp.zeros((len(DRIVEN), len(PULSES))), "times": times}
+first = x = {"torques": jnp.zeros((6, 5)), "times": times}
 gradient, adam = jax.jit(jax.value_and_grad(loss, has_aux=True)), optax.adam(0.07)
 memory = adam.init(x)
 for _ in range(STEPS):
-    (_, distance), slope = gradient(x)
-    updates, memory = adam.update(slope, memory)
+    updates, memory = adam.update(gradient(x)[1], memory)
     x = optax.apply_updates(x, updates)
 
 figure, panels = plt.subplots(1, 2, figsize=(13, 6), layout="constrained")
@@ -79,7 +68,7 @@ for panel, steps, at in zip(panels, (0, STEPS), (first, x)):
     traj, ((_, distance), _) = swing(at, 1.6, jnp.linspace(0, 1.6, 65)), gradient(at)
     right, left = traj.events.time
     title = f"after {steps} steps: lands at {distance:.2f} m, releases at {right:.3f}, {left:.3f} s"
-    print(f"{title}; torque parameters up to {100 * jnp.abs(at['torques']).max():.0f} N m")
+    print(title)
     with tempfile.TemporaryDirectory() as folder:
         panel.imshow(plt.imread(svkc.render(chain, traj, pathlib.Path(folder) / "strobe.png")))
     panel.set(title=title, xticks=[], yticks=[])
