@@ -22,21 +22,11 @@ events = [svkc.at(0.9, cut="right_hand_grip"), svkc.at(1.15, cut="left_hand_grip
 traj = svkc.simulate(
     chain, state, 1.8, ts=jnp.linspace(0, 1.8, 73), events=events, rtol=1e-8, atol=1e-10
 )
+print(traj)
 
-for phase in range(int(traj.phases.count)):
-    p = traj.phases
-    print(
-        f"{float(p.start[phase]):.2f} s to {float(p.stop[phase]):.2f} s:"
-        f" {int(p.joint_freedoms[phase])} joint freedoms, mobility {int(p.freedoms[phase])}"
-    )
-
-# path of the hips, and the largest loop gap
-positions, _ = jax.vmap(lambda s: svkc.poses(chain, s))(traj.states)
-hips = positions[:, chain.body_names.index("torso")]
-print(
-    f"hips from {hips[0].round(2)} to {hips[-1].round(2)} m; largest loop gap"
-    f" {float(traj.report().gap):.1e} m"
-)
+# the path of the centre of mass
+path = jax.vmap(lambda s: svkc.center_of_mass(chain, s))(traj.states).position
+print(f"centre of mass from {path[0].round(2)} to {path[-1].round(2)} m")
 
 folder = pathlib.Path(sys.argv[1] if len(sys.argv) > 1 else ".")
 print("wrote", svkc.render(chain, traj, folder / "01_high_bar.png"))

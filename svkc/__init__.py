@@ -32,6 +32,7 @@ from svkc.tree.kinematics import poses as poses, velocities as velocities
 from svkc.tree.points import (
     center_of_mass as center_of_mass,
     jacobian as _jacobian,
+    point_position as point_position,
     point_velocity as point_velocity,
     apply_force as apply_force,
 )
@@ -107,6 +108,7 @@ __all__ = [
     "velocities",
     "center_of_mass",
     "jacobian",
+    "point_position",
     "point_velocity",
     "apply_force",
     "integrate",

@@ -100,7 +100,7 @@ class NamedAccess(eqx.Module):
         return v_slice(self.topology, joint, links=True)
 
     def body_index(self, name: str) -> int:
-        """Return the row of a body in the results of `svkc.poses` and `svkc.velocities`.
+        """Return the row of a body, by its name, in the results of `svkc.poses` and others.
 
         Raises ValueError, with the nearest names, if there is no such body.
         """
@@ -110,6 +110,7 @@ class NamedAccess(eqx.Module):
         """Return q and v of a joint: scalars for a hinge or slide, arrays for other joints.
 
         state: a state, or several with leading axes, which the result has too.
+        name: of a joint or a virtual link.
         Raises ValueError, with the nearest names, if there is no such joint.
         """
         q, v = state.q[..., self.q_index(name)], state.v[..., self.v_index(name)]

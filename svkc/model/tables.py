@@ -29,7 +29,7 @@ class Table:
     def remainder(self) -> str:
         """The line that counts the rows that are not shown; "" if all are shown."""
         more = len(self.rows) - self.most
-        return f"... {more} more" if more > 0 else ""
+        return f"... {count(more, 'more row')}" if more > 0 else ""
 
     @property
     def columns_of_numbers(self) -> list[bool]:

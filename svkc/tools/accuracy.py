@@ -81,7 +81,7 @@ class Tuning:
                 *lines,
                 (
                     "* the fastest that holds the target, + those that hold it too"
-                    if self.best
+                    if self.best is not None
                     else "no candidate holds the target"
                 ),
             ]

@@ -88,6 +88,26 @@ def _jacobian(chain: Chain, state: State, point, *, frame: FixedFrame) -> Jacobi
     return Jacobian(linear=linear.T, angular=angular.T)
 
 
+def point_position(
+    chain: Chain, state: State, body: str, point: Numbers = (0.0, 0.0, 0.0)
+) -> Float[Array, "3"]:
+    """Return the position (m) of a point of a body in the world.
+
+    body: name of a body, or of a site of the model. A name that both have is the body's.
+    point: [3] the point in the frame of the body, or of the site (m).
+    Raises ValueError if the name is unknown, or if point has another shape.
+    """
+    check_state(chain, state)
+    return _point_position(chain, state, point=point, frame=body_or_site(chain.topology, body))
+
+
+@checked_jit(static=("frame",))
+def _point_position(chain: Chain, state: State, point, *, frame: FixedFrame) -> Float[Array, "3"]:
+    """Return the position of a point of a frame."""
+    kin = kinematics(chain, state.q)
+    return kin.root_position[frame.row] + _from_root(kin, frame, point)
+
+
 def point_velocity(
     chain: Chain, state: State, body: str, point: Numbers = (0.0, 0.0, 0.0)
 ) -> Float[Array, "3"]:

@@ -11,9 +11,14 @@ import svkc
 from svkc import _deprecated
 
 ROOT = pathlib.Path(__file__).parents[2]
-PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
 PACKAGES = {path.parent.name for path in (ROOT / "svkc").glob("*/__init__.py")}
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+
+
+def page_id(page: pathlib.Path) -> str:
+    """Return the path of a page within the project."""
+    return page.relative_to(ROOT).with_suffix("").as_posix()
 
 
 def anchors(page: pathlib.Path) -> set[str]:
@@ -27,7 +32,7 @@ def test_the_readme_is_short():
     assert len((ROOT / "README.md").read_bytes()) <= 9500
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", PAGES, ids=page_id)
 def test_links_have_targets(page):
     for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
         if target.startswith("http"):
@@ -38,7 +43,7 @@ def test_links_have_targets(page):
         assert not anchor or anchor in anchors(file), target
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", PAGES, ids=page_id)
 def test_paths_exist(page):
     """Files of the project that a page names exist. The changelog may name removed files."""
     named = re.findall(r"`((?:svkc|tests|benchmarks|examples|docs)/[\w/.]+\.\w+)", page.read_text())
@@ -46,7 +51,7 @@ def test_paths_exist(page):
     assert page.stem == "CHANGELOG" or not missing, missing
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", PAGES, ids=page_id)
 def test_public_names_exist(page):
     """Every `svkc.name` of a page exists. The changelog and the page of errors have old names."""
     if page.stem == "CHANGELOG":

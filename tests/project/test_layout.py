@@ -218,5 +218,5 @@ def test_the_table_of_the_paper_names_existing_files_and_tests():
 
 
 def test_ruff_passes():
-    done = run(*"-m ruff check svkc tests examples benchmarks".split())
+    done = run(*"-m ruff check svkc tests examples benchmarks docs".split())
     assert done.returncode == 0, done.stdout

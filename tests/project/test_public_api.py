@@ -34,7 +34,9 @@ def public_objects() -> dict[str, object]:
             if name[0] != "_" and not inspect.ismodule(x)
         }
     for cls in CLASSES:
-        for name, x in vars(cls).items():
+        bases = [base for base in cls.__mro__ if base.__module__.startswith("svkc.")]
+        for name in sorted({name for base in bases for name in vars(base)}):
+            x = inspect.getattr_static(cls, name)
             if name[0] != "_" and (inspect.isfunction(x) or isinstance(x, property)):
                 out[f"{cls.__name__}.{name}"] = x
     return out

@@ -144,7 +144,7 @@ def test_many_events_are_counted(batch):
     busy = eqx.tree_at(lambda t: (t.events.which, t.events.time), batch, (several, times))
     lines = str(busy).splitlines()
     assert len(lines) < 25
-    assert f"... {rows - 4} more" in lines
+    assert f"... {rows - 4} more rows" in lines
 
 
 def test_mobility_and_actuation(results):

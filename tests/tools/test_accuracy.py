@@ -375,3 +375,10 @@ def test_estimate_error_agrees_with_the_true_error(arm, exact):
         error = float(np.sqrt(np.mean(svkc.difference(chain, exact.q, run.final.q) ** 2)))
         assert 0.5 * error < estimate < 2 * error
         assert f"by a finer run {estimate:.2e}" in str(run.report(halved=estimate))
+
+
+def test_default_options_can_be_the_best():
+    """The best candidate's options may be empty, as those of the defaults are."""
+    candidates = (svkc.accuracy.Candidate("default", {}, seconds=0.1, error=1e-9),)
+    assert "* the fastest" in str(svkc.accuracy.Tuning(1e-6, {}, candidates))
+    assert "no candidate" in str(svkc.accuracy.Tuning(1e-12, None, candidates))

@@ -27,6 +27,7 @@ def quantities(chain, state, name):
     return {
         "linear": J.linear,
         "angular": J.angular,
+        "position": svkc.point_position(chain, state, name, POINT),
         "velocity": svkc.point_velocity(chain, state, name, POINT),
         "force": tau,
     }
@@ -41,7 +42,13 @@ def mujoco_quantities(model, data, body, pos, R):
     mujoco.mj_applyFT(model, data, **wrench, point=point, body=body, qfrc_target=tau)
     mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, body, twist, 0)
     velocity = twist[3:] + np.cross(twist[:3], point - data.xpos[body])
-    return {"linear": linear, "angular": angular, "velocity": velocity, "force": tau}
+    return {
+        "linear": linear,
+        "angular": angular,
+        "position": point,
+        "velocity": velocity,
+        "force": tau,
+    }
 
 
 def random_motion(chain):
