@@ -11,7 +11,7 @@ from svkc.model.chain_names import ChainNames, chain_names
 from svkc.model.names import unknown_name
 from svkc.simulation.trajectory import Trajectory
 from svkc.tree.energy import kinetic_energy, potential_energy
-from svkc.viz.shapes import event_descriptions, saved_states
+from svkc.viz.run_data import event_descriptions, saved_states
 
 # curves in a panel, and curves of coordinates if no joints are named
 MOST_CURVES, MOST_SHOWN = 8, 48
@@ -75,16 +75,20 @@ def coordinates(names: ChainNames | None, q: np.ndarray) -> list[Curve]:
     q: [times q].
     """
     if names is None:
-        return [Curve(f"q[{i}]", f"q[{i}]", UNITS[0], q[:, i]) for i in range(q.shape[1])]
+        labels = [f"q[{i}]" for i in range(q.shape[1])]
+        return [Curve(x, label=x, unit=UNITS[0], values=q[:, i]) for i, x in enumerate(labels)]
     result = []
     for joint, start, stop in names.q_ranges:
         for i, label in enumerate(names.q[start:stop], start):
             if label in names.v:
                 unit = UNITS[1 + names.angular[names.v.index(label)]]
-                result.append(Curve(joint, label, unit, q[:, i]))
+                result.append(Curve(joint, label=label, unit=unit, values=q[:, i]))
             elif label.endswith(".qw"):
-                turns = zip("xyz", rotation_vectors(q[:, i : i + 4]).T, strict=True)
-                result += [Curve(joint, f"{label[:-2]}r{k}", UNITS[2], x) for k, x in turns]
+                stem, vectors = label.removesuffix("qw"), rotation_vectors(q[:, i : i + 4])
+                result += [
+                    Curve(joint, label=stem + axis, unit=UNITS[2], values=values)
+                    for axis, values in zip(("rx", "ry", "rz"), vectors.T, strict=True)
+                ]
     return result
 
 

@@ -11,7 +11,7 @@ from svkc.model.validation import integer, names, positive_scalar, scalar, vecto
 from svkc.simulation.trajectory import Trajectory
 from svkc.viz.html_page import write_page
 from svkc.viz.meshes import MIN_FACES
-from svkc.viz.shapes import check_single_run
+from svkc.viz.run_data import check_single_run
 
 
 def _require_packages() -> None:

@@ -17,7 +17,7 @@ from svkc.viz.plots import (
     panels_of_coordinates,
     rotation_vectors,
 )
-from svkc.viz.shapes import saved_states
+from svkc.viz.run_data import saved_states
 
 SCENES = pathlib.Path(svkc.__file__).parent / "scenes"
 
@@ -84,7 +84,10 @@ def test_panels_of_joints_are_legible(figure):
 
 def test_more_coordinates_than_fit():
     """Of very many coordinates, those that change most are shown; named joints are all shown."""
-    every = [Curve(f"j{i}", f"j{i}", "angle (rad)", np.array([0.0, i % 60])) for i in range(100)]
+    every = [
+        Curve(f"j{i}", label=f"j{i}", unit="angle (rad)", values=np.array([0.0, i % 60]))
+        for i in range(100)
+    ]
     groups, note = panels_of_coordinates(every, None, None)
     labels = [curve.label for group in groups for curve in group]
     assert note.startswith("48 of 100 coordinates")
