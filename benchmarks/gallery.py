@@ -227,7 +227,8 @@ def measure(robot: Robot) -> str:
     chain = svkc.load(
         str(package.locate_file(robot.path)), virtual_links=robot.links, ignore=robot.ignore
     )
-    rest = chain.state(robot.q)
+    # the angles have four digits, fewer than closed loops need: they are a guess
+    rest = chain.state(robot.q, hold=False)
     mobility, difference = svkc.mobility(chain, rest), mujoco_difference(chain, rest)
     state = chain.state(rest.q, {name: robot.v[name] for name in robot.v} if robot.v else None)
     tau = jnp.array([(robot.tau or {}).get(name, 0.0) for name in chain.dof_names])

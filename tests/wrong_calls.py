@@ -173,7 +173,6 @@ CASES = {
     "camera: no": lambda s: s.drawn(camera="nobody's"),
     "mp4 needs": render_without_ffmpeg,
     "run: no scene": lambda s: commands._load_scene("nowhere", ()),
-    "trails: no": lambda s: s.drawn(trails=("nobody",)),
     "... is not linear": lambda s: jax.linear_transpose(
         custom_primitive("odd", jnp.sin, lambda p, t: (p[0], t[0])), jnp.ones(2)
     )(jnp.ones(2)),

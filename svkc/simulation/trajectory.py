@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from svkc._jax.eager import eager_jit
-from svkc.model.annotations import Function, Path, Scalar
+from svkc.model.annotations import Function, Names, Path, Scalar
 from svkc.model.chain import Chain
 from svkc.model.chain_names import ChainNames
 from svkc.model.state import State
@@ -110,15 +110,16 @@ class Trajectory(Printed):
 
         save(self, path, chain, options)
 
-    def plot(self, chain: Chain | None = None) -> Any:
-        """Return a matplotlib figure of joint coordinates, loop gaps, energy and mobility over
-        time, with events as vertical lines.
+    def plot(self, chain: Chain | None = None, *, joints: Names | None = None) -> Any:
+        """Return a matplotlib figure of joint coordinates, energy, loop gaps and mobility over
+        time, with events as vertical lines, as `svkc.plot` does.
 
-        chain: adds joint names, and kinetic and potential energy at the save times; optional.
+        chain: adds the parts of the energy at the save times; optional.
+        joints: names of joints and virtual links whose coordinates are shown; None: of the tree's.
         """
         from svkc.viz.render import plot
 
-        return plot(self, chain)
+        return plot(self, chain, joints=joints)
 
     def trace_non_finite(
         self, chain: Chain, *, control: Function | None = None, events: EventList = (),

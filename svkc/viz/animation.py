@@ -13,7 +13,7 @@ from svkc.model.chain import Chain
 from svkc.simulation.trajectory import Trajectory
 from svkc.viz.offscreen import add_line, add_sphere, offscreen
 from svkc.viz.outlines import ground_and_bodies, motion_box
-from svkc.viz.shapes import (
+from svkc.viz.run_data import (
     color,
     connected_link_positions,
     event_descriptions,
@@ -92,9 +92,7 @@ def frames(
     import mujoco
 
     model = chain.model.model
-    unknown = [name for name in trails if name not in chain.body_names]
-    if unknown:
-        raise ValueError(f"trails: no body {unknown[0]!r}; bodies: {', '.join(chain.body_names)}")
+    trailed = [chain.body_index(name) for name in trails]
     ts, _, states = saved_states(traj)
     positions, R = positions_and_rotations(chain, states)
     links = connected_link_positions(chain, states, positions, R)
@@ -108,7 +106,7 @@ def frames(
         for t in np.arange(ts[0], ts[-1] + 0.5 / fps, 1 / fps):
             i = int(np.argmin(np.abs(ts - t)))
             _set_poses(model, data, positions[i], R[i])
-            paths = [positions[: i + 1, chain.body_names.index(name)] for name in trails]
+            paths = [positions[: i + 1, body] for body in trailed]
             just_changed = any(0 <= t - time < FLASH_DURATION for time, _ in events)
 
             def decorate(scene, i=i, paths=paths, just_changed=just_changed):

@@ -22,7 +22,7 @@ from svkc.tree.energy import energy
 from svkc.tree.kinematics import poses
 from svkc.viz.meshes import MIN_FACES, Mesh, decimate, load_mesh, mesh_key
 from svkc.viz.outlines import geom_color, geom_kind, visible_geoms
-from svkc.viz.shapes import check_single_run, event_descriptions, saved_states
+from svkc.viz.run_data import check_single_run, event_descriptions, saved_states
 
 FOLDER = pathlib.Path(__file__).parent / "web"
 

@@ -22,15 +22,12 @@ class Mesh(NamedTuple):
 def mesh_key(model, geom: int) -> tuple[bool, int] | None:
     """Return whether the geom is a height field, and the number of its mesh or field.
 
-    None for a primitive. A primitive that was fitted to a mesh keeps the mesh's number, but is
-    drawn as the primitive.
+    None for a primitive.
     """
     import mujoco
 
-    kinds, kind = mujoco.mjtGeom, int(model.geom_type[geom])
-    if kind not in (kinds.mjGEOM_MESH, kinds.mjGEOM_SDF, kinds.mjGEOM_HFIELD):
-        return None
-    return kind == kinds.mjGEOM_HFIELD, int(model.geom_dataid[geom])
+    i = int(model.geom_dataid[geom])
+    return None if i < 0 else (model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_HFIELD, i)
 
 
 def load_mesh(model, key: tuple[bool, int]) -> Mesh:

@@ -11,7 +11,7 @@ from svkc.model.validation import integer, names, positive_scalar, scalar, vecto
 from svkc.simulation.trajectory import Trajectory
 from svkc.viz.html_page import write_page
 from svkc.viz.meshes import MIN_FACES
-from svkc.viz.shapes import check_single_run
+from svkc.viz.run_data import check_single_run
 
 
 def _require_packages() -> None:
@@ -87,16 +87,23 @@ def _view(camera, lookat, distance, azimuth, elevation) -> dict:
     }
 
 
-def plot(traj: Trajectory, chain: Chain | None = None) -> Any:
+def plot(traj: Trajectory, chain: Chain | None = None, *, joints: Names | None = None) -> Any:
     """Return a matplotlib figure of coordinates, energy, loop gaps and mobility over time.
 
-    Events are numbered vertical lines.
+    Events are numbered vertical lines. A panel of coordinates has at most eight curves, labelled by
+    joint; lengths and angles are in panels of their own, and rotation vectors (rad) stand for
+    quaternions. The parts of the energy add up to a constant, and the panel states by how much
+    their sum drifts: kinetic energy, that of gravity and of springs, what control, dampers and
+    limits took, and what was lost in events.
 
     traj: one run, not a batch.
-    chain: the chain of the run, which adds joint names, and kinetic and potential energy (J) at
-        every save time.
+    chain: the chain of the run, which adds the parts of the energy (J). Without a chain, the panel
+        shows the energy at the ends of phases.
+    joints: names of joints and virtual links whose coordinates are shown. None: all joints of the
+        tree; of more than 48 coordinates, those 48 that change most.
 
-    Raises ValueError if `traj` is a batch, RuntimeError if matplotlib is not installed.
+    Raises ValueError if `traj` is a batch or a joint does not exist, RuntimeError if matplotlib is
+    not installed.
     """
     from svkc.viz.plots import curves
 
@@ -104,4 +111,4 @@ def plot(traj: Trajectory, chain: Chain | None = None) -> Any:
     _require_packages()
     if chain is not None:
         check_chain(chain)
-    return curves(traj, chain)
+    return curves(traj, chain, None if joints is None else names("joints", joints))

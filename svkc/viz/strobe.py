@@ -8,7 +8,7 @@ import numpy as np
 from svkc.model.chain import Chain
 from svkc.simulation.trajectory import Trajectory
 from svkc.viz.outlines import Shape, ground_and_bodies, motion_box, outlines
-from svkc.viz.shapes import (
+from svkc.viz.run_data import (
     color,
     connected_link_positions,
     positions_and_rotations,

@@ -20,8 +20,8 @@ def check_single_run(traj: Any) -> None:
         raise ValueError(f"traj: expected one run of svkc.simulate, got {type(traj).__name__}")
     if np.ndim(traj.ts) != 1:
         raise ValueError(
-            f"render: a picture shows one run, got a batch of {traj.ts.shape[:-1]}; give one lane:"
-            " jax.tree.map(lambda x: x[0], traj)"
+            f"render: a picture shows one run, got a batch of {traj.ts.shape[:-1]};"
+            " give one lane: traj[0]"
         )
 
 
