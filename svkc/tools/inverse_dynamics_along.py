@@ -262,22 +262,22 @@ def _along(
         state = State(state.q, co.W @ jnp.where(co.independent, v, 0), structure)
         co = coordinates(chain, state)
         vdot = co.W @ jnp.where(co.independent, vdot, 0) + co.bias
-        found, _ = solve_unbounded(chain, state, vdot, weight, chain.actuated)
-        forces = loop_forces_of_motion(chain, state, vdot, found.tau)
+        torques, _ = solve_unbounded(chain, state, vdot, weight, chain.actuated)
+        forces = loop_forces_of_motion(chain, state, vdot, torques.tau)
         undetermined = co.independent & ~specified & jnp.any(co.J != 0, 0) & by_name
-        return state.v, vdot, found, forces, undetermined
+        return state.v, vdot, torques, forces, undetermined
 
-    v, vdot, found, forces, undetermined = jax.vmap(at_time)(states, *rates)
+    v, vdot, torques, forces, undetermined = jax.vmap(at_time)(states, *rates)
     nan_if_undetermined = lambda x: jnp.where(jnp.any(undetermined), jnp.nan, x)
     result = InverseDynamics(
         ts=ts,
         states=State(states.q, v, states.structure),
         vdot=nan_if_undetermined(vdot),
-        tau=nan_if_undetermined(found.tau),
-        residual=found.residual,
+        tau=nan_if_undetermined(torques.tau),
+        residual=torques.residual,
         loop_force=forces.force,
         loop_torque=forces.torque,
-        null_space=found.null_space,
+        null_space=torques.null_space,
         dof_names=chain.dof_names,
         link_names=chain.link_names,
     )

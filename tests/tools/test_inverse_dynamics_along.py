@@ -74,23 +74,23 @@ def figure_path():
 def test_open_chain_against_mj_inverse():
     """Torques and, at the base, the residual are MuJoCo's generalized force."""
     chain, q = figure_path()
-    found = svkc.inverse_dynamics_along(chain, TIMES, q)
+    motion = svkc.inverse_dynamics_along(chain, TIMES, q)
     model = chain.model.model
     data = mujoco.MjData(model)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     for i in range(0, len(TIMES), 8):
-        data.qpos[:], data.qvel[:], data.qacc[:] = q[i], found.states.v[i], found.vdot[i]
+        data.qpos[:], data.qvel[:], data.qacc[:] = q[i], motion.states.v[i], motion.vdot[i]
         mujoco.mj_inverse(model, data)
         force, scale = data.qfrc_inverse, np.abs(data.qfrc_inverse).max()
-        np.testing.assert_allclose(found.tau[i] + found.residual[i], force, atol=1e-10 * scale)
+        np.testing.assert_allclose(motion.tau[i] + motion.residual[i], force, atol=1e-10 * scale)
     # the turn is about a fixed axis at a constant rate, in body axes
-    turn = found.states.v[:, 3:6] - jnp.array([[3.1, 0.2, 0.0]])
+    turn = motion.states.v[:, 3:6] - jnp.array([[3.1, 0.2, 0.0]])
     assert float(jnp.abs(turn).max()) < 1e-4
-    assert not np.any(found.torque("base"))
-    assert found.torque("base").shape == (len(TIMES), 6)
+    assert not np.any(motion.torque("base"))
+    assert motion.torque("base").shape == (len(TIMES), 6)
     elbow = chain.dof_names.index("right_elbow")
-    assert (found.torque("right_elbow") == found.tau[:, elbow]).all()
-    lines = str(found).splitlines()
+    assert (motion.torque("right_elbow") == motion.tau[:, elbow]).all()
+    lines = str(motion).splitlines()
     assert len(lines) == 3 + 16
     assert re.match(r"largest residual \S+ N m or N, of base", lines[-1])
 
@@ -99,22 +99,22 @@ def test_torques_move_a_double_pendulum_along_the_path():
     """A cubic spline through the torques gives the path back, as well as it interpolates them."""
     chain = svkc.load(models.MJCF.format(models.TWO_RODS))
     path = {"upper": 0.4 * jnp.sin(TIMES), "lower": 0.5 - 0.5 * jnp.cos(TIMES)}
-    found = svkc.inverse_dynamics_along(chain, TIMES, path)
-    spline = jnp.asarray(CubicSpline(TIMES, found.tau).c)
+    motion = svkc.inverse_dynamics_along(chain, TIMES, path)
+    spline = jnp.asarray(CubicSpline(TIMES, motion.tau).c)
 
     def control(t, state, args):
         i = jnp.clip(jnp.searchsorted(TIMES, t, side="right") - 1, 0, len(TIMES) - 2)
         return jnp.polyval(spline[:, i], t - TIMES[i])
 
-    start = jax.tree.map(lambda x: x[0], found.states)
+    start = jax.tree.map(lambda x: x[0], motion.states)
     traj = svkc.simulate(chain, start, 2.0, ts=TIMES, control=control)
     # 5e-8, and a sixteenth or less of it for half the distance of times
-    np.testing.assert_allclose(traj.states.q, found.states.q, atol=2e-7)
+    np.testing.assert_allclose(traj.states.q, motion.states.q, atol=2e-7)
 
 
-def check_round_trip(chain, found):
+def check_round_trip(chain, motion):
     """Check that torques give the accelerations, the loop forces, and the power dE/dt."""
-    states, tau = found.states, found.tau
+    states, tau = motion.states, motion.tau
 
     @jax.jit
     def compute(chain, states, vdot, tau):
@@ -133,27 +133,27 @@ def check_round_trip(chain, found):
 
         return jax.vmap(at_time)(states, vdot, tau)
 
-    back, forces, rate, gap_rates = compute(chain, states, found.vdot, tau)
+    back, forces, rate, gap_rates = compute(chain, states, motion.vdot, tau)
     scale = max(1.0, float(jnp.abs(tau).max()))
-    np.testing.assert_allclose(back, found.vdot, atol=REFERENCE)
-    np.testing.assert_allclose(forces.force, found.loop_force, atol=REFERENCE * scale)
-    np.testing.assert_allclose(forces.torque, found.loop_torque, atol=REFERENCE * scale)
+    np.testing.assert_allclose(back, motion.vdot, atol=REFERENCE)
+    np.testing.assert_allclose(forces.force, motion.loop_force, atol=REFERENCE * scale)
+    np.testing.assert_allclose(forces.torque, motion.loop_torque, atol=REFERENCE * scale)
     assert float(jnp.abs(gap_rates).max()) < ROUND_OFF
     damping = 0 if chain.damping is None else jnp.sum(chain.damping[None] * states.v**2, 1)
     power = jnp.sum(tau * states.v, 1) - damping
     np.testing.assert_allclose(power, rate, atol=1e-11 * scale)
-    assert float(jnp.abs(found.residual).max()) < 1e-11 * scale
+    assert float(jnp.abs(motion.residual).max()) < 1e-11 * scale
 
 
 def test_four_bar_driven_by_a_motor(four_bar):
-    found = svkc.inverse_dynamics_along(four_bar, TIMES, {"crank": CRANK})
-    check_round_trip(four_bar, found)
-    assert np.flatnonzero(np.any(found.tau, 0)).tolist() == [0]
-    assert (found.torque("crank") == found.tau[:, 0]).all()
-    force, torque = found.wrench("pin")
+    motion = svkc.inverse_dynamics_along(four_bar, TIMES, {"crank": CRANK})
+    check_round_trip(four_bar, motion)
+    assert np.flatnonzero(np.any(motion.tau, 0)).tolist() == [0]
+    assert (motion.torque("crank") == motion.tau[:, 0]).all()
+    force, torque = motion.wrench("pin")
     assert force.shape == torque.shape == (len(TIMES), 3)
     # the error of the spline
-    np.testing.assert_allclose(found.vdot[:, 0], -4 * CRANK, atol=1e-4)
+    np.testing.assert_allclose(motion.vdot[:, 0], -4 * CRANK, atol=1e-4)
     # another structure: cut open, the named crank turns with the others at rest
     opened = svkc.inverse_dynamics_along(four_bar, TIMES, {"crank": CRANK}, connected=())
     assert not np.any(opened.states.v[:, 1:3])
@@ -174,28 +174,29 @@ def test_stewart_platform_follows_a_path_of_its_plate():
         "slide0": 0.05 * jnp.sin(2 * TIMES),
         "plate": quat_exp(turn),
     }
-    found = svkc.inverse_dynamics_along(chain, TIMES, path)
-    check_round_trip(chain, found)
-    driven = [chain.dof_names[i] for i in np.flatnonzero(np.any(found.tau, 0))]
+    motion = svkc.inverse_dynamics_along(chain, TIMES, path)
+    check_round_trip(chain, motion)
+    driven = [chain.dof_names[i] for i in np.flatnonzero(np.any(motion.tau, 0))]
     assert sorted(driven) == [f"slide{i}" for i in range(6)]
     # the same by the lengths of the legs
-    start = jax.tree.map(lambda x: x[0], found.states)
+    start = jax.tree.map(lambda x: x[0], motion.states)
     legs = [chain.joint_names.index(f"slide{i}") for i in range(6)]
     at = np.array(chain.topology.q_start)[np.array(chain.topology.joint_row)[legs]]
-    by_legs = {f"slide{i}": found.states.q[:, k] for i, k in enumerate(at)}
+    by_legs = {f"slide{i}": motion.states.q[:, k] for i, k in enumerate(at)}
     again = svkc.inverse_dynamics_along(chain, TIMES, by_legs)
-    np.testing.assert_allclose(again.states.q, found.states.q, atol=1e-8)
+    np.testing.assert_allclose(again.states.q, motion.states.q, atol=1e-8)
     np.testing.assert_allclose(start.q, chain.q_load, atol=REFERENCE)
-    # accelerations of the other coordinates differ by the errors of the two splines
-    scale = float(jnp.abs(found.tau).max())
-    np.testing.assert_allclose(again.tau, found.tau, atol=1e-5 * scale)
+    # the errors of two splines through different coordinates, which are largest at the ends
+    error = jnp.abs(again.tau - motion.tau).max(1) / jnp.abs(motion.tau).max()
+    assert error[5:-5].max() < 1e-7
+    assert error.max() < 1e-4
 
 
 @pytest.mark.slow
 def test_array_of_a_closed_chain_is_as_the_named_joint(four_bar):
-    found = svkc.inverse_dynamics_along(four_bar, TIMES, {"crank": CRANK})
-    by_array = svkc.inverse_dynamics_along(four_bar, TIMES, found.states.q[:, : four_bar.nq])
-    np.testing.assert_allclose(by_array.tau, found.tau, atol=REFERENCE)
+    motion = svkc.inverse_dynamics_along(four_bar, TIMES, {"crank": CRANK})
+    by_array = svkc.inverse_dynamics_along(four_bar, TIMES, motion.states.q[:, : four_bar.nq])
+    np.testing.assert_allclose(by_array.tau, motion.tau, atol=REFERENCE)
 
 
 @pytest.mark.slow
@@ -222,8 +223,8 @@ def test_gradient_of_the_peak_torque(four_bar):
     def peak(x):
         chain = eqx.tree_at(lambda c: c.mass, four_bar, x["mass"])
         path = {"crank": x["amplitude"] * jnp.sin(2 * TIMES)}
-        found = svkc.inverse_dynamics_along(chain, x["duration"] * TIMES, path)
-        return jnp.max(jnp.abs(found.tau)), jnp.max(jnp.abs(found.loop_force[:, 0, 2]))
+        motion = svkc.inverse_dynamics_along(chain, x["duration"] * TIMES, path)
+        return jnp.max(jnp.abs(motion.tau)), jnp.max(jnp.abs(motion.loop_force[:, 0, 2]))
 
     x = {
         "amplitude": jnp.asarray(0.3),
@@ -243,4 +244,5 @@ def test_lanes_and_failures_under_jit(four_bar):
     for lane, factor in zip(tau, (1, 2), strict=True):
         single = svkc.inverse_dynamics_along(four_bar, TIMES, {"crank": factor * CRANK})
         np.testing.assert_allclose(lane, single.tau, atol=REFERENCE)
-    assert np.isnan(torques({"coupler": jnp.full((2, len(TIMES)), 9.0)})).all()
+    undetermined = jax.jit(lambda ts: svkc.inverse_dynamics_along(four_bar, ts, {}).tau)
+    assert np.isnan(undetermined(TIMES)).all()
