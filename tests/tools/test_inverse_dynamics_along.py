@@ -200,6 +200,17 @@ def test_array_of_a_closed_chain_is_as_the_named_joint(four_bar):
 
 
 @pytest.mark.slow
+def test_unnamed_joints_outside_of_loops_rest():
+    inside = models.FOUR_BAR + models.bar("rod", models.Y, "0 0 -1", "0 2 0")
+    chain = svkc.load(models.MJCF.format(inside), virtual_links=[models.pin()])
+    motion = svkc.inverse_dynamics_along(chain, TIMES, {"crank": CRANK})
+    check_round_trip(chain, motion)
+    assert not np.any(motion.states.q[:, 3])
+    assert not np.any(motion.states.v[:, 3])
+    assert np.all(motion.torque("rod") != 0)
+
+
+@pytest.mark.slow
 def test_weights_of_redundant_motors(four_bar):
     """Without actuators all joints have motors; a heavy weight relieves the crank's."""
     chain = models.four_bar()
