@@ -57,6 +57,7 @@ from svkc.loops.forward_dynamics import (
     loop_forces as loop_forces,
 )
 from svkc.loops.actuation import actuation as actuation
+from svkc.tools.inverse_dynamics_along import inverse_dynamics_along as inverse_dynamics_along
 from svkc.loops.constraint import (
     loop_gaps as loop_gaps,
     loop_gap_rates as loop_gap_rates,
@@ -125,6 +126,7 @@ __all__ = [
     "forward_dynamics",
     "loop_forces",
     "actuation",
+    "inverse_dynamics_along",
     "loop_gaps",
     "loop_gap_rates",
     "loop_jacobian",

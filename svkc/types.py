@@ -12,6 +12,7 @@ from svkc.simulation.codes import DERIVATIVE as DERIVATIVE
 from svkc.simulation.records import Events as Events, Phases as Phases
 from svkc.simulation.report import Report as Report
 from svkc.tools.gradient_check import GradientCheck as GradientCheck
+from svkc.tools.inverse_dynamics_along import InverseDynamics as InverseDynamics
 from svkc.transitions.guards import AbstractGuard as AbstractGuard
 from svkc.tree.energy import Momentum as Momentum
 from svkc.tree.kinematics import Jacobian as Jacobian, Poses as Poses, Velocities as Velocities

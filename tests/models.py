@@ -155,14 +155,20 @@ def rod_on_balls() -> svkc.Chain:
     return svkc.load(MJCF.format(crank + rocker), virtual_links=[link])
 
 
-def stewart() -> svkc.Chain:
+def stewart(spread: float = 0.0, motors: str = "") -> svkc.Chain:
     """Return a Stewart platform: six legs of a universal joint (two hinges), a slide and a ball.
 
     The ball of the first leg is in the tree; the other balls are virtual links.
+
+    spread: angle by which pairs of feet are apart, and pairs of balls closer (rad). Two regular
+        hexagons, without spread, leave the plate one freedom when the slides are locked.
+    motors: MJCF of the actuators.
     """
     angle = np.deg2rad([0, 60, 120, 180, 240, 300])
-    feet = np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
-    tops = np.stack([0.5 * np.cos(angle + 0.5), 0.5 * np.sin(angle + 0.5), 0 * angle + 1], 1)
+    apart = spread * np.array([1, -1, 1, -1, 1, -1])
+    foot_angle, top_angle = angle + apart, angle - apart + 0.5
+    feet = np.stack([np.cos(foot_angle), np.sin(foot_angle), 0 * angle], 1)
+    tops = np.stack([0.5 * np.cos(top_angle), 0.5 * np.sin(top_angle), 0 * angle + 1], 1)
     xml, links = "", []
     for i, (foot, top) in enumerate(zip(feet, tops)):
         axis, length = (top - foot) / np.linalg.norm(top - foot), np.linalg.norm(top - foot)
@@ -193,7 +199,8 @@ def stewart() -> svkc.Chain:
     # positions of the balls in the plate's frame, from the load pose
     import mujoco
 
-    model = mujoco.MjModel.from_xml_string(MJCF.format(xml))
+    text = MJCF.format(xml).replace("</mujoco>", motors + "</mujoco>")
+    model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     R, p = data.body("plate").xmat.reshape(3, 3), data.body("plate").xpos
@@ -209,7 +216,7 @@ def stewart() -> svkc.Chain:
         )
         for i, k in enumerate(links)
     ]
-    return svkc.load(MJCF.format(xml), virtual_links=placed_links)
+    return svkc.load(text, virtual_links=placed_links)
 
 
 def five_bar() -> svkc.Chain:

@@ -16,6 +16,7 @@ from svkc._jax.primitive import custom_primitive
 from svkc.cli import run as commands
 from svkc.loops.constrained_dynamics import Dynamics
 
+TIMES = np.linspace(0, 1, 5)
 SITE = models.MJCF.format(models.bar("b", models.Y, "0 0 1", inside='<site name="s"/>'))
 FREE = models.MJCF.format(models.bar("base", 'type="free"', "0 0 1"))
 
@@ -55,6 +56,9 @@ class Setting:
 
     def rollout(self, **kw):
         return svkc.rollout(self.four, self.lanes(), 1.0, **kw)
+
+    def along(self, q, ts=TIMES, **kw):
+        return svkc.inverse_dynamics_along(self.four, ts, q, **kw)
 
     def load(self, text=None, **kw):
         return svkc.load(text or models.MJCF.format(models.FOUR_BAR), **kw)
@@ -199,7 +203,7 @@ CASES = {
         s.four, jnp.zeros(9)
     ),
     "...: got ..., expected a positive": lambda s: s.simulate(dt=-1.0),
-    "...: got shape ..., expected (...,) for the tree": lambda s: s.four.state(np.zeros(7)),
+    "...: got shape ..., expected ... for the tree": lambda s: s.four.state(np.zeros(7)),
     "...: got shape ..., expected a number or": lambda s: s.actuation(
         bounds=(np.zeros(2), np.ones(2))
     ),
@@ -271,6 +275,9 @@ CASES = {
     "events: expected": lambda s: s.simulate(events=["pin"]),
     "here: ...": lambda s: svkc.at(0.5, connect="pin", here="other"),
     "ignore: got": lambda s: s.load(ignore=("nothing",)),
+    "inverse_dynamics_along: at t = ... s the joints": lambda s: s.along({}),
+    "inverse_dynamics_along: at t = ... s:": lambda s: s.along({"crank": TIMES, "rocker": TIMES}),
+    "q[...]: got shape": lambda s: s.along({"crank": TIMES[:2]}),
     "joint: got": lambda s: link(joint="screw"),
     "lane: expected a dict": lambda s: s.rollout(lane=lambda chain, data: 3),
     "...: expected a path": lambda s: svkc.load_trajectory(3),
@@ -352,7 +359,8 @@ CASES = {
     "to_mjcf: the": lambda s: svkc.load(s.four.model.model).to_mjcf(),
     "traj: expected": lambda s: svkc.render(s.four, 3, "x.gif"),
     "touch: axes": lambda s: svkc.touch(s.four, "pin", 0.1, axes="w"),
-    "ts: expected": lambda s: s.simulate(ts=jnp.array([0.5, 0.2])),
+    "ts: expected at least": lambda s: s.along({"crank": TIMES}, ts=TIMES[::-1]),
+    "ts: expected non": lambda s: s.simulate(ts=jnp.array([0.5, 0.2])),
     "u: got": lambda s: s.load(s.motor).motors(jnp.zeros(3)),
     "unbind: expected": lambda s: svkc.at(0.5, unbind=3),
     "vdot: got": lambda s: svkc.inverse_dynamics(s.four, s.state, jnp.zeros(9)),
@@ -497,6 +505,33 @@ ALSO = [
         lambda s: svkc.jacobian(s.four, s.state, "crank", (1, 2)),
     ),
     (r"force: expected real", lambda s: svkc.apply_force(s.four, s.state, "crank", "up")),
+    # paths
+    ("q: got shape .5, 2., expected .5, 3. for the tree", lambda s: s.along(np.ones((5, 2)))),
+    ("q: got shape .3,., expected .5, 3. for the tree", lambda s: s.along(np.zeros(3))),
+    ("q.'crank'.: got 2 numbers, the joint has 1", lambda s: s.along({"crank": np.ones((5, 2))})),
+    ("q.'crank'.: expected finite", lambda s: s.along({"crank": np.full(5, np.inf)})),
+    ("no joint 'nose'", lambda s: s.along({"nose": TIMES})),
+    (
+        "at t = 0.25 s: q: the loops do not allow.*rocker by",
+        lambda s: s.along({"crank": TIMES, "rocker": TIMES}),
+    ),
+    ("ts: expected at least four", lambda s: s.along({}, ts=TIMES[:3])),
+    ("weight: expected positive", lambda s: s.along({"crank": TIMES}, weight=-1.0)),
+    ("no virtual link 'pins'", lambda s: s.along({"crank": TIMES}, connected="pins")),
+    (
+        "norm 2",
+        lambda s: svkc.inverse_dynamics_along(
+            s.free, TIMES, {"base": np.tile([0, 0, 0, 2.0, 0, 0, 0], (5, 1))}
+        ),
+    ),
+    (
+        "no joint 'nose'. joints: base.x",
+        lambda s: svkc.inverse_dynamics_along(s.free, TIMES, {}).torque("nose"),
+    ),
+    (
+        "no virtual link 'pin'. virtual links: none",
+        lambda s: svkc.inverse_dynamics_along(s.free, TIMES, {}).wrench("pin"),
+    ),
     # states
     ("got 3 numbers, the joint has 7", lambda s: s.free.state(q={"base": np.zeros(3)})),
     ("norm 2", lambda s: s.free.state(q={"base": [0, 0, 0, 2, 0, 0, 0]})),

@@ -119,43 +119,49 @@ def actuation(
                 f" coordinate, or ({count},), theta_G"
             )
         vdot = jnp.zeros(chain.dofs, vdot.dtype).at[np.flatnonzero(independent)].set(vdot)
-    weight = _per_dof(chain, "weight", weight, 1.0, state)
-    if is_concrete(weight) and not np.all(
-        (np.asarray(weight) > 0) & np.isfinite(np.asarray(weight))
-    ):
-        raise ValueError(f"weight: expected positive numbers, got {np.asarray(weight)}")
+    weight = weight_per_dof(chain, weight)
     mask = chain.actuated if actuated is None else as_array(actuated)
     if mask.shape != (chain.dofs,) or mask.dtype != bool:
         raise ValueError(
             f"actuated: expected {chain.dofs} Booleans, got {mask.dtype} of shape {mask.shape}"
         )
     mask = jnp.asarray(mask)
-    result, problem = _solve_unbounded(chain, state, vdot, weight, mask)
+    result, problem = solve_unbounded(chain, state, vdot, weight, mask)
     if bounds is None:
         return result
-    tau, residual = solve_bounded(problem, weight, *_limits(chain, bounds, state))
+    tau, residual = solve_bounded(problem, weight, *_limits(chain, bounds))
     return eqx.tree_at(lambda r: (r.tau, r.residual), result, (tau, residual))
 
 
-def _per_dof(chain: Chain, name: str, value, default, state: State) -> Float[Array, " dofs"]:
+def weight_per_dof(chain: Chain, weight) -> Float[Array, " dofs"]:
+    """Return the weight over every coordinate; raise ValueError if it is not positive."""
+    weight = _per_dof(chain, "weight", weight, 1.0)
+    if is_concrete(weight) and not np.all(
+        (np.asarray(weight) > 0) & np.isfinite(np.asarray(weight))
+    ):
+        raise ValueError(f"weight: expected positive numbers, got {np.asarray(weight)}")
+    return weight
+
+
+def _per_dof(chain: Chain, name: str, value, default) -> Float[Array, " dofs"]:
     """Return the argument `name` over every coordinate.
 
     Raises ValueError for another shape than () or [dofs].
     """
-    value = real_array(name, default if value is None else value, state.v.dtype)
+    value = real_array(name, default if value is None else value, chain.q_load.dtype)
     if value.shape not in ((), (chain.dofs,)):
         raise ValueError(f"{name}: got shape {value.shape}, expected a number or ({chain.dofs},)")
     return jnp.broadcast_to(value, (chain.dofs,))
 
 
-def _limits(chain: Chain, bounds, state: State) -> list[Float[Array, " dofs"]]:
+def _limits(chain: Chain, bounds) -> list[Float[Array, " dofs"]]:
     """Return the lower and the upper bounds.
 
     Raises ValueError if they are not a pair, or if they cross.
     """
     if not isinstance(bounds, tuple | list | np.ndarray | jax.Array) or len(bounds) != 2:
         raise ValueError(f"bounds: expected (lower, upper), got {bounds!r}")
-    limits = [_per_dof(chain, "bounds", b, 0.0, state) for b in bounds]
+    limits = [_per_dof(chain, "bounds", b, 0.0) for b in bounds]
     if is_concrete(limits) and not np.all(np.asarray(limits[0]) <= np.asarray(limits[1])):
         lower, upper = np.asarray(limits)
         raise ValueError(f"bounds: expected lower at or below upper, got {lower} and {upper}")
@@ -191,7 +197,7 @@ def _null_space_basis(
 
 
 @eager_jit
-def _solve_unbounded(chain: Chain, state: State, vdot_G, weight, actuated: Bool[Array, " dofs"]):
+def solve_unbounded(chain: Chain, state: State, vdot_G, weight, actuated: Bool[Array, " dofs"]):
     """Return the `Actuation` without bounds, and (B, force, column) for `solve_bounded`."""
     nv = chain.nv
     co, kin, V = _coordinates_and_twists(chain, state)

@@ -183,18 +183,28 @@ def loop_forces(chain: Chain, state: State, tau: Torques) -> LoopForces:
     Raises ValueError if tau has neither length, or a name is unknown.
     """
     tau = torques_over_dofs(chain, tau)
+    dynamics = default_dynamics(chain)
+    vdot = acceleration(chain, state.structure, state.q, state.v, tau, dynamics)
+    return loop_forces_of_motion(chain, state, vdot, tau)
+
+
+def loop_forces_of_motion(
+    chain: Chain, state: State, vdot: Float[Array, " dofs"], tau: Float[Array, " dofs"]
+) -> LoopForces:
+    """Return the wrenches of the virtual links in a motion, for torques that produce the motion.
+
+    What the torques lack is taken to act on the independent coordinates.
+    """
+    q, v, s = state.q, state.v, state.structure
     if not len(chain.link_names):
         return LoopForces(
-            jnp.zeros((0, 3), state.v.dtype), jnp.zeros((0, 3), state.v.dtype), jnp.zeros(0, bool)
+            jnp.zeros((0, 3), v.dtype), jnp.zeros((0, 3), v.dtype), jnp.zeros(0, bool)
         )
-    q, v, s, nv = state.q, state.v, state.structure, chain.nv
     loops = loop_kinematics(chain, s, q)
-    kin, J = loops.kin, loops.J
-    V = twists(chain, kin, v)
-    vdot = acceleration(chain, s, q, v, tau, default_dynamics(chain))
-    force = pad_to_dofs(chain, rnea(chain, kin, V, v, vdot[:nv]))
-    qr = select_pivots(s, J)
-    wrench = -constraint_forces(chain, qr, J, force - passive_forces(chain, q, v) - tau)
+    V = twists(chain, loops.kin, v)
+    force = pad_to_dofs(chain, rnea(chain, loops.kin, V, v, vdot[: chain.nv]))
+    qr = select_pivots(s, loops.J)
+    wrench = -constraint_forces(chain, qr, loops.J, force - passive_forces(chain, q, v) - tau)
     return LoopForces(wrench[:, 3:], wrench[:, :3], ~self_stressed(s, qr))
 
 

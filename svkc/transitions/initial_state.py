@@ -2,6 +2,7 @@
 closed by continuation, the velocity projected, and errors that name what could not be reached."""
 
 import functools
+import math
 import warnings
 
 import equinox as eqx
@@ -35,20 +36,21 @@ def _set_values(array, at, values):
     return out
 
 
-def _full_vector(chain: Chain, quantity: str, value, default):
+def full_vector(chain: Chain, quantity: str, value, default):
     """Return the full vector of a user's array or dict, and the mask of degrees of freedom whose
     values the user gives.
 
     An array has the size of the model itself, of the tree, or of every coordinate.
 
     quantity: "q" or "v".
-    default: values of the coordinates that the user does not give.
+    default: values of the coordinates that the user does not give. With leading axes, those of
+        times, the user's arrays have these axes too.
     """
     top = chain.topology
     tree_size, slice_of, model_entries = (
         (top.nq, q_slice, top.model_q) if quantity == "q" else (top.nv, v_slice, top.model_v)
     )
-    named = np.zeros(top.dofs, bool)
+    named, batch = np.zeros(top.dofs, bool), default.shape[:-1]
     if value is None:
         return default, named
     if isinstance(value, dict):
@@ -56,31 +58,29 @@ def _full_vector(chain: Chain, quantity: str, value, default):
         for name, number in value.items():
             at = slice_of(top, name)
             number = finite_array(f"{quantity}[{name!r}]", number, default.dtype)
-            if number.size != at.stop - at.start:
-                raise ValueError(
-                    f"{quantity}[{name!r}]: got {number.size} numbers, the joint has"
-                    f" {at.stop - at.start}"
-                )
-            out = _set_values(out, at, number.reshape(-1))
+            size, width = number.size // math.prod(batch), at.stop - at.start
+            if size != width:
+                raise ValueError(f"{quantity}[{name!r}]: got {size} numbers, the joint has {width}")
+            out = _set_values(out, (..., at), number.reshape(*batch, width))
             named[v_slice(top, name)] = True
         return out, named
     value = finite_array(quantity, value, default.dtype)
-    if top.cuttable_joints and value.shape == (len(model_entries),):
+    if top.cuttable_joints and value.shape == (*batch, len(model_entries)):
         # the size in the model itself, in which no joint is cut
         named[np.array(top.model_v, int)] = True
-        return _set_values(default, np.array(model_entries, int), value), named
-    if value.shape == (tree_size,):
+        return _set_values(default, (..., np.array(model_entries, int)), value), named
+    if value.shape == (*batch, tree_size):
         named[: top.nv] = True
-        return _set_values(default, slice(tree_size), value), named
+        return _set_values(default, (..., slice(tree_size)), value), named
     if value.shape != default.shape:
         raise ValueError(
-            f"{quantity}: got shape {value.shape}, expected ({tree_size},) for the tree or"
+            f"{quantity}: got shape {value.shape}, expected {(*batch, tree_size)} for the tree or"
             f" {default.shape} for every coordinate"
         )
     return value, ~named
 
 
-def _check_quaternions(chain: Chain, q):
+def check_quaternions(chain: Chain, q):
     """Raise ValueError if a quaternion of a concrete q deviates from unit length by more than 1e-3.
 
     Smaller deviations are round-off, which normalising removes.
@@ -88,11 +88,12 @@ def _check_quaternions(chain: Chain, q):
     first, _ = chain.topology.quaternion_starts
     if not is_concrete(q) or not len(first):
         return
-    norms = np.linalg.norm(np.asarray(q)[first[:, None] + np.arange(4)], axis=1)
+    norms = np.linalg.norm(np.asarray(q)[..., first[:, None] + np.arange(4)], axis=-1)
     if np.any(np.abs(norms - 1) > 1e-3):
-        i = int(np.argmax(np.abs(norms - 1)))
+        worst = int(np.argmax(np.abs(norms - 1)))
+        i = first[worst % len(first)]
         raise ValueError(
-            f"q: the quaternion at q[{first[i]}:{first[i] + 4}] has norm {norms[i]:.6g}, expected 1"
+            f"q: the quaternion at q[{i}:{i + 4}] has norm {norms.flat[worst]:.6g}, expected 1"
         )
 
 
@@ -152,12 +153,12 @@ def assemble(
     chain: Chain, q, v, connected, *, near: State | None, hold: bool | None, tolerance, throw: bool
 ) -> State:
     """Return a consistent state; see `Chain.state`."""
-    start, structure = _start(chain, near, connected)
+    start, structure = starting_point(chain, near, connected)
     _warn_of_precision(chain, q, v)
-    requested, specified_q = _full_vector(chain, "q", q, start)
-    v_full, specified_v = _full_vector(chain, "v", v, np.zeros(chain.dofs, chain.q_load.dtype))
+    requested, specified_q = full_vector(chain, "q", q, start)
+    v_full, specified_v = full_vector(chain, "v", v, np.zeros(chain.dofs, chain.q_load.dtype))
     requested, v_full = jnp.asarray(requested), jnp.asarray(v_full)
-    _check_quaternions(chain, requested)
+    check_quaternions(chain, requested)
     holds = [isinstance(x, dict) if hold is None else boolean("hold", hold) for x in (q, v)]
     throw, tolerance = boolean("throw", throw), _tolerance(chain, tolerance)
     if not len(chain.link_names):
@@ -188,7 +189,7 @@ def _tolerance(chain: Chain, tolerance) -> Float[Array, ""]:
     return jnp.asarray(positive_scalar("tolerance", tolerance), chain.q_load.dtype)
 
 
-def _start(chain: Chain, near: State | None, connected) -> tuple[Array, Structure]:
+def starting_point(chain: Chain, near: State | None, connected) -> tuple[Array, Structure]:
     """Return the load pose or the configuration of `near`, and the structure of the state."""
     if near is None:
         start, structure = chain.q_load, chain.structure
