@@ -39,7 +39,7 @@ nitpick_ignore = [
     ("py:class", name)
     for name in """
     Any Array Bool Callable Float Int MuJoCo Sequence pathlib.Path
-    At When Touch Leaves Overload Page BodyParameters JointState
+    At When Touch Leaves Overload Page
     """.split()
 ]
 autodoc_typehints = "none"  # `format_signature` writes annotations as the sources have them
