@@ -31,15 +31,7 @@ events = [svkc.when(distance_beyond_edge(link), cut=link, direction=True) for li
 traj = svkc.simulate(
     chain, state, 2.0, ts=jnp.linspace(0, 2.0, 81), events=events, rtol=1e-8, atol=1e-10
 )
-
-p = traj.phases
-for i in range(int(p.count)):
-    held = [name for name, on in zip(chain.link_names, p.connected[i], strict=True) if on]
-    print(
-        f"{float(p.start[i]):.3f} s to {float(p.stop[i]):.3f} s: {int(p.joint_freedoms[i])} joint"
-        f" freedoms with the swing's own, held by {', '.join(held)}"
-    )
-print(f"largest loop gap {float(traj.report().gap):.1e} m")
+print(traj)
 
 folder = pathlib.Path(sys.argv[1] if len(sys.argv) > 1 else ".")
 print("wrote", svkc.render(chain, traj, folder / "02_swing.png"))
