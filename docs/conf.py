@@ -27,7 +27,7 @@ html_theme = "furo"
 html_title = f"svkc {version}"
 html_css_files = ["site.css"]
 html_static_path = ["_static"]
-html_show_sphinx = False
+html_show_copyright = html_show_sphinx = False
 highlight_language = "none"
 maximum_signature_line_length = 88
 html_copy_source = False
@@ -39,7 +39,7 @@ nitpick_ignore = [
     ("py:class", name)
     for name in """
     Any Array Bool Callable Float Int MuJoCo Sequence pathlib.Path
-    At When Touch Leaves Overload Page BodyParameters JointState
+    At When Touch Leaves Overload Page
     """.split()
 ]
 autodoc_typehints = "none"  # `format_signature` writes annotations as the sources have them

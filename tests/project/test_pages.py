@@ -1,5 +1,6 @@
 """The pages of the documentation: their code runs, the reference is complete, the site is whole."""
 
+import ast
 import re
 import runpy
 import shutil
@@ -45,6 +46,28 @@ def test_the_code_of_a_page_runs(name, tmp_path, monkeypatch):
             exec(compile("\n" * line + code, page, "exec"), namespace)
     if "plt" in namespace:
         namespace["plt"].close("all")
+
+
+def literal_subscripts(code: str) -> list[str]:
+    """Return the subscripts of q, v and tau by literal numbers, such as `state.q[7:23]`."""
+    return [
+        ast.unparse(node)
+        for node in ast.walk(ast.parse(code))
+        if isinstance(node, ast.Subscript)
+        and re.search(r"\b(q|v|tau)(\.at)?$", ast.unparse(node.value))
+        and any(isinstance(getattr(x, "value", None), int) for x in ast.walk(node.slice))
+    ]
+
+
+def test_no_page_reads_coordinates_by_number():
+    assert literal_subscripts("state.q[7:23], tau[0], run.v[:, 2]; q[f('x')] + v[j]") == [
+        "state.q[7:23]",
+        "tau[0]",
+        "run.v[:, 2]",
+    ]
+    for page in (ROOT / "README.md", *DOCS.rglob("*.md")):
+        for line, code in docstrings.python_blocks(page):
+            assert not literal_subscripts(code), f"{page}:{line}"
 
 
 def test_every_public_name_has_an_entry_with_an_example():
