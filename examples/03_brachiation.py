@@ -17,7 +17,7 @@ from svkc.scenes import BAR_HEIGHT, PALM
 from svkc.scenes.brachiation import BAR_SPACING, brachiation
 
 chain, state = brachiation()
-HOLDING = {"shoulder_flexion": 3.0, "shoulder_abduction": -0.1, "elbow": 0.85, "wrist": 0.2}  # rad
+HANGING = {"shoulder_flexion": 3.0, "shoulder_abduction": -0.1, "elbow": 0.85, "wrist": 0.2}  # rad
 FREE = {"shoulder_flexion": 1.2, "elbow": 0.6, "hip_flexion": 0.3, "knee": 0.4, "ankle": -0.5}
 PUMPED = {"hip_flexion": 0.9, "knee": 0.6}  # rad: raised legs while the hips move forwards
 # kg m^2: an arm that holds a bar moves the whole body, a free limb only itself
@@ -46,9 +46,9 @@ def control(t, state, args):
         dof = chain.v_index(joint)
         goal = FREE.get(part, 0.0) + PUMPED.get(part, 0.0) * forwards
         tau = limb[dof] * (81.0 * (goal - q) - 18.0 * v)
-        if part in HOLDING:
+        if part in HANGING:
             tau = jnp.where(reaches[side], pulls[side][dof] - 8.0 * limb[dof] * v, tau)
-            held = BODY[part] * (64.0 * (HOLDING[part] - q) - 16.0 * v)
+            held = BODY[part] * (64.0 * (HANGING[part] - q) - 16.0 * v)
             tau = jnp.where(holds[side], held, tau)
         torques[joint] = tau
     return torques

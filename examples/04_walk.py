@@ -47,9 +47,9 @@ def control(t, state, args):
     now = [chain.joint(state, joint) for joint in joints]
     error, error_rate = q - jnp.stack([j.q for j in now]), v - jnp.stack([j.v for j in now])
     co = svkc.coordinates(chain, state)
-    W, wanted = co.W[dofs], a + 200 * error + 28 * error_rate - co.bias[dofs]
+    W, desired = co.W[dofs], a + 200 * error + 28 * error_rate - co.bias[dofs]
     unused = jnp.diag(jnp.where(co.independent, 0.0, 1.0))
-    vdot = co.bias + co.W @ jnp.linalg.solve(W.T @ W + unused, W.T @ wanted)
+    vdot = co.bias + co.W @ jnp.linalg.solve(W.T @ W + unused, W.T @ desired)
     phase = jnp.clip((steps_done(t) - jnp.round(steps_done(t))) / DOUBLE_SUPPORT, 0, 1)
     # fraction of the load on the front foot; it exceeds one at the end: the ground would have to
     # pull the rear foot, so that the guard of this foot releases it

@@ -5,7 +5,7 @@ Writes a picture to the folder named on the command line (default: the current o
 
 import pathlib
 import sys
-import tempfile
+from tempfile import TemporaryDirectory
 
 import jax
 
@@ -66,7 +66,7 @@ for i in range(41):
     p, best = optax.apply_updates(p, updates), p
 figure, panels = plt.subplots(1, 2, figsize=(11, 7.6), layout="constrained")
 for panel, what, x in zip(panels, ("before", "after"), (first, best)):
-    with tempfile.TemporaryDirectory() as folder:
+    with TemporaryDirectory() as folder:
         picture = pathlib.Path(folder) / "strobe.png"
         svkc.render(chain, fly(x, 0.8, jnp.linspace(0, 0.8, 65)), picture, frames=6)
         panel.imshow(plt.imread(picture))
