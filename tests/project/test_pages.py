@@ -6,6 +6,7 @@ import runpy
 import shutil
 
 import jax
+import nbformat
 import pytest
 from processes import ROOT, run
 from test_public_api import public_objects
@@ -59,7 +60,17 @@ def literal_subscripts(code: str) -> list[str]:
     ]
 
 
-def test_no_page_reads_coordinates_by_number():
+def code_of_examples() -> list[tuple[str, str]]:
+    """Return (place, code) of every example, and of every cell of the notebook."""
+    files = sorted((ROOT / "examples").glob("*.py"))
+    cells = nbformat.read(ROOT / "examples" / "tour.ipynb", 4).cells
+    code = [cell.source for cell in cells if cell.cell_type == "code"]
+    # lines of IPython are no Python
+    code = [re.sub(r"^%.*", "", source, flags=re.M) for source in code]
+    return [(f.name, f.read_text()) for f in files] + [("tour", source) for source in code]
+
+
+def test_no_page_or_example_reads_coordinates_by_number():
     assert literal_subscripts("state.q[7:23], tau[0], run.v[:, 2]; q[f('x')] + v[j]") == [
         "state.q[7:23]",
         "tau[0]",
@@ -68,6 +79,10 @@ def test_no_page_reads_coordinates_by_number():
     for page in (ROOT / "README.md", *DOCS.rglob("*.md")):
         for line, code in docstrings.python_blocks(page):
             assert not literal_subscripts(code), f"{page}:{line}"
+    examples = code_of_examples()
+    assert len(examples) > 15
+    for place, code in examples:
+        assert not literal_subscripts(code), place
 
 
 def test_every_public_name_has_an_entry_with_an_example():
