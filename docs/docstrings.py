@@ -27,6 +27,7 @@ OBJECTS_IN_EXAMPLES = {
     "Chain": ("chain",),
     "State": ("state",),
     "Trajectory": ("traj", "lanes"),
+    "types.InverseDynamics": ("along",),
     "types.Report": ("report",),
 }
 # classes that users do not construct; their entries have no signature
@@ -56,6 +57,7 @@ GIVEN_BY = {
     "types.Events": "Trajectory.events",
     "types.GradientCheck": "check_grad",
     "types.Jacobian": "loop_jacobian",
+    "types.InverseDynamics": "inverse_dynamics_along",
     "types.JointState": "Chain.joint",
     "types.LoopForces": "loop_forces",
     "types.Mobility": "mobility",
