@@ -20,7 +20,11 @@ ROOT = pathlib.Path(__file__).parents[2]
 TOUR = ROOT / "examples" / "tour.ipynb"
 NUMBER = re.compile(r"(?<![A-Za-z_])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?|\binf\b")
 # lines whose numbers depend on the machine's round-off: errors of differences, numbers of steps
-ROUGH = re.compile(r"worst relative error .*?:|^work .*|^errors of steps.*|^rank margin.*")
+ROUGH = re.compile(
+    r"worst relative error .*?:|^work .*|^errors of steps.*|^rank margin.*"
+    # the last columns of the phases: steps and energy drift
+    r"| \d+ +[-+]?\d\.\d+e[-+]\d+$"
+)
 
 
 def execute_tour():
