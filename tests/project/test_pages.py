@@ -13,7 +13,7 @@ from test_public_api import public_objects
 
 DOCS = ROOT / "docs"
 # pages whose code takes less than four seconds
-FAST = ("reference/bodies", "reference/derivatives", "reference/interop")
+FAST = ("reference/derivatives", "reference/interop")
 
 
 conf = runpy.run_path(str(DOCS / "conf.py"))

@@ -33,7 +33,9 @@ def four_bar():
     return svkc.load(text.replace("</mujoco>", motor), virtual_links=[models.pin()])
 
 
-@pytest.mark.parametrize("count", [4, 5, 6, 7, 30])
+@pytest.mark.parametrize(
+    "count", [4, 5, *(pytest.param(n, marks=pytest.mark.slow) for n in (6, 7, 30))]
+)
 def test_spline_of_a_polynomial_is_exact(count):
     """For times at unequal distances, by all that so many points determine."""
     rng = np.random.default_rng(count)
@@ -45,6 +47,7 @@ def test_spline_of_a_polynomial_is_exact(count):
     np.testing.assert_allclose(second[:, 0], curve.deriv(2)(ts), atol=1e5 * ROUND_OFF)
 
 
+@pytest.mark.slow
 def test_spline_is_of_the_fourth_order_and_as_smooth_as_that_of_scipy():
     """Far from the ends, the spline is scipy's, which has other conditions there."""
     errors = []
@@ -95,6 +98,7 @@ def test_open_chain_against_mj_inverse():
     assert re.match(r"largest residual \S+ N m or N, of base", lines[-1])
 
 
+@pytest.mark.slow
 def test_torques_move_a_double_pendulum_along_the_path():
     """A cubic spline through the torques gives the path back, as well as it interpolates them."""
     chain = svkc.load(models.MJCF.format(models.TWO_RODS))
@@ -145,6 +149,7 @@ def check_round_trip(chain, motion):
     assert float(jnp.abs(motion.residual).max()) < 1e-11 * scale
 
 
+@pytest.mark.slow
 def test_four_bar_driven_by_a_motor(four_bar):
     motion = svkc.inverse_dynamics_along(four_bar, TIMES, {"crank": CRANK})
     check_round_trip(four_bar, motion)

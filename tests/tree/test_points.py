@@ -203,6 +203,7 @@ def test_a_force_at_the_centre_of_mass_moves_a_free_body():
     np.testing.assert_allclose(rise.velocity, 4 * expected, atol=REFERENCE)
 
 
+@pytest.mark.slow
 def test_derivatives_against_differences():
     chain = cases.CASES["free_tree"].build()
     state, *_ = random_motion(chain)
