@@ -114,7 +114,8 @@ def is_readable(value: Any) -> bool:
             if not field.metadata.get("static")
             for part in [getattr(value, field.name)]
         )
-    return isinstance(value, np.ndarray | np.generic | jax.Array) and not isinstance(value, Tracer)
+    numbers = float | int | np.ndarray | np.generic | jax.Array
+    return isinstance(value, numbers) and not isinstance(value, Tracer)
 
 
 def number(x: Any) -> str:
