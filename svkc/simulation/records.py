@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc.integration.solution import PhaseSolution, Stats
@@ -166,11 +167,11 @@ class Phases(eqx.Module):
     kinetic_energy: Float[Array, " phases"] | None = None
 
     @property
-    def freedoms(self) -> Int[Array, "... phases"]:
+    def freedoms(self) -> Int[Array | np.ndarray, "... phases"]:
         """Mobility N_F = N_J - m (paper, (13))."""
         return self.joint_freedoms - self.rank
 
     @property
-    def energy_drift(self) -> Float[Array, "... phases"]:
+    def energy_drift(self) -> Float[Array | np.ndarray, "... phases"]:
         """Change of energy that the work does not explain (J)."""
         return self.energy[..., 1] - self.energy[..., 0] - self.work

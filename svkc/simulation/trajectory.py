@@ -89,7 +89,7 @@ class Trajectory(Printed):
         return jax.tree.map(lambda x: x[lane_index(lane, np.shape(self.t_final))], self)
 
     @property
-    def connected(self) -> Bool[Array, "... times links"]:
+    def connected(self) -> Bool[Array | np.ndarray, "... times links"]:
         """Which virtual links are connected at each save time."""
         return self.states.structure.connected
 
