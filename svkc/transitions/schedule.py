@@ -86,9 +86,10 @@ def event_capacity(plan: Plan) -> int:
     """Return the default capacity for events: four for each guard, one for each timed event, and
     for an event after another as many as for that one."""
 
-    def capacity(i: int) -> int:
-        if i in plan.guarded:
+    def capacity(event: int) -> int:
+        if event in plan.guarded:
             return 4
-        return 1 if plan.after[i] is None else capacity(plan.after[i])
+        before = plan.after[event]
+        return 1 if before is None else capacity(before)
 
-    return sum(capacity(i) for i in range(len(plan.actions)))
+    return sum(map(capacity, range(len(plan.actions))))
