@@ -10,6 +10,9 @@ from tolerances import ROUND_OFF
 
 import svkc
 
+# MuJoCo warns so of gymnasium's half_cheetah.xml
+pytestmark = pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass' is deprecated")
+
 NAMES = [
     name if "fast" in case.tags.split() else pytest.param(name, marks=pytest.mark.slow)
     for name, case in cases.CASES.items()

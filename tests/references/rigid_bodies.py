@@ -148,6 +148,11 @@ class Bodies:
 
     def active(self, structure):
         """Return the mask of the coordinates that can move."""
+        mask = self.existing(structure)
+        return mask if structure.locked is None else mask & ~np.asarray(structure.locked)
+
+    def existing(self, structure):
+        """Return the mask of the coordinates of joints that are not cut."""
         mask = np.ones((self.count, self.dofs), bool)
         for i, dofs in enumerate(self.top.links.dof):
             free = (
@@ -156,7 +161,7 @@ class Bodies:
             for k, d in enumerate(dofs):
                 if d < self.dofs:
                     mask[:, d] = free[:, k]
-        return mask if structure.locked is None else mask & ~np.asarray(structure.locked)
+        return mask
 
     def centres(self, q, poses=None):
         """Return the Jacobians of the centres of mass and of the rotations of the rows, and the
@@ -180,7 +185,8 @@ class Bodies:
     def potential_energy(self, structure, q):
         centre = self.centres(q)[0]
         weight = np.einsum("nr,nri,ni->n", self.number["mass"], centre, self.number["gravity"])
-        stretch = self.change(self.number["q_spring"], q) * self.active(structure)
+        # the spring of a locked joint stays stretched
+        stretch = self.change(self.number["q_spring"], q) * self.existing(structure)
         return np.sum(self.number["stiffness"] * stretch**2, 1) / 2 - weight
 
     def momentum(self, q, v):
