@@ -34,7 +34,7 @@ limb = jnp.diag(svkc.mass_matrix(chain, start))  # kg m^2
 def control(t, state, bend):
     """Return joint torques (N m) for accelerations `bend` (rad/s^2) at start and end of flight."""
     now = bend[0] + (bend[1] - bend[0]) * t / CATCH_TIME
-    now = jnp.where(state.structure.connected[0], 0.0, now)
+    now = jnp.where(chain.connected(state, "right_hand_grip"), 0.0, now)
     both = [(side + joint, a) for side in ("right_", "left_") for joint, a in zip(JOINTS, now)]
     return {joint: limb[chain.v_index(joint)] * a for joint, a in both}
 

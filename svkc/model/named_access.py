@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from svkc.model.chain_names import ChainNames, chain_names
-from svkc.model.names import body_index, q_slice, v_slice
+from svkc.model.names import body_index, link_index, q_slice, v_slice
 from svkc.model.state import State
 from svkc.model.topology import Topology
 from svkc.model.validation import real_array
@@ -115,6 +115,15 @@ class NamedAccess(eqx.Module):
         """
         q, v = state.q[..., self.q_index(name)], state.v[..., self.v_index(name)]
         return JointState(*(x[..., 0] if x.shape[-1] == 1 else x for x in (q, v)))
+
+    def connected(self, state: State, link: str) -> Bool[Array, "..."]:
+        """Return whether a virtual link is connected.
+
+        state: a state, or several with leading axes, which the result has too.
+        link: name of the virtual link.
+        Raises ValueError, with the nearest names, if there is no such link.
+        """
+        return state.structure.connected[..., link_index(self.topology, link)]
 
     def torques(self, torques: Mapping[str, Any]) -> Float[Array, " dofs"]:
         """Return joint torques (N m, N) over every coordinate from torques by joint name.

@@ -130,7 +130,7 @@ class Report(Printed):
         balance = (
             f"{float(self.momentum_drift):.2e} N s, {float(self.angular_momentum_drift):.2e} N m s"
             if self.free
-            else "held to the ground throughout"
+            else "in no phase are all bodies free of the ground"
         )
         error = (
             f"{float(self.error):.2e}"

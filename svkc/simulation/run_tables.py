@@ -29,7 +29,8 @@ def extent(traj: Any) -> str:
         count(most(traj.phases.count), "phase"),
         count(most(traj.events.count), "event"),
     ]
-    return f"{runs}: {', '.join(numbers)}"
+    stopped = not lanes and str(traj.result) == "stopped"
+    return f"{runs}: {', '.join(numbers)}" + "; stopped by an event" * stopped
 
 
 def link_labels(names: ChainNames | None, size: int) -> tuple[str, ...]:

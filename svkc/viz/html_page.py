@@ -22,7 +22,12 @@ from svkc.tree.energy import energy
 from svkc.tree.kinematics import poses
 from svkc.viz.meshes import MIN_FACES, Mesh, decimate, load_mesh, mesh_key
 from svkc.viz.outlines import geom_color, geom_kind, visible_geoms
-from svkc.viz.run_data import check_single_run, event_descriptions, saved_states
+from svkc.viz.run_data import (
+    check_single_run,
+    event_descriptions,
+    saved_states,
+    warn_of_another_chain,
+)
 
 FOLDER = pathlib.Path(__file__).parent / "web"
 
@@ -120,6 +125,7 @@ def _run_data(chain: Chain, traj: Trajectory, max_faces: int) -> dict:
     positions, quats, energies = jax.jit(jax.vmap(lambda s: (*poses(chain, s), energy(chain, s))))(
         states
     )
+    warn_of_another_chain(traj, ts, energies)
     phases = _phase_rows(chain, traj, ts, states)
     geoms, meshes = _geoms(chain.model.model, max_faces)
     return {

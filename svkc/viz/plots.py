@@ -11,7 +11,7 @@ from svkc.model.chain_names import ChainNames, chain_names
 from svkc.model.names import unknown_name
 from svkc.simulation.trajectory import Trajectory
 from svkc.tree.energy import kinetic_energy, potential_energy
-from svkc.viz.run_data import event_descriptions, saved_states
+from svkc.viz.run_data import event_descriptions, saved_states, warn_of_another_chain
 
 # curves in a panel, and curves of coordinates if no joints are named
 MOST_CURVES, MOST_SHOWN = 8, 48
@@ -62,6 +62,7 @@ def curves(
     bounds = np.append(np.asarray(p.start)[:count], p.stop[count - 1])
     mobility.stairs(np.asarray(p.freedoms)[:count], bounds, baseline=None, linewidth=1.5)
     mobility.set(ylabel="mobility", xlabel="t (s)")
+    mobility.yaxis.get_major_locator().set_params(integer=True)
     for axes in panels[:-1]:
         axes.legend(loc="upper left", bbox_to_anchor=(1, 1), fontsize=8, frameon=False)
     panels[0].set_title(note, fontsize=9, loc="left", pad=16)
@@ -157,6 +158,8 @@ def _plot_energies(axes, traj: Trajectory, ts, numbers, chain: Chain | None):
         return
     parts = energy_parts(traj, ts, numbers, chain)
     total = np.sum(list(parts.values()), 0)
+    stored = parts["kinetic"] + parts["gravity"] + parts["springs"]
+    warn_of_another_chain(traj, ts, stored)
     for name, values in parts.items():
         if np.any(values):
             axes.plot(ts, values, linewidth=1, label=name)

@@ -1,5 +1,6 @@
 """Saved states, poses, link positions and descriptions of events, which all pictures use."""
 
+import warnings
 from typing import Any
 
 import jax
@@ -43,6 +44,27 @@ def saved_states(traj: Trajectory) -> tuple[np.ndarray, np.ndarray, State]:
         return ts, numbers, states
     append = lambda x, last: jnp.concatenate([x, last[None]])
     return np.append(ts, end), numbers, jax.tree.map(append, states, traj.final)
+
+
+def warn_of_another_chain(traj: Trajectory, ts: Any, energies: Any) -> None:
+    """Warn if the energy at the start of a phase is not the one that the run recorded.
+
+    ts, energies: save times (s), and the mechanical energy (J) of the chain that is drawn.
+    """
+    p, count = traj.phases, int(traj.phases.count)
+    recorded = np.asarray(p.energy, float)[:count, 0]
+    size = max(np.max(np.abs(recorded), initial=0), np.max(np.abs(energies), initial=0))
+    tolerance = np.sqrt(np.finfo(traj.ts.dtype).eps) * size
+    for start, of_run in zip(np.asarray(p.start)[:count], recorded, strict=True):
+        for of_chain in np.asarray(energies)[: len(ts)][np.asarray(ts) == start]:
+            if abs(of_chain - of_run) > tolerance:
+                warnings.warn(
+                    f"the chain is not that of the run: at {start:.6g} s its energy is"
+                    f" {of_chain:.6g} J, the run's {of_run:.6g} J. Give the chain of this lane,"
+                    " with its own masses.",
+                    stacklevel=2,
+                )
+                return
 
 
 def positions_and_rotations(chain: Chain, states: State) -> tuple[np.ndarray, np.ndarray]:

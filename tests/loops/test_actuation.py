@@ -337,6 +337,7 @@ def test_derivative_of_bounded():
     assert not np.any(loose)
 
 
+@pytest.mark.slow
 def test_bounds_under_transformations(five_bar):
     """Under jit, vmap and grad each lane has its own active set.
 

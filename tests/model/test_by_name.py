@@ -55,6 +55,9 @@ def test_a_virtual_link_has_the_coordinates_of_its_joint():
     chain = models.four_bar()
     state = chain.state({"crank": 0.3})
     assert chain.joint(state, "pin").q.shape == ()
+    assert bool(chain.connected(state, "pin"))
+    lanes = jax.tree.map(lambda x: jnp.stack([x, x]), svkc.cut(chain, state, "pin"))
+    np.testing.assert_array_equal(chain.connected(lanes, "pin"), [False, False])
     assert chain.q_index("pin") == slice(chain.nq, chain.topology.nq_all)
     welded = svkc.load(models.ARM, virtual_links=[svkc.VirtualLink("w", "world", "arm")])
     assert chain.dofs - chain.nv == 1

@@ -108,8 +108,8 @@ def test_inside_compiled_programs(setting):
 
 
 def test_warnings_and_errors_of_other_libraries(setting, tmp_path):
-    in_float64, again, deprecated, missing, unlike = error_page.OTHERS
-    assert error_page.messages_of("warn", 0) == {in_float64, again, deprecated}
+    in_float64, again, another, deprecated, missing, unlike = error_page.OTHERS
+    assert error_page.messages_of("warn", 0) == {in_float64, again, another, deprecated}
     # raised after two compilations, tested in tests/_jax/test_functions.py
     assert "a new function object" in again
     assert "a new function object" in (TESTS / "_jax/test_functions.py").read_text()
@@ -117,6 +117,11 @@ def test_warnings_and_errors_of_other_libraries(setting, tmp_path):
         chain = models.four_bar()
         with pytest.warns(UserWarning, match=error_page.pattern(in_float64)):
             chain.state(v=np.array([1.0, 0.0, 0.0]))
+    heavier = setting.four.replace(mass={"crank": 9.0})
+    with pytest.warns(UserWarning, match=error_page.pattern(another)):
+        svkc.show(heavier, setting.short())
+    with pytest.warns(UserWarning, match=error_page.pattern(another)):
+        setting.short().plot(heavier)
     with pytest.warns(DeprecationWarning, match=error_page.pattern(deprecated)):
         assert svkc.prefer is svkc.with_independent
     for read in (svkc.load_trajectory, svkc.load_chain):

@@ -57,6 +57,7 @@ def lanes(pendulum):
     return run, jax.jit(jax.vmap(jax.value_and_grad(run, has_aux=True)))
 
 
+@pytest.mark.slow
 def test_times_of_lanes(lanes):
     """Codes, finite states, and lanes beside them that do not change by a bit."""
     _, batch = lanes
@@ -144,6 +145,7 @@ def with_bodies(chain, factors):
     return eqx.tree_at(lambda c: (c.mass, c.inertia), chain, (chain.mass * factors[0], inertia))
 
 
+@pytest.mark.slow
 def test_masses_of_lanes(pendulum):
     """Codes, finite states, and lanes beside them that do not change by a bit."""
 

@@ -83,6 +83,7 @@ def test_adaptive_steps(arm):
     assert re.match(r"the control: nan for 'lower' .*, at t = 0\.011\d* s", source)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["grad", "jvp"])
 def test_the_source_is_named_inside_of_derivatives(arm, mode):
     """The control reads a traced value; a second one is passed as args."""
@@ -100,6 +101,7 @@ def test_the_source_is_named_inside_of_derivatives(arm, mode):
         calls[mode]()
 
 
+@pytest.mark.slow
 def test_lanes_of_a_batch_are_named(arm):
     """With the data of each lane, after a compiled run; other results have no line."""
     lane = lambda chain, data: {

@@ -217,7 +217,7 @@ def test_every_line_of_the_report():
     for word in (
         "largest loop gap",
         "drift",
-        "held to the ground",
+        "in no phase are all bodies free",
         "rank margin",
         "350 evaluations",
         "successful",
@@ -326,6 +326,7 @@ def test_a_non_finite_event_keeps_the_state_before_it():
         assert float(traj.t_final) == 1e-5
 
 
+@pytest.mark.slow
 def test_tune(capsys):
     """`tune` returns the fastest candidate that reaches the target, or None."""
     chain = models.four_bar()

@@ -103,6 +103,7 @@ def test_lock_and_unlock(high_bar):
     assert float(svkc.forward_dynamics(chain, free, jnp.zeros(chain.dofs))[knee]) != 0
 
 
+@pytest.mark.slow
 def test_locking_is_an_impact_also_in_a_chain_with_links():
     """The momentum of a joint that stops goes to the others: M v+ = M v- but for the locked row."""
     link = svkc.VirtualLink("grip", "world", "lower", "ball", pos=(0, 0, 1))

@@ -22,6 +22,7 @@ def sweep(chain, angles):
     return jax.jit(jax.vmap(lambda x: chain.state({"crank": x}).q))(jnp.asarray(angles))
 
 
+@pytest.mark.slow
 def test_neighbours_are_on_one_branch(four_bar):
     """A crank turned in small steps: every joint moves in small steps, through several turns."""
     angles = np.concatenate([np.arange(0, 0.8, 2e-2), np.arange(0.8, 14, 0.1)])
@@ -224,6 +225,7 @@ def compare_with_derivatives(name, count):
     return (np.abs(q_dot[both] - difference[both]) / size).max(1)
 
 
+@pytest.mark.slow
 def test_derivatives_of_twenty_geometries():
     """With a freedom left, by least change."""
     assert compare_with_derivatives("five-bar, one name", 20).max() < 1e-6

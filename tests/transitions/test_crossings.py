@@ -152,6 +152,7 @@ def test_the_catch_is_differentiable_by_the_height(ball, options):
     np.testing.assert_allclose(difference, expected, rtol=DIFFERENCE)
 
 
+@pytest.mark.slow
 def test_the_derivative_of_a_double_crossing_by_a_parameter(ball):
     """Forward mode, with a guard of time: no motion is differentiated."""
     guard = lambda t, state, a: (t - 1.2) ** 2 - a
@@ -168,6 +169,7 @@ def oscillation(t, state, args):
     return jnp.cos(2 * jnp.pi * 12.5 * t) + 0.987
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options", [{"dt": 0.5}, pytest.param({}, marks=pytest.mark.slow)], ids=["fixed", "adaptive"]
 )
@@ -186,6 +188,7 @@ def test_max_step_bounds_steps_while_the_guard_is_armed(ball, options):
     assert np.all(traj.phases.accepted.sum(1) >= np.array([40, 10]))
 
 
+@pytest.mark.slow
 def test_dtmax_bounds_adaptive_steps(ball):
     run = lambda limit: svkc.simulate(ball, ball.state(), 2.0, dtmax=limit).phases.accepted[0]
     counts = jax.jit(jax.vmap(run))(jnp.array([0.1, 1.9]))
@@ -246,6 +249,7 @@ def test_first_crossings_of_random_guards(ball):
     assert len(wrong) <= 1, wrong
 
 
+@pytest.mark.slow
 def test_a_guard_that_is_nan_where_its_root_is_sought_ends_the_run(ball):
     guard = lambda t, state, args: jnp.where(jnp.abs(t - 0.05) < 0.01, jnp.nan, t - 0.05)
     traj = svkc.simulate(

@@ -71,6 +71,7 @@ def events_of():
     return events_of
 
 
+@pytest.mark.slow
 def test_a_guard_at_zero_at_the_start_fires_when_it_crosses_zero_later(events_of):
     """The sine rises from zero at 0, falls through zero at 0.5 and rises through it at 1."""
     for index, first, second in ((SINE, FALLING, RISING), (MINUS_SINE, RISING, FALLING)):

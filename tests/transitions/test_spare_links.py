@@ -47,6 +47,7 @@ def test_connecting_a_slot_that_is_not_bound_is_an_error(sliders):
         svkc.connect(chain, bound, "spare_0", "spare_1")
 
 
+@pytest.mark.slow
 def test_an_event_that_connects_a_slot_that_is_not_bound_ends_the_run(sliders):
     """In a batch only the lane whose slot is not bound stops, before the change."""
     chain, state = sliders
@@ -76,6 +77,7 @@ def test_an_event_binds_and_connects_a_slot(sliders):
     np.testing.assert_allclose(traj.final.v[:2], 2.0, atol=ROUND_OFF)
 
 
+@pytest.mark.slow
 def test_a_grip_replaces_the_one_that_its_event_ends(sliders):
     """The old grip ends, the new one is made in the same slot with its impact, in one event that
     unbinds or cuts, and in two events of one instant in either order."""
@@ -129,6 +131,7 @@ def test_an_event_that_contradicts_itself_is_an_error(changes):
         svkc.when(lambda t, s, args: t, **changes)
 
 
+@pytest.mark.slow
 def test_a_run_with_more_events_than_rows_keeps_the_state_before_the_next_event(sliders):
     """Two events at one instant with one row left are both left out."""
     chain, state = sliders
@@ -187,6 +190,7 @@ def test_binding_a_slot_that_is_connected_is_an_error(sliders):
         move(held)
 
 
+@pytest.mark.slow
 def test_a_loop_that_cannot_be_closed_is_an_error_under_jit_and_in_runs(sliders):
     """The placement is 4 mm beside the line on which the boxes slide: near, but out of reach."""
     chain, state = sliders
