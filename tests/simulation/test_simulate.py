@@ -282,6 +282,7 @@ def test_projection_removes_drift(stabilization):
     assert max_gap_after_two_seconds(stabilization) < 1e-13
 
 
+@pytest.mark.slow
 def test_baumgarte_bounds_drift():
     """Baumgarte's term keeps the gap below the 6e-6 of the run without stabilization."""
     assert 1e-13 < max_gap_after_two_seconds(svkc.stabilization.Baumgarte(30.0)) < 1e-6

@@ -191,7 +191,17 @@ def state_of_geometry(name):
     return state
 
 
-@pytest.mark.parametrize("name", linkages.TOPOLOGIES)
+# planar topologies, one in space and a platform; the slow tier has all geometries of all topologies
+IN_FAST_TIER = ("five-bar", "six-bar", "crank and rocker in space", "platform")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        n if n in IN_FAST_TIER else pytest.param(n, marks=pytest.mark.slow)
+        for n in linkages.TOPOLOGIES
+    ],
+)
 def test_states_of_twenty_geometries(name):
     numbers = (x[:20] for x in linkages.geometries(name))
     compare_states(name, np.asarray(jax.jit(jax.vmap(state_of_geometry(name)))(*numbers)))
