@@ -30,6 +30,7 @@ from svkc.loops.pivoting import (
 from svkc.model.annotations import Torques
 from svkc.model.chain import Chain, State, Structure, active_dofs
 from svkc.model.checked_jit import checked_jit, torques_over_dofs
+from svkc.model.names import unknown_name
 from svkc.tree.inverse_dynamics import pad_to_dofs, passive_forces, rnea
 from svkc.tree.kinematics import kinematics, twists
 
@@ -165,11 +166,24 @@ class LoopForces(eqx.Module):
     force: in N. torque: in N m, about the joint.
     unique: whether the motion determines the wrench. Redundant loops have wrenches that it does
     not determine; theirs are of least norm, with torques divided by `chain.length`.
+    link_names: names of the virtual links.
     """
 
-    force: Float[Array, "links 3"]
-    torque: Float[Array, "links 3"]
-    unique: Bool[Array, " links"]
+    force: Float[Array, "*lanes links 3"]
+    torque: Float[Array, "*lanes links 3"]
+    unique: Bool[Array, "*lanes links"]
+    link_names: tuple[str, ...] = eqx.field(static=True, default=())
+
+    def wrench(self, link: str) -> tuple[Float[Array, "*lanes 3"], Float[Array, "*lanes 3"]]:
+        """Return the force (N) and the torque (N m) of a virtual link.
+
+        link: name of the virtual link.
+        Raises ValueError, with the nearest names, if there is no such link.
+        """
+        if link not in self.link_names:
+            raise unknown_name("virtual link", link, self.link_names)
+        i = self.link_names.index(link)
+        return self.force[..., i, :], self.torque[..., i, :]
 
     def __iter__(self) -> Iterator[Array]:
         return iter((self.force, self.torque))
@@ -205,7 +219,12 @@ def loop_forces_of_motion(
     force = pad_to_dofs(chain, rnea(chain, loops.kin, V, v, vdot[: chain.nv]))
     qr = select_pivots(s, loops.J)
     wrench = -constraint_forces(chain, qr, loops.J, force - passive_forces(chain, q, v) - tau)
-    return LoopForces(wrench[:, 3:], wrench[:, :3], ~self_stressed(s, qr))
+    return LoopForces(
+        force=wrench[:, 3:],
+        torque=wrench[:, :3],
+        unique=~self_stressed(s, qr),
+        link_names=chain.link_names,
+    )
 
 
 def self_stressed(structure: Structure, qr: PivotedQR) -> Bool[Array, " links"]:

@@ -35,7 +35,7 @@ def chain_blocks(chain: Any) -> list[Block]:
         return [chain_summary(chain), bodies]
     distances = np.linalg.norm(np.asarray(chain.structure.real_pos), axis=-1)
     rows = _link_rows(chain, distances)
-    place = "place on real, from\nits origin (m)"
+    place = "distance on real to\nits origin (m)"
     titles = "virtual link", "joint", "freedoms", "parent", "real", "connected", place
     notes = [
         f"{name}: no real_pos given, so its place on {real} is where its place on {parent} is in"

@@ -97,6 +97,12 @@ def test_control_and_loop_forces_take_torques_by_name():
     assert float(jnp.abs(runs[0].work[-1, 0])) > 0.1
     forces = [svkc.loop_forces(chain, state, tau) for tau in ({"crank": 3.0}, [3.0, 0, 0])]
     np.testing.assert_array_equal(forces[0].force, forces[1].force)
+    force, torque = forces[0].wrench("pin")
+    np.testing.assert_array_equal(
+        jnp.stack([force, torque]), [forces[0].force[0], forces[0].torque[0]]
+    )
+    with pytest.raises(ValueError, match="no virtual link 'pim'; did you mean 'pin'"):
+        forces[0].wrench("pim")
 
 
 MODEL = """<mujoco><compiler angle="radian"/><worldbody>

@@ -185,7 +185,7 @@ def test_info(tmp_path):
     (tmp_path / "m.xml").write_text(f"<mujoco><worldbody>{bars}</worldbody>{pin}</mujoco>")
     told = run("-m", "svkc", "info", tmp_path / "m.xml").stdout
     for line in (
-        "3 bodies, 3 joints, 1 virtual link,", "place on real, from", "rank of the loops (m)     5",
+        "3 bodies, 3 joints, 1 virtual link,", "distance on real to", "rank of the loops (m)     5",
         "pin:  6 rows, 1 of them redundant", "left out: collision",
         "joints that can be cut, load(..., cuttable=[...]): crank, coupler, rocker",
         "ends of the tree, which could be held: coupler, rocker",

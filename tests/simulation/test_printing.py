@@ -62,7 +62,7 @@ Chain: 1 body, 1 joint, 1 virtual link, 0 actuators, 1 joint freedom in the tree
 body  parent  joint  kind   freedoms  mass (kg)
 rod   world   rod    hinge         1      2.941
 
-virtual link  joint  freedoms  parent  real  connected  place on real, from
+virtual link  joint  freedoms  parent  real  connected  distance on real to
                                                              its origin (m)
 hook          weld          0  world   rod   no                         0.5
 hook: no real_pos given, so its place on rod is where its place on world is in the load pose, \
