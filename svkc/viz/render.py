@@ -62,6 +62,8 @@ def render(
     path = pathlib.Path(os.fspath(path))
     size = tuple(integer("size", n, 16, 8192) for n in vector("size", size, 2))
     trails, max_faces = names("trails", trails), integer("max_faces", max_faces, MIN_FACES)
+    for body in trails:
+        chain.body_index(body)
     view = _view(camera, lookat, distance, azimuth, elevation)
     if path.suffix not in (".png", ".gif", ".mp4", ".html"):
         raise ValueError(f"render: {path.name} should end in .png, .gif, .mp4 or .html")
