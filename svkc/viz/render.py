@@ -7,6 +7,7 @@ from typing import Any
 from svkc.model.annotations import Integer, Names, Numbers, Path, Scalar
 from svkc.model.chain import Chain
 from svkc.model.checked_jit import check_chain
+from svkc.model.names import body_rows
 from svkc.model.validation import integer, names, positive_scalar, scalar, vector
 from svkc.simulation.trajectory import Trajectory
 from svkc.viz.html_page import write_page
@@ -62,8 +63,7 @@ def render(
     path = pathlib.Path(os.fspath(path))
     size = tuple(integer("size", n, 16, 8192) for n in vector("size", size, 2))
     trails, max_faces = names("trails", trails), integer("max_faces", max_faces, MIN_FACES)
-    for body in trails:
-        chain.body_index(body)
+    body_rows(chain.topology, *trails)
     view = _view(camera, lookat, distance, azimuth, elevation)
     if path.suffix not in (".png", ".gif", ".mp4", ".html"):
         raise ValueError(f"render: {path.name} should end in .png, .gif, .mp4 or .html")
