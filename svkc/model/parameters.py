@@ -91,6 +91,8 @@ def _with_entries(chain: Any, field: str, array: Array, values: Mapping[str, Any
         value = finite_array(label, value, array.dtype)
         if field == "inertia" and value.shape == (3,):
             value = jnp.diag(value)
+        if field in ("axis", "quat"):
+            value = value / jnp.linalg.norm(value)
         # one number for a hinge, two for its range
         if value.size == entries.size and (value.size == 1 or field == "limit"):
             value = value.reshape(entries.shape)

@@ -1,4 +1,4 @@
-"""Standing on flat ground: the paper's first example of a varying structure (section V-A)."""
+"""Walking on flat ground: the paper's first example of a varying structure (section V-A)."""
 
 from typing import Any
 

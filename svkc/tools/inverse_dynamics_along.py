@@ -63,7 +63,9 @@ class InverseDynamics(eqx.Module):
         joint: name of a joint, or of one of its coordinates (`Chain.dof_names`).
         Raises ValueError if the name is unknown.
         """
-        own = [i for i, n in enumerate(self.dof_names) if joint in (n, n.rpartition(".")[0] or n)]
+        suffixes = ("", ".x", ".y", ".z", ".rx", ".ry", ".rz")
+        known = [f"{joint}{suffix}" for suffix in suffixes]
+        own = [i for i, n in enumerate(self.dof_names) if n in known]
         if not own:
             raise unknown_name("joint", joint, self.dof_names)
         tau = self.tau[..., np.array(own)]

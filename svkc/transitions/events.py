@@ -136,10 +136,9 @@ def at(
 ) -> At:  # fmt: skip
     """Return an event that changes the structure at a given time.
 
-    All events of one instant make one change: links are cut and slots cleared first, then grips
-    are made and links connected. The order of the events does not matter: a link that one event
-    connects and another one cuts is cut, and a joint that one locks and another unlocks is free.
-    A grip may take a slot that the same instant cuts or clears.
+    All events of one instant make one change, whatever their order. A link that one event connects
+    and another one cuts is cut; a joint that one locks and another unlocks is free. Slots are cut
+    and cleared before grips are made, so that a grip may take such a slot.
 
     time: when the event happens (s), with `after` from the time of that event on. The time is
         differentiable.
@@ -181,7 +180,7 @@ def when(
     The time of the event is located to round-off and is differentiable if the guard is smooth.
 
     A guard is armed while its action would change the structure; one whose event stops the run, or
-    has no action, is always armed.
+    has no action, is always armed. A guard with `after` is armed once that event has happened.
     A guard that starts the run within round-off of zero (eps^(3/4): 1.8e-12 in float64, 6.4e-6 in
     float32) has not crossed zero, whatever its sign and `direction`. It fires at its first crossing
     after it has left zero. The same holds after an event, for the guard that fired and for a guard

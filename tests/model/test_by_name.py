@@ -130,7 +130,7 @@ BEFORE = {
             {"mass": "3", "inertia": "0.15 0.3 0.375"},
             {"mass": {"base": 3.0}, "scale_inertia": True},
         ),
-        ({"axis": "0 0.6 0.8"}, {"axis": {"bend": [0, 0.6, 0.8]}}),
+        ({"axis": "0 0.6 0.8"}, {"axis": {"bend": [0, 1.2, 1.6]}}),
         ({"bend": 'damping="0.4"'}, {"damping": {"bend": 0.4}}),
         ({"bend": 'armature="0.4"'}, {"armature": {"bend": 0.4}}),
         ({"bend": 'stiffness="3"'}, {"stiffness": {"bend": 3.0}}),
