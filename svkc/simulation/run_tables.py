@@ -66,10 +66,7 @@ def event_table(traj: Any) -> Table:
     events, labels = traj.events, link_labels(traj.names, np.shape(traj.connected)[-1])
     which, lost = np.asarray(events.which), np.asarray(events.energy_lost)
     rows = []
-    p, final = traj.phases, traj.final.structure.connected
-    written = slice(int(p.count))
-    records = p.start[written], p.connected[written], events.time, final
-    for time, connected, cut in _changes(*map(np.asarray, records)):
+    for time, connected, cut in changes_of_run(traj):
         now = np.asarray(events.time) == time
         numbers = ", ".join(map(str, which[now].tolist()))
         changed = [join_names(_of_mask(labels, mask)) for mask in (connected, cut)]
@@ -134,13 +131,22 @@ def _changes(starts, connected, times, final) -> list[tuple[float, np.ndarray, n
     starts, connected: of the phases of one run. times: of its events.
     final: which links are connected at the end of the run.
     """
-    changes = []
-    for time in np.unique(times[np.isfinite(times)]):
-        before = max(np.searchsorted(starts, time) - 1, 0)
-        after = np.searchsorted(starts, time, "right") - 1
-        old, new = connected[before], connected[after] if after > before else final
+    changes, instants = [], np.unique(times[np.isfinite(times)])
+    for time in instants:
+        old = connected[max(np.searchsorted(starts, time) - 1, 0)]
+        # a phase starts at each instant, but not always after the last one
+        last = time == instants[-1]
+        new = final if last else connected[np.searchsorted(starts, time, "right") - 1]
         changes.append((float(time), new & ~old, old & ~new))
     return changes
+
+
+def changes_of_run(traj: Any) -> list[tuple[float, np.ndarray, np.ndarray]]:
+    """Return `_changes` of one run."""
+    p, written = traj.phases, slice(int(traj.phases.count))
+    final = traj.final.structure.connected
+    records = p.start[written], p.connected[written], traj.events.time, final
+    return _changes(*map(np.asarray, records))
 
 
 def _of_mask(labels: tuple[str, ...], mask: Any) -> list[str]:

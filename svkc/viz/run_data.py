@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from svkc.model.chain import Chain, State
+from svkc.simulation.run_tables import changes_of_run, link_labels
 from svkc.simulation.trajectory import Trajectory
 from svkc.tree.kinematics import poses
 
@@ -118,25 +119,14 @@ def event_descriptions(traj: Trajectory, chain: Chain | None = None) -> list[tup
     A description lists the virtual links that were connected and cut. If none was, the description
     is the numbers of the events.
 
-    chain: the chain of the run, for link names. None: links are numbered.
+    chain: the chain of the run, for link names. None: the names that the run keeps.
     """
-    p, e, descriptions = traj.phases, traj.events, []
-    starts, connected = np.asarray(p.start)[: int(p.count)], np.asarray(p.connected)[: int(p.count)]
-    times = np.asarray(e.time)[: int(e.count)]
-    link_name = (lambda k: chain.link_names[k]) if chain is not None else (lambda k: f"link {k}")
-    for time in np.unique(times):
-        before = connected[max(int(np.sum(starts < time)) - 1, 0)]
-        # the structure after an event at the end of the run has no phase
-        after = (
-            connected[int(np.sum(starts <= time)) - 1]
-            if np.any(starts >= time)
-            else np.asarray(traj.final.structure.connected)
-        )
-        changes = [f"connect {link_name(k)}" for k in np.flatnonzero(after & ~before)] + [
-            f"cut {link_name(k)}" for k in np.flatnonzero(before & ~after)
-        ]
-        event_indices = ", ".join(
-            str(int(k)) for k in np.asarray(e.which)[: int(e.count)][times == time]
-        )
-        descriptions.append((float(time), ", ".join(changes) or f"event {event_indices}"))
+    e, descriptions = traj.events, []
+    names = traj.names if chain is None else chain.names
+    labels = link_labels(names, np.shape(traj.connected)[-1])
+    for time, connected, cut in changes_of_run(traj):
+        changes = [f"connect {labels[k]}" for k in np.flatnonzero(connected)]
+        changes += [f"cut {labels[k]}" for k in np.flatnonzero(cut)]
+        which = np.asarray(e.which)[np.asarray(e.time) == time]
+        descriptions.append((time, ", ".join(changes) or f"event {', '.join(map(str, which))}"))
     return descriptions
