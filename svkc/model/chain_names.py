@@ -34,6 +34,7 @@ class ChainNames:
         .ry, .rz (angles, rad).
     v: name of each entry of `State.v`; with several coordinates, .x, .y, .z and .rx, .ry, .rz.
     angular: whether each entry of `State.v` is an angular velocity (rad/s), not a linear one (m/s).
+    cuttable: names of the cuttable joints, each that of a coordinate or of a virtual link.
     q_ranges, v_ranges: (name, start, stop) in q and v of each joint and each virtual link; a
         cuttable joint is both.
     """
@@ -46,6 +47,7 @@ class ChainNames:
     angular: tuple[bool, ...]
     q_ranges: tuple[tuple[str, int, int], ...]
     v_ranges: tuple[tuple[str, int, int], ...]
+    cuttable: tuple[str, ...] = ()
 
 
 @functools.lru_cache(maxsize=256)
@@ -66,6 +68,7 @@ def chain_names(topology: Topology) -> ChainNames:
     angular = ~np.isin(np.arange(top.dofs), np.concatenate(linear))
     return ChainNames(
         bodies=top.body_names,
+        cuttable=tuple(name for name, _, _ in top.cuttable_joints),
         joints=top.joint_names,
         links=top.link_names,
         q=q,

@@ -82,7 +82,10 @@ def joint_table(traj: Any) -> Table:
     """
     names, q, v = traj.names, np.asarray(traj.states.q), np.asarray(traj.states.v)
     of_links = {
-        i for name, start, stop in names.q_ranges if name in names.links for i in range(start, stop)
+        i
+        for name, start, stop in names.q_ranges
+        if name in names.links and name not in names.cuttable
+        for i in range(start, stop)
     }
     rows = []
     for i, name in enumerate(names.q):

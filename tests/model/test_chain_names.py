@@ -43,6 +43,7 @@ def test_every_coordinate_has_a_name(chain):
         "cylinder.z", "spare_0.x", "spare_0.y", "spare_0.z",
     ]  # fmt: skip
     assert (names.bodies, names.links) == (chain.body_names, chain.link_names)
+    assert names.cuttable == ("bend", "turn")
 
 
 def test_ranges_are_those_of_the_joints(chain):

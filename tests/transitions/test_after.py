@@ -91,6 +91,17 @@ def test_a_chain_of_events_and_a_guard_that_waits(falling):
 
 
 @pytest.mark.slow
+def test_tables_show_events_of_one_instant_at_the_end(falling):
+    chain, state = falling
+    grip = svkc.at(0.1, connect="hook", here=True)
+    stop = svkc.at(0.0, cut="hook", stop=True, after=grip)
+    traj = svkc.simulate(chain, state, 1.0, events=[grip, stop])
+    assert int(traj.events.count) == 2
+    assert not bool(chain.connected(traj.final, "hook"))
+    assert "0, 1   -          -" in str(traj)
+
+
+@pytest.mark.slow
 def test_each_catch_is_followed_by_its_release(falling):
     """In lanes that start at different heights, each with several catches."""
     chain, state = falling
