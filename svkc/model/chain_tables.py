@@ -38,8 +38,8 @@ def chain_blocks(chain: Any) -> list[Block]:
     place = "distance on real to\nits origin (m)"
     titles = "virtual link", "joint", "freedoms", "parent", "real", "connected", place
     notes = [
-        f"{name}: no real_pos given, so its place on {real} is where its place on {parent} is in"
-        f" the load pose, {distance} m from the origin of {real}"
+        f"{name}: real_pos was not given. It was computed from the load pose, where the point"
+        f" of the joint on {parent} is {distance} m from the origin of {real}"
         for (name, _, _, parent, real, is_connected, distance), as_loaded in zip(
             rows, chain.topology.link_as_loaded, strict=True
         )

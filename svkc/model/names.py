@@ -1,6 +1,6 @@
 """Indices of bodies, joints and virtual links by their names.
 
-Raises ValueError, with the names that exist, for an unknown one.
+Functions raise ValueError, with the nearest names, for an unknown one.
 """
 
 import difflib
@@ -14,7 +14,7 @@ from svkc.model.chain_names import chain_names
 from svkc.model.topology import FixedFrame, Topology
 from svkc.model.validation import as_array
 
-# an error lists as many of the known names
+# at most this many known names are listed in an error
 _MOST_NAMES = 20
 
 
@@ -60,7 +60,7 @@ def _is_among(name: Any, known: Collection[str]) -> bool:
 
 def link_index(top: Topology, name: str) -> int:
     """Return the index of a virtual link in `Structure`'s entries."""
-    if _is_among(name, top.joint_names):
+    if _is_among(name, top.joint_names) and name not in top.link_names:
         raise ValueError(
             f"no virtual link {name!r}, but a joint of the tree; to cut it, load the chain with"
             f" svkc.load(..., cuttable={name!r})"

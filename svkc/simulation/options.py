@@ -29,9 +29,9 @@ from svkc.simulation.option_checks import (
     check_step_options,
     check_times,
 )
+from svkc.transitions.event_schedule import event_capacity
 from svkc.transitions.events import as_events
 from svkc.transitions.plan import Plan, make_plan
-from svkc.transitions.schedule import event_capacity
 
 
 class Options(eqx.Module):

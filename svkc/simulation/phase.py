@@ -31,8 +31,8 @@ from svkc.model.chain import State
 from svkc.simulation.codes import DERIVATIVE, RESULTS
 from svkc.simulation.options import Options
 from svkc.simulation.records import Events, PhaseRecords
+from svkc.transitions.event_schedule import EventSchedule, armed_guards
 from svkc.transitions.plan import Plan
-from svkc.transitions.schedule import Schedule, armed_guards
 
 
 class RunState(eqx.Module):
@@ -53,7 +53,7 @@ class RunState(eqx.Module):
     work: Float[Array, "3"] | None
     guard_values: Float[Array, " guards"] | None
     stale: Bool[Array, " guards"] | None
-    schedule: Schedule
+    schedule: EventSchedule
     events: Events
     records: PhaseRecords
     count: Int[Array, ""]

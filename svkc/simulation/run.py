@@ -22,8 +22,8 @@ from svkc.simulation.options import Options
 from svkc.simulation.phase import PhaseOutcome, RunState, solve_phase
 from svkc.simulation.records import empty_events, empty_phase_records, write_phase_row
 from svkc.simulation.traced_checks import initial_result
+from svkc.transitions.event_schedule import EventSchedule, armed_guards
 from svkc.transitions.plan import Plan, guard_round_off
-from svkc.transitions.schedule import Schedule, armed_guards
 
 
 def with_lock_mask(chain: Chain, state: State, plan: Plan) -> State:
@@ -60,7 +60,7 @@ def initial_run_state(
         work=jnp.zeros(3, dtype) if options.has_work else None,
         guard_values=jnp.asarray(initial, dtype) if plan.guards else None,
         stale=jnp.asarray(reevaluated_guards(plan)) if plan.guards else None,
-        schedule=Schedule.at_start(plan),
+        schedule=EventSchedule.at_start(plan),
         events=empty_events(rows, links, dtype),
         records=empty_phase_records(rows + 1, state),
         count=jnp.asarray(0, jnp.int32),
@@ -138,7 +138,7 @@ def run_phase(
     """
     t1, ts = times
     run = _reevaluate_stale_guards(chain, run, plan, options, args)
-    active = (run.t < t1) | jnp.any(run.schedule.until(t1))
+    active = (run.t < t1) | jnp.any(run.schedule.due(t1))
     active = active & (run.result == RESULTS.successful)
     stop = _next_stop(run, t1)
     outcome = solve_phase(run, stop, ts, plan, options, FieldArgs(chain, run.state.structure, args))
@@ -166,7 +166,7 @@ def run_phase(
         work=outcome.y.work,
         guard_values=guard_values,
         stale=stale,
-        schedule=run.schedule.after(plan, outcome.t, fired, timed),
+        schedule=run.schedule.advance(plan, outcome.t, fired, timed),
         events=events,
         records=records,
         count=run.count + active.astype(jnp.int32),
@@ -181,7 +181,7 @@ def run_phase(
 def _fired_events(run: RunState, outcome: PhaseOutcome, active, plan: Plan):
     """Return the mask of the timed events, and that of all events, that fired after a phase."""
     reached = active & (outcome.result == RESULTS.successful)
-    timed = run.schedule.until(outcome.t + event_tolerance(outcome.t)) & reached
+    timed = run.schedule.due(outcome.t + event_tolerance(outcome.t)) & reached
     indices = np.array(plan.timed + plan.guarded, int)
     fired = jnp.concatenate([timed, outcome.fired & reached])
     return timed, jnp.zeros(len(plan.actions), bool).at[indices].set(fired)

@@ -17,14 +17,15 @@ MOST_ROWS = 12
 def extent(traj: Any) -> str:
     """Return one line: the times of a run, and the numbers of its save times, phases and events.
 
-    Of a batch, the line has the lanes, the whole range of times, and the largest numbers.
+    For a batch, the line has its shape, the overall range of times, and the largest numbers of any
+    lane.
     """
     lanes = "x".join(map(str, np.shape(traj.t_final)))
     runs = f"Trajectories of {lanes} lanes" if lanes else "Trajectory"
     most = lambda counts: int(np.max(np.asarray(counts), initial=0))
     end = float(np.max(traj.t_final))
     numbers = [
-        f"t = {np.min(traj.ts, initial=end):.6g} to {end:.6g} s",
+        f"t = {np.min(traj.phases.start):.6g} to {end:.6g} s",
         count(np.shape(traj.ts)[-1], "save time"),
         count(most(traj.phases.count), "phase"),
         count(most(traj.events.count), "event"),
@@ -62,7 +63,7 @@ def phase_table(phases: Phases, names: ChainNames | None) -> Table:
 
 
 def event_table(traj: Any) -> Table:
-    """Return a row for each instant of one run at which events changed the structure."""
+    """Return a row for each instant of one run with events."""
     events, labels = traj.events, link_labels(traj.names, np.shape(traj.connected)[-1])
     which, lost = np.asarray(events.which), np.asarray(events.energy_lost)
     rows = []

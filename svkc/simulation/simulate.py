@@ -63,8 +63,8 @@ def simulate(
     stabilization: of `svkc.stabilization`; by default `Projection()`.
     dynamics: of `svkc.dynamics`; None: chosen for the chain.
     adjoint: `svkc.integrators.Replay()`, the default, or an adjoint of diffrax.
-    max_events: capacity for events; by default one for each timed event, four for each guard.
-        The run ends at the next event after that many, in the state before that event.
+    max_events: capacity for events; by default one for each timed event, four for each guard and
+        each event after a guard. The run ends before the next event.
     max_steps: bound on the number of steps in one phase.
     throw: raise RuntimeError if the run fails; False returns the trajectory, whose `result` says
         why the run failed.

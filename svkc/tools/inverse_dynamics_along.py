@@ -32,7 +32,7 @@ from svkc.tree.spatial import quat_conjugate, quat_multiply
 
 
 class InverseDynamics(eqx.Module):
-    """Torques that move a chain along a path. `str` gives a table by joint.
+    """Torques that move a chain along a path. `str` gives a table by coordinate.
 
     ts: the times (s).
     states: the states at these times; `v` are velocities along the path.
@@ -108,9 +108,9 @@ def inverse_dynamics_along(
     """Return the torques that move the chain along a path.
 
     A quintic spline goes through the path; velocities and accelerations are its exact derivatives.
-    Its error in accelerations is of the fourth order in the distance of the times. Rotations are
-    unit quaternions of which successive ones turn by less than 180 degrees. The forces of the
-    joints' springs and dampers are subtracted, those of joint ranges are not. Results have
+    Its error in accelerations is of the fourth order in the distance of the times. Successive
+    quaternions must be less than 180 degrees apart. The torques are those besides the joints'
+    springs and dampers; torques of joint ranges are neglected. Results have
     derivatives with respect to `ts`, `q` and the floats of the chain.
 
     ts: [times] at least four increasing times (s).
@@ -214,8 +214,8 @@ def _path_rates(
 ) -> tuple[Float[Array, "times dofs"], Float[Array, "times dofs"]]:
     """Return velocities and accelerations at `ts` of the spline through q.
 
-    Quaternions are those of a spline in their four numbers, normalized: it does not depend on the
-    frames, and has no singular rotations.
+    Quaternions are splined componentwise and normalized, which is independent of the frames and
+    free of singularities.
     """
     quat_q, quat_v = chain.topology.quaternion_starts
     scalar_q, scalar_v = chain.topology.scalar_coordinates

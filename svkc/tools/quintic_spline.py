@@ -1,8 +1,9 @@
 """The quintic spline through points: its derivatives at the points, themselves differentiable.
 
-Of all curves through the points it has the least integral of the squared third derivative, and its
-derivatives are continuous up to the fourth. The integral is a quadratic function of the first and
-second derivatives at the points, with a positive definite block tridiagonal matrix.
+Of all curves through the points with its first and second derivatives at both ends, it has the
+least integral of the squared third derivative. Its derivatives are continuous up to the fourth.
+The integral is a quadratic function of the first and second derivatives at the points, with a
+positive definite block tridiagonal matrix.
 """
 
 import jax
@@ -50,7 +51,7 @@ def _solve_block_tridiagonal(
 ) -> Float[Array, "m k n"]:
     """Return the solution of a positive definite block tridiagonal system.
 
-    D: diagonal blocks. B: blocks above the diagonal, each with its row before it; the first is 0.
+    D: diagonal blocks. B: block i is at row i - 1 and column i; block 0 is zero.
     """
 
     def forward(carry, row):
@@ -79,8 +80,8 @@ def spline_derivatives(
 ) -> tuple[Float[Array, "times n"], Float[Array, "times n"]]:
     """Return the first and second derivatives at `ts` of the quintic spline through y.
 
-    At both ends the derivatives are those of the polynomial through the first and the last six
-    points, so that polynomials up to the fifth degree have no error.
+    At each end the derivatives are those of the polynomial through the nearest six points, or
+    through all if there are fewer. Polynomials up to the degree of these have no error.
 
     ts: at least four increasing times.
     """

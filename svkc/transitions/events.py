@@ -140,7 +140,7 @@ def at(
     and another one cuts is cut; a joint that one locks and another unlocks is free. Slots are cut
     and cleared before grips are made, so that a grip may take such a slot.
 
-    time: when the event happens (s), with `after` from the time of that event on. The time is
+    time: when the event happens (s); with `after`, the delay after that event. The time is
         differentiable.
     connect, cut: name or names of virtual links.
     lock, unlock: name or names of joints of the tree.

@@ -1,7 +1,7 @@
 """Points of bodies: centre of mass, body Jacobian, velocity of a point, and forces at a point.
 
-Bodies and sites are named. Names are resolved before JAX traces, so that a compiled program depends
-on the row and the place of a site, and not on the name.
+Bodies and sites are named. Names are resolved outside of jit: compiled programs depend on the
+frame, not on its name.
 """
 
 from typing import Any, NamedTuple

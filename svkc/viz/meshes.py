@@ -1,10 +1,10 @@
-"""Triangle meshes of a model: meshes, height fields, and meshes with fewer faces."""
+"""Triangle meshes of a model's mesh and height-field geoms, and their decimation."""
 
 from typing import NamedTuple
 
 import numpy as np
 
-# what two cells along each axis leave at most is less
+# two cells per axis leave eight vertices, hence at most 56 faces
 MIN_FACES = 100
 
 
@@ -110,7 +110,9 @@ def cluster(mesh: Mesh, cell: float) -> Mesh:
 
 
 def decimate(mesh: Mesh, max_faces: int) -> Mesh:
-    """Return the mesh, clustered as finely as leaves at most `max_faces` faces if it has more.
+    """Return the mesh, or if it has more than `max_faces` faces, a clustering that does not.
+
+    The clustering has as many cells along the longest side as bisection finds.
 
     max_faces: at least `MIN_FACES`.
     """

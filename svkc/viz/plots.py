@@ -120,9 +120,9 @@ def panels_of_coordinates(
     number, note = sum(map(len, of_joints)), ""
     if joints is None and number > MOST_SHOWN:
         note = f"{MOST_SHOWN} of {number} coordinates, those that change most; joints=[...] chooses"
-        changes = sorted((np.ptp(c.values) for block in of_joints for c in block), reverse=True)
-        least = changes[MOST_SHOWN - 1]
-        of_joints = [[c for c in block if np.ptp(c.values) >= least] for block in of_joints]
+        changes = [np.ptp(c.values) for block in of_joints for c in block]
+        rank = iter(np.argsort(np.argsort(-np.array(changes), kind="stable")))
+        of_joints = [[c for c in block if next(rank) < MOST_SHOWN] for block in of_joints]
     panels = []
     for unit in UNITS:
         blocks = [[curve for curve in block if curve.unit == unit] for block in of_joints]

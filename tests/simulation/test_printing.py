@@ -65,8 +65,8 @@ rod   world   rod    hinge         1      2.941
 virtual link  joint  freedoms  parent  real  connected  distance on real to
                                                              its origin (m)
 hook          weld          0  world   rod   no                         0.5
-hook: no real_pos given, so its place on rod is where its place on world is in the load pose, \
-0.5 m from the origin of rod"""
+hook: real_pos was not given. It was computed from the load pose, where the point of the joint on \
+world is 0.5 m from the origin of rod"""
 
 RUN = """\
 Trajectory: t = 0 to 0.3 s, 4 save times, 3 phases, 2 events

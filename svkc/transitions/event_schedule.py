@@ -11,7 +11,7 @@ from svkc.model.chain import Chain, Structure
 from svkc.transitions.plan import Plan
 
 
-class Schedule(eqx.Module):
+class EventSchedule(eqx.Module):
     """The state of the events of a run.
 
     times: of each timed event (s); inf for one that waits for another event.
@@ -24,7 +24,7 @@ class Schedule(eqx.Module):
     happened: Bool[Array, " events"] | None
 
     @classmethod
-    def at_start(cls, plan: Plan) -> "Schedule":
+    def at_start(cls, plan: Plan) -> "EventSchedule":
         """Return the schedule before the first phase."""
         waits = np.array([plan.after[i] is not None for i in plan.timed], bool)
         guard_waits = any(plan.after[i] is not None for i in plan.guarded)
@@ -38,16 +38,17 @@ class Schedule(eqx.Module):
         """Return the time of the next timed event (s), inf if there is none."""
         return jnp.min(jnp.where(self.pending, self.times, jnp.inf), initial=jnp.inf)
 
-    def until(self, t) -> Bool[Array, " timed"]:
+    def due(self, t) -> Bool[Array, " timed"]:
         """Return which timed events are pending and happen up to the time t (s)."""
         return self.pending & (self.times <= t)
 
-    def after(
+    def advance(
         self, plan: Plan, t, fired: Bool[Array, " events"], timed: Bool[Array, " timed"]
-    ) -> "Schedule":
+    ) -> "EventSchedule":
         """Return the schedule after the events that fired at the time t (s).
 
-        An event that is `after` one of them is scheduled from t on, anew if it was before.
+        Each timed event whose `after` event fired is rescheduled to t plus its delay, also if it
+        was pending.
 
         timed: which timed events fired.
         """
@@ -69,10 +70,10 @@ class Schedule(eqx.Module):
 
 
 def armed_guards(
-    chain: Chain, structure: Structure, plan: Plan, schedule: Schedule
+    chain: Chain, structure: Structure, plan: Plan, schedule: EventSchedule
 ) -> Bool[Array, " guards"]:
-    """Return which guards are armed: those whose action would change the structure, and that wait
-    for no event that has not happened."""
+    """Return which guards are armed: those for which `Plan.armed` holds and whose `after` event, if
+    any, has happened."""
     armed = plan.armed(chain, structure)
     if schedule.happened is None:
         return armed
@@ -83,8 +84,8 @@ def armed_guards(
 
 
 def event_capacity(plan: Plan) -> int:
-    """Return the default capacity for events: four for each guard, one for each timed event, and
-    for an event after another as many as for that one."""
+    """Return the default capacity for events: four for each guard, and one for each timed event. A
+    timed event after another event has as many as that event."""
 
     def capacity(event: int) -> int:
         if event in plan.guarded:
