@@ -578,6 +578,7 @@ ALSO = [
     (r"no joint 'cranc'; did you mean 'crank'\?", lambda s: s.four.v_index("cranc")),
     (r"no body 'cranc'; did you mean 'crank'\?", lambda s: s.four.body_index("cranc")),
     ("no body 'nobody'", lambda s: s.four.replace(mass={"nobody": 1.0})),
+    (r"axis\['crank'\]: expected finite", lambda s: s.four.replace(axis={"crank": [0, 0, 0]})),
     (r"no parameter 'masses'; did you mean 'mass'\?", lambda s: s.four.replace(masses=1.0)),
     ("no joint 'nobody'", lambda s: svkc.forward_dynamics(s.four, s.state, {"nobody": 1.0})),
     ("no joint 'nobody'", lambda s: s.simulate(control=lambda t, state, args: {"nobody": 1.0})),

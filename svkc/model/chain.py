@@ -138,9 +138,9 @@ class Chain(Printed, NamedAccess):
 
         parameters: `mass={"ball": 2.0}` sets the entries of the bodies or joints named, and
             `gravity=[0, 0, -1.6]` a whole array. By body name: `mass` (kg), `com` (m), `inertia`
-            (kg m^2, [3 3], or [3] on the diagonal), `pos` (m), `quat` (wxyz). By joint name:
-            `axis`, `armature`, `damping`, `stiffness`, `q_spring`, `limit` (lower and upper end).
-            Any other array of the chain as a whole. All values may be traced.
+            (kg m^2, [3 3], or [3] on the diagonal), `pos` (m), `quat` (wxyz, normalized). By joint
+            name: `axis` (normalized), `armature`, `damping`, `stiffness`, `q_spring`, `limit`
+            (lower and upper end). Any other array as a whole. All values may be traced.
         scale_inertia: scale the inertia of each body named in `mass` by the ratio of its masses.
 
         Raises ValueError if a name is unknown, a shape is wrong, or a number is not finite.

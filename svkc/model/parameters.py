@@ -56,20 +56,20 @@ def with_parameters(
     for field, value in parameters.items():
         if field not in old:
             raise unknown_name("parameter", field, sorted(old))
-        array = _zeros_like_field(chain, field) if old[field] is None else old[field]
+        array = _default_array(chain, field) if old[field] is None else old[field]
         if isinstance(value, Mapping):
             new[field] = _with_entries(chain, field, array, value)
         else:
             new[field] = _as_shape(field, value, array)
     if "stiffness" in new and old["q_spring"] is None:
-        new.setdefault("q_spring", old["q_load"])
+        new.setdefault("q_spring", new.get("q_load", old["q_load"]))
     if boolean("scale_inertia", scale_inertia):
         new["inertia"] = _scaled_inertia(chain, new, parameters)
     return dataclasses.replace(chain, **new)  # pyright: ignore[reportArgumentType]
 
 
-def _zeros_like_field(chain: Any, field: str) -> Array:
-    """Return the array of a parameter that the scene does not have: zeros, or the load pose.
+def _default_array(chain: Any, field: str) -> Array:
+    """Return the array of a parameter that the model does not have: zeros, or the load pose.
 
     Raises ValueError for joint ranges, whose springs the model defines.
     """
@@ -94,7 +94,7 @@ def _with_entries(chain: Any, field: str, array: Array, values: Mapping[str, Any
         if field in ("axis", "quat"):
             value = value / jnp.linalg.norm(value)
         # one number for a hinge, two for its range
-        if value.size == entries.size and (value.size == 1 or field == "limit"):
+        if value.size == entries.size and value.shape in ((), (1,), (2,)):
             value = value.reshape(entries.shape)
         array = array.at[at].set(_as_shape(label, value, entries))
     return array

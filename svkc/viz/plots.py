@@ -96,7 +96,8 @@ def coordinates(names: ChainNames | None, q: np.ndarray) -> list[Curve]:
 def rotation_vectors(quats: np.ndarray) -> np.ndarray:
     """Return rotation vectors (rad) of quaternions [times 4], continuous up to whole turns."""
     flips = np.sign(np.sum(quats[1:] * quats[:-1], -1))
-    quats = quats * np.cumprod(np.append(1, np.where(flips < 0, -1, 1)))[:, None]
+    first = np.where(quats[:1, 0] < 0, -1, 1)
+    quats = quats * np.cumprod(np.append(first, np.where(flips < 0, -1, 1)))[:, None]
     length = np.linalg.norm(quats[:, 1:], axis=-1, keepdims=True)
     # the limit of angle / sin(angle / 2) at no rotation is 2
     angle = 2 * np.arctan2(length, quats[:, :1])

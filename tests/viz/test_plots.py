@@ -105,6 +105,8 @@ def test_rotation_vectors_of_quaternions():
     quats = np.concatenate([np.cos(angle / 2)[:, None], np.sin(angle / 2)[:, None] * axis], -1)
     quats[10:20] *= -1
     np.testing.assert_allclose(rotation_vectors(quats), angle[:, None] * axis, atol=1e-12)
+    # q and -q are one rotation
+    np.testing.assert_allclose(rotation_vectors(-quats), angle[:, None] * axis, atol=1e-12)
 
 
 def test_joints_by_name():
