@@ -166,6 +166,20 @@ def _solve(inputs: list, lanes: int, *, const_lengths, jaxprs, **_):
     )
 
 
+def _cond(inputs: list, lanes: int, *, branches, **_) -> list:
+    """Evaluate a `cond` whose index all lanes share, with lanes last in its branches."""
+    index, *operands = inputs
+    batched = [isinstance(v, Batched) for v in operands]
+
+    def evaluate(closed, arrays):
+        values = [Batched(x) if b else x for x, b in zip(arrays, batched, strict=True)]
+        return [broadcast_to_lanes(x, lanes) for x in evaluate_jaxpr(closed, values, lanes)]
+
+    arrays = [v.x if isinstance(v, Batched) else v for v in operands]
+    branches = [functools.partial(evaluate, closed) for closed in branches]
+    return lax.switch(index, branches, arrays)
+
+
 def _apply_vmap(primitive, inputs: list, params: dict, lanes: int):
     """Evaluate one primitive by `jax.vmap`, with the lanes moved to the front and back."""
     axes = [0 if isinstance(v, Batched) else None for v in inputs]
@@ -217,6 +231,10 @@ def evaluate_jaxpr(closed: core.ClosedJaxpr, inputs: list, lanes: int) -> list:
             out = evaluate_jaxpr(params[CALL_JAXPR_PARAMETERS[name]], values, lanes)
         elif name in ("custom_linear_solve", "linear_solve") and batched:
             out = _solve(values, lanes, **params)
+        elif name == "cond" and batched and not isinstance(values[0], Batched):
+            out = [Batched(x) for x in _cond(values, lanes, **params)]
+        elif name == "unvmap_any" and batched:
+            out = [jnp.any(values[0].x)]
         else:
             out = (
                 eqn.primitive.bind(*values, **params)

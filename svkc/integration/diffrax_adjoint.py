@@ -71,7 +71,7 @@ class ProjectedSolver(diffrax.AbstractWrappedSolver[Any]):
         made_jump: Any,
     ) -> Any:
         # Projection moved the state, so the FSAL derivative is stale: re-evaluate.
-        stale = True if needs_projection(self.field.stabilization, args) else made_jump
+        stale = True if needs_projection(self.field.stabilization, args.chain) else made_jump
         y_solver, error, dense_info, solver_state, result = self.solver.step(
             terms, t0, t1, y0, args, solver_state, made_jump=stale
         )
@@ -122,6 +122,7 @@ def integrate_with_diffrax(
         y=jax.tree.map(lambda x: x[0], y_end),
         ys=ys,
         step_ts=jnp.zeros(0, t0.dtype),
+        step_near=None,
         checkpoints=ys,
         accepted=accepted,
         rejected=rejected,

@@ -11,7 +11,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Bool
 
 from svkc._jax.control_flow import buffer_at_set, while_loop
 from svkc._jax.pytrees import tree_where
@@ -40,6 +40,7 @@ from svkc.integration.step_size import (
     with_projection_error,
 )
 from svkc.integration.vector_field import initial_projection_info, project_state
+from svkc.loops.pivoting import singularity_threshold
 
 
 def integrate_phase(
@@ -64,7 +65,7 @@ def integrate_phase(
         cond_fun,
         lambda s: _body_fun(s, times, problem, options),
         _init_stepper(start, times, problem, options),
-        buffers=lambda s: (s.step_ts, s.checkpoints, s.ys),
+        buffers=lambda s: (s.step_ts, s.step_near, s.checkpoints, s.ys),
         kind="lax",
     )
     options.progress_meter.close(end.progress_meter_state)
@@ -84,6 +85,7 @@ def integrate_phase(
         y=end.y,
         ys=ys,
         step_ts=end.step_ts,
+        step_near=end.step_near,
         checkpoints=end.checkpoints,
         accepted=end.accepted,
         rejected=end.rejected,
@@ -111,6 +113,7 @@ def _init_stepper(
     )
     rows = lambda n: jax.tree.map(lambda x: jnp.broadcast_to(x[None], (n, *x.shape)), start)
     info = initial_projection_info(field, field_args, start.q)
+    near = problem.field_args.near
     guard_values, search = None, None
     if options.armed_guards is not None:
         guard_values = options.armed_guards.initial_values
@@ -126,13 +129,19 @@ def _init_stepper(
         progress_meter_state=options.progress_meter.init(),
         guard_values=guard_values,
         search=search,
+        near=near,
         step_ts=jnp.full(options.max_steps, jnp.inf, t0.dtype),
+        step_near=None if near is None else jnp.zeros(options.max_steps, bool),
         checkpoints=rows(options.max_steps // options.checkpoint_interval),
         ys=rows(save_ts.shape[0]),
         accepted=zero,
         rejected=zero,
         result=jnp.asarray(SUCCESSFUL, jnp.int32),
-        stats=Stats.zeros(t0.dtype, info is not None and info.pivots is not None),
+        stats=Stats.zeros(
+            t0.dtype,
+            counts_swaps=info is not None and info.pivots is not None,
+            counts_by_pivots=near is not None,
+        ),
         projection_info=info,
     )
 
@@ -144,7 +153,7 @@ def _attempt_step(
     field, field_args, controller = problem.field, problem.field_args, options.controller
     term = diffrax.ODETerm(field)
     # Projection moved the state, so the FSAL derivative is stale: re-evaluate.
-    stale = True if needs_projection(field.stabilization, field_args) else s.made_jump
+    stale = True if needs_projection(field.stabilization, field_args.chain) else s.made_jump
     y_solver, error, dense_info, solver_state, solver_result = options.solver.step(
         term, s.t, t1, s.y, field_args, s.solver_state, made_jump=stale
     )
@@ -176,6 +185,7 @@ def _attempt_step(
         t=t,
         y=y,
         keep_step=keep_step & ok,
+        closed=ok,
         step_size=unclipped_step_size(
             controller, keep_step, t1 - s.t, proposed=proposed - t, before=s.step_size
         ),
@@ -187,6 +197,27 @@ def _attempt_step(
         projection_info=info,
         interpolation=_interpolation((s.t, t1), dense_info, y, y_solver, options),
     )
+
+
+def _with_pivots_if_near(
+    s: StepperState, attempt: StepAttempt, problem: PhaseProblem
+) -> tuple[StepAttempt, Bool[Array, ""] | None, Bool[Array, ""]]:
+    """Return the attempt, whether the next one is taken by pivots, and whether this one is redone.
+
+    An attempt by articulated bodies that ends near a singular configuration, or that does not close
+    the loops, is not kept: it is taken again by pivots. Pivots are used until a step is kept that
+    ends away from singular configurations.
+    """
+    if s.near is None:
+        return attempt, None, jnp.zeros((), bool)
+    assert attempt.projection_info is not None
+    threshold = singularity_threshold(problem.field_args.structure)
+    # false for NaN
+    away = attempt.projection_info.margin > threshold
+    redo = ~s.near & ~(away & attempt.closed)
+    near = jnp.where(s.near, ~(attempt.keep_step & away), redo)
+    keep_step = attempt.keep_step & ~redo
+    return dataclasses.replace(attempt, keep_step=keep_step), near, redo
 
 
 def _interpolation(
@@ -236,16 +267,18 @@ def _body_fun(
         problem = eqx.tree_at(
             lambda p: p.field_args.pivots, problem, info.pivots, is_leaf=lambda x: x is None
         )
-    if s.search is None:
-        attempt = _attempt_step(s, s.tnext, problem, options)
-        guard_values, search, hold = None, None, jnp.zeros((), bool)
-    else:
-        t1 = s.search.end_of_attempt(s.tnext)
-        attempt = _attempt_step(s, t1, problem, options)
+    problem = eqx.tree_at(lambda p: p.field_args.near, problem, s.near, is_leaf=lambda x: x is None)
+    t1 = s.tnext if s.search is None else s.search.end_of_attempt(s.tnext)
+    attempt, near, redo = _with_pivots_if_near(s, _attempt_step(s, t1, problem, options), problem)
+    guard_values, search, hold = None, None, jnp.zeros((), bool)
+    if s.search is not None:
         attempt, guard_values, search, hold = locate_event(s, attempt, t1, problem, options)
+        search = tree_where(redo, s.search, search)
+    hold = hold | redo
     rejected = ~attempt.keep_step & ~hold
     if search is not None:
-        rejected = rejected | jnp.isfinite(search.retry_time)
+        rejected = rejected | jnp.isfinite(search.retry_time) & ~redo
+    rejected = rejected | redo
     if_advancing = lambda new, old: tree_where(attempt.keep_step, new, old)
     unless_held = lambda new, old: tree_where(hold, old, new)
     t, accepted = if_advancing(attempt.t, s.t), s.accepted + attempt.keep_step.astype(jnp.int32)
@@ -268,7 +301,9 @@ def _body_fun(
         # These are updated by every attempt.
         progress_meter_state=options.progress_meter.step(s.progress_meter_state, progress),
         search=search,
+        near=near,
         step_ts=_write_row(s.step_ts, s.accepted, t, attempt.keep_step),
+        step_near=_write_row(s.step_near, s.accepted, s.near, attempt.keep_step),
         checkpoints=checkpoints,
         ys=ys,
         accepted=accepted,

@@ -30,12 +30,14 @@ class FieldArgs(eqx.Module):
     args: the user's `args`, passed on to control and guards.
     pivots: pivots of the loops' rows that are reused instead of selected anew
         (`AbstractDynamics.hold`). None: select pivots at every evaluation.
+    near: whether articulated bodies use pivots, as near a singular configuration. None: never.
     """
 
     chain: Chain
     structure: Structure
     args: Any
     pivots: Float[Array, "steps dofs"] | None = None
+    near: Bool[Array, ""] | None = None
 
 
 def is_finite(y: ODEState) -> Bool[Array, ""]:

@@ -7,6 +7,7 @@ cotangent. The stepping loop stores the times of the steps and a checkpoint of t
 there gives the derivative.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -61,18 +62,19 @@ def _step_grid(t0, save_ts, solution: PhaseSolution):
     return jnp.where(unused, times[solution.accepted], times), save_index
 
 
-def _replay_block(y: ODEState, times, problem: PhaseProblem, solver) -> tuple[ODEState, ODEState]:
+def _replay_block(y: ODEState, steps, problem: PhaseProblem, solver) -> tuple[ODEState, ODEState]:
     """Return the state after one block of steps, and the states after each of its steps.
 
-    times: starts and ends of the steps.
+    steps: starts and ends of the steps, and which are taken by pivots.
     """
 
-    def step(y, interval):
-        start, stop = interval
-        y = replay_step(solver, problem.field, start, stop, y, problem.field_args)
+    def replay(y, step):
+        start, stop, near = step
+        field_args = dataclasses.replace(problem.field_args, near=near)
+        y = replay_step(solver, problem.field, start, stop, y, field_args)
         return y, y
 
-    return jax.lax.scan(step, y, times)
+    return jax.lax.scan(replay, y, steps)
 
 
 def _integrate(start: ODEState, times, problem: PhaseProblem, options: StepperOptions, guards):
@@ -182,7 +184,7 @@ def _blocks(start: ODEState, step_grid, solution: PhaseSolution, interval: int):
     """Return the blocks of `interval` steps, padded to whole groups.
 
     For each block: its index, whether any of its steps was taken, the state at its start, and the
-    starts and ends of its steps.
+    starts and ends of its steps and which of them were taken by pivots.
     """
     groups = -(-(solution.checkpoints.q.shape[0] + 1) // BLOCKS_PER_GROUP)
     count = groups * BLOCKS_PER_GROUP
@@ -200,7 +202,11 @@ def _blocks(start: ODEState, step_grid, solution: PhaseSolution, interval: int):
     )
     rest = count * interval + 1 - step_grid.shape[0]
     times = jnp.concatenate([step_grid, jnp.broadcast_to(step_grid[-1:], (rest,))])
-    return index, used, states, (times[:-1].reshape(-1, interval), times[1:].reshape(-1, interval))
+    rows = lambda x: x.reshape(-1, interval)
+    near = solution.step_near
+    if near is not None:
+        near = rows(jnp.concatenate([near, jnp.zeros(rest, bool)]))
+    return index, used, states, (rows(times[:-1]), rows(times[1:]), near)
 
 
 @eqx.filter_jit
@@ -220,10 +226,10 @@ def _replay_tangents(
 
     def block(carry, x):
         d_y, d_ys = carry
-        i, used, y, times = x
+        i, used, y, steps = x
 
         def replay():
-            d_after, d_steps = _block_tangent(d_y, y, times, problem, options.solver)
+            d_after, d_steps = _block_tangent(d_y, y, steps, problem, options.solver)
             last = jnp.minimum((i + 1) * interval, solution.accepted)
             in_block = (save_index > i * interval) & (save_index <= last)
             step_index = jnp.clip(save_index - i * interval - 1, 0, interval - 1)
@@ -257,10 +263,10 @@ def _replay_tangents(
 
 
 @eqx.filter_checkpoint
-def _block_tangent(d_y: ODEState, y: ODEState, times, problem, solver):
+def _block_tangent(d_y: ODEState, y: ODEState, steps, problem, solver):
     """Return the tangents after a block of steps and after each of its steps."""
     problem, d_problem = problem
-    replay = lambda y, problem: _replay_block(y, times, problem, solver)
+    replay = lambda y, problem: _replay_block(y, steps, problem, solver)
     return eqx.filter_jvp(replay, (y, problem), (d_y, d_problem))[1]
 
 

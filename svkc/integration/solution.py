@@ -66,6 +66,7 @@ class Stats(eqx.Module):
     swaps: changes of the dependent coordinates. -1: not counted.
     loop: index of a loop that could not be closed. -1: none.
     gap: largest gaps of the loops (rad, m).
+    by_pivots: steps taken by pivots instead of articulated bodies. -1: not counted.
     """
 
     attempts: Int[Array, ""]
@@ -74,9 +75,10 @@ class Stats(eqx.Module):
     swaps: Int[Array, ""]
     loop: Int[Array, ""]
     gap: Float[Array, "2"]
+    by_pivots: Int[Array, ""]
 
     @classmethod
-    def zeros(cls, dtype: DType, counts_swaps: bool) -> "Stats":
+    def zeros(cls, dtype: DType, *, counts_swaps: bool, counts_by_pivots: bool) -> "Stats":
         """Return the statistics before the first step."""
         zero = jnp.zeros((), jnp.int32)
         return cls(
@@ -86,6 +88,7 @@ class Stats(eqx.Module):
             swaps=zero if counts_swaps else zero - 1,
             loop=zero - 1,
             gap=jnp.zeros(2, dtype),
+            by_pivots=zero if counts_by_pivots else zero - 1,
         )
 
     @classmethod
@@ -99,6 +102,7 @@ class Stats(eqx.Module):
             swaps=unknown,
             loop=unknown,
             gap=jnp.zeros(2, dtype),
+            by_pivots=unknown,
         )
 
 
@@ -108,6 +112,8 @@ class PhaseSolution(eqx.Module):
     t, y: time and state at its end.
     ys: states at the save times.
     step_ts: times at the ends of the steps, inf in unused rows.
+    step_near: which steps were taken by pivots, near a singular configuration. None: see
+        `StepperState.near`.
     checkpoints: states after every `checkpoint_interval` steps.
     accepted, rejected: numbers of steps.
     result: result code, diffrax's or one of this module.
@@ -118,6 +124,7 @@ class PhaseSolution(eqx.Module):
     y: ODEState
     ys: ODEState
     step_ts: Float[Array, " steps"]
+    step_near: Bool[Array, " steps"] | None
     checkpoints: ODEState
     accepted: Int[Array, ""]
     rejected: Int[Array, ""]
@@ -132,7 +139,9 @@ class StepperState(eqx.Module):
     tnext: end of the next step, clipped at save times.
     step_size: size that the controller proposed, before clipping.
     guard_values: values of the guards at t.
-    step_ts, checkpoints, ys: as in `PhaseSolution`, as buffers of the loop.
+    near: whether the next step is taken by pivots, as near a singular configuration. None: steps
+        are never taken by articulated bodies and pivots in turn.
+    step_ts, step_near, checkpoints, ys: as in `PhaseSolution`, as buffers of the loop.
     projection_info: that of the last projection. None: steps are not projected.
     """
 
@@ -146,7 +155,9 @@ class StepperState(eqx.Module):
     progress_meter_state: Any
     guard_values: Float[Array, " guards"] | None
     search: EventSearch | None
+    near: Bool[Array, ""] | None
     step_ts: Any
+    step_near: Any
     checkpoints: Any
     ys: Any
     accepted: Int[Array, ""]
@@ -162,6 +173,7 @@ class StepAttempt(eqx.Module):
     t: end of the step if it is kept, else its start.
     y: projected state at the end of the step.
     keep_step: whether the loop advances to (t, y).
+    closed: whether y is finite and its loops are closed.
     step_size: size that the controller proposes for the next step.
     error_norm: root mean square of the estimated error over q and v. inf: no estimate.
     interpolation: dense output of the step. None: there are no guards.
@@ -170,6 +182,7 @@ class StepAttempt(eqx.Module):
     t: Float[Array, ""]
     y: ODEState
     keep_step: Bool[Array, ""]
+    closed: Bool[Array, ""]
     step_size: Float[Array, ""]
     made_jump: Bool[Array, ""]
     solver_state: Any
@@ -189,10 +202,10 @@ def update_stats(
     """
     old, keep_step, info = s.stats, attempt.keep_step, attempt.projection_info
     margin, swaps, loop, gap = old.margin, old.swaps, old.loop, old.gap
-    if info is not None and info.pivots is not None:
-        assert info.margin is not None
-        assert s.projection_info is not None
+    if info is not None and info.margin is not None:
         margin = jnp.where(keep_step, jnp.minimum(margin, info.margin), margin)
+    if info is not None and info.pivots is not None:
+        assert s.projection_info is not None
         dependent = s.projection_info.dependent
         # The first selection of a phase is not a swap.
         swapped = jnp.any(dependent) & jnp.any(dependent != info.dependent)
@@ -209,6 +222,9 @@ def update_stats(
         swaps=swaps,
         loop=loop,
         gap=gap,
+        by_pivots=old.by_pivots
+        if s.near is None
+        else old.by_pivots + (keep_step & s.near).astype(jnp.int32),
     )
 
 

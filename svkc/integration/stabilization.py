@@ -3,7 +3,7 @@
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from svkc.integration.ode import FieldArgs
+from svkc.model.chain import Chain
 from svkc.model.validation import integer, scalar
 
 
@@ -65,7 +65,7 @@ class NoStabilization(AbstractStabilization):
     """Let loops drift. A run whose gap exceeds the tolerance ends with the result `loop_open`."""
 
 
-def needs_projection(stabilization: AbstractStabilization, field_args: FieldArgs) -> bool:
+def needs_projection(stabilization: AbstractStabilization, chain: Chain) -> bool:
     """Return whether steps are projected: the scene has loops and the method is a projection."""
-    has_loops = bool(field_args.chain.topology.link_names)
+    has_loops = bool(chain.topology.link_names)
     return has_loops and isinstance(stabilization, Projection)

@@ -1,6 +1,7 @@
 """The vector field of one phase, and the projection of its states onto closed loops."""
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -19,9 +20,10 @@ from svkc.loops.forward_dynamics import (
     velocity_and_acceleration,
     velocity_and_acceleration_lanes_last,
 )
+from svkc.loops.pivoting import singularity_threshold
 from svkc.loops.projection import ProjectionInfo, project, project_by_loop_forces
 from svkc.model.annotations import Scalar
-from svkc.model.chain import Chain, State, active_dofs
+from svkc.model.chain import Chain, State, Structure, active_dofs
 from svkc.model.checked_jit import torques_over_dofs
 from svkc.model.validation import as_array, description, is_real
 from svkc.tree.configuration import configuration_derivative, normalize
@@ -44,7 +46,7 @@ class VectorField(eqx.Module):
 
     @property
     def projects_by_loop_forces(self) -> bool:
-        """Whether steps are projected by the forces of the loops, without pivots."""
+        """Whether steps are projected by articulated bodies, which use pivots where they must."""
         return (
             not self.dynamics.uses_pivots
             and isinstance(self.stabilization, Projection)
@@ -63,7 +65,7 @@ class VectorField(eqx.Module):
         )
         if self._batches_lanes_last(chain) and not project_velocity:
             v, vdot = velocity_and_acceleration_lanes_last(
-                chain, structure, y.q, y.v, tau, baumgarte
+                chain, structure, y.q, y.v, tau, baumgarte, field_args.near
             )
         else:
             v, vdot = velocity_and_acceleration(
@@ -76,6 +78,7 @@ class VectorField(eqx.Module):
                 baumgarte=baumgarte,
                 project_velocity=project_velocity,
                 pivots=field_args.pivots,
+                near=field_args.near,
             )
         return ODEState(
             configuration_derivative(chain, y.q, jnp.where(active_dofs(chain, structure), v, 0)),
@@ -132,12 +135,29 @@ def _control_torques(chain: Chain, value, dtype) -> Float[Array, " dofs"]:
     return torques_over_dofs(chain, jnp.asarray(tau, dtype))
 
 
+def phase_field_args(
+    chain: Chain, structure: Structure, args: Any, field: VectorField
+) -> FieldArgs:
+    """Return the arguments of the vector field at the start of a phase.
+
+    args: the user's.
+    """
+    near = None
+    if needs_projection(field.stabilization, chain) and field.projects_by_loop_forces:
+        near = ~(structure.margin > singularity_threshold(structure))
+    return FieldArgs(chain, structure, args, near=near)
+
+
 def initial_projection_info(field: VectorField, field_args: FieldArgs, q) -> ProjectionInfo | None:
     """Return the projection's result before the first step. None: steps are not projected."""
-    if not needs_projection(field.stabilization, field_args):
+    if not needs_projection(field.stabilization, field_args.chain):
         return None
-    with_pivots = not field.projects_by_loop_forces
-    return ProjectionInfo.initial(field_args.chain, q.dtype, with_pivots=with_pivots)
+    return ProjectionInfo.initial(
+        field_args.chain,
+        q.dtype,
+        with_margin=True,
+        with_pivots=not field.projects_by_loop_forces,
+    )
 
 
 def project_state(
@@ -149,7 +169,7 @@ def project_state(
     """
     chain, structure = field_args.chain, field_args.structure
     stabilization = field.stabilization
-    if not needs_projection(stabilization, field_args):
+    if not needs_projection(stabilization, chain):
         return eqx.tree_at(lambda y: y.q, y, normalize(chain, y.q)), None
     assert isinstance(stabilization, Projection)
     if field.projects_by_loop_forces:
@@ -158,6 +178,7 @@ def project_state(
             structure,
             y.q,
             y.v,
+            field_args.near,
             iterations=stabilization.iterations,
             differentiated=field.differentiated,
         )

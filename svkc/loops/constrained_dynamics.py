@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from svkc._jax.batched_lapack import batched_solve_triangular, cholesky_solver
 from svkc.loops.constraint import LoopKinematics, jacobian_scales
+from svkc.loops.constraint_rows import constraint_rows
 from svkc.loops.coordinates import Coordinates, partition_coordinates
 from svkc.loops.delassus import loop_force_solver
 from svkc.loops.pivoting import PivotedQR, pivot_blocks
@@ -53,14 +54,15 @@ class AbstractDynamics(eqx.Module):
     @abc.abstractmethod
     def prepare(
         self, chain: Chain, structure: Structure, loops: LoopKinematics,
-        selection: PivotedQR | None = None,
+        selection: Any = None,
     ) -> Callable[..., Any]:  # fmt: skip
         """Return solve: (force [dofs], bias [rows]) -> x on a chain with virtual links.
 
         x solves M x = force + J_C^T lambda and J_C x + bias = 0 (III-B); bias has scaled rows.
 
         loops: kinematics of the tree and of its loops.
-        selection: the pivoted QR of `loops.J`; not used if `uses_pivots` is False.
+        selection: the pivoted QR of `loops.J` if `uses_pivots` is True, else its `ConstraintRows`
+        (None: not reduced).
         """
 
     @abc.abstractmethod
@@ -92,15 +94,17 @@ class ArticulatedBodies(AbstractDynamics):
 
     def prepare(
         self, chain: Chain, structure: Structure, loops: LoopKinematics,
-        selection: PivotedQR | None = None,
+        selection: Any = None,
     ) -> Callable[..., Any]:  # fmt: skip
         column, active = jacobian_scales(chain)[1], active_dofs(chain, structure)
+        rows = constraint_rows(chain, structure, loops.J) if selection is None else selection
         J, chain_and_kin, locked = jax.lax.stop_gradient(
             (loops.J, (chain, loops.kin), structure.locked)
         )
         solve = loop_force_solver(
             *chain_and_kin,
             jnp.where(active[None], J / column[None], 0),
+            rows,
             None if locked is None else active[: chain.nv],
         )
         # all rows, dependent ones included
@@ -125,7 +129,7 @@ class AbstractMassMatrix(AbstractDynamics):
 
     def prepare(
         self, chain: Chain, structure: Structure, loops: LoopKinematics,
-        selection: PivotedQR | None = None,
+        selection: Any = None,
     ) -> Callable[..., Any]:  # fmt: skip
         assert selection is not None
         qr, J, chain_and_kin, frozen_structure = jax.lax.stop_gradient(

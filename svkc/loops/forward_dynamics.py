@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from svkc._jax.control_flow import unvmap_any
 from svkc._jax.lanes_last import with_lanes_last
 from svkc.loops.constrained_dynamics import (
     AbstractDynamics,
@@ -16,6 +17,11 @@ from svkc.loops.constrained_dynamics import (
     default_dynamics,
 )
 from svkc.loops.constraint import constraint_bias, jacobian_scales, loop_kinematics
+from svkc.loops.constraint_rows import (
+    ConstraintRows,
+    constraint_rows,
+    with_consistent_velocities,
+)
 from svkc.loops.coordinates import with_dependent_velocities
 from svkc.loops.diagonal_inertia import with_armature, with_inertia
 from svkc.loops.pivoting import (
@@ -47,6 +53,7 @@ def velocity_and_acceleration(
     baumgarte=None,
     project_velocity: bool = False,
     pivots=None,
+    near: Bool[Array, ""] | None = None,
     added_inertia: Float[Array, " dofs"] | None = None,
 ) -> tuple[Float[Array, " dofs"], Float[Array, " dofs"]]:
     """Return the velocity and the acceleration (paper, section III-B, steps 1 to 5).
@@ -58,20 +65,26 @@ def velocity_and_acceleration(
     project_velocity: near a singular configuration compute the dependent velocities from the
     independent ones, as the errors of v would grow there from stage to stage of a step.
     pivots: as in `select_pivots`.
+    near: whether articulated bodies reduce the rows of the loops, as near a singular configuration
+    (None: never). The dependent velocities are then computed from the independent ones, too.
     added_inertia: added to the diagonal of the mass matrix (None: nothing), on the coordinates of
     the tree and of cuttable joints.
     """
     if chain.topology.link_names:
         loops = loop_kinematics(chain, structure, q)
         kin, J = loops.kin, loops.J
-        qr = (
+        selection = (
             select_pivots(structure, J, pivots)
             if project_velocity or dynamics.uses_pivots
             else None
         )
         if project_velocity:
-            assert qr is not None
-            v = _projected_if_near_singular(chain, structure, qr, J, v)
+            assert selection is not None
+            v = _projected_if_near_singular(chain, structure, selection, J, v)
+        if not dynamics.uses_pivots:
+            selection = constraint_rows(chain, structure, J, near)
+            if near is not None:
+                v = _with_consistent_velocities_if(near, chain, structure, J, v, selection)
     else:
         kin, loops = kinematics(chain, q), None
     V = twists(chain, kin, v)
@@ -82,7 +95,7 @@ def velocity_and_acceleration(
     if loops is None:
         return v, dynamics.prepare_open(chain, structure, kin)(force)
     loop_bias = constraint_bias(chain, structure, v, loops, V, baumgarte)
-    solve = dynamics.prepare(chain, structure, loops, qr)
+    solve = dynamics.prepare(chain, structure, loops, selection)
     if added_inertia is not None:
         solve = _with_cuttable_inertia(chain, solve, added_inertia)
     return v, solve(force, loop_bias)
@@ -97,6 +110,18 @@ def _projected_if_near_singular(
     return jnp.where(near, with_dependent_velocities(chain, qr, J, active_v), v)
 
 
+def _with_consistent_velocities_if(
+    near: Bool[Array, ""], chain: Chain, structure: Structure, J, v, rows: ConstraintRows
+) -> Float[Array, " dofs"]:
+    """Return v, where `near` holds with its dependent part from the independent one."""
+    active_v = jnp.where(active_dofs(chain, structure), v, 0)
+    return jax.lax.cond(
+        unvmap_any(near),
+        lambda: jnp.where(near, with_consistent_velocities(chain, J, active_v, rows), v),
+        lambda: v,
+    )
+
+
 def _with_cuttable_inertia(
     chain: Chain, solve: Callable, inertia: Float[Array, " dofs"]
 ) -> Callable:
@@ -109,11 +134,11 @@ def _with_cuttable_inertia(
 
 @with_lanes_last
 def velocity_and_acceleration_lanes_last(
-    chain: Chain, structure: Structure, q, v, tau, baumgarte
+    chain: Chain, structure: Structure, q, v, tau, baumgarte, near
 ) -> tuple[Float[Array, " dofs"], Float[Array, " dofs"]]:
     """Return `velocity_and_acceleration` by articulated bodies; a `vmap` keeps lanes last."""
     return velocity_and_acceleration(
-        chain, structure, q, v, tau, dynamics=ArticulatedBodies(), baumgarte=baumgarte
+        chain, structure, q, v, tau, dynamics=ArticulatedBodies(), baumgarte=baumgarte, near=near
     )
 
 

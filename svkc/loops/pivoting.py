@@ -248,6 +248,16 @@ def pivot_blocks(
 NEAR_SINGULAR = 0.1
 
 
+def singularity_threshold(structure: Structure) -> Float[Array, ""]:
+    """Return the margin below which a configuration counts as near a singular one.
+
+    It is `NEAR_SINGULAR` of the phase's margin, and at least eps^(3/16) (float64: 1.2e-3), where
+    the square of the loops' condition number leaves too few digits.
+    """
+    eps = jnp.finfo(structure.margin.dtype).eps
+    return jnp.maximum(NEAR_SINGULAR * structure.margin, eps ** (3 / 16))
+
+
 def select_pivots(
     structure: Structure, J: Float[Array, "rows dofs"], pivots: Any = None
 ) -> PivotedQR:

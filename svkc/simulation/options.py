@@ -18,7 +18,12 @@ from svkc.integration.replay import Replay
 from svkc.integration.stabilization import AbstractStabilization, Projection
 from svkc.integration.step_size import MAX_STRETCH, FixedSteps
 from svkc.integration.vector_field import VectorField
-from svkc.loops.constrained_dynamics import AbstractDynamics, Dynamics, default_dynamics
+from svkc.loops.constrained_dynamics import (
+    AbstractDynamics,
+    ArticulatedBodies,
+    Dynamics,
+    default_dynamics,
+)
 from svkc.loops.constraint import gap_tolerance
 from svkc.model.annotations import DType, Scalar
 from svkc.model.chain import Chain, State
@@ -124,11 +129,12 @@ def prepare_options(
     if controller is None:
         smallest = np.finfo(dtype).eps * host.maximum(host.abs(span), host.abs(cast(t1)))
         controller = _default_controller(rtol, atol, smallest, dtmax, dtype)
+    stabilization = _resolve_stabilization(stabilization)
     options = Options(
         control=control,
         solver=_resolve_solver(solver, None if dt is not None else controller, dtype),
-        stabilization=_resolve_stabilization(stabilization),
-        dynamics=_resolve_dynamics(chain, dynamics),
+        stabilization=stabilization,
+        dynamics=_resolve_dynamics(chain, dynamics, stabilization),
         controller=controller,
         adjoint=_resolve_adjoint(adjoint, controller if dt is None else None),
         progress_meter=diffrax.NoProgressMeter() if progress_meter is None else progress_meter,
@@ -174,10 +180,16 @@ def _resolve_stabilization(stabilization) -> AbstractStabilization:
     return stabilization
 
 
-def _resolve_dynamics(chain: Chain, dynamics) -> AbstractDynamics:
-    """Return the dynamics, by default those of the chain. Raises ValueError for another type."""
+def _resolve_dynamics(
+    chain: Chain, dynamics, stabilization: AbstractStabilization
+) -> AbstractDynamics:
+    """Return the dynamics. Raises ValueError for another type.
+
+    The default is articulated bodies, which use pivots near singular configurations if steps are
+    projected by `Projection`. With other stabilizations it is that of the chain.
+    """
     if dynamics is None:
-        return default_dynamics(chain)
+        return ArticulatedBodies() if type(stabilization) is Projection else default_dynamics(chain)
     if isinstance(dynamics, Dynamics):
         return dynamics.resolved(chain)
     if not isinstance(dynamics, AbstractDynamics):

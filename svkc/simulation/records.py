@@ -81,7 +81,7 @@ def empty_phase_records(rows: int, state: State) -> PhaseRecords:
         work=jnp.zeros(rows, dtype),
         accepted=jnp.zeros(rows, jnp.int32),
         rejected=jnp.zeros(rows, jnp.int32),
-        stats=repeat(Stats.zeros(dtype, True), rows),
+        stats=repeat(Stats.zeros(dtype, counts_swaps=True, counts_by_pivots=True), rows),
     )
 
 
@@ -126,7 +126,7 @@ class Phases(eqx.Module):
     energy: mechanical energy at the start and at the end (J).
     work: done by control, joint limits and dampers (J).
     margin: least |R_mm| / |R_11|, the distance from losing rank. Over all steps if they are
-        projected by pivots in svkc's own loop, otherwise over the two ends of the phase.
+        projected in svkc's own loop, otherwise over the two ends of the phase.
     accepted, rejected: numbers of steps.
     evaluations: of the vector field in all attempts; with `Replay` event location is included.
     swaps: how often the choice of dependent coordinates changed between steps (-1: not recorded).
@@ -143,6 +143,8 @@ class Phases(eqx.Module):
     count: number of phases. Rows past `count` are empty.
     kinetic_energy: largest kinetic energy at the two ends of the phase and at the save times within
         (J); None in files of older versions.
+    by_pivots: steps near a singular configuration, taken by pivots instead of articulated bodies
+        (-1: not counted); None in files of older versions.
     """
 
     start: Float[Array, " phases"]
@@ -165,6 +167,7 @@ class Phases(eqx.Module):
     momentum_drift: Float[Array, "phases 2"]
     count: Int[Array, ""]
     kinetic_energy: Float[Array, " phases"] | None = None
+    by_pivots: Int[Array, " phases"] | None = None
 
     @property
     def freedoms(self) -> Int[Array | np.ndarray, "... phases"]:

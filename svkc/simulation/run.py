@@ -14,7 +14,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.pytrees import stop_gradient_tree
 from svkc.integration.event_location import GuardValues, event_tolerance
-from svkc.integration.ode import FieldArgs, ODEState, Times
+from svkc.integration.ode import ODEState, Times
+from svkc.integration.vector_field import phase_field_args
 from svkc.model.chain import Chain, State
 from svkc.simulation.apply_events import apply_events, reevaluated_guards
 from svkc.simulation.codes import DERIVATIVE, RESULTS
@@ -82,7 +83,7 @@ def _reevaluate_stale_guards(
     """
     if not plan.guards or not reevaluated_guards(plan).any():
         return run
-    field_args = FieldArgs(chain, run.state.structure, args)
+    field_args = phase_field_args(chain, run.state.structure, args, options.field)
     assert run.stale is not None
     assert run.guard_values is not None
     values = stop_gradient_tree(GuardValues(plan, options.field))(
@@ -141,7 +142,8 @@ def run_phase(
     active = (run.t < t1) | jnp.any(run.schedule.due(t1))
     active = active & (run.result == RESULTS.successful)
     stop = _next_stop(run, t1)
-    outcome = solve_phase(run, stop, ts, plan, options, FieldArgs(chain, run.state.structure, args))
+    field_args = phase_field_args(chain, run.state.structure, args, options.field)
+    outcome = solve_phase(run, stop, ts, plan, options, field_args)
     timed, fired = _fired_events(run, outcome, active, plan)
     end_state = State(outcome.y.q, outcome.y.v, run.state.structure)
     saved, saved_work = _write_saved_states(run, end_state, outcome, ts)

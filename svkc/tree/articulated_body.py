@@ -77,10 +77,21 @@ def _batched_matvec(A: Float[Array, "n i j"], x: Float[Array, "n j *k"]) -> Floa
     return jnp.sum(A.reshape(*A.shape, *(1,) * (x.ndim - 2)) * x[:, None], 2)
 
 
-def _inward_pass(top: Topology, bodies, f: Float[Array, "nv *k"]):
-    """Return (u, D^-1 u) of each level, with u = f - S p^A (Featherstone table 7.1, second pass).
+class JointForces(NamedTuple):
+    """Joint forces passed towards the roots: u = f - S p^A, and D^-1 u, over all levels.
 
-    p^A is the articulated bias force that a body's children pass to it. f may have trailing axes.
+    p^A is the articulated bias force that a body's children pass to it (Featherstone table 7.1,
+    second pass). The rows are those of the levels in order, padding included.
+    """
+
+    u: Float[Array, "padded *k"]
+    x: Float[Array, "padded *k"]
+
+
+def pass_inward(top: Topology, bodies: Any, f: Float[Array, "nv *k"]) -> JointForces:
+    """Return u = L^-T f and D^-1 u, for M = L^T D L with a block of D for each joint.
+
+    (Featherstone section 6.5.) f may have trailing axes.
     """
 
     def step(from_children, level_data):
@@ -91,34 +102,29 @@ def _inward_pass(top: Topology, bodies, f: Float[Array, "nv *k"]):
         to_parent = _batched_matvec(jnp.swapaxes(body.U, 1, 2), x)
         return to_parent if p is None else to_parent + p, (u, x)
 
-    return scan_levels(
+    parts = scan_levels(
         step,
         initial_carry(top, 6, *f.shape[1:], dtype=f.dtype),
         zip_levels(with_level_data(top, lambda x: static_take(f, x.dofs)), bodies),
         reverse=True,
     )
-
-
-def delassus_matrix(
-    top: Topology, bodies: Any, J: Float[Array, "rows nv"]
-) -> Float[Array, "rows rows"]:
-    """Return Delassus' matrix J M^-1 J^T from the factors of M, `bodies`.
-
-    M = L^T D L with a block of D for each joint (Featherstone section 6.5), so that the inward
-    pass, L^-T J^T, is enough.
-    """
-    parts = _inward_pass(top, bodies, J.T)
     parts = parts if isinstance(parts, list) else [parts]
-    u, x = (jnp.concatenate([part[i].reshape(-1, J.shape[0]) for part in parts]) for i in (0, 1))
+    flat = lambda i: jnp.concatenate([part[i].reshape(-1, *f.shape[1:]) for part in parts])
+    return JointForces(flat(0), flat(1))
+
+
+def inner_product(a: JointForces, b: JointForces) -> Float[Array, "columns *k"]:
+    """Return f_a^T M^-1 f_b, of the columns f_a and f_b that were passed inward."""
+    u = a.u.reshape(*a.u.shape, *(1,) * (b.x.ndim - 1))
     # sums instead of a `dot`, which XLA's CPU backend does not fuse with its neighbours
-    return sum_in_chunks(u[:, :, None] * x[:, None], (0,))
+    return sum_in_chunks(u * b.x[:, None], (0,))
 
 
-def solve_mass_matrix(top: Topology, bodies: Any, f: Float[Array, " nv"]) -> Float[Array, " nv"]:
-    """Return M^-1 f, the joint accelerations at rest without gravity (Featherstone table 7.1)."""
+def pass_outward(top: Topology, bodies: Any, x: Float[Array, " padded"]) -> Float[Array, " nv"]:
+    """Return L^-1 x, which is M^-1 f if x is D^-1 L^-T f (Featherstone table 7.1, third pass)."""
 
     def step(previous, level_data):
-        (level, body), (_, x) = level_data
+        (level, body), x = level_data
         if previous is not None:
             a = static_take(previous, level.parent)
             x = x - jnp.sum(body.D_inverse * jnp.sum(body.U * a[:, None], -1)[:, None], -1)
@@ -126,10 +132,17 @@ def solve_mass_matrix(top: Topology, bodies: Any, f: Float[Array, " nv"]) -> Flo
         return relative if previous is None else a + relative, x
 
     levels = level_tables(top)
+    shape = lambda level: level.dofs.shape
+    if isinstance(levels, list):
+        ends = np.cumsum([level.dofs.size for level in levels])
+        parts = [
+            x[end - level.dofs.size : end].reshape(shape(level))
+            for level, end in zip(levels, ends, strict=True)
+        ]
+    else:
+        parts = x.reshape(shape(levels))
     x = scan_levels(
-        step,
-        initial_carry(top, 6, dtype=f.dtype),
-        zip_levels(zip_levels(levels, bodies), _inward_pass(top, bodies, f)),
+        step, initial_carry(top, 6, dtype=x.dtype), zip_levels(zip_levels(levels, bodies), parts)
     )
     if isinstance(levels, list):
         x = jnp.concatenate([y.ravel() for y in x])
@@ -138,3 +151,8 @@ def solve_mass_matrix(top: Topology, bodies: Any, f: Float[Array, " nv"]) -> Flo
         x, dofs = x.ravel(), levels.dofs.ravel()
     # the padding, whose entries of `dofs` are nv, comes last
     return static_take(x, np.argsort(dofs, kind="stable")[: top.nv])
+
+
+def solve_mass_matrix(top: Topology, bodies: Any, f: Float[Array, " nv"]) -> Float[Array, " nv"]:
+    """Return M^-1 f, the joint accelerations at rest without gravity (Featherstone table 7.1)."""
+    return pass_outward(top, bodies, pass_inward(top, bodies, f).x)
