@@ -158,7 +158,7 @@ def _attempt_step(
         term, s.t, t1, s.y, field_args, s.solver_state, made_jump=stale
     )
     y, info = project_state(field, field_args, y_solver)
-    if error is not None and field.projects_by_loop_forces:
+    if error is not None and field.projects_by_loop_forces and s.near is None:
         error = with_projection_error(error, y, y_solver)
     failure = jnp.where(ok := is_finite(y), LOOP_OPEN, NON_FINITE)
     if info is not None:
