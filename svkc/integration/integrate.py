@@ -40,7 +40,7 @@ from svkc.integration.step_size import (
     with_projection_error,
 )
 from svkc.integration.vector_field import initial_projection_info, project_state
-from svkc.loops.pivoting import singularity_threshold
+from svkc.loops.pivoting import has_redundant_rows, singularity_threshold
 
 
 def integrate_phase(
@@ -204,16 +204,17 @@ def _with_pivots_if_near(
 ) -> tuple[StepAttempt, Bool[Array, ""] | None, Bool[Array, ""]]:
     """Return the attempt, whether the next one is taken by pivots, and whether this one is redone.
 
-    An attempt by articulated bodies that ends near a singular configuration, or that does not close
-    the loops, is not kept: it is taken again by pivots. Pivots are used until a step is kept that
-    ends away from singular configurations.
+    An attempt that ends near a singular configuration, or that does not close the loops, is not
+    kept: it is taken again with reduced rows. Rows are reduced until a step is kept that ends away
+    from singular configurations, and throughout a phase whose loops are redundant.
     """
     if s.near is None:
         return attempt, None, jnp.zeros((), bool)
     assert attempt.projection_info is not None
-    threshold = singularity_threshold(problem.field_args.structure)
+    structure = problem.field_args.structure
     # false for NaN
-    away = attempt.projection_info.margin > threshold
+    away = attempt.projection_info.margin > singularity_threshold(structure)
+    away = away & ~has_redundant_rows(structure)
     redo = ~s.near & ~(away & attempt.closed)
     near = jnp.where(s.near, ~(attempt.keep_step & away), redo)
     keep_step = attempt.keep_step & ~redo

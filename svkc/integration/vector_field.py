@@ -20,7 +20,7 @@ from svkc.loops.forward_dynamics import (
     velocity_and_acceleration,
     velocity_and_acceleration_lanes_last,
 )
-from svkc.loops.pivoting import singularity_threshold
+from svkc.loops.pivoting import has_redundant_rows, singularity_threshold
 from svkc.loops.projection import ProjectionInfo, project, project_by_loop_forces
 from svkc.model.annotations import Scalar
 from svkc.model.chain import Chain, State, Structure, active_dofs
@@ -144,7 +144,9 @@ def phase_field_args(
     """
     near = None
     if needs_projection(field.stabilization, chain) and field.projects_by_loop_forces:
-        near = ~(structure.margin > singularity_threshold(structure))
+        near = has_redundant_rows(structure) | ~(
+            structure.margin > singularity_threshold(structure)
+        )
     return FieldArgs(chain, structure, args, near=near)
 
 

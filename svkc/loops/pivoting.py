@@ -258,6 +258,11 @@ def singularity_threshold(structure: Structure) -> Float[Array, ""]:
     return jnp.maximum(NEAR_SINGULAR * structure.margin, eps ** (3 / 16))
 
 
+def has_redundant_rows(structure: Structure) -> Bool[Array, ""]:
+    """Return whether the connected virtual links have more rows than the phase's rank."""
+    return structure.rank < 6 * jnp.sum(structure.connected, dtype=jnp.int32)
+
+
 def select_pivots(
     structure: Structure, J: Float[Array, "rows dofs"], pivots: Any = None
 ) -> PivotedQR:

@@ -25,6 +25,7 @@ from svkc.loops.constrained_dynamics import (
     default_dynamics,
 )
 from svkc.loops.constraint import gap_tolerance
+from svkc.loops.delassus import LAPACK_MIN_ROWS
 from svkc.model.annotations import DType, Scalar
 from svkc.model.chain import Chain, State
 from svkc.model.validation import check_function, integer
@@ -185,11 +186,17 @@ def _resolve_dynamics(
 ) -> AbstractDynamics:
     """Return the dynamics. Raises ValueError for another type.
 
-    The default is articulated bodies, which use pivots near singular configurations if steps are
-    projected by `Projection`. With other stabilizations it is that of the chain.
+    The default is articulated bodies, which reduce the rows of the loops near singular
+    configurations if steps are projected by `Projection`. With other stabilizations, and for many
+    loops, where a reduction costs more than pivots that are held, it is that of the chain.
     """
     if dynamics is None:
-        return ArticulatedBodies() if type(stabilization) is Projection else default_dynamics(chain)
+        few_rows = 6 * len(chain.link_names) < LAPACK_MIN_ROWS
+        return (
+            ArticulatedBodies()
+            if type(stabilization) is Projection and few_rows
+            else default_dynamics(chain)
+        )
     if isinstance(dynamics, Dynamics):
         return dynamics.resolved(chain)
     if not isinstance(dynamics, AbstractDynamics):
