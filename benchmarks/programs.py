@@ -1,9 +1,14 @@
-"""Compiled loops of steps, with their compile times and memory."""
+"""Compiled loops of steps, with their compile times and memory; time of runs that alternate."""
 
+import os
+import platform
 import time
 
 import jax
+import mujoco
 import numpy as np
+
+import svkc
 
 
 class Program:
@@ -41,3 +46,41 @@ def compile_steps(step, states, steps: int) -> Program:
         if single
         else Program(scan_steps(jax.vmap(step), steps), states)
     )
+
+
+def time_in_turns(runs: dict, rounds: int = 7) -> dict[str, np.ndarray]:
+    """Return the seconds of each run of each function. Functions alternate; the first round is
+    dropped.
+    """
+    seconds = {name: [] for name in runs}
+    for _ in range(rounds + 1):
+        for name, run in list(runs.items()):
+            start = time.perf_counter()
+            try:
+                run()
+            except TimeoutError as timeout:
+                print(f"left out: {timeout}", flush=True)
+                del runs[name]
+                continue
+            seconds[name].append(time.perf_counter() - start)
+    return {name: np.array(seconds[name][1:]) for name in runs}
+
+
+def machine() -> dict:
+    """Return versions, processor and number of cores."""
+    cpu = [
+        line.split(":")[1].strip()
+        for line in open("/proc/cpuinfo")
+        if line.startswith("model name")
+    ]
+    versions = {
+        "python": platform.python_version(),
+        "jax": jax.__version__,
+        "svkc": svkc.__version__,
+        "mujoco": mujoco.__version__,
+    }
+    return versions | {
+        "backend": jax.default_backend(),
+        "processor": cpu[0],
+        "cores": os.cpu_count(),
+    }
