@@ -1,10 +1,10 @@
 """Steps and reverse gradients of batches on an accelerator: svkc beside MJX.
 
-`python benchmarks/gpu.py [case ...] [--dtype ..] [--lanes ..] [--gradient-lanes ..]` (extras
-`bench` and `viz`, and a jax for the accelerator) prints and writes gpu.csv and draws gpu.png, in
-results/ or in `--out FOLDER`. Each group of rows is saved when it is measured; a later call
-replaces equal rows and keeps the others. `--small` runs all of it with a few lanes on any machine,
-and writes to out/.
+`python benchmarks/gpu.py [case ...] [--by ..] [--dtype ..] [--lanes ..] [--gradient-lanes ..]`
+(extras `bench` and `viz`, and a jax for the accelerator) prints and writes gpu.csv and draws
+gpu.png, in results/ or in `--out FOLDER`. Each group of rows is saved when it is measured; a later
+call replaces equal rows and keeps the others. `--small` runs all of it with a few lanes on any
+machine, and writes to out/.
 
 Cases, models and initial states are those of speed_cases.py, dt is 2 ms. Both libraries take the
 steps in one `lax.scan` of a `vmap`, in this process, in turns. Grips are hard in svkc and soft in
@@ -183,7 +183,7 @@ def measure_group(name: str, what: str, lanes: int, options) -> list[Row]:
     """
     rows = {
         who: Row(case=name, dtype=options.precision, lanes=lanes, what=what, by=who)
-        for who in LIBRARIES
+        for who in options.by
     }
     steps = options.steps if what == "steps" else min(options.steps, GRADIENT_STEPS)
     programs = {}
@@ -248,6 +248,7 @@ def parse(arguments: list[str]):
     )
     parser.add_argument("--small", action="store_true", help="a few lanes, on any machine")
     parser.add_argument("--dtype", nargs="+", default=["float32", "float64"])
+    parser.add_argument("--by", nargs="+", default=list(LIBRARIES), help="libraries")
     parser.add_argument("--lanes", nargs="+", type=int)
     parser.add_argument("--gradient-lanes", nargs="*", type=int)
     parser.add_argument("--out", type=pathlib.Path, help="folder of the table and the picture")

@@ -1,6 +1,7 @@
 """Compiled loops of steps, with their compile times and memory; time of runs that alternate."""
 
 import os
+import pathlib
 import platform
 import time
 
@@ -68,11 +69,9 @@ def time_in_turns(runs: dict, rounds: int = 7) -> dict[str, np.ndarray]:
 
 def machine() -> dict:
     """Return versions, processor and number of cores."""
-    cpu = [
-        line.split(":")[1].strip()
-        for line in open("/proc/cpuinfo")
-        if line.startswith("model name")
-    ]
+    info = pathlib.Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.exists() else []
+    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
     versions = {
         "python": platform.python_version(),
         "jax": jax.__version__,
@@ -81,6 +80,6 @@ def machine() -> dict:
     }
     return versions | {
         "backend": jax.default_backend(),
-        "processor": cpu[0],
+        "processor": names[0] if names else platform.machine(),
         "cores": os.cpu_count(),
     }
