@@ -18,13 +18,13 @@ class Program:
     compile_stats: seconds of tracing, lowering and compilation; temporary memory (MB).
     """
 
-    def __init__(self, function, states):
+    def __init__(self, function, states, compiler_options=None):
         seconds = [time.perf_counter()]
         stages = jax.jit(function).trace(states)
         seconds.append(time.perf_counter())
         stages = stages.lower()
         seconds.append(time.perf_counter())
-        self.program, self.states = stages.compile(), states
+        self.program, self.states = stages.compile(compiler_options), states
         self.compile_stats = [
             *np.diff([*seconds, time.perf_counter()]).tolist(),
             self.program.memory_analysis().temp_size_in_bytes / 1e6,

@@ -5,6 +5,7 @@ import csv
 import types
 
 import gpu
+import gpu_kernels
 import gpu_table
 import jax
 import jax.numpy as jnp
@@ -91,11 +92,32 @@ def test_saved_groups_replace_equal_ones(tmp_path, monkeypatch):
     assert saved == [("8", "svkc", "other"), ("64", "svkc", "again"), ("64", "MJX", "again")]
 
 
+def test_kernels_are_counted_in_loops():
+    text = """HloModule m
+
+%region_0.1 (a.1: (s32[], f32[8,3])) -> (s32[], f32[8,3]) {
+  %a.1 = (s32[], f32[8,3]{0,1}) parameter(0), metadata={scheduling_name="a.1"}
+  %i = s32[] get-tuple-element(%a.1), index=0
+  %x = f32[8,3]{0,1} get-tuple-element(%a.1), index=1
+  %sum = f32[8]{0} fusion(%x, %x), kind=kInput, calls=%fused_add.1
+  %y = f32[8,3]{1,0} copy(%x)
+  ROOT %t = (s32[], f32[8,3]{1,0}) tuple(%i, %y)
+}
+
+ENTRY %main (x: f32[8,3]) -> f32[8,3] {
+  %x.2 = f32[8,3]{0,1} parameter(0)
+  %z = f32[8,3]{1,0} copy(%x.2)
+  ROOT %w = f32[8,3]{1,0} while(%z), condition=%region_1.1, body=%region_0.1
+}
+"""
+    assert gpu_kernels.count_in_loops(text) == (2, 4 * (24 + 8 + 24 + 24))
+
+
 @pytest.mark.slow
 def test_all_of_it_with_a_few_lanes(tmp_path):
     """Steps and gradients of the open figure; MJX's rows are measured, or say why not."""
-    sizes = "--small --dtype float32 --lanes 3 --gradient-lanes 2 --out".split()
-    done = processes.run("benchmarks/gpu.py", "open", *sizes, tmp_path, optimized=False)
+    few = "--small --dtype float32 --lanes 3 --gradient-lanes 2 --out".split()
+    done = processes.run("benchmarks/gpu.py", "open", *few, tmp_path, optimized=False)
     assert done.returncode == 0, done.stdout + done.stderr
     rows = rows_of(tmp_path)
     groups = [(what, by) for what in ("steps", "gradient") for by in ("svkc", "MJX")]
