@@ -66,15 +66,17 @@ def count_in_loops(text: str) -> tuple[int, int]:
     for body in set(re.findall(r"body=%?([\w.\-]+)", text)):
         start = text.index(f"\n%{body} ")
         bytes_by_name = {}
-        for line in text[start : text.index("\n}", start)].splitlines()[2:]:
-            name, shape, operation, operands = re.match(
-                r"\s*(?:ROOT )?%([\w.\-]+) = (.*?) ([\w\-]+)\((.*)", line
-            ).groups()
+        instructions = re.findall(
+            r"^ +(?:ROOT )?%([\w.\-]+) = (.*?) ([\w\-]+)\((.*?)\)",
+            text[start : text.index("\n}", start)],
+            re.MULTILINE,
+        )
+        for name, shape, operation, operands in instructions:
             bytes_by_name[name] = bytes_of(shape)
             if operation in ("fusion", "copy"):
-                read = set(re.findall(r"%([\w.\-]+)", operands.split(")")[0]))
+                read = set(re.findall(r"%([\w.\-]+)", operands))
                 kernels += 1
-                traffic += bytes_by_name[name] + sum(bytes_by_name[operand] for operand in read)
+                traffic += bytes_by_name[name] + sum(bytes_by_name[x] for x in read)
     return kernels, traffic
 
 
@@ -92,7 +94,7 @@ def main(cases: list[str], what: str, lanes: int):
     print("| " + " | ".join(HEAD) + " |", flush=True)
     for name in cases:
         program = compile_case(name, what, lanes)
-        kernels, traffic = count_in_loops(program.program.as_text())
+        kernels, traffic = count_in_loops(program.program.as_text() or "")
         row = Row(case=name, dtype="float32", lanes=lanes, what=what, by="svkc")
         row.compiled(program)
         cells = [name, what, lanes, kernels, f"{traffic / lanes / 1e3:.0f}", f"{row.memory:.0f}"]

@@ -37,6 +37,7 @@ class Row:
         """Take over compile times and memory of a program."""
         self.compile_seconds = tuple(program.compile_stats[:3])
         plan = program.program.memory_analysis()
+        assert plan is not None
         total = plan.argument_size_in_bytes + plan.output_size_in_bytes + plan.temp_size_in_bytes
         self.memory = (total - plan.alias_size_in_bytes) / 1e6
 

@@ -49,6 +49,7 @@ def count_roundings(function: Callable, inputs) -> int:
     Raises ValueError for a loop, whose number of turns is not known, and for a library's call.
     """
     module = jax.jit(function).lower(inputs).compiler_ir("stablehlo")
+    assert module is not None
     functions = {f.name.value: f for f in module.body.operations}
     main = functions["main"].regions[0].blocks[0]
     return max(_depths_of_results(main, [0] * len(main.arguments), functions))
