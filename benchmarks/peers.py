@@ -165,8 +165,8 @@ class Process:
         self.process.wait()
 
 
-def mjx_program(name: str, batch: int, steps: int):
-    """Return MJX's steps of a case."""
+def mjx_steps(name: str, batch: int):
+    """Return MJX's step of a case, and a batch of its states."""
     from mujoco import mjx
 
     chain, state = speed_cases.load_case(name)
@@ -174,11 +174,8 @@ def mjx_program(name: str, batch: int, steps: int):
     v = jnp.asarray(speed_cases.random_states(chain, state, batch).v[:, : chain.nv])
     mjx_model = mjx.put_model(model)
     data = mjx.make_data(mjx_model)
-    return compile_steps(
-        lambda d: mjx.step(mjx_model, d),
-        jax.vmap(lambda v: data.replace(qpos=jnp.asarray(q, v.dtype), qvel=v))(v),
-        steps,
-    )
+    states = jax.vmap(lambda v: data.replace(qpos=jnp.asarray(q, v.dtype), qvel=v))(v)
+    return lambda d: mjx.step(mjx_model, d), states
 
 
 def jaxsim_program(name: str, batch: int, steps: int):
@@ -276,7 +273,11 @@ def main(kind: str, name: str, dtype: str, batch: int, steps: int):
     answer = lambda x: os.write(stdout, (json.dumps(x) + "\n").encode())
     jax.config.update("jax_enable_x64", dtype == "float64")
     try:
-        program = {"mjx": mjx_program, "jaxsim": jaxsim_program}[kind](name, batch, steps)
+        program = (
+            compile_steps(*mjx_steps(name, batch), steps)
+            if kind == "mjx"
+            else jaxsim_program(name, batch, steps)
+        )
     except ImportError as missing:
         answer({"missing": str(missing)})
         return

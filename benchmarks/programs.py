@@ -1,9 +1,15 @@
-"""Compiled loops of steps, with their compile times and memory."""
+"""Compiled loops of steps, with their compile times and memory; time of runs that alternate."""
 
+import os
+import pathlib
+import platform
 import time
 
 import jax
+import mujoco
 import numpy as np
+
+import svkc
 
 
 class Program:
@@ -12,13 +18,13 @@ class Program:
     compile_stats: seconds of tracing, lowering and compilation; temporary memory (MB).
     """
 
-    def __init__(self, function, states):
+    def __init__(self, function, states, compiler_options=None):
         seconds = [time.perf_counter()]
         stages = jax.jit(function).trace(states)
         seconds.append(time.perf_counter())
         stages = stages.lower()
         seconds.append(time.perf_counter())
-        self.program, self.states = stages.compile(), states
+        self.program, self.states = stages.compile(compiler_options), states
         self.compile_stats = [
             *np.diff([*seconds, time.perf_counter()]).tolist(),
             self.program.memory_analysis().temp_size_in_bytes / 1e6,
@@ -41,3 +47,39 @@ def compile_steps(step, states, steps: int) -> Program:
         if single
         else Program(scan_steps(jax.vmap(step), steps), states)
     )
+
+
+def time_in_turns(runs: dict, rounds: int = 7) -> dict[str, np.ndarray]:
+    """Return the seconds of each run of each function. Functions alternate; the first round is
+    dropped.
+    """
+    seconds = {name: [] for name in runs}
+    for _ in range(rounds + 1):
+        for name, run in list(runs.items()):
+            start = time.perf_counter()
+            try:
+                run()
+            except TimeoutError as timeout:
+                print(f"left out: {timeout}", flush=True)
+                del runs[name]
+                continue
+            seconds[name].append(time.perf_counter() - start)
+    return {name: np.array(seconds[name][1:]) for name in runs}
+
+
+def machine() -> dict:
+    """Return versions, processor and number of cores."""
+    info = pathlib.Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.exists() else []
+    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
+    versions = {
+        "python": platform.python_version(),
+        "jax": jax.__version__,
+        "svkc": svkc.__version__,
+        "mujoco": mujoco.__version__,
+    }
+    return versions | {
+        "backend": jax.default_backend(),
+        "processor": names[0] if names else platform.machine(),
+        "cores": os.cpu_count(),
+    }

@@ -55,7 +55,6 @@ HEAD = [
 ]
 REFERENCE = {"rtol": 1e-11, "atol": 1e-13, "max_steps": 100000}
 REFERENCE_LANES, ROUNDS, END = 8, 3, 1.8
-speed.ROUNDS = ROUNDS
 
 
 def events(right, left):
@@ -110,7 +109,7 @@ def single_runs(chain, state):
     }
     reference = make_run(**REFERENCE)(state)
     runs = {who: (lambda f=f: jax.block_until_ready(f(state))) for who, f in programs.items()}
-    seconds = speed.time_in_turns(runs | dict([mujoco_steps(chain, state, 1, 2000)]))
+    seconds = speed.time_in_turns(runs | dict([mujoco_steps(chain, state, 1, 2000)]), ROUNDS)
     for who, f in programs.items():
         traj = f(state)
         yield result_row(
@@ -139,7 +138,7 @@ def batch_runs(chain, state, lanes: int, methods: dict, peers=()):
         for who, options in methods.items()
     }
     runs = {who: (lambda f=f: jax.block_until_ready(f())) for who, f in rollouts.items()}
-    seconds = speed.time_in_turns(runs | dict(peers))
+    seconds = speed.time_in_turns(runs | dict(peers), ROUNDS)
     reference = jax.jit(
         lambda time: svkc.simulate(chain, state, END, **lane(chain, time), **REFERENCE)
     )
@@ -179,7 +178,7 @@ def unequal_runs(chain, state, lanes: int):
         "Tsit5, rtol 1e-4, sorted": lambda: roll(ends),
     }
     seconds = speed.time_in_turns(
-        {who: (lambda f=f: jax.block_until_ready(f())) for who, f in runs.items()}
+        {who: (lambda f=f: jax.block_until_ready(f())) for who, f in runs.items()}, ROUNDS
     )
     for who, f in runs.items():
         line = result_row(

@@ -16,8 +16,6 @@ import argparse
 import csv
 import os
 import pathlib
-import platform
-import time
 
 import peers  # first: saves XLA_FLAGS for its processes
 
@@ -33,18 +31,17 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_num_cpu_devices", os.cpu_count())
 
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import speed_cases
 from jax.sharding import PartitionSpec
 from peers import mujoco_runs
-from programs import Program, scan_steps
+from programs import Program, machine, scan_steps, time_in_turns
 from speed_cases import DT
 
 import svkc
 
 RESULTS = pathlib.Path(__file__).parent / "results"
-BATCHES, ROUNDS = (1, 64, 1024, 16384), 7
+BATCHES = (1, 64, 1024, 16384)
 HEAD = [
     "case",
     "dtype",
@@ -95,24 +92,6 @@ def svkc_runs(chain, state, batch: int, steps: int):
             states, jax.sharding.NamedSharding(mesh, PartitionSpec("lanes"))
         )
         yield "svkc, all cores", Program(sharded, sharded_states)
-
-
-def time_in_turns(runs: dict) -> dict[str, np.ndarray]:
-    """Return the seconds of each run of each function. Functions alternate; the first round is
-    dropped.
-    """
-    seconds = {name: [] for name in runs}
-    for _ in range(ROUNDS + 1):
-        for name, run in list(runs.items()):
-            start = time.perf_counter()
-            try:
-                run()
-            except TimeoutError as timeout:
-                print(f"left out: {timeout}", flush=True)
-                del runs[name]
-                continue
-            seconds[name].append(time.perf_counter() - start)
-    return {name: np.array(seconds[name][1:]) for name in runs}
 
 
 def compare_case(name: str, dtype: str, batch: int, messages: set):
@@ -206,26 +185,6 @@ def draw(table):
     axes[0, 0].set_ylabel("us per step and lane")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), fontsize=7, loc="outside right center")
     figure.savefig(RESULTS / "speed.png", dpi=110)
-
-
-def machine() -> dict:
-    """Return versions, processor and number of cores."""
-    cpu = [
-        line.split(":")[1].strip()
-        for line in open("/proc/cpuinfo")
-        if line.startswith("model name")
-    ]
-    versions = {
-        "python": platform.python_version(),
-        "jax": jax.__version__,
-        "svkc": svkc.__version__,
-        "mujoco": mujoco.__version__,
-    }
-    return versions | {
-        "backend": jax.default_backend(),
-        "processor": cpu[0],
-        "cores": os.cpu_count(),
-    }
 
 
 def main(cases, dtypes, batches):

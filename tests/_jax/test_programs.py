@@ -1,5 +1,5 @@
 """Contents of compiled programs: no callbacks to Python, float32 throughout in float32, no LAPACK
-in steps by articulated bodies."""
+in steps by articulated bodies, nothing slow on a GPU in steps of batches."""
 
 import re
 
@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import models
 import pytest
+import speed_cases
 
 import svkc
 
@@ -65,3 +66,30 @@ def test_programs(precision):
         assert ("f64" in text) == (precision == "float64"), name
         # on a GPU these are its own library's
         assert all(call.startswith("lapack") for call in custom_calls), (name, custom_calls)
+
+
+def steps_for_cuda(name: str) -> str:
+    """Return the steps of 48 lanes of a case of the speed benchmarks, lowered for CUDA."""
+    chain, state = speed_cases.load_case(name)
+    batch = jax.tree.map(lambda x: jax.ShapeDtypeStruct((48, *x.shape), x.dtype), state)
+    tau = jnp.zeros(chain.nv)
+    step = jax.jit(jax.vmap(lambda s: svkc.step(chain, s, tau, speed_cases.DT)))
+    return step.trace(batch).lower(lowering_platforms=("cuda",)).as_text()
+
+
+@pytest.mark.parametrize("name", ["open", "two ball grips", "two hinge grips"])
+def test_steps_of_lanes_for_cuda(name, monkeypatch):
+    """With a GPU as the default backend: no library calls, no scatter, no loop, no `dot`.
+
+    A `dot` in float32 would be in TF32. On a CPU the same lanes are a loop over tiles.
+    """
+    if name == "open":
+        assert "stablehlo.while" in steps_for_cuda(name)
+        # the batched program of the same number of lanes is kept
+        jax.clear_caches()
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    text = steps_for_cuda(name)
+    assert text.count("stablehlo.") > 1000
+    for operation in ("custom_call", "scatter", "while", "dot_general", "cholesky"):
+        assert f"stablehlo.{operation}" not in text
+    jax.clear_caches()

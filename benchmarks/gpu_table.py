@@ -1,0 +1,125 @@
+"""The table and the picture of gpu.py."""
+
+import csv
+import dataclasses
+import pathlib
+
+import jax
+import numpy as np
+import speed_cases
+from programs import Program, machine
+
+HEAD = [
+    "case", "dtype", "lanes", "what", "by", "M steps per s", "least", "most", "trace s", "lower s",
+    "compile s", "memory MB", "difference", "bound", "note",
+]  # fmt: skip
+# columns that a group of rows has in common, and by which the table is sorted
+KEY = ("case", "dtype", "lanes", "what")
+
+
+@dataclasses.dataclass
+class Row:
+    """One row; what was not measured is empty."""
+
+    case: str
+    dtype: str
+    lanes: int
+    what: str
+    by: str
+    rates: tuple[float, ...] = ()
+    compile_seconds: tuple[float, ...] = ()
+    memory: float | None = None
+    difference: float | None = None
+    bound: float | None = None
+    note: str = ""
+
+    def compiled(self, program: Program):
+        """Take over compile times and memory of a program."""
+        self.compile_seconds = tuple(program.compile_stats[:3])
+        plan = program.program.memory_analysis()
+        assert plan is not None
+        total = plan.argument_size_in_bytes + plan.output_size_in_bytes + plan.temp_size_in_bytes
+        self.memory = (total - plan.alias_size_in_bytes) / 1e6
+
+    def timed(self, rates: np.ndarray):
+        """Take over the rates of all rounds."""
+        self.rates = tuple(float(f(rates)) for f in (np.median, np.min, np.max))
+
+    def cells(self) -> list[str]:
+        """Return the row as text, a cell for each entry of `HEAD`."""
+        number = lambda x, form: "" if x is None else format(x, form)
+        return [
+            *(self.case, self.dtype, str(self.lanes), self.what, self.by),
+            *([format(x, ".4g") for x in self.rates] or [""] * 3),
+            *([format(x, ".2f") for x in self.compile_seconds] or [""] * 3),
+            number(self.memory, ".1f"),
+            number(self.difference, ".1e"),
+            number(self.bound, ".1e"),
+            self.note,
+        ]
+
+
+def print_row(row: Row):
+    """Print one row."""
+    print("| " + " | ".join(row.cells()) + " |", flush=True)
+
+
+def save(folder: pathlib.Path, group: list[Row]):
+    """Replace the rows of a group in gpu.csv and redraw gpu.png.
+
+    folder: of both files; is created.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    here = machine() | {"device": jax.devices()[0].device_kind}
+    rows = [dict(zip(HEAD, row.cells(), strict=True)) | here for row in group]
+    path = folder / "gpu.csv"
+    key = lambda row: tuple(str(row[name]) for name in KEY)
+    if path.exists():
+        with path.open(newline="") as file:
+            rows += [row for row in csv.DictReader(file) if key(row) != key(rows[0])]
+    rows.sort(key=_order)
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, [*HEAD, *here], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    draw(rows, folder / "gpu.png")
+
+
+def _order(row: dict) -> tuple:
+    """Return the sort key of a row: cases as in speed_cases.py, svkc before MJX."""
+    case = speed_cases.CASES.index(row["case"])
+    return case, row["dtype"], row["what"] != "steps", int(row["lanes"]), row["by"] != "svkc"
+
+
+def draw(rows: list[dict], path: pathlib.Path):
+    """Draw rates against lanes: a column of panels for each case; steps above, gradients below.
+
+    Left out if matplotlib is not installed.
+    """
+    try:
+        import matplotlib.pyplot as plt
+    except ImportError:
+        return
+    cases = list(dict.fromkeys(row["case"] for row in rows))
+    figure, axes = plt.subplots(
+        2, len(cases), figsize=(3.5 * len(cases), 5.5), layout="constrained", squeeze=False
+    )
+    for i, what in enumerate(("steps", "gradient")):
+        for ax, case in zip(axes[i], cases, strict=True):
+            for who, color in (("svkc", "C0"), ("MJX", "C4")):
+                for dtype, style in (("float32", "s--"), ("float64", "o-")):
+                    key = [case, dtype, what, who]
+                    points = [
+                        (int(row["lanes"]), float(row["M steps per s"]))
+                        for row in rows
+                        if [row[name] for name in ("case", "dtype", "what", "by")] == key
+                        and row["M steps per s"]
+                    ]
+                    label = f"{who}, {dtype}"
+                    ax.loglog(*zip(*points), style, color=color, label=label) if points else None
+            ax.set(title=f"{case}: {what}", xlabel="lanes")
+            ax.grid(alpha=0.3)
+        axes[i, 0].set_ylabel("million steps per s")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), fontsize=8, loc="outside right center")
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
