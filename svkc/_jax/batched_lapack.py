@@ -1,8 +1,12 @@
-"""Cholesky factorisation and triangular solves whose batches are split into small chunks.
+"""Cholesky factorisation and triangular solves in pieces that LAPACK computes in one thread.
 
 jaxlib 0.10 splits a batch of more than 2e5 operations over its thread pool, and blocks the calling
 thread until they are done. If several CPU devices share the pool, all threads may block, which is a
 deadlock. There, `lax.map` runs the batch in chunks below that size.
+
+OpenBLAS, which jaxlib calls, distributes one large matrix over threads of its own. Where another
+thread uses the processor, these wait for one another for milliseconds. Large matrices are therefore
+factored in blocks, and many right-hand sides solved in groups.
 """
 
 import functools
@@ -16,6 +20,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 # largest number of operations that jaxlib runs in one thread
 SINGLE_THREAD_OPERATIONS = 200_000 - 1
+# Cholesky factorisations of fewer rows, and triangular solves with at most so many entries of the
+# right-hand sides, run in one thread of OpenBLAS
+CHOLESKY_THREADED_ROWS = 128
+SOLVE_SINGLE_THREAD_ENTRIES = 1000
 
 
 def _in_chunks(function: Callable, cost: Callable) -> Callable:
@@ -72,7 +80,25 @@ def batched_solve_triangular(
     Only the triangle named by `lower` is read. There is no derivative rule: use this function as
     the `solve` of a `custom_linear_solve`.
     """
-    return _triangular_solver(lower, trans)(A, x.reshape(x.shape[0], -1)).reshape(x.shape)
+    solve, columns = functools.partial(_triangular_solver(lower, trans), A), x.reshape(len(x), -1)
+    width = max(1, SOLVE_SINGLE_THREAD_ENTRIES // max(1, len(x)))
+    if columns.shape[1] <= width or jax.default_backend() != "cpu":
+        return solve(columns).reshape(x.shape)
+    rows = columns.T
+    padded = jnp.concatenate([rows, jnp.zeros((-len(rows) % width, len(x)), x.dtype)])
+    out = lax.map(lambda y: solve(y.T).T, padded.reshape(-1, width, len(x)))
+    return out.reshape(padded.shape)[: len(rows)].T.reshape(x.shape)
+
+
+def _blocked_cholesky(A: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """Return the lower Cholesky factor of A, of which the lower triangle is read."""
+    if len(A) < CHOLESKY_THREADED_ROWS or jax.default_backend() != "cpu":
+        return _cholesky(A)
+    n = len(A) // 2
+    first = _blocked_cholesky(A[:n, :n])
+    below = batched_solve_triangular(first, A[n:, :n].T, lower=True).T
+    second = _blocked_cholesky(A[n:, n:] - below @ below.T)
+    return jnp.block([[first, jnp.zeros_like(below.T)], [below, second]])
 
 
 def cholesky_solver(A: Float[Array, "n n"]) -> Callable:
@@ -80,7 +106,7 @@ def cholesky_solver(A: Float[Array, "n n"]) -> Callable:
 
     A is factored once. As for `batched_solve_triangular`, there is no derivative rule.
     """
-    L = _cholesky(A)
+    L = _blocked_cholesky(A)
     return lambda x: batched_solve_triangular(
         L, batched_solve_triangular(L, x, lower=True), trans=True, lower=True
     )

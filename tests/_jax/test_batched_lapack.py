@@ -1,6 +1,7 @@
-"""Batched Cholesky and triangular solves: equality with single solves, and no deadlock of several
-CPU devices in one process."""
+"""Batched Cholesky and triangular solves: equality with single solves, no large matrix for LAPACK,
+and no deadlock of several CPU devices in one process."""
 
+import re
 import subprocess
 import sys
 
@@ -37,6 +38,19 @@ def test_batches_are_their_single_solves(lanes, size):
             np.swapaxes(upper, -1, -2) if trans else upper, np.asarray(x)[..., None]
         )[..., 0]
         np.testing.assert_allclose(solve(A, x), expected, rtol=REFERENCE, atol=ROUND_OFF)
+
+
+@pytest.mark.parametrize("columns", [1, 9])
+def test_lapack_is_given_what_it_computes_in_one_thread(columns):
+    rng = np.random.default_rng(0)
+    A, x = rng.normal(size=(150, 150)), rng.normal(size=(150, columns))
+    A = A @ A.T + 150 * np.eye(150)
+    run = jax.jit(lambda A, x: cholesky_solver(A)(x)).lower(A, x).compile()
+    np.testing.assert_allclose(run(A, x), np.linalg.solve(A, x), rtol=REFERENCE, atol=ROUND_OFF)
+    shapes = lambda name: re.findall(rf"f64\[(\d+),(\d+)\][^=]* custom-call.*{name}", run.as_text())
+    assert {int(n) for n, _ in shapes("dpotrf")} == {75}
+    assert all(int(n) * int(m) <= 1000 for n, m in shapes("dtrsm"))
+    assert shapes("dtrsm")
 
 
 TWO_DEVICES = """
