@@ -15,6 +15,9 @@ MAX_STRETCH = 1e-6
 # A step has at least this fraction of its change by projection as its estimated error.
 PROJECTION_ERROR_WEIGHT = 1e-3
 
+# A new step has this fraction of the length at which its error would meet the tolerance.
+SAFETY = 0.8
+
 
 class FixedSteps(diffrax.AbstractStepSizeController[None, Any]):
     """Steps of a fixed size, clipped at save times. A step to a non-finite state ends the solve.
@@ -65,6 +68,39 @@ class FixedSteps(diffrax.AbstractStepSizeController[None, Any]):
         )
         next_t0 = jnp.where(keep_step, t1, t0)
         return keep_step, next_t0, self._tnext(t1), False, controller_state, result
+
+
+class LimitedPIDController(diffrax.PIDController):
+    """A PID controller after whose rejections the next kept step is followed by none longer.
+
+    The step after a rejected one is as long as the error allowed, so that growing at once often
+    ends in the next rejection (Hairer, Norsett and Wanner, Solving Ordinary Differential Equations
+    I, section II.4).
+    """
+
+    def init(self, *args: Any, **kwargs: Any) -> Any:
+        t1, state = super().init(*args, **kwargs)
+        return t1, (state, jnp.full_like(t1, jnp.inf))
+
+    def adapt_step_size(
+        self,
+        t0: Any,
+        t1: Any,
+        y0: Any,
+        y1_candidate: Any,
+        args: Any,
+        y_error: Any,
+        error_order: Any,
+        controller_state: Any,
+    ) -> Any:
+        state, longest = controller_state
+        keep_step, next_t0, next_t1, made_jump, state, result = super().adapt_step_size(
+            t0, t1, y0, y1_candidate, args, y_error, error_order, state
+        )
+        # the size proposed by the rejection, as a save time may have clipped the step since
+        next_t1 = jnp.where(keep_step, jnp.minimum(next_t1, next_t0 + longest), next_t1)
+        longest = jnp.where(keep_step, jnp.inf, next_t1 - next_t0)
+        return keep_step, next_t0, next_t1, made_jump, (state, longest), result
 
 
 def clip_step(

@@ -16,7 +16,12 @@ from svkc.integration.integrators import SimplifiedNewton
 from svkc.integration.ode import rms_norm
 from svkc.integration.replay import Replay
 from svkc.integration.stabilization import AbstractStabilization, Projection
-from svkc.integration.step_size import MAX_STRETCH, FixedSteps
+from svkc.integration.step_size import (
+    MAX_STRETCH,
+    SAFETY,
+    FixedSteps,
+    LimitedPIDController,
+)
 from svkc.integration.vector_field import VectorField
 from svkc.loops.constrained_dynamics import (
     AbstractDynamics,
@@ -163,9 +168,9 @@ def _default_controller(
     rtol, atol = resolve_tolerances(dtype, rtol, atol)
     # a step is stretched by up to MAX_STRETCH if it then ends at a save time
     largest = None if dtmax is None else jnp.asarray(dtmax, dtype) / (1 + MAX_STRETCH)
-    return diffrax.PIDController(
+    return LimitedPIDController(
         rtol, atol, norm=rms_norm, dtmin=jnp.asarray(smallest, dtype), dtmax=largest,
-        force_dtmin=False,
+        force_dtmin=False, safety=SAFETY,
     )  # fmt: skip
 
 
