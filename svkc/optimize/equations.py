@@ -54,8 +54,8 @@ class IntervalData(eqx.Module):
     structure: of the states.
     """
 
-    reference: Float[Array | np.ndarray, "... nq"]
-    following: Float[Array | np.ndarray, "... nq"]
+    reference: Any
+    following: Any
     active: Any
     structure: Any
 

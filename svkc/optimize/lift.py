@@ -140,8 +140,8 @@ class Lift:
         n = A.shape[0]
         times, motion, control, f = self.layout.split_stage(A)
         by_T = times[:, 1] + self.fraction * times[:, 0]
-        by_T = by_T + jnp.sum(motion * _combine(self.dC, self.x), (1, 2))
-        by_T = by_T + jnp.sum(control * _combine(self.dD, self.w), (1, 2))
+        by_T = by_T + jnp.sum(motion * _combine(self.dC, self.x)[None], (1, 2))
+        by_T = by_T + jnp.sum(control * _combine(self.dD, self.w)[None], (1, 2))
         through = lambda M, K: jnp.sum(M[:, :, None, :] * K[None, :, :, None], 1).reshape(n, -1)
         return jnp.concatenate(
             [
