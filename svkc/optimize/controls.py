@@ -51,6 +51,12 @@ class AbstractControls(abc.ABC):
     def names(self, chain: Chain) -> list[str]:
         """Return the names of the numbers of a block."""
 
+    def driven(self, chain: Chain) -> np.ndarray:
+        """Return the mask [nv] of the coordinates with torques."""
+        driven = np.zeros(chain.nv, bool)
+        driven[_columns(chain, getattr(self, "joints", ()))[0]] = True
+        return driven
+
     @abc.abstractmethod
     def torques(
         self, chain: Chain, t, state: State, blocks: Float[Array, "k n"], args: Any

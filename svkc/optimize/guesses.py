@@ -9,8 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from svkc._jax.eager import eager_jit
 from svkc.model.chain import Chain, State
 from svkc.model.validation import finite_array
+from svkc.optimize.equations import equations_of_motion
 from svkc.optimize.loop_rows import LinkRows, gaps_at, possible_rows, rates_at
 from svkc.optimize.phases import Phase
 from svkc.optimize.points import tree_configuration, tree_velocity
@@ -123,3 +125,28 @@ def close_loops(chain: Chain, q: np.ndarray, rows: np.ndarray) -> np.ndarray:
         full = tree_velocity(chain, jnp.asarray(step))
         moved = integrate(chain, tree_configuration(chain, moved), full)[: chain.nq]
     return np.asarray(moved) if np.max(np.abs(gaps)) < _NEARLY_CLOSED else q
+
+
+def static_forces(
+    chain: Chain, connected: Sequence[str], driven: np.ndarray, q: np.ndarray
+) -> np.ndarray:
+    """Return multipliers [nodes 6 links] of connected links that carry the weight at rest.
+
+    They are those of least norm for the coordinates that no motor drives.
+    driven: mask [nv] of the others. q: [nodes nq].
+    """
+    out = np.zeros((len(q), 6 * len(chain.link_names)))
+    rows = possible_rows(chain, np.isin(chain.link_names, connected))
+    if not len(rows):
+        return out
+    table, zero = LinkRows.of(chain, rows), jnp.zeros(chain.nv)
+
+    def balance(q):
+        tau, f = jnp.zeros(chain.dofs), jnp.zeros(len(rows))
+        weight = equations_of_motion(chain, table, q, zero, zero, tau, f)[0]
+        return weight, jax.jacfwd(lambda v: rates_at(chain, q, v, table))(zero)
+
+    weight, J = (np.asarray(x) for x in eager_jit(jax.vmap(balance))(jnp.asarray(q)))
+    for i in range(len(q)):
+        out[i, rows] = np.linalg.lstsq(J[i][:, ~driven].T, weight[i][~driven], rcond=1e-6)[0]
+    return out

@@ -193,12 +193,16 @@ class Ipopt(AbstractSolver):
             "max_iter": int(self.max_iterations),
             "max_wall_time": float(self.max_seconds),
             "tol": float(self.tolerance),
+            # of rows as they are, before IPOPT's own scaling
+            "constr_viol_tol": 1e-7,
             "print_level": 0,
             "sb": "yes",
             # on meshes of three stages the monotone strategy got stuck
             "mu_strategy": "monotone" if stages < 3 else "adaptive",
             "mumps_mem_percent": 200,
             "honor_original_bounds": "yes",
+            # NaN in a matrix would crash MUMPS
+            "check_derivatives_for_naninf": "yes",
         }
         if warm:
             options |= {

@@ -15,7 +15,7 @@ from svkc.optimize.checks import Check, check, check_finite
 from svkc.optimize.controls import AbstractControls
 from svkc.optimize.encoding import encode
 from svkc.optimize.equations import Model, Params
-from svkc.optimize.guesses import Guess, PhaseMotion, PoseLine
+from svkc.optimize.guesses import Guess, PhaseMotion, PoseLine, static_forces
 from svkc.optimize.ipopt import AbstractSolver, Ipopt, SolverResult
 from svkc.optimize.lift import Layout
 from svkc.optimize.loop_rows import LinkRows
@@ -92,7 +92,7 @@ class Problem:
         noise: float = 0.0,
         key: int = 0,
     ) -> Guess:
-        """Return a guess: straight lines between poses, at rest otherwise.
+        """Return a guess: straight lines between poses, and the forces of statics.
 
         poses: at the start of each phase and at the end: coordinates of the tree as an array, by
             joint name, or a State. None where a pose is not known: the line goes on. The loops of
@@ -113,9 +113,10 @@ class Problem:
         return Guess([self._at_rest(*x) for x in zip(self.phases, durations, lines)], noise, key)
 
     def _at_rest(self, phase: Phase, duration: float, line: tuple) -> PhaseMotion:
-        """Return a phase along a line, without torques, accelerations and forces."""
+        """Return a phase along a line, without torques and accelerations."""
         n, s, control = phase.intervals, self.scheme.stages, self.controls.count(self.chain)
-        links = 6 * len(self.chain.link_names)
+        links, q = 6 * len(self.chain.link_names), line[0]
+        forces = static_forces(self.chain, phase.connected, self.controls.driven(self.chain), q)
         return PhaseMotion(
             duration=float(duration),
             q=line[0],
@@ -123,7 +124,7 @@ class Problem:
             states=np.zeros((n + 1, control * self.controls.has_state)),
             blocks=np.zeros((n, self.controls.blocks(self.scheme), control)),
             vdot=np.zeros((n, s, self.chain.nv)),
-            forces=np.zeros((n, s, links)),
+            forces=np.repeat(forces[:-1, None], s, 1),
             impulse=np.zeros(links),
         )
 

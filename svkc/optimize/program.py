@@ -89,18 +89,20 @@ class Program:
         self.whole, self.params, self.blocks = whole, params, whole.blocks
         self.unit = whole.builder.table.unit
         self.count, self.cost_row = whole.builder.table.count, whole.rows.count
-        self.row_unit = np.append(whole.rows.unit, cost_unit)
         self._index = [np.where(b.unknowns < 0, self.count, b.unknowns) for b in self.blocks]
         blocks = self.blocks
         self._data = [jax.tree.map(jnp.asarray, b.data) for b in blocks]
         self._values = _over_blocks(blocks, lambda b, *x: b.values(*x))
         self._first = _over_blocks(blocks, lambda b, *x: b.jacobian(*x))
         self._second = _over_blocks(blocks, lambda b, *x: b.hessian(*x))
+        first = [self._first(self.params, self._data, self._local(x)) for x in draws]
+        self._set_row_units(first)
+        self.row_unit = np.append(whole.rows.unit, cost_unit)
         rows = [b.rows.reshape(-1) for b in blocks]
         self._target = np.concatenate(rows) if rows else np.zeros(0, int)
         linear = whole.linear
         self._linear = linear[0], linear[1], linear[2] / self.row_unit[linear[0]]
-        self.jacobian_entries, self.hessian_entries = self._patterns(draws)
+        self.jacobian_entries, self.hessian_entries = self._patterns(draws, first)
         # rows of fixed unknowns alone would make the solver's matrices singular
         table, entries = whole.builder.table, self.jacobian_entries
         free = table.lower < table.upper
@@ -125,19 +127,33 @@ class Program:
         padded = np.append(x, 0.0)
         return [padded[index] for index in self._index]
 
-    def _patterns(self, draws: np.ndarray) -> tuple[Entries, Entries]:
+    def _set_row_units(self, jacobians: list[list[jax.Array]]) -> None:
+        """Set units that are not known: each kind of row gets the size of its gradient."""
+        unit = np.append(self.unit, 0.0)
+        largest = np.zeros(self.cost_row + 2)
+        for dense in jacobians:
+            for block, index, matrix in zip(self.blocks, self._index, dense, strict=True):
+                size = np.max(np.abs(matrix) * unit[index][:, None], axis=2, initial=0.0)
+                np.maximum.at(largest, block.rows, size)
+        table = self.whole.rows
+        for segment in table.segments:
+            own = slice(segment.start, segment.stop)
+            if np.isnan(table.unit[own]).any():
+                table.unit[own] = np.max(largest[own], initial=0.0) or 1.0
+
+    def _patterns(self, draws: np.ndarray, jacobians) -> tuple[Entries, Entries]:
         """Return the entries of the Jacobian and of the lower half of the Hessian."""
         random = np.random.default_rng(1)
         first = [np.zeros(b.rows.shape + b.unknowns.shape[1:], bool) for b in self.blocks]
         second = [np.zeros(b.unknowns.shape + b.unknowns.shape[1:], bool) for b in self.blocks]
         unit = np.append(self.unit, 1.0)
         units = [unit[index] for index in self._index]
-        for x in draws:
+        for x, jacobian in zip(draws, jacobians, strict=True):
             z = self._local(x)
             multipliers = [
                 np.where(b.rows < 0, 0, random.normal(size=b.rows.shape)) for b in self.blocks
             ]
-            for used, dense, u in zip(first, self._first(self.params, self._data, z), units):
+            for used, dense, u in zip(first, jacobian, units):
                 used |= _not_round_off(np.asarray(dense) * u[:, None], axes=2)
             dense_hessians = self._second(self.params, self._data, z, multipliers)
             for used, dense, u in zip(second, dense_hessians, units):

@@ -36,7 +36,8 @@ class Segment:
 class Table:
     """Entries with bounds, units and names, appended segment by segment.
 
-    lower, upper: bounds, in SI units and radians. unit: by which the solver divides an entry.
+    lower, upper: bounds, in SI units and radians. unit: by which the solver divides an entry; NaN:
+        not known yet.
     """
 
     def __init__(self) -> None:

@@ -117,6 +117,7 @@ class UserRows:
                     name,
                     phase.name,
                     (lanes, len(stages), *shape.numbers),
+                    unit=np.nan,
                     lower=bounds[0],
                     upper=bounds[1],
                     entries=[str(k) for k in range(shape.numbers[0])] * (shape.numbers[0] > 1),
