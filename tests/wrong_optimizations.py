@@ -32,10 +32,10 @@ def problem(controls=None, chain=None, scheme=None, **of_phase):
     )
 
 
-def check(start=0.0, end=1.0, of=None, **of_phase):
+def check(first=0.0, last=1.0, of=None, **of_phase):
     """Check a problem at a straight line."""
     of = problem(**of_phase) if of is None else of
-    return of.check(of.guess([{"x": start}, {"x": end}]))
+    return of.check(of.guess([{"x": first}, {"x": last}]))
 
 
 @functools.cache
@@ -70,8 +70,8 @@ CASES = {
         controls=optimize.Torques(np.ones(3))
     ),
     "Radau: got": lambda s: optimize.Radau(9),
-    "at the guess ... is": lambda s: check(end=-1.0, of=fixed_problem()),
-    "at the guess the derivative": lambda s: check(end=0.0, of=fixed_problem()),
+    "at the guess ... is": lambda s: check(last=-1.0, of=fixed_problem()),
+    "at the guess the derivative": lambda s: check(last=0.0, of=fixed_problem()),
     "backend: got": lambda s: optimize.Ipopt(backend="snopt"),
     "between: ... has": lambda s: optimize.between("x", 1, 0),
     "between: of=": lambda s: check(bounds=[optimize.between("x", 0, 1, of="torque")]),

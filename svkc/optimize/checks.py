@@ -56,14 +56,14 @@ def check_finite(program: Program, x: np.ndarray) -> None:
         row = int(np.argmin(np.isfinite(values)))
         raise ValueError(f"at the guess {label(row)} is {values[row]}")
     entries = program.jacobian(x)
+    if not np.isfinite(entries).all():
+        row = int(program.jacobian_entries.row[np.argmin(np.isfinite(entries))])
+        raise ValueError(f"at the guess the derivative of {label(row)} is not finite")
     fixed = np.setdiff1d(np.arange(program.cost_row), program.kept)
     violation = program.violation(x)[fixed]
     if np.any(violation > _FIXED_VIOLATION):
         row = int(fixed[np.argmax(violation)])
         raise ValueError(f"{label(row)} depends on fixed unknowns alone, which do not satisfy it")
-    if not np.isfinite(entries).all():
-        row = int(program.jacobian_entries.row[np.argmin(np.isfinite(entries))])
-        raise ValueError(f"at the guess the derivative of {label(row)} is not finite")
 
 
 def check(program: Program, x: np.ndarray) -> Check:

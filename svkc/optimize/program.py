@@ -47,8 +47,10 @@ class Entries:
 
 def _not_round_off(dense: np.ndarray, axes) -> np.ndarray:
     """Return the mask of entries above round-off of the largest along some axes."""
-    size = np.abs(dense)
-    return size > _ROUND_OFF * np.max(size, axis=axes, keepdims=True, initial=0.0)
+    # what is not finite at a random point is an entry
+    finite = np.isfinite(dense)
+    size = np.where(finite, np.abs(dense), 0)
+    return ~finite | (size > _ROUND_OFF * np.max(size, axis=axes, keepdims=True, initial=0.0))
 
 
 def _over_blocks(blocks: Sequence[Block], call: Callable) -> Callable:
@@ -134,7 +136,7 @@ class Program:
         for dense in jacobians:
             for block, index, matrix in zip(self.blocks, self._index, dense, strict=True):
                 size = np.max(np.abs(matrix) * unit[index][:, None], axis=2, initial=0.0)
-                np.maximum.at(largest, block.rows, size)
+                np.maximum.at(largest, block.rows, np.where(np.isfinite(size), size, 0))
         table = self.whole.rows
         for segment in table.segments:
             own = slice(segment.start, segment.stop)
