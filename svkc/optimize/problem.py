@@ -163,6 +163,23 @@ class Problem:
             raise_on_failure(program, result)
         return solution(self, program, result)
 
+    def multistart(
+        self,
+        guesses: Sequence[Guess | Solution],
+        *,
+        solver: AbstractSolver | None = None,
+        progress_meter: Any = None,
+    ) -> list[Solution]:
+        """Return the solutions from several guesses, one after another in one compiled program.
+
+        Those that failed are among them: `result` says how each ended.
+
+        guesses: as of `solve`.
+        solver, progress_meter: as in `solve`.
+        """
+        options = {"solver": solver, "progress_meter": progress_meter, "throw": False}
+        return [self.solve(guess, **options) for guess in guesses]
+
     def start(self, guess: Guess | Solution) -> tuple[Program, SolverResult]:
         """Return the compiled problem, and a guess in the solver's units."""
         motion = as_guess(guess, self)

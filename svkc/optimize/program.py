@@ -7,6 +7,7 @@ points; only these are handed to the solver. Unknowns and rows are divided by th
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -208,6 +209,26 @@ class Program:
         local = [scaled[np.where(b.rows < 0, len(scaled) - 1, b.rows)] for b in self.blocks]
         dense = self._second(self.params, self._data, self._local(x * self.unit), local)
         return self.hessian_entries.gather(dense)
+
+    def parameter_gradient(self, x: np.ndarray, multipliers: np.ndarray) -> Params:
+        """Return the derivatives of the Lagrangian by the parameters, in the cost's unit."""
+        scaled = np.append(multipliers / self.row_unit[:-1], [1 / self.row_unit[-1], 0.0])
+        local = [scaled[np.where(b.rows < 0, len(scaled) - 1, b.rows)] for b in self.blocks]
+        z = self._local(x * self.unit)
+
+        @eqx.filter_jit
+        def gradient(params, data, z, local):
+            arrays, rest = eqx.partition(params, eqx.is_inexact_array)
+
+            def lagrangian(arrays):
+                own = eqx.combine(arrays, rest)
+                values = (b.values(own, d, x) for b, d, x in zip(self.blocks, data, z))
+                return sum(jnp.sum(v * m) for v, m in zip(values, local))
+
+            return jax.grad(lagrangian)(arrays)
+
+        result = gradient(self.params, self._data, z, local)
+        return jax.tree.map(lambda x: x * self.row_unit[-1], result)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return lower and upper bounds of unknowns and of rows, in the solver's units."""

@@ -7,14 +7,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from svkc.model.chain import State
+from svkc.model.chain import State, Structure
 from svkc.model.names import link_index, unknown_name
 from svkc.model.tables import Block, Printed, Table, as_text, number
+from svkc.model.validation import positive_scalar
+from svkc.optimize.certificate import SolutionReport, report
 from svkc.optimize.encoding import decode
 from svkc.optimize.guesses import PhaseMotion
 from svkc.optimize.ipopt import SolverResult
 from svkc.optimize.points import full_state
 from svkc.optimize.program import Program
+from svkc.optimize.replay import replay
+from svkc.simulation.trajectory import Trajectory
 from svkc.tree.spatial import quat_matrix
 
 if TYPE_CHECKING:  # as equinox annotates the metaclass of its enumerations
@@ -62,6 +66,8 @@ class Solution(Printed):
     multipliers: of rows and bounds.
     iterations: of the solver. seconds: its wall time, and that part of it in functions.
     result: how the optimization ended.
+    structures: of the phases.
+    cost_error: how far the cost moved between the last two meshes of `refined`; NaN before.
     problem: of which this is a solution.
     """
 
@@ -75,6 +81,8 @@ class Solution(Printed):
     iterations: Any
     seconds: Any
     result: OUTCOME
+    structures: tuple[Structure, ...]
+    cost_error: Any
     problem: Any = eqx.field(static=True)
 
     def _blocks(self) -> list[Block]:
@@ -114,6 +122,52 @@ class Solution(Printed):
             connected = tuple(n for phase in self.problem.phases for n in phase.connected)
             raise unknown_name("virtual link", link, connected)
         return np.concatenate(parts)
+
+    def report(self) -> SolutionReport:
+        """Return the certificate: how far every interval is from a motion.
+
+        All intervals are simulated in one batched run, each from its own first node.
+        """
+        return report(self.problem, self.structures, self.motion)
+
+    def refined(
+        self, tol: float = 1e-3, *, rounds: int = 4, solver: Any = None, progress_meter: Any = None
+    ) -> "Solution":
+        """Return the motion solved again on finer meshes, until every interval is a motion.
+
+        Phases with defects above the tolerance get more intervals, those far below it fewer. Each
+        mesh starts from the solution before. `cost_error` of the result says how far the cost moved
+        between the last two meshes.
+
+        tol: largest defect of a position (rad, m); of a velocity it is ten times this number.
+        rounds: largest number of meshes.
+        solver, progress_meter: as in `Problem.solve`.
+        """
+        # refinement imports this module, so the import is deferred
+        from svkc.optimize.refinement import refine
+
+        return refine(self, positive_scalar("tol", tol), rounds, solver, progress_meter)
+
+    def trajectory(self, ts: Any = None, *, rate: float = 0.0, **options: Any) -> Trajectory:
+        """Return the motion as a run of `svkc.simulate`, with events between the phases.
+
+        Open loop an unstable phase leaves the plan: with a rate, torques of springs and dampers
+        towards the plan are added in the driven joints.
+
+        ts: save times (s); None: 101 times over the motion.
+        rate: of the feedback (1/s); zero: the plan's torques alone.
+        options: keyword arguments of `svkc.simulate`.
+        """
+        return replay(self, rate, ts, options)
+
+    def gradient(self) -> Any:
+        """Return the derivatives of the optimal cost by the chain's floats and by args.
+
+        A pair (chain, args) with the derivatives as leaves, None where there are none. They are
+        those of the Lagrangian (envelope theorem), valid while the active bounds do not change.
+        """
+        program, start = self.problem.start(self)
+        return program.parameter_gradient(start.x, self.multipliers.rows)
 
     def impulse(self, phase: str, link: str | None = None) -> Any:
         """Return the impulse (N s) [3] of a virtual link in the impact at the start of a phase.
@@ -160,6 +214,8 @@ def solution(problem: Any, program: Program, result: SolverResult) -> Solution:
         iterations=np.asarray(result.iterations),
         seconds=np.array([result.seconds, result.functions]),
         result=OUTCOME._name_to_item[result.status],
+        structures=tuple(s.structure for s in whole.structures),
+        cost_error=np.asarray(np.nan),
         problem=problem,
     )
 
