@@ -1,6 +1,7 @@
 """The certificate of a solution: every interval simulated from its own first node."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -42,7 +43,10 @@ class SolutionReport:
 
     def largest(self) -> tuple[float, float]:
         """Return the largest defects in position and in velocity over all intervals."""
-        return tuple(float(max(np.max(x) for x in of)) for of in (self.position, self.velocity))
+        position, velocity = (
+            float(max(np.max(x) for x in of)) for of in (self.position, self.velocity)
+        )
+        return position, velocity
 
     def __str__(self) -> str:
         header = ("phase", "position\n(rad, m)", "velocity\n(rad/s, m/s)", "interval", "worst of")
@@ -94,7 +98,7 @@ def control_table(controls: Any, scheme: Any) -> np.ndarray:
     return np.stack([np.tensordot(inverse, D, 1) for D in controls.coefficients(scheme, fractions)])
 
 
-def _lanes(problem: Any, structures: list[Structure], motion: tuple[PhaseMotion, ...]) -> tuple:
+def _lanes(problem: Any, structures: Sequence[Structure], motion: tuple[PhaseMotion, ...]) -> tuple:
     """Return first states, ends (q, v) and torques of all intervals."""
     chain, starts, parts = problem.chain, 0.0, []
     for m, structure in zip(motion, structures, strict=True):
@@ -135,7 +139,7 @@ def _simulate_all(chain: Chain, states: State, ends, torques: _Torques, control)
     return jax.vmap(run)(states, ends, torques)
 
 
-def report(problem: Any, structures: list[Structure], motion) -> SolutionReport:
+def report(problem: Any, structures: Sequence[Structure], motion) -> SolutionReport:
     """Return the certificate of a motion."""
     chain = problem.chain
     table = control_table(problem.controls, problem.scheme)

@@ -188,7 +188,7 @@ class Ipopt(AbstractSolver):
         if self.backend not in (None, "cyipopt", "casadi"):
             raise ValueError(f"backend: got {self.backend!r}, expected 'cyipopt' or 'casadi'")
 
-    def _options(self, warm: bool, stages: int) -> dict[str, Any]:
+    def _options(self, warm: bool) -> dict[str, Any]:
         options: dict[str, Any] = {
             "max_iter": int(self.max_iterations),
             "max_wall_time": float(self.max_seconds),
@@ -197,8 +197,8 @@ class Ipopt(AbstractSolver):
             "constr_viol_tol": 1e-7,
             "print_level": 0,
             "sb": "yes",
-            # on meshes of three stages the monotone strategy got stuck
-            "mu_strategy": "monotone" if stages < 3 else "adaptive",
+            # the monotone strategy got stuck in the backflip, and on meshes of three stages
+            "mu_strategy": "adaptive",
             "mumps_mem_percent": 200,
             "honor_original_bounds": "yes",
             # NaN in a matrix would crash MUMPS
@@ -226,9 +226,7 @@ class Ipopt(AbstractSolver):
         callbacks = Callbacks(program, progress, int(self.max_iterations))
         run = _by_casadi if backend == "casadi" else _by_cyipopt
         begin = time.perf_counter()
-        x, multipliers, lower, upper, status = run(
-            callbacks, self._options(warm, program.whole.scheme.stages), start
-        )
+        x, multipliers, lower, upper, status = run(callbacks, self._options(warm), start)
         seconds = time.perf_counter() - begin
         if isinstance(callbacks.exception, KeyboardInterrupt):
             status = "interrupted"

@@ -108,7 +108,7 @@ class Phase:
     """
 
     name: str
-    connected: Names = ()
+    connected: Any = ()
     duration: Any = (0.1, 1.0)
     intervals: Any = 20
     bounds: Sequence[Any] = ()
