@@ -13,16 +13,8 @@ def _sparsity(casadi: Any, shape: tuple[int, int], row: np.ndarray, column: np.n
     return pattern, order
 
 
-def nlp_functions(casadi: Any, callbacks: Any) -> dict[str, Any]:
-    """Return the callbacks `nlp`, `grad_f`, `jac_g` and `hess_lag` for `nlpsol`."""
-    program = callbacks.program
-    n, m = program.count, len(program.kept)
-    dense = casadi.Sparsity.dense
-    x, p, f, g = dense(n), dense(0), dense(1), dense(m)
-    jac, jac_order = _sparsity(casadi, (m, n), *callbacks.jacobianstructure())
-    row, column = callbacks.hessianstructure()
-    # CasADi asks for the upper half
-    hess, hess_order = _sparsity(casadi, (n, n), column, row)
+def _callback_class(casadi: Any) -> Any:
+    """Return the class of functions that CasADi calls."""
 
     class Values(casadi.Callback):
         """A function of dense inputs that returns the entries of its outputs."""
@@ -60,6 +52,21 @@ def nlp_functions(casadi: Any, callbacks: Any) -> dict[str, Any]:
                     np.frombuffer(result, float)[:] = value
             return 0
 
+    return Values
+
+
+def nlp_functions(casadi: Any, callbacks: Any) -> dict[str, Any]:
+    """Return the callbacks `nlp`, `grad_f`, `jac_g` and `hess_lag` for `nlpsol`."""
+    program = callbacks.program
+    n, m = program.count, len(program.kept)
+    dense = casadi.Sparsity.dense
+    x, p, f, g = dense(n), dense(0), dense(1), dense(m)
+    jac, jac_order = _sparsity(casadi, (m, n), *callbacks.jacobianstructure())
+    row, column = callbacks.hessianstructure()
+    # CasADi asks for the upper half
+    hess, hess_order = _sparsity(casadi, (n, n), column, row)
+
+    Values = _callback_class(casadi)
     c = callbacks
     point = {"x": x, "p": p}
     return {

@@ -50,7 +50,7 @@ class Check:
 
 def check_finite(program: Program, x: np.ndarray) -> None:
     """Raise ValueError if a row, the cost or a derivative is not finite, by its name."""
-    values, table = program.rows(x), program.whole.rows
+    values, table = program.rows(x), program.transcription.rows
     label = lambda row: "the cost" if row == program.cost_row else table.label(row)
     if not np.isfinite(values).all():
         row = int(np.argmin(np.isfinite(values)))
@@ -89,7 +89,7 @@ def check(program: Program, x: np.ndarray) -> Check:
     differences = (program.rows(ends[0]) - program.rows(ends[1])) / (2 * step)
     of_gradients = (gradient(ends[0]) - gradient(ends[1])) / (2 * step)
     error = lambda exact, other: float(np.max(np.abs(exact - other)) / np.max(np.abs(exact)))
-    violation, table = program.violation(x), program.whole.rows
+    violation, table = program.violation(x), program.transcription.rows
     worst = [i for i in np.argsort(-violation)[:_ROWS_SHOWN] if violation[i] > 0]
     return Check(
         unknowns=program.count,
@@ -99,6 +99,6 @@ def check(program: Program, x: np.ndarray) -> Check:
         derivative_error=error(along(program.jacobian(x)), differences),
         hessian_error=error(product, of_gradients),
         cost=float(program.rows(x)[-1] * program.row_unit[-1]),
-        units=str(program.whole.builder.units),
+        units=str(program.transcription.builder.units),
         violated=tuple((table.label(i), float(violation[i] * table.unit[i])) for i in worst),
     )

@@ -52,10 +52,8 @@ class AbstractControls(abc.ABC):
         """Return the names of the numbers of a block."""
 
     def driven(self, chain: Chain) -> np.ndarray:
-        """Return the mask [nv] of the coordinates with torques."""
-        driven = np.zeros(chain.nv, bool)
-        driven[_columns(chain, getattr(self, "joints", ()))[0]] = True
-        return driven
+        """Return the mask [nv] of the coordinates that are known to have torques."""
+        return np.zeros(chain.nv, bool)
 
     @abc.abstractmethod
     def torques(
@@ -93,17 +91,17 @@ def _bounds(name: str, limit: Any, joints: list[str]) -> np.ndarray:
 def _driven_joints(chain: Chain, joints: Names | None, *limits: Any) -> list[str]:
     """Return the names of the driven joints: those named, those with limits, or the actuated."""
     if joints is not None:
-        listed_joints = list(names("joints", joints))
+        driven_joints = list(names("joints", joints))
     elif named := [limit for limit in limits if isinstance(limit, Mapping)]:
-        listed_joints = list(named[0])
+        driven_joints = list(named[0])
     else:
         driven = np.asarray(chain.actuated)
-        listed_joints = [j for j in chain.joint_names if np.all(driven[chain.v_index(j)])]
-    for joint in listed_joints:
+        driven_joints = [j for j in chain.joint_names if np.all(driven[chain.v_index(j)])]
+    for joint in driven_joints:
         at = chain.v_index(joint)
         if at.stop > chain.nv:
             raise ValueError(f"controls: {joint!r} is a virtual link; only joints of the tree are")
-    return listed_joints
+    return driven_joints
 
 
 def _columns(chain: Chain, joints: Any) -> tuple[np.ndarray, list[str]]:
@@ -112,8 +110,30 @@ def _columns(chain: Chain, joints: Any) -> tuple[np.ndarray, list[str]]:
     return np.array(at, int), [chain.dof_names[i] for i in at]
 
 
+class _JointTorques(AbstractControls):
+    """Controls whose first block is the torques of driven joints."""
+
+    joints: Any = None
+
+    def _coordinates(self, chain: Chain) -> tuple[np.ndarray, list[str]]:
+        return _columns(chain, self.joints)
+
+    def driven(self, chain: Chain) -> np.ndarray:
+        return np.isin(np.arange(chain.nv), self._coordinates(chain)[0])
+
+    def count(self, chain: Chain) -> int:
+        return len(self._coordinates(chain)[0])
+
+    def names(self, chain: Chain) -> list[str]:
+        return self._coordinates(chain)[1]
+
+    def torques(self, chain: Chain, t, state: State, blocks, args: Any) -> Float[Array, " dofs"]:
+        at = self._coordinates(chain)[0]
+        return jnp.zeros(chain.dofs, blocks.dtype).at[at].set(blocks[0])
+
+
 @dataclasses.dataclass(frozen=True)
-class Torques(AbstractControls):
+class Torques(_JointTorques):
     """Joint torques: a polynomial through one value at each stage, or constant over an interval.
 
     limit: largest torque of each joint (N m, N): a number, an array over the driven coordinates, a
@@ -138,25 +158,12 @@ class Torques(AbstractControls):
         D0 = (constant if self.constant else scheme.interpolation(fractions))[:, None]
         return D0, np.zeros_like(D0)
 
-    def _coordinates(self, chain: Chain) -> tuple[np.ndarray, list[str]]:
-        return _columns(chain, self.joints)
-
-    def count(self, chain: Chain) -> int:
-        return len(self._coordinates(chain)[0])
-
-    def names(self, chain: Chain) -> list[str]:
-        return self._coordinates(chain)[1]
-
-    def torques(self, chain: Chain, t, state: State, blocks, args: Any) -> Float[Array, " dofs"]:
-        at = self._coordinates(chain)[0]
-        return jnp.zeros(chain.dofs, blocks.dtype).at[at].set(blocks[0])
-
     def limits(self, chain: Chain) -> list[np.ndarray]:
         return [_bounds("limit", self.limit, self.names(chain))]
 
 
 @dataclasses.dataclass(frozen=True)
-class TorqueRates(AbstractControls):
+class TorqueRates(_JointTorques):
     """Torque rates, constant over an interval; torques are states.
 
     limit: largest rate of each joint's torque (N m/s, N/s), in the forms of `Torques.limit`.
@@ -181,19 +188,6 @@ class TorqueRates(AbstractControls):
         D0[:, 0, 0] = D0[:, 1, 1] = 1
         D1[:, 0, 1] = fractions
         return D0, D1
-
-    def _coordinates(self, chain: Chain) -> tuple[np.ndarray, list[str]]:
-        return _columns(chain, self.joints)
-
-    def count(self, chain: Chain) -> int:
-        return len(self._coordinates(chain)[0])
-
-    def names(self, chain: Chain) -> list[str]:
-        return self._coordinates(chain)[1]
-
-    def torques(self, chain: Chain, t, state: State, blocks, args: Any) -> Float[Array, " dofs"]:
-        at = self._coordinates(chain)[0]
-        return jnp.zeros(chain.dofs, blocks.dtype).at[at].set(blocks[0])
 
     def limits(self, chain: Chain) -> list[np.ndarray]:
         over = self.names(chain)

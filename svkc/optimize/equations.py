@@ -77,7 +77,14 @@ def links_force(
 
 
 def equations_of_motion(
-    chain: Chain, table: LinkRows, q: Float[Array, " nq"], v: Float[Array, " nv"], vdot, tau, f
+    chain: Chain,
+    table: LinkRows,
+    q: Float[Array, " nq"],
+    v: Float[Array, " nv"],
+    vdot: Float[Array, " nv"],
+    *,
+    tau: Float[Array, " dofs"],
+    f: Float[Array, " rows"],
 ) -> tuple[Float[Array, " nv"], Float[Array, " rows"]]:
     """Return the residual of the equations of motion, and the links' accelerations J vdot + Jdot v.
 
@@ -110,7 +117,7 @@ def stage_equations(model: Model, params: Params, data: IntervalData, weight, y)
     state = full_state(chain, data.structure, q, v) if needs_state else None
     tau = model.controls.torques(chain, t, state, blocks, args)
     f = jnp.where(data.active, f, 0)
-    force, links = equations_of_motion(chain, model.rows, q, v, vdot, tau, f)
+    force, links = equations_of_motion(chain, model.rows, q, v, vdot, tau=tau, f=f)
     return jnp.concatenate([force, links])
 
 

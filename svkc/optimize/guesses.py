@@ -143,7 +143,7 @@ def static_forces(
 
     def balance(q):
         tau, f = jnp.zeros(chain.dofs), jnp.zeros(len(rows))
-        weight = equations_of_motion(chain, table, q, zero, zero, tau, f)[0]
+        weight = equations_of_motion(chain, table, q, zero, zero, tau=tau, f=f)[0]
         return weight, jax.jacfwd(lambda v: rates_at(chain, q, v, table))(zero)
 
     weight, J = (np.asarray(x) for x in eager_jit(jax.vmap(balance))(jnp.asarray(q)))

@@ -43,7 +43,7 @@ def between(joint: Names, lower: Scalar, upper: Scalar, *, of: str = "position")
         raise ValueError(
             f"between: {joint!r} has the bounds {lower} to {upper}, which no value has"
         )
-    return Between(names("joint", joint), lower, upper, of)
+    return Between(joint=names("joint", joint), lower=lower, upper=upper, of=of)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,7 +65,7 @@ def constraint(
     function: a function of a `Point` that returns a number or an array.
     lower, upper: bounds of its values; equal bounds make an equation.
     """
-    return Constraint(name, function, lower, upper)
+    return Constraint(name=name, function=function, lower=lower, upper=upper)
 
 
 def as_constraint(where: str, index: int, entry: Any) -> Any:
@@ -81,7 +81,8 @@ def as_constraint(where: str, index: int, entry: Any) -> Any:
             " optimize.constraint(...) or optimize.between(...)"
         )
     name = getattr(entry, "__name__", "<lambda>")
-    return Constraint(f"{where}[{index}]" if name == "<lambda>" else name, entry, lower, upper)
+    name = f"{where}[{index}]" if name == "<lambda>" else name
+    return Constraint(name=name, function=entry, lower=lower, upper=upper)
 
 
 @dataclasses.dataclass(frozen=True)

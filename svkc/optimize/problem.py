@@ -21,6 +21,7 @@ from svkc.optimize.lift import Layout
 from svkc.optimize.loop_rows import LinkRows
 from svkc.optimize.phases import Phase, as_constraint
 from svkc.optimize.program import Program
+from svkc.optimize.refinement import is_fine, new_counts
 from svkc.optimize.resampling import as_guess
 from svkc.optimize.schemes import Radau
 from svkc.optimize.solution import Solution, raise_on_failure, solution
@@ -163,6 +164,43 @@ class Problem:
             raise_on_failure(program, result)
         return solution(self, program, result)
 
+    def with_intervals(self, counts: Sequence[int]) -> "Problem":
+        """Return the problem with other numbers of intervals.
+
+        counts: for each phase.
+        """
+        phases = [
+            dataclasses.replace(phase, intervals=n)
+            for phase, n in zip(self.phases, counts, strict=True)
+        ]
+        return Problem(
+            self.chain,
+            phases,
+            controls=self.controls,
+            running=self.running,
+            final=self.final,
+            scheme=self.scheme,
+            args=self.args,
+            units=self.units,
+            project=self.project,
+        )
+
+    def refine(self, solution: Solution, tol: float, rounds: int, **options: Any) -> Solution:
+        """Return the solution that `Solution.refined` describes.
+
+        solution: of this problem. tol, rounds: as there. options: of `solve`.
+        """
+        order = 2 * self.scheme.stages - 1
+        for _ in range(rounds):
+            report = solution.report()
+            if is_fine(report, tol):
+                break
+            problem = self.with_intervals(new_counts(report, order, tol))
+            finer = problem.solve(solution, **options)
+            change = abs(float(finer.cost) - float(solution.cost))
+            solution = dataclasses.replace(finer, cost_error=np.asarray(change))
+        return solution
+
     def multistart(
         self,
         guesses: Sequence[Guess | Solution],
@@ -185,7 +223,7 @@ class Problem:
         motion = as_guess(guess, self)
         program = self.program(motion)
         program.set_references([m.q for m in motion.phases])
-        x = encode(program.whole, motion) / program.unit
+        x = encode(program.transcription, motion) / program.unit
         rows, count = np.zeros(program.cost_row), np.zeros(program.count)
         multipliers = guess.multipliers if isinstance(guess, Solution) else None
         if multipliers is not None and len(multipliers.rows) == len(rows):
@@ -226,7 +264,7 @@ class Problem:
         builder = UnknownsBuilder(
             chain, controls, rows, scheme=self.scheme, units=self.units, project=self.project
         )
-        whole = Transcription(
+        transcription = Transcription(
             builder,
             self.phases,
             Model(layout, LinkRows.of(chain, rows), controls),
@@ -236,26 +274,26 @@ class Problem:
         )
         builder.table.freeze()
         params = Params(chain, self.args)
-        draws = self._draws(builder.table, whole)
-        users = UserRows(whole, params, draws)
+        draws = self._draws(builder.table, transcription)
+        users = UserRows(transcription, params, draws)
         last = len(self.phases) - 1
         for i, phase in enumerate(self.phases):
             running = [f for f in (self.running, phase.running) if f is not None]
             final = [f for f in (self.final if i == last else None, phase.final) if f is not None]
             users.add_phase(i, running, final)
-        whole.rows.freeze()
-        users.set_cost_row(whole.rows.count)
-        program = Program(whole, params, draws, self.units.cost or 1.0)
+        transcription.rows.freeze()
+        users.set_cost_row(transcription.rows.count)
+        program = Program(transcription, params, draws, self.units.cost or 1.0)
         if self.units.cost is None:
             costs = [abs(program.rows(x / program.unit)[-1]) for x in draws]
             program.set_cost_unit(max(float(np.median(costs)) / _COST_AT_DRAWS, 1e-12))
         return program
 
-    def _draws(self, table, whole: Transcription) -> np.ndarray:
+    def _draws(self, table, transcription: Transcription) -> np.ndarray:
         """Return random points in SI units, the durations near the middle of their bounds."""
         random = np.random.default_rng(0)
         draws = random.normal(size=(_DRAWS, table.count)) * table.unit
-        for phase, indices in zip(self.phases, whole.phases):
+        for phase, indices in zip(self.phases, transcription.phases):
             middle = sum(phase.duration) / 2
             draws[:, indices.duration] = middle * random.uniform(0.8, 1.2, _DRAWS)
         fixed = table.lower == table.upper

@@ -88,10 +88,12 @@ class Program:
     patterns are found. cost_unit: by which the cost is divided.
     """
 
-    def __init__(self, whole: Transcription, params: Params, draws: np.ndarray, cost_unit: float):
-        self.whole, self.params, self.blocks = whole, params, whole.blocks
-        self.unit = whole.builder.table.unit
-        self.count, self.cost_row = whole.builder.table.count, whole.rows.count
+    def __init__(
+        self, transcription: Transcription, params: Params, draws: np.ndarray, cost_unit: float
+    ):
+        self.transcription, self.params, self.blocks = transcription, params, transcription.blocks
+        self.unit = transcription.builder.table.unit
+        self.count, self.cost_row = transcription.builder.table.count, transcription.rows.count
         self._index = [np.where(b.unknowns < 0, self.count, b.unknowns) for b in self.blocks]
         blocks = self.blocks
         self._data = [jax.tree.map(jnp.asarray, b.data) for b in blocks]
@@ -100,14 +102,14 @@ class Program:
         self._second = _over_blocks(blocks, lambda b, *x: b.hessian(*x))
         first = [self._first(self.params, self._data, self._local(x)) for x in draws]
         self._set_row_units(first)
-        self.row_unit = np.append(whole.rows.unit, cost_unit)
+        self.row_unit = np.append(transcription.rows.unit, cost_unit)
         rows = [b.rows.reshape(-1) for b in blocks]
         self._target = np.concatenate(rows) if rows else np.zeros(0, int)
-        linear = whole.linear
+        linear = transcription.linear
         self._linear = linear[0], linear[1], linear[2] / self.row_unit[linear[0]]
         self.jacobian_entries, self.hessian_entries = self._patterns(draws, first)
         # rows of fixed unknowns alone would make the solver's matrices singular
-        table, entries = whole.builder.table, self.jacobian_entries
+        table, entries = transcription.builder.table, self.jacobian_entries
         free = table.lower < table.upper
         self.kept = np.intersect1d(entries.row[free[entries.column]], np.arange(self.cost_row))
 
@@ -121,8 +123,8 @@ class Program:
 
     def set_references(self, references: Sequence[np.ndarray]) -> None:
         """Set the origins of the charts: configurations [n + 1 nq] of each phase."""
-        if len(quaternion_starts(self.whole.builder.chain)[0]):
-            self.whole.set_references(references)
+        if len(quaternion_starts(self.transcription.builder.chain)[0]):
+            self.transcription.set_references(references)
             self._data = [jax.tree.map(jnp.asarray, b.data) for b in self.blocks]
 
     def _local(self, x: np.ndarray) -> list[np.ndarray]:
@@ -138,7 +140,7 @@ class Program:
             for block, index, matrix in zip(self.blocks, self._index, dense, strict=True):
                 size = np.max(np.abs(matrix) * unit[index][:, None], axis=2, initial=0.0)
                 np.maximum.at(largest, block.rows, np.where(np.isfinite(size), size, 0))
-        table = self.whole.rows
+        table = self.transcription.rows
         for segment in table.segments:
             own = slice(segment.start, segment.stop)
             if np.isnan(table.unit[own]).any():
@@ -201,7 +203,7 @@ class Program:
     def jacobian(self, x: np.ndarray) -> np.ndarray:
         """Return the values of `jacobian_entries`, the cost's gradient among them."""
         dense = self._first(self.params, self._data, self._local(x * self.unit))
-        return self.jacobian_entries.gather([*dense, self.whole.linear[2]])
+        return self.jacobian_entries.gather([*dense, self.transcription.linear[2]])
 
     def hessian(self, x: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
         """Return the values of `hessian_entries` for multipliers of all rows, the cost's last."""
@@ -232,7 +234,7 @@ class Program:
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return lower and upper bounds of unknowns and of rows, in the solver's units."""
-        table, rows = self.whole.builder.table, self.whole.rows
+        table, rows = self.transcription.builder.table, self.transcription.rows
         return (
             table.lower / self.unit,
             table.upper / self.unit,

@@ -57,10 +57,10 @@ def plan_of(solution: Any, rate: float) -> Plan:
 def _planned(chain: Chain, q, v, step, s) -> tuple[Any, Any]:
     """Return q and v of the tree at a fraction s of an interval, by Hermite's cubic polynomial."""
     start = tree_configuration(chain, q[0])
-    whole = difference(chain, start, tree_configuration(chain, q[1]))[: chain.nv]
-    moved = (3 * s**2 - 2 * s**3) * whole
+    step_to = difference(chain, start, tree_configuration(chain, q[1]))[: chain.nv]
+    moved = (3 * s**2 - 2 * s**3) * step_to
     moved = moved + step * ((s - 2 * s**2 + s**3) * v[0] + (s**3 - s**2) * v[1])
-    rate = (6 * s - 6 * s**2) * whole / step
+    rate = (6 * s - 6 * s**2) * step_to / step
     rate = rate + (1 - 4 * s + 3 * s**2) * v[0] + (3 * s**2 - 2 * s) * v[1]
     return integrate(chain, start, tree_velocity(chain, moved))[: chain.nq], rate
 

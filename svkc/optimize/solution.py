@@ -143,10 +143,8 @@ class Solution(Printed):
         rounds: largest number of meshes.
         solver, progress_meter: as in `Problem.solve`.
         """
-        # refinement imports this module, so the import is deferred
-        from svkc.optimize.refinement import refine
-
-        return refine(self, positive_scalar("tol", tol), rounds, solver, progress_meter)
+        options = {"solver": solver, "progress_meter": progress_meter}
+        return self.problem.refine(self, positive_scalar("tol", tol), rounds, **options)
 
     def trajectory(self, ts: Any = None, *, rate: float = 0.0, **options: Any) -> Trajectory:
         """Return the motion as a run of `svkc.simulate`, with events between the phases.
@@ -195,13 +193,13 @@ class Solution(Printed):
 
 def solution(problem: Any, program: Program, result: SolverResult) -> Solution:
     """Return the solution from what a solver returned."""
-    whole, rows = program.whole, program.rows(result.x)
-    motion = decode(whole, result.x * program.unit)
+    transcription, rows = program.transcription, program.rows(result.x)
+    motion = decode(transcription, result.x * program.unit)
     ends = np.cumsum([m.duration for m in motion])
     ts = [np.linspace(end - m.duration, end, len(m.q)) for end, m in zip(ends, motion, strict=True)]
     states = [
         jax.vmap(lambda q, v, s=s: full_state(problem.chain, s.structure, q, v))(m.q, m.v)
-        for m, s in zip(motion, whole.structures, strict=True)
+        for m, s in zip(motion, transcription.structures, strict=True)
     ]
     return Solution(
         cost=rows[-1] * program.row_unit[-1],
@@ -214,7 +212,7 @@ def solution(problem: Any, program: Program, result: SolverResult) -> Solution:
         iterations=np.asarray(result.iterations),
         seconds=np.array([result.seconds, result.functions]),
         result=OUTCOME._name_to_item[result.status],
-        structures=tuple(s.structure for s in whole.structures),
+        structures=tuple(s.structure for s in transcription.structures),
         cost_error=np.asarray(np.nan),
         problem=problem,
     )
@@ -235,7 +233,7 @@ def violated_rows(program: Program, x: np.ndarray, tolerance: float = 1e-6) -> s
     """Return the names of the rows that are violated most, with the amounts in SI units."""
     violation = program.violation(x)
     order = np.argsort(-np.nan_to_num(violation, nan=np.inf))[:_ROWS_SHOWN]
-    table = program.whole.rows
+    table = program.transcription.rows
     return "; ".join(
         f"{table.label(i)}: {violation[i] * table.unit[i]:.3g}"
         for i in order

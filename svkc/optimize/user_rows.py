@@ -52,13 +52,13 @@ class UserRows:
     """
 
     def __init__(self, transcription: Transcription, params: Params, draws: np.ndarray):
-        self.whole, self.params, self.draws = transcription, params, draws
+        self.transcription, self.params, self.draws = transcription, params, draws
         # rows of the cost are known when all others are
         self.cost_places: list[tuple[StageBlock, np.ndarray]] = []
 
     def add_phase(self, i: int, running: Sequence[Callable], final: Sequence[Callable]) -> None:
         """Append the constraints and costs of a phase."""
-        phase, n, s = self.whole.specification[i], 0, self.whole.scheme.stages
+        phase, n, s = self.transcription.specification[i], 0, self.transcription.scheme.stages
         n = phase.intervals
         path, every = phase.constraints("path"), np.arange(n)
         self._add("path", i, path, running, stages=list(range(s)), intervals=every)
@@ -68,8 +68,8 @@ class UserRows:
         self._add("end", i, end, final, stages=[s - 1], intervals=every[-1:])
 
     def _point(self, i: int, params: Params, data, y, **options: Any) -> Point:
-        active = np.asarray(self.whole.structures[i].active)
-        return point_of_stage(self.whole.model, params, data, y, active, **options)
+        active = np.asarray(self.transcription.structures[i].active)
+        return point_of_stage(self.transcription.model, params, data, y, active, **options)
 
     def _reads_links(self, block: StageBlock) -> bool:
         """Return whether a block's function reads coordinates of virtual joints."""
@@ -90,7 +90,7 @@ class UserRows:
     def _shapes(self, i: int, entries: Sequence[Constraint], at_start: bool) -> list[Values]:
         """Return shapes and bounds of constraints' values, without computing them."""
         out: list[Values] = []
-        data = jax.tree.map(lambda x: x[0], self.whole.data(i))
+        data = jax.tree.map(lambda x: x[0], self.transcription.data(i))
 
         def evaluate(y):
             point = self._point(i, self.params, data, y, at_start=at_start)
@@ -98,7 +98,7 @@ class UserRows:
             out.extend(values)
             return [v.numbers for v in values]
 
-        y = jnp.zeros(self.whole.model.layout.of_stage, self.params.chain.q_load.dtype)
+        y = jnp.zeros(self.transcription.model.layout.of_stage, self.params.chain.q_load.dtype)
         shapes = jax.eval_shape(evaluate, y)
         return [Values(x.shape, v.lower, v.upper) for x, v in zip(shapes, out)]
 
@@ -106,23 +106,9 @@ class UserRows:
         """Append a block of constraints and costs at some stages of some intervals."""
         if not entries and not costs:
             return
-        whole, at_start, is_running = self.whole, stages == [-1], place == "path"
-        phase, lanes = whole.specification[i], len(intervals)
-        rows = []
-        for entry, shape in zip(entries, self._shapes(i, entries, at_start)):
-            bounds = self._bounds(entry, shape)
-            name = f"{place} {entry.name!r}" if entry.name[: len(place)] != place else entry.name
-            rows.append(
-                whole.rows.add(
-                    name,
-                    phase.name,
-                    (lanes, len(stages), *shape.numbers),
-                    unit=np.nan,
-                    lower=bounds[0],
-                    upper=bounds[1],
-                    entries=[str(k) for k in range(shape.numbers[0])] * (shape.numbers[0] > 1),
-                )
-            )
+        transcription, at_start, is_running = self.transcription, stages == [-1], place == "path"
+        phase, lanes = transcription.specification[i], len(intervals)
+        rows = self._rows_of(place, i, entries, (lanes, len(stages)))
         cost_rows = np.full((lanes, len(stages), len(costs)), -1)
 
         def function(params, data, weight, y):
@@ -132,14 +118,14 @@ class UserRows:
             name = "running" if is_running else "final"
             return jnp.concatenate([*parts, *(scale * _cost(f, name, point)[None] for f in costs)])
 
-        forces = np.full_like(whole.phases[i].forces, -1)
-        forces[:, 0] = whole.phases[i].impulse
-        unknowns = whole.phases[i].intervals(forces if at_start else None)[intervals]
-        source = lambda: jax.tree.map(lambda x: x[intervals], whole.data(i))
+        forces = np.full_like(transcription.phases[i].forces, -1)
+        forces[:, 0] = transcription.phases[i].impulse
+        unknowns = transcription.phases[i].intervals(forces if at_start else None)[intervals]
+        source = lambda: jax.tree.map(lambda x: x[intervals], transcription.data(i))
         block = StageBlock(
             function,
-            whole.model.layout,
-            polynomials(whole.scheme, whole.model.controls, stages),
+            transcription.model.layout,
+            polynomials(transcription.scheme, transcription.model.controls, stages),
             data=source(),
             index=intervals,
             count=np.full(lanes, phase.intervals),
@@ -153,7 +139,27 @@ class UserRows:
             is_cost = np.zeros((lanes, len(stages), sum(r.shape[-1] for r in rows) + len(costs)))
             is_cost[..., -len(costs) :] = 1
             self.cost_places.append((block, is_cost.reshape(lanes, -1) > 0))
-        whole.add_block(block, source)
+        transcription.add_block(block, source)
+
+    def _rows_of(self, place: str, i: int, entries, lanes: tuple[int, int]) -> list[np.ndarray]:
+        """Append the rows of constraints; return their indices [lanes stages values]."""
+        rows, phase = [], self.transcription.specification[i]
+        for entry, shape in zip(entries, self._shapes(i, entries, place == "start")):
+            lower, upper = self._bounds(entry, shape)
+            name = entry.name if entry.name.startswith(place) else f"{place} {entry.name!r}"
+            count = shape.numbers[0]
+            rows.append(
+                self.transcription.rows.add(
+                    name,
+                    phase.name,
+                    (*lanes, count),
+                    lower=lower,
+                    upper=upper,
+                    unit=np.nan,
+                    entries=[str(k) for k in range(count)] * (count > 1),
+                )
+            )
+        return rows
 
     def _bounds(self, entry: Constraint, shape: Values) -> list[np.ndarray]:
         """Return a constraint's bounds over its values. Raises ValueError for wrong bounds."""

@@ -94,12 +94,8 @@ def _turn(lower: float, upper: float) -> list[Between]:
     return [optimize.between("pelvis", lower * np.pi, upper * np.pi)]
 
 
-def backflip_problem(chain: Chain, *, project: bool = True, **options: Any) -> optimize.Problem:
-    """Return the problem of the backflip.
-
-    chain: of `svkc.scenes.backflip.backflip`.
-    project: as of `svkc.optimize.Problem`; options: its further keyword arguments.
-    """
+def _phases(chain: Chain, project: bool) -> list[optimize.Phase]:
+    """Return the phases. project: whether nodes are projected onto their loops."""
     between, by_time = optimize.between, lambda cost: lambda p: cost * p.duration
     rest = between(chain.joint_names, 0, 0, of="velocity")
     on_ground, in_place = (_toe_on_ground, 0, 0), (_toe_forward, -PLACE, PLACE)
@@ -118,24 +114,38 @@ def backflip_problem(chain: Chain, *, project: bool = True, **options: Any) -> o
     ]  # fmt: skip
     # the projection keeps the toe where it landed
     end += [] if project else [on_ground, in_place]
-    phases = [
-        optimize.Phase("push", "toe", (0.1, 0.4), 20, bounds=_turn(-1, 1), path=GROUND,
+    return [
+        optimize.Phase("push", "toe", duration=(0.1, 0.4), intervals=20,
+                       bounds=_turn(-1, 1), path=GROUND,
                        here=True, start=start, final=_take_off,
                        end=[(lambda p: p.forces("toe")[1:], 0.01, 50)]),
-        optimize.Phase("flight", (), (0.1, 0.3), 20, bounds=_turn(-1, 1.5), final=by_time(10),
+        optimize.Phase("flight", (), duration=(0.1, 0.3), intervals=20,
+                       bounds=_turn(-1, 1.5), final=by_time(10),
                        continuous_torques=False),
-        optimize.Phase("tuck", "tuck", (0.1, 0.4), 30, path=TUCKED, impact=False,
+        optimize.Phase("tuck", "tuck", duration=(0.1, 0.4), intervals=30,
+                       path=TUCKED, impact=False,
                        bounds=[*_turn(-1, 2), *TUCK_RANGES],
                        end=_turn(0.75, 1.5), final=by_time(-10)),
-        optimize.Phase("open", (), (0.1, 0.3), 30, bounds=_turn(0.75, 2 + 0.5 / np.pi),
+        optimize.Phase("open", (), duration=(0.1, 0.3), intervals=30,
+                       bounds=_turn(0.75, 2 + 0.5 / np.pi),
                        final=by_time(10)),
-        optimize.Phase("landing", "toe", (0.2, 1.0), 30, bounds=_turn(0.5, 2 + 1.66 / np.pi),
+        optimize.Phase("landing", "toe", duration=(0.2, 1.0), intervals=30,
+                       bounds=_turn(0.5, 2 + 1.66 / np.pi),
                        path=GROUND, here=True, start=touch, end=end, final=by_time(100)),
     ]  # fmt: skip
+
+
+def backflip_problem(chain: Chain, *, project: bool = True, **options: Any) -> optimize.Problem:
+    """Return the problem of the backflip.
+
+    chain: of `svkc.scenes.backflip.backflip`.
+    project: as of `svkc.optimize.Problem`; options: its further keyword arguments.
+    """
+    between = optimize.between
     rates = between(chain.joint_names, -LARGEST_RATE, LARGEST_RATE, of="velocity")
     return optimize.Problem(
         chain,
-        phases,
+        _phases(chain, project),
         controls=optimize.TorqueRates(limit=1e4, torque=TORQUE_LIMITS),
         running=_running,
         final=_final,

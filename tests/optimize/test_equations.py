@@ -45,8 +45,8 @@ def test_open_chains_are_those_of_inverse_dynamics(name):
     vdot = jnp.asarray(np.random.default_rng(0).normal(size=chain.nv))
     none = LinkRows.of(chain, np.zeros(0, int))
     zero = jnp.zeros(chain.dofs)
-    evaluate = jax.jit(lambda *x: equations_of_motion(chain, none, *x)[0])
-    force = evaluate(q, v, vdot, zero, zero[:0])
+    evaluate = jax.jit(lambda *x: equations_of_motion(chain, none, *x, tau=zero, f=zero[:0])[0])
+    force = evaluate(q, v, vdot)
     expected = svkc.inverse_dynamics(chain, state, vdot)
     limits = svkc.tree.inverse_dynamics.limit_forces(chain, state.q, state.v)[: chain.nv]
     np.testing.assert_allclose(force, expected - limits, rtol=KERNEL, atol=KERNEL)
@@ -62,7 +62,7 @@ def test_closed_chains_are_those_of_forward_dynamics_and_loop_forces(name):
     q, v = tree(chain, state)
     vdot = svkc.forward_dynamics(chain, state, tau)[: chain.nv]
     table = connected_rows(chain, state)
-    evaluate = jax.jit(lambda f: equations_of_motion(chain, table, q, v, vdot, tau, f))
+    evaluate = jax.jit(lambda f: equations_of_motion(chain, table, q, v, vdot, tau=tau, f=f))
     without, links = (np.asarray(x) for x in evaluate(jnp.zeros(len(table))))
     scale = 1 + np.abs(vdot).max()
     assert np.abs(links).max() < KERNEL * scale

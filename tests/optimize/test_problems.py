@@ -40,11 +40,11 @@ def test_minimum_time_of_a_double_integrator():
     guess = problem.guess([{"x": 0.0}, {"x": 1.0}])
     check = problem.check(guess)
     assert max(check.derivative_error, check.hessian_error) < 1e-6
-    found_motion = problem.solve(guess, solver=optimize.Ipopt(backend="cyipopt"))
-    assert abs(float(found_motion.cost) - 2) < KNOWN
-    assert found_motion.result == optimize.OUTCOME.successful
-    assert found_motion.violation < KNOWN
-    np.testing.assert_allclose(found_motion.motion[0].blocks.ravel(), [1, 1, -1, -1], atol=1e-5)
+    solution = problem.solve(guess, solver=optimize.Ipopt(backend="cyipopt"))
+    assert abs(float(solution.cost) - 2) < KNOWN
+    assert solution.result == optimize.OUTCOME.successful
+    assert solution.violation < KNOWN
+    np.testing.assert_allclose(solution.motion[0].blocks.ravel(), [1, 1, -1, -1], atol=1e-5)
 
 
 @pytest.mark.slow
@@ -67,8 +67,8 @@ def test_brachistochrone():
     problem = optimize.Problem(
         chain, [phase], controls=optimize.Parametrized(1, wire), scheme=optimize.Radau(3)
     )
-    found_motion = problem.solve(problem.guess([{}, target]))
-    assert abs(float(found_motion.cost) - angle * np.sqrt(radius / 9.81)) < KNOWN
+    solution = problem.solve(problem.guess([{}, target]))
+    assert abs(float(solution.cost) - angle * np.sqrt(radius / 9.81)) < KNOWN
 
 
 @pytest.mark.slow
@@ -86,7 +86,7 @@ def test_linear_quadratic_regulator(backend):
         scheme=optimize.Radau(3),
         running=lambda p: p.state.q[0] ** 2 + p.state.v[0] ** 2 + p.u[0] ** 2,
     )
-    found_motion = problem.solve(
+    solution = problem.solve(
         problem.guess([{"x": 1.0}, {"x": 1.0}]), solver=optimize.Ipopt(backend=backend)
     )
     slope = lambda t, P: (
@@ -95,7 +95,7 @@ def test_linear_quadratic_regulator(backend):
     ).ravel()  # fmt: skip
     P = solve_ivp(slope, (0, 1), np.zeros(4), rtol=1e-11, atol=1e-12).y[:, -1].reshape(2, 2)
     x = np.array([1, 0.5])
-    assert abs(float(found_motion.cost) - x @ P @ x) < KNOWN
+    assert abs(float(solution.cost) - x @ P @ x) < KNOWN
 
 
 @pytest.mark.slow
@@ -169,10 +169,10 @@ def test_redundant_loops_are_solved():
         controls=optimize.Torques(joints=joints),
         running=lambda p: jnp.sum(p.u**2),
     )
-    found_motion = problem.solve(problem.guess([high, low]))
-    assert found_motion.violation < 1e-6
+    solution = problem.solve(problem.guess([high, low]))
+    assert solution.violation < 1e-6
     weight = 9.81 * float(np.sum(chain.mass))
-    total = found_motion.forces("left_foot")[:, 2] + found_motion.forces("right_foot")[:, 2]
+    total = solution.forces("left_foot")[:, 2] + solution.forces("right_foot")[:, 2]
     assert 0.3 * weight < np.mean(total) < 2 * weight
 
 
@@ -190,6 +190,6 @@ def test_free_bodies_turn_through_quaternions():
         chain, [phase], controls=optimize.Torques(joints=["a"]), running=lambda p: p.u @ p.u,
         scheme=optimize.Radau(3),
     )  # fmt: skip
-    found_motion = problem.solve(problem.guess([start, svkc.State(end, start.v, start.structure)]))
-    assert float(found_motion.cost) < KNOWN
-    np.testing.assert_allclose(found_motion.motion[0].v[:, 5], 1.5, atol=1e-4)
+    solution = problem.solve(problem.guess([start, svkc.State(end, start.v, start.structure)]))
+    assert float(solution.cost) < KNOWN
+    np.testing.assert_allclose(solution.motion[0].v[:, 5], 1.5, atol=1e-4)
