@@ -90,7 +90,7 @@ class UserRows:
     def _shapes(self, i: int, entries: Sequence[Constraint], at_start: bool) -> list[Values]:
         """Return shapes and bounds of constraints' values, without computing them."""
         out: list[Values] = []
-        data = jax.tree.map(lambda x: x[0], self.transcription.data(i))
+        data = jax.tree.map(lambda x: jnp.asarray(x[0]), self.transcription.data(i))
 
         def evaluate(y):
             point = self._point(i, self.params, data, y, at_start=at_start)

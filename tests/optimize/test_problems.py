@@ -49,13 +49,18 @@ def test_minimum_time_of_a_double_integrator():
 
 @pytest.mark.slow
 def test_brachistochrone():
-    """The fastest wire is a cycloid. The wire's force is normal to the velocity."""
+    """The fastest wire is a cycloid, on which the force by the speed is constant: 3.27 1/s.
+
+    The wire's force is normal to the velocity. Its limit keeps the first interval, at whose start
+    the velocity is zero, from what the scheme alone allows.
+    """
     chain, angle = svkc.load(BEAD), 2.0
     radius = 1 / (angle - np.sin(angle))
     target = {"x": 1.0, "z": -radius * (1 - np.cos(angle))}
     phase = optimize.Phase(
         "fall",
-        duration=(0.1, 2.0),
+        duration=(0.3, 1.5),
+        intervals=40,
         start=at(("x", 0, 0), ("z", 0, 0)),
         end=at(*((joint, value) for joint, value in target.items())),
         final=lambda p: p.duration,
@@ -65,7 +70,7 @@ def test_brachistochrone():
         return {"x": -u[0] * state.v[1], "z": u[0] * state.v[0]}
 
     problem = optimize.Problem(
-        chain, [phase], controls=optimize.Parametrized(1, wire), scheme=optimize.Radau(3)
+        chain, [phase], controls=optimize.Parametrized(1, wire, limit=3.4), scheme=optimize.Radau(3)
     )
     solution = problem.solve(problem.guess([{}, target]))
     assert abs(float(solution.cost) - angle * np.sqrt(radius / 9.81)) < KNOWN
@@ -99,8 +104,8 @@ def test_linear_quadratic_regulator(backend):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("stages", "order"), [(2, 3), (3, 5)])
-def test_order_of_convergence_on_a_closed_loop(stages, order):
+@pytest.mark.parametrize(("stages", "order", "meshes"), [(2, 3, (3, 6, 12)), (3, 5, (2, 4))])
+def test_order_of_convergence_on_a_closed_loop(stages, order, meshes):
     """Without controls the solution is the motion; its error falls by 2^(2 s - 1) per halving."""
     chain, link = models.four_bar(), models.four_bar().link_names[0]
     state = chain.state(v={"crank": 2.0})
@@ -111,7 +116,7 @@ def test_order_of_convergence_on_a_closed_loop(stages, order):
           for j in ["crank"]),
     ]  # fmt: skip
     errors = []
-    for intervals in (3, 6, 12):
+    for intervals in meshes:
         phase = optimize.Phase("fall", link, duration=0.3, intervals=intervals, start=fixed)
         problem = optimize.Problem(
             chain,
