@@ -1,0 +1,115 @@
+"""The certificate, refinement, replay and gradient of a solution."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import wrong_optimizations
+
+import svkc
+from svkc import optimize
+from svkc.scenes.backflip import backflip
+from svkc.scenes.backflip_problem import backflip_guess, backflip_problem
+
+ROD = (
+    '<mujoco><worldbody><body name="rod"><joint name="pivot" axis="0 1 0"/><geom type="capsule"'
+    ' fromto="0 0 0 0 0 -1" size="0.03"/></body></worldbody></mujoco>'
+)
+
+
+def swing_up(chain):
+    rest = optimize.between("pivot", 0, 0, of="velocity")
+    swing = optimize.Phase(
+        "swing",
+        duration=(0.5, 3.0),
+        intervals=12,
+        start=[optimize.between("pivot", 0, 0), rest],
+        end=[optimize.between("pivot", np.pi, np.pi), rest],
+    )
+    return optimize.Problem(
+        chain,
+        [swing],
+        controls=optimize.Torques(limit=5.0),
+        running=lambda p: p.args * jnp.sum(p.u**2),
+        args=1.0,
+    )
+
+
+@pytest.fixture(scope="module")
+def solution():
+    problem = swing_up(svkc.load(ROD))
+    return problem.solve(problem.guess([{"pivot": 0.0}, {"pivot": np.pi}]))
+
+
+@pytest.mark.slow
+def test_refined_until_it_is_a_motion(solution):
+    coarse, fine = solution.report(), solution.refined(tol=1e-4)
+    assert coarse.failed == 0
+    assert max(coarse.largest()) > 1e-3
+    position, velocity = fine.report().largest()
+    assert position < 1e-4
+    assert velocity < 1e-3
+    assert len(fine.ts) > len(solution.ts)
+    assert 0 < fine.cost_error < 0.05 * fine.cost
+    traj = fine.trajectory(rate=20.0)
+    assert abs(float(fine.problem.chain.joint(traj.final, "pivot").q) - np.pi) < 1e-3
+    assert "worst of" in str(coarse)
+
+
+@pytest.mark.slow
+def test_gradient_of_the_optimal_cost_against_solutions(solution):
+    """The envelope theorem: by the rod's mass, and by the factor of the cost."""
+    chain, step = solution.problem.chain, 1e-4
+    of_chain, of_args = solution.gradient()
+    assert abs(float(of_args) - float(solution.cost)) < 1e-5 * float(solution.cost)
+    mass = float(chain.mass[-1])
+    costs = []
+    for sign in (1, -1):
+        heavier = chain.replace(mass={"rod": mass * (1 + sign * step)})
+        costs.append(float(swing_up(heavier).solve(solution).cost))
+    difference = (costs[0] - costs[1]) / (2 * step * mass)
+    assert abs(float(of_chain.mass[-1]) - difference) < 1e-4 * abs(difference)
+
+
+@pytest.mark.slow
+def test_many_starts():
+    """Each start has its result; one that cannot be solved does not end the others."""
+    rest = optimize.between("x", 0, 0, of="velocity")
+    phase = optimize.Phase(
+        "move", duration=1.0, intervals=2, start=[optimize.between("x", 0, 0), rest],
+        end=[optimize.between("x", 1, 1), rest],
+    )  # fmt: skip
+    problem = optimize.Problem(
+        wrong_optimizations.cart(),
+        [phase],
+        controls=optimize.Torques(),
+        running=lambda p: p.u @ p.u,
+    )
+    guesses = [problem.guess([{"x": 0.0}, {"x": 1.0}], noise=0.2, key=key) for key in range(3)]
+    many = problem.multistart(guesses)
+    np.testing.assert_allclose([m.cost for m in many], float(many[0].cost), rtol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("project", [False, True])
+def test_backflip(project):
+    """Without projection the cost is at most 5.94416e6, that of the same transcription in CasADi.
+
+    With projection the loops keep closed.
+    """
+    chain, _ = backflip()
+    problem = backflip_problem(chain, project=project)
+    guess = backflip_guess(problem)
+    motion = problem.solve(guess, solver=optimize.Ipopt(tolerance=1e-6))
+    assert motion.violation < 1e-6
+    assert float(motion.cost) < 5.94416e6 * (1 + 1e-6)
+    assert motion.impulse("landing")[2] > 0
+    hand_on_shank = jax.vmap(
+        lambda s: (
+            svkc.point_position(chain, s, "forearms", (0, 0, -0.41))
+            - svkc.point_position(chain, s, "shanks", (0, 0.07, -0.1575))
+        )
+    )
+    tuck = np.asarray(motion.states.structure.connected[:, 1])
+    gaps = np.abs(hand_on_shank(motion.states))[tuck]
+    assert gaps.max() < (1e-6 if project else 1e-3)
