@@ -59,7 +59,7 @@ def test_a_wrong_rank_is_reported():
     for kw in ({"dt": 1e-3}, FINE):
         low = svkc.simulate(chain, with_rank(2), 1.0, throw=False, **kw)
         assert low.result == svkc.RESULTS.loop_open
-        assert 0 < float(low.t_final) < 0.1
+        assert float(low.t_final) < 0.1
         assert int(low.report().loop) == 0
         assert float(low.gaps.max()) < 1e-5
         with pytest.raises(RuntimeError, match=r"in phase 1, loop 'pin': A loop is open"):
@@ -81,7 +81,7 @@ def test_loops_that_allow_only_the_first_order():
     state = chain.state(seated.q[: chain.nq], {"base": [0, 0, 0, 0, 0, 3.0]}, hold=False)
     with pytest.raises(
         RuntimeError,
-        match=r"t = 0\.01\d+ s, in phase 1, loop '(left|right)_thigh_plate': A loop is open",
+        match=r"t = 0\.0[01]\d+ s, in phase 1, loop '(left|right)_thigh_plate': A loop is open",
     ):
         svkc.simulate(chain, state, 0.03)
 
@@ -141,20 +141,22 @@ def test_a_crank_that_turns_back_at_a_dead_centre():
     near = chain.state({"crank": 0.2, "rod": -0.5}, hold=False)
     state = chain.state(near.q, {"crank": 2.0})
     ts = jnp.linspace(0, 3.0, 301)
-    traj = svkc.simulate(chain, state, 3.0, ts=ts, **FINE)
-    crank_angle = np.asarray(traj.states.q[:, chain.dof_names.index("crank")])
-    # The rod of half a metre reaches the slider's line only from within that distance.
-    assert np.abs(-np.cos(crank_angle) + 0.9).max() <= 0.5 + 1e-9
-    assert np.diff(np.sign(np.diff(crank_angle))).any()
-    assert abs(float(traj.report().energy_drift)) < 1e-6
-    assert int(traj.report().swaps) > 0
+    pivots = {"dynamics": svkc.dynamics.CompositeBodies()}
+    for options in ({}, pivots):
+        traj = svkc.simulate(chain, state, 3.0, ts=ts, **FINE, **options)
+        crank_angle = np.asarray(traj.states.q[:, chain.dof_names.index("crank")])
+        # The rod of half a metre reaches the slider's line only from within that distance.
+        assert np.abs(-np.cos(crank_angle) + 0.9).max() <= 0.5 + 1e-9
+        assert np.diff(np.sign(np.diff(crank_angle))).any()
+        assert abs(float(traj.report().energy_drift)) < 1e-6
+        assert (int(traj.report().swaps) > 0) == (options is pivots)
 
 
 @pytest.mark.slow
-def test_without_pivots_a_singular_configuration_may_end_the_run():
+def test_a_slider_crank_passes_its_bifurcation_in_both_ways():
     """A slider-crank of equal bars with a massless slider has a bifurcation as the bars align.
 
-    Pivots determine the branch. Without pivots the run ends with a result code.
+    Pivots determine the branch, and so does the reduction of rows by articulated bodies.
     """
     bar = (
         '<body name="{0}" pos="{1} 0 0"><joint name="{0}" axis="0 1 0"/><geom type="capsule"'
@@ -173,13 +175,11 @@ def test_without_pivots_a_singular_configuration_may_end_the_run():
         virtual_links=[slot],
     )
     state = chain.state({"crank": -np.pi / 4, "rod": np.pi / 2}, {"crank": 3.0})
-    run = lambda **kw: svkc.simulate(chain, state, 3.0, throw=False, **kw)
-    through, not_through = run(), run(dynamics=svkc.dynamics.ArticulatedBodies())
-    assert through.result == svkc.RESULTS.successful
-    assert float(through.final.q[0]) > 3 * np.pi
-    assert not_through.result == svkc.RESULTS.step_too_small
-    for traj in (through, not_through):
+    for dynamics in (svkc.dynamics.CompositeBodies(), svkc.dynamics.ArticulatedBodies()):
+        traj = svkc.simulate(chain, state, 3.0, dynamics=dynamics)
+        assert float(traj.final.q[0]) > 3 * np.pi
         assert abs(float(traj.report().energy_drift)) < 2e-6
+        assert bool(traj.phases.by_pivots[0] > 0) == (not dynamics.uses_pivots)
 
 
 @pytest.mark.slow
