@@ -140,7 +140,7 @@ def _init_stepper(
         stats=Stats.zeros(
             t0.dtype,
             counts_swaps=info is not None and info.pivots is not None,
-            counts_by_pivots=near is not None,
+            counts_reduced_steps=near is not None,
         ),
         projection_info=info,
     )
@@ -199,10 +199,10 @@ def _attempt_step(
     )
 
 
-def _with_pivots_if_near(
+def _redone_if_near(
     s: StepperState, attempt: StepAttempt, problem: PhaseProblem
 ) -> tuple[StepAttempt, Bool[Array, ""] | None, Bool[Array, ""]]:
-    """Return the attempt, whether the next one is taken by pivots, and whether this one is redone.
+    """Return the attempt, whether the next one has reduced rows, and whether this one is redone.
 
     An attempt that ends near a singular configuration, or that does not close the loops, is not
     kept: it is taken again with reduced rows. Rows are reduced until a step is kept that ends away
@@ -270,7 +270,7 @@ def _body_fun(
         )
     problem = eqx.tree_at(lambda p: p.field_args.near, problem, s.near, is_leaf=lambda x: x is None)
     t1 = s.tnext if s.search is None else s.search.end_of_attempt(s.tnext)
-    attempt, near, redo = _with_pivots_if_near(s, _attempt_step(s, t1, problem, options), problem)
+    attempt, near, redo = _redone_if_near(s, _attempt_step(s, t1, problem, options), problem)
     guard_values, search, hold = None, None, jnp.zeros((), bool)
     if s.search is not None:
         attempt, guard_values, search, hold = locate_event(s, attempt, t1, problem, options)

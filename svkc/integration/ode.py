@@ -30,7 +30,8 @@ class FieldArgs(eqx.Module):
     args: the user's `args`, passed on to control and guards.
     pivots: pivots of the loops' rows that are reused instead of selected anew
         (`AbstractDynamics.hold`). None: select pivots at every evaluation.
-    near: whether articulated bodies use pivots, as near a singular configuration. None: never.
+    near: whether articulated bodies reduce the rows of the loops, as near a singular configuration.
+        None: never.
     """
 
     chain: Chain

@@ -65,7 +65,7 @@ def _step_grid(t0, save_ts, solution: PhaseSolution):
 def _replay_block(y: ODEState, steps, problem: PhaseProblem, solver) -> tuple[ODEState, ODEState]:
     """Return the state after one block of steps, and the states after each of its steps.
 
-    steps: starts and ends of the steps, and which are taken by pivots.
+    steps: starts and ends of the steps, and which are taken with reduced rows.
     """
 
     def replay(y, step):
@@ -184,7 +184,7 @@ def _blocks(start: ODEState, step_grid, solution: PhaseSolution, interval: int):
     """Return the blocks of `interval` steps, padded to whole groups.
 
     For each block: its index, whether any of its steps was taken, the state at its start, and the
-    starts and ends of its steps and which of them were taken by pivots.
+    starts and ends of its steps and which of them were taken with reduced rows.
     """
     groups = -(-(solution.checkpoints.q.shape[0] + 1) // BLOCKS_PER_GROUP)
     count = groups * BLOCKS_PER_GROUP

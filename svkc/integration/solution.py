@@ -66,7 +66,7 @@ class Stats(eqx.Module):
     swaps: changes of the dependent coordinates. -1: not counted.
     loop: index of a loop that could not be closed. -1: none.
     gap: largest gaps of the loops (rad, m).
-    by_pivots: steps taken by pivots instead of articulated bodies. -1: not counted.
+    reduced_steps: steps taken with reduced rows of the loops. -1: not counted.
     """
 
     attempts: Int[Array, ""]
@@ -75,10 +75,10 @@ class Stats(eqx.Module):
     swaps: Int[Array, ""]
     loop: Int[Array, ""]
     gap: Float[Array, "2"]
-    by_pivots: Int[Array, ""]
+    reduced_steps: Int[Array, ""]
 
     @classmethod
-    def zeros(cls, dtype: DType, *, counts_swaps: bool, counts_by_pivots: bool) -> "Stats":
+    def zeros(cls, dtype: DType, *, counts_swaps: bool, counts_reduced_steps: bool) -> "Stats":
         """Return the statistics before the first step."""
         zero = jnp.zeros((), jnp.int32)
         return cls(
@@ -88,7 +88,7 @@ class Stats(eqx.Module):
             swaps=zero if counts_swaps else zero - 1,
             loop=zero - 1,
             gap=jnp.zeros(2, dtype),
-            by_pivots=zero if counts_by_pivots else zero - 1,
+            reduced_steps=zero if counts_reduced_steps else zero - 1,
         )
 
     @classmethod
@@ -102,7 +102,7 @@ class Stats(eqx.Module):
             swaps=unknown,
             loop=unknown,
             gap=jnp.zeros(2, dtype),
-            by_pivots=unknown,
+            reduced_steps=unknown,
         )
 
 
@@ -112,7 +112,7 @@ class PhaseSolution(eqx.Module):
     t, y: time and state at its end.
     ys: states at the save times.
     step_ts: times at the ends of the steps, inf in unused rows.
-    step_near: which steps were taken by pivots, near a singular configuration. None: see
+    step_near: which steps were taken with reduced rows of the loops. None: see
         `StepperState.near`.
     checkpoints: states after every `checkpoint_interval` steps.
     accepted, rejected: numbers of steps.
@@ -139,8 +139,8 @@ class StepperState(eqx.Module):
     tnext: end of the next step, clipped at save times.
     step_size: size that the controller proposed, before clipping.
     guard_values: values of the guards at t.
-    near: whether the next step is taken by pivots, as near a singular configuration. None: steps
-        are never taken by articulated bodies and pivots in turn.
+    near: whether the next step is taken with reduced rows of the loops, as near a singular
+        configuration. None: rows are never reduced.
     step_ts, step_near, checkpoints, ys: as in `PhaseSolution`, as buffers of the loop.
     projection_info: that of the last projection. None: steps are not projected.
     """
@@ -222,9 +222,9 @@ def update_stats(
         swaps=swaps,
         loop=loop,
         gap=gap,
-        by_pivots=old.by_pivots
+        reduced_steps=old.reduced_steps
         if s.near is None
-        else old.by_pivots + (keep_step & s.near).astype(jnp.int32),
+        else old.reduced_steps + (keep_step & s.near).astype(jnp.int32),
     )
 
 

@@ -83,19 +83,12 @@ class LimitedPIDController(diffrax.PIDController):
         return t1, (state, jnp.full_like(t1, jnp.inf))
 
     def adapt_step_size(
-        self,
-        t0: Any,
-        t1: Any,
-        y0: Any,
-        y1_candidate: Any,
-        args: Any,
-        y_error: Any,
-        error_order: Any,
-        controller_state: Any,
-    ) -> Any:
+        self, t0: Any, t1: Any, y0: Any, y1_candidate: Any, args: Any, y_error: Any,
+        error_order: Any, controller_state: Any,
+    ) -> Any:  # fmt: skip
         state, longest = controller_state
         keep_step, next_t0, next_t1, made_jump, state, result = super().adapt_step_size(
-            t0, t1, y0, y1_candidate, args, y_error, error_order, state
+            t0, t1, y0, y1_candidate, args, y_error, error_order=error_order, controller_state=state
         )
         # the size proposed by the rejection, as a save time may have clipped the step since
         next_t1 = jnp.where(keep_step, jnp.minimum(next_t1, next_t0 + longest), next_t1)

@@ -79,8 +79,8 @@ class ArticulatedBodies(AbstractDynamics):
     """Articulated bodies and loop forces by Delassus' matrix, without pivots.
 
     The fastest method, and the one for batches. Delassus' matrix squares the condition number of
-    J_C near singular configurations. With `svkc.stabilization.Projection` the report knows the
-    margin at the ends of phases only, and counts no changes of pivots.
+    J_C near singular configurations. There, and where loops are redundant, a run that uses
+    `svkc.stabilization.Projection` reduces the rows of J_C first.
 
     Massless bodies that loops hold cost one more solve for each coordinate of their joints. They
     are those whose mass, or moment of inertia about a joint, is below 1e-7 of the model's largest
@@ -107,9 +107,8 @@ class ArticulatedBodies(AbstractDynamics):
             rows,
             None if locked is None else active[: chain.nv],
         )
-        # all rows, dependent ones included
-        used = jnp.ones(loops.J.shape[0], bool)
-        return _implicit_solve(chain, structure, loops, solve, lambda x: x, used)
+        every = jnp.ones(len(loops.J), bool)
+        return _implicit_solve(chain, structure, loops, solve, lambda x: x, every)
 
     def prepare_open(
         self, chain: Chain, structure: Structure, kin: Kinematics

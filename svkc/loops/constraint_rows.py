@@ -180,8 +180,8 @@ def constraint_rows(
         delassus_rows(chain, structure.locked is not None),
         J,
     )
-    in_D = static_take(J[:, : chain.nv], rows.in_D.rows)
-    scaled, unscale = rows.reject(in_D.T).T, 1 / column[None, : chain.nv]
+    J_D = static_take(J[:, : chain.nv], in_D.rows)
+    scaled, unscale = rows.reject(J_D.T).T, 1 / column[None, : chain.nv]
     if near is None:
         return rows._replace(A=scaled * unscale)
     identity = scaled, jnp.eye(len(scaled), dtype=J.dtype), jnp.zeros_like(scaled)

@@ -136,7 +136,7 @@ def _phases(
         rejected=r.rejected,
         evaluations=stages * r.stats.attempts,
         swaps=r.stats.swaps,
-        by_pivots=r.stats.by_pivots,
+        reduced_steps=r.stats.reduced_steps,
         loop=r.stats.loop,
         error=r.stats.error,
         gap=fill(jnp.maximum(gap, r.stats.gap), 0),

@@ -81,7 +81,7 @@ def empty_phase_records(rows: int, state: State) -> PhaseRecords:
         work=jnp.zeros(rows, dtype),
         accepted=jnp.zeros(rows, jnp.int32),
         rejected=jnp.zeros(rows, jnp.int32),
-        stats=repeat(Stats.zeros(dtype, counts_swaps=True, counts_by_pivots=True), rows),
+        stats=repeat(Stats.zeros(dtype, counts_swaps=True, counts_reduced_steps=True), rows),
     )
 
 
@@ -143,8 +143,9 @@ class Phases(eqx.Module):
     count: number of phases. Rows past `count` are empty.
     kinetic_energy: largest kinetic energy at the two ends of the phase and at the save times within
         (J); None in files of older versions.
-    by_pivots: steps near a singular configuration, taken by pivots instead of articulated bodies
-        (-1: not counted); None in files of older versions.
+    reduced_steps: steps by articulated bodies with reduced rows of the loops, as near a singular
+        configuration and where loops are redundant (-1: not by articulated bodies); None in files
+        of older versions.
     """
 
     start: Float[Array, " phases"]
@@ -167,7 +168,7 @@ class Phases(eqx.Module):
     momentum_drift: Float[Array, "phases 2"]
     count: Int[Array, ""]
     kinetic_energy: Float[Array, " phases"] | None = None
-    by_pivots: Int[Array, " phases"] | None = None
+    reduced_steps: Int[Array, " phases"] | None = None
 
     @property
     def freedoms(self) -> Int[Array | np.ndarray, "... phases"]:

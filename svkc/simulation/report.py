@@ -41,6 +41,8 @@ class Report(Printed):
     error: sum of the estimated errors of all steps (inf: none from this solver or adjoint).
     margin: least rank margin |R_mm| / |R_11| (R of the loop Jacobian's pivoted QR, m its rank).
     swaps: how often the choice of dependent coordinates changed (-1: not recorded).
+    reduced_steps: accepted steps by articulated bodies with reduced rows of the loops, as near a
+        singular configuration and where loops are redundant (-1: not by articulated bodies).
     accepted, rejected: numbers of steps.
     evaluations: number of evaluations of the vector field in steps.
     drift_share: sum of the phases' absolute energy drifts, divided by the largest kinetic energy at
@@ -67,6 +69,7 @@ class Report(Printed):
     error: Float[Array, "*lanes"]
     margin: Float[Array, "*lanes"]
     swaps: Int[Array, "*lanes"]
+    reduced_steps: Int[Array, "*lanes"]
     accepted: Int[Array, "*lanes"]
     rejected: Int[Array, "*lanes"]
     evaluations: Int[Array, "*lanes"]
@@ -142,6 +145,8 @@ class Report(Printed):
             if self.swaps >= 0
             else "changes of the dependent coordinates not recorded"
         )
+        if self.reduced_steps >= 0:
+            swaps = f"loop rows reduced in {int(self.reduced_steps)} steps"
         if self.halved is not None:
             error += f"; by a finer run {float(self.halved):.2e} rad, m"
         gap = f"{float(self.gap):.2e} m, {float(self.angular_gap):.2e} rad"

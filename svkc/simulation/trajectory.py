@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.eager import eager_jit
 from svkc.model.annotations import Function, Names, Path, Scalar
@@ -176,7 +176,10 @@ def _report(traj: Trajectory) -> "Report":
         free=jnp.any(p.free, -1),
         error=jnp.sum(p.error, -1),
         margin=jnp.min(p.margin, -1),
-        swaps=jnp.where(jnp.any(p.swaps < 0, -1), -1, jnp.sum(p.swaps, -1)),
+        swaps=_sum_of_counts(p.swaps),
+        reduced_steps=_sum_of_counts(jnp.full_like(p.swaps, -1))
+        if p.reduced_steps is None
+        else _sum_of_counts(p.reduced_steps),
         accepted=jnp.sum(p.accepted, -1),
         rejected=jnp.sum(p.rejected, -1),
         evaluations=jnp.sum(p.evaluations, -1),
@@ -189,6 +192,11 @@ def _report(traj: Trajectory) -> "Report":
         derivative=traj.derivative,
         names=traj.names,
     )
+
+
+def _sum_of_counts(counts: Int[Array, "*lanes phases"]) -> Int[Array, "*lanes"]:
+    """Return the sum over phases, and -1 where a phase was not counted."""
+    return jnp.where(jnp.any(counts < 0, -1), -1, jnp.sum(counts, -1))
 
 
 def _drift_share(p: Phases) -> Float[Array, "..."]:

@@ -12,7 +12,7 @@ from tolerances import DIFFERENCE, REFERENCE, ROUND_OFF
 
 import svkc
 
-BUDGET = 42500
+BUDGET = 46700
 
 
 @pytest.mark.slow

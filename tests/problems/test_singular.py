@@ -179,7 +179,7 @@ def test_a_slider_crank_passes_its_bifurcation_in_both_ways():
         traj = svkc.simulate(chain, state, 3.0, dynamics=dynamics)
         assert float(traj.final.q[0]) > 3 * np.pi
         assert abs(float(traj.report().energy_drift)) < 2e-6
-        assert bool(traj.phases.by_pivots[0] > 0) == (not dynamics.uses_pivots)
+        assert bool(traj.phases.reduced_steps[0] > 0) == (not dynamics.uses_pivots)
 
 
 @pytest.mark.slow

@@ -6,10 +6,10 @@ import compile_cases
 import jax
 import pytest
 
-# 10 % above the counts with jax 0.10.1
-BUDGETS = {"forward dynamics": 2900, "main job": 14500, "four bar": 14500}
+# 10 % above the counts with jax 0.10.1; 5 % where articulated bodies enlarged a run
+BUDGETS = {"forward dynamics": 2900, "main job": 17000, "four bar": 15500}
 # (test_gradients counts a smaller gradient, which it compiles as well)
-SLOW = {"arm and ball": 16700, "gradient": 43600, "arm and ball gradient": 53900}
+SLOW = {"arm and ball": 19500, "gradient": 54000, "arm and ball gradient": 66000}
 
 
 @pytest.mark.parametrize(

@@ -377,7 +377,8 @@ def test_default_absolute_tolerance(pendulum, dtype, rtol, atol):
         svkc.simulate(chain, start, 1.0, ts=ts, rtol=rtol),
         svkc.simulate(chain, start, 1.0, ts=ts, rtol=rtol, atol=atol),
     )
-    np.testing.assert_array_equal(alone.final.q, both.final.q)
+    # a hundredth of rtol may differ from atol in its last digit
+    np.testing.assert_allclose(alone.final.q, both.final.q, atol=ROUND_OFF)
     assert int(alone.report().accepted) == int(both.report().accepted)
 
 
