@@ -53,9 +53,8 @@ class AbstractDynamics(eqx.Module):
 
     @abc.abstractmethod
     def prepare(
-        self, chain: Chain, structure: Structure, loops: LoopKinematics,
-        selection: Any = None,
-    ) -> Callable[..., Any]:  # fmt: skip
+        self, chain: Chain, structure: Structure, loops: LoopKinematics, selection: Any = None
+    ) -> Callable[..., Any]:
         """Return solve: (force [dofs], bias [rows]) -> x on a chain with virtual links.
 
         x solves M x = force + J_C^T lambda and J_C x + bias = 0 (III-B); bias has scaled rows.
@@ -93,9 +92,8 @@ class ArticulatedBodies(AbstractDynamics):
     uses_pivots: ClassVar[bool] = False
 
     def prepare(
-        self, chain: Chain, structure: Structure, loops: LoopKinematics,
-        selection: Any = None,
-    ) -> Callable[..., Any]:  # fmt: skip
+        self, chain: Chain, structure: Structure, loops: LoopKinematics, selection: Any = None
+    ) -> Callable[..., Any]:
         column, active = jacobian_scales(chain)[1], active_dofs(chain, structure)
         rows = constraint_rows(chain, structure, loops.J) if selection is None else selection
         J, chain_and_kin, locked = jax.lax.stop_gradient(
@@ -127,9 +125,8 @@ class AbstractMassMatrix(AbstractDynamics):
         """Return the mass matrix of the tree."""
 
     def prepare(
-        self, chain: Chain, structure: Structure, loops: LoopKinematics,
-        selection: Any = None,
-    ) -> Callable[..., Any]:  # fmt: skip
+        self, chain: Chain, structure: Structure, loops: LoopKinematics, selection: Any = None
+    ) -> Callable[..., Any]:
         assert selection is not None
         qr, J, chain_and_kin, frozen_structure = jax.lax.stop_gradient(
             (selection, loops.J, (chain, loops.kin), structure)
