@@ -22,7 +22,6 @@ def swing_up(chain):
     swing = optimize.Phase(
         "swing",
         duration=(0.5, 3.0),
-        intervals=12,
         start=[optimize.between("pivot", 0, 0), rest],
         end=[optimize.between("pivot", np.pi, np.pi), rest],
     )
