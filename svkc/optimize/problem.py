@@ -1,5 +1,6 @@
 """A problem of motion optimization: phases, controls and costs."""
 
+import copy
 import dataclasses
 from collections.abc import Sequence
 from typing import Any
@@ -173,21 +174,13 @@ class Problem:
 
         counts: for each phase.
         """
-        phases = [
+        problem = copy.copy(self)
+        problem.phases = [
             dataclasses.replace(phase, intervals=n)
             for phase, n in zip(self.phases, counts, strict=True)
         ]
-        return Problem(
-            self.chain,
-            phases,
-            controls=self.controls,
-            running=self.running,
-            final=self.final,
-            scheme=self.scheme,
-            args=self.args,
-            units=self.units,
-            project=self.project,
-        )
+        problem._programs = {}
+        return problem
 
     def refine(self, solution: Solution, tol: float, rounds: int, **options: Any) -> Solution:
         """Return the solution that `Solution.refined` describes.
