@@ -86,7 +86,7 @@ def _control(controls: Any, chain: Chain, table: np.ndarray, args: Any):
 
 def blocks_at(table: np.ndarray, step: Any, fraction: Any, blocks: Any) -> Any:
     """Return the blocks of a stage at a fraction of an interval, from the interval's blocks."""
-    powers = fraction ** np.arange(table.shape[1])
+    powers = jnp.stack([fraction**k for k in range(table.shape[1])])
     D = jnp.tensordot(powers, table[0], 1) + step * jnp.tensordot(powers, table[1], 1)
     return D @ blocks
 

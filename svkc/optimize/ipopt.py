@@ -197,8 +197,6 @@ class Ipopt(AbstractSolver):
             "constr_viol_tol": 1e-7,
             "print_level": 0,
             "sb": "yes",
-            # the monotone strategy got stuck in the backflip, and on meshes of three stages
-            "mu_strategy": "adaptive",
             "mumps_mem_percent": 200,
             "honor_original_bounds": "yes",
             # NaN in a matrix would crash MUMPS
@@ -225,8 +223,14 @@ class Ipopt(AbstractSolver):
             backend = "casadi" if importlib.util.find_spec("casadi") else "cyipopt"
         callbacks = Callbacks(program, progress, int(self.max_iterations))
         run = _by_casadi if backend == "casadi" else _by_cyipopt
-        begin = time.perf_counter()
-        x, multipliers, lower, upper, status = run(callbacks, self._options(warm), start)
+        begin, iterations = time.perf_counter(), 0
+        for strategy in ("adaptive", "monotone"):
+            options = {"mu_strategy": strategy} | self._options(warm)
+            x, multipliers, lower, upper, status = run(callbacks, options, start)
+            iterations += callbacks.iterations
+            # where one strategy gets stuck the other often does not
+            if status not in ("infeasible", "failed") or "mu_strategy" in self._options(warm):
+                break
         seconds = time.perf_counter() - begin
         if isinstance(callbacks.exception, KeyboardInterrupt):
             status = "interrupted"
@@ -238,7 +242,7 @@ class Ipopt(AbstractSolver):
             lower=lower,
             upper=upper,
             status=status,
-            iterations=callbacks.iterations,
+            iterations=iterations,
             seconds=seconds,
             functions=callbacks.functions,
         )

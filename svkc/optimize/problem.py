@@ -1,9 +1,11 @@
 """A problem of motion optimization: phases, controls and costs."""
 
+import copy
 import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -70,7 +72,10 @@ class Problem:
         check_chain(chain)
         phases = [phases] if isinstance(phases, Phase) else list(phases)
         bounds = tuple(as_constraint("bounds", i, entry) for i, entry in enumerate(bounds))
-        self.chain, self.controls, self.args = chain, controls.for_chain(chain), args
+        self.chain, self.controls = chain, controls.for_chain(chain)
+        # numbers are data, by which the optimal cost has derivatives
+        as_data = lambda x: jnp.asarray(x) if isinstance(x, float) else x
+        self.args = jax.tree.map(as_data, args)
         self.phases = [dataclasses.replace(p, bounds=(*bounds, *p.bounds)) for p in phases]
         names = [p.name for p in phases]
         if not phases or len(set(names)) < len(names):
@@ -169,21 +174,13 @@ class Problem:
 
         counts: for each phase.
         """
-        phases = [
+        problem = copy.copy(self)
+        problem.phases = [
             dataclasses.replace(phase, intervals=n)
             for phase, n in zip(self.phases, counts, strict=True)
         ]
-        return Problem(
-            self.chain,
-            phases,
-            controls=self.controls,
-            running=self.running,
-            final=self.final,
-            scheme=self.scheme,
-            args=self.args,
-            units=self.units,
-            project=self.project,
-        )
+        problem._programs = {}
+        return problem
 
     def refine(self, solution: Solution, tol: float, rounds: int, **options: Any) -> Solution:
         """Return the solution that `Solution.refined` describes.

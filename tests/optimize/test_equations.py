@@ -68,14 +68,14 @@ def test_closed_chains_are_those_of_forward_dynamics_and_loop_forces(name):
     assert np.abs(links).max() < KERNEL * scale
     # the multipliers are linear in the force that the links must give
     J = jacobian(chain, q, table)
-    f = np.linalg.lstsq(J.T, without, rcond=1e-9)[0]
-    assert np.abs(evaluate(jnp.asarray(f))[0]).max() < KERNEL * scale * (1 + np.abs(f).max())
+    f = jnp.asarray(np.linalg.lstsq(J.T, without, rcond=1e-9)[0])
+    assert np.abs(evaluate(f)[0]).max() < KERNEL * scale * (1 + np.abs(f).max())
     wrenches = svkc.loop_forces(chain, state, tau)
     rotations = svkc.poses(chain, state).quaternion
     for i, link in enumerate(chain.link_names):
         if not wrenches.unique[i] or not state.structure.connected[i]:
             continue
-        parent = np.flatnonzero(np.array(chain.topology.body_row) == state.structure.parent[i])
+        parent = np.flatnonzero(np.array(chain.topology.body_row) == int(state.structure.parent[i]))
         to_parent = svkc.tree.spatial.quat_conjugate(rotations[int(parent[0])])
         own = link_force(chain, table, i, f), link_torque(chain, q, table, i, f)
         for ours, theirs in zip(own, wrenches.wrench(link), strict=True):
