@@ -166,8 +166,8 @@ except _Missing:  # a source tree that is not installed
 
 
 def __getattr__(name: str) -> _Any:
-    """Return `svkc.scenes`, imported at its first use; or the object of a deprecated name, with a
-    `DeprecationWarning`."""
-    if name == "scenes":
-        return _import_module("svkc.scenes")
+    """Return `svkc.scenes` or `svkc.optimize`, imported at its first use; or the object of a
+    deprecated name, with a `DeprecationWarning`."""
+    if name in ("scenes", "optimize"):
+        return _import_module(f"svkc.{name}")
     return _deprecated.resolve(name)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import models
 import mujoco
 import numpy as np
+import wrong_optimizations
 
 import svkc
 from svkc._jax.primitive import custom_primitive
@@ -374,6 +375,7 @@ CASES = {
     "virtual_links: names": lambda s: s.load(virtual_links=[link(), link()]),
     "weight: expected": lambda s: s.actuation(weight=-np.ones(4)),
     "when: direction": lambda s: svkc.when(lambda t, x, args: t, direction="up"),
+    **wrong_optimizations.CASES,
 }
 
 # other ways to some of the messages, by words of those

@@ -182,7 +182,8 @@ def _apply_rule(primitive, inputs: list, params: dict, shape: tuple[int, ...], l
     """
     name = primitive.name
     if name == "reduce_sum":
-        return sum_in_chunks(inputs[0].x, params["axes"])
+        # after a vmap within the function, axes are NumPy's integers
+        return sum_in_chunks(inputs[0].x, tuple(map(int, params["axes"])))
     if name in UNBATCHED_AXES:
         return primitive.bind(inputs[0].x, **params)
     if name in CONCATENATIONS:

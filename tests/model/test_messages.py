@@ -21,6 +21,7 @@ ELSEWHERE = {
     "rollout: another process": ("tools/test_rollout.py", "another process"),
     "out: ... holds another": ("tools/test_rollout.py", "holds another rollout"),
     "expected NAME@TIME": ("project/test_commands.py", "expected NAME@TIME"),
+    "optimize needs IPOPT": ("optimize/test_ipopt.py", "optimize needs IPOPT"),
     "module ... has no": ("project/test_public_api.py", "has no attribute"),
 }
 

@@ -1,0 +1,104 @@
+"""What is to know of a problem before it is solved."""
+
+import dataclasses
+
+import numpy as np
+
+from svkc.model.tables import Table, as_text
+from svkc.optimize.program import Program
+
+_ROWS_SHOWN = 12
+# of a row that no unknown can change, in the solver's units
+_FIXED_VIOLATION = 1e-6
+
+
+@dataclasses.dataclass(frozen=True)
+class Check:
+    """A problem at a guess.
+
+    unknowns, rows, jacobian, hessian: their numbers, and those of entries that are not zero.
+    derivative_error: largest difference of the Jacobian along a direction from central
+        differences, by the largest entry.
+    hessian_error: of the Hessian of the Lagrangian, in the same way.
+    cost: at the guess.
+    units: by which the solver divides.
+    violated: (name, amount in SI units) of the rows that the guess violates most.
+    """
+
+    unknowns: int
+    rows: int
+    jacobian: int
+    hessian: int
+    derivative_error: float
+    hessian_error: float
+    cost: float
+    units: str
+    violated: tuple[tuple[str, float], ...]
+
+    def __str__(self) -> str:
+        words = (
+            f"{self.unknowns} unknowns, {self.rows} rows; {self.jacobian} entries of the Jacobian,"
+            f" {self.hessian} of the Hessian",
+            f"derivatives against differences: {self.derivative_error:.1e},"
+            f" {self.hessian_error:.1e} (second)",
+            f"units: {self.units}",
+            f"cost at the guess: {self.cost:.6g}",
+        )
+        rows = [(name, f"{amount:.3g}") for name, amount in self.violated]
+        return as_text([*words, Table(("violated most", "by"), rows)])
+
+
+def check_finite(program: Program, x: np.ndarray) -> None:
+    """Raise ValueError if a row, the cost or a derivative is not finite, by its name."""
+    values, table = program.rows(x), program.transcription.rows
+    label = lambda row: "the cost" if row == program.cost_row else table.label(row)
+    if not np.isfinite(values).all():
+        row = int(np.argmin(np.isfinite(values)))
+        raise ValueError(f"at the guess {label(row)} is {values[row]}")
+    entries = program.jacobian(x)
+    if not np.isfinite(entries).all():
+        row = int(program.jacobian_entries.row[np.argmin(np.isfinite(entries))])
+        raise ValueError(f"at the guess the derivative of {label(row)} is not finite")
+    fixed = np.setdiff1d(np.arange(program.cost_row), program.kept)
+    violation = program.violation(x)[fixed]
+    if np.any(violation > _FIXED_VIOLATION):
+        row = int(fixed[np.argmax(violation)])
+        raise ValueError(f"{label(row)} depends on fixed unknowns alone, which do not satisfy it")
+
+
+def check(program: Program, x: np.ndarray) -> Check:
+    """Return the problem's numbers at a guess in the solver's units."""
+    check_finite(program, x)
+    random, step = np.random.default_rng(0), 1e-6
+    direction = random.normal(size=program.count)
+    multipliers = random.normal(size=program.cost_row + 1)
+    first, second = program.jacobian_entries, program.hessian_entries
+
+    def along(values):
+        return np.bincount(first.row, values * direction[first.column], program.cost_row + 1)
+
+    def gradient(x):
+        values = program.jacobian(x)
+        return np.bincount(first.column, values * multipliers[first.row], program.count)
+
+    H = program.hessian(x, multipliers)
+    product = np.bincount(second.row, H * direction[second.column], program.count)
+    off = second.row != second.column
+    product += np.bincount(second.column[off], (H * direction[second.row])[off], program.count)
+    ends = x + step * direction, x - step * direction
+    differences = (program.rows(ends[0]) - program.rows(ends[1])) / (2 * step)
+    of_gradients = (gradient(ends[0]) - gradient(ends[1])) / (2 * step)
+    error = lambda exact, other: float(np.max(np.abs(exact - other)) / np.max(np.abs(exact)))
+    violation, table = program.violation(x), program.transcription.rows
+    worst = [i for i in np.argsort(-violation)[:_ROWS_SHOWN] if violation[i] > 0]
+    return Check(
+        unknowns=program.count,
+        rows=program.cost_row,
+        jacobian=len(first.row),
+        hessian=len(second.row),
+        derivative_error=error(along(program.jacobian(x)), differences),
+        hessian_error=error(product, of_gradients),
+        cost=float(program.rows(x)[-1] * program.row_unit[-1]),
+        units=str(program.transcription.builder.units),
+        violated=tuple((table.label(i), float(violation[i] * table.unit[i])) for i in worst),
+    )

@@ -1,0 +1,229 @@
+"""What the solver chooses over an interval: torques, torque rates, or numbers of the user's own."""
+
+import abc
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from svkc.model.annotations import Checked, Function, Integer, Names, Numbers, Scalar
+from svkc.model.chain import Chain, State
+from svkc.model.checked_jit import torques_over_dofs
+from svkc.model.validation import boolean, names, real_array
+from svkc.optimize.schemes import Radau
+
+Limits = Checked[Scalar | Numbers | Mapping[str, Any] | None]
+
+
+class AbstractControls(abc.ABC):
+    """Base class of controls: blocks of numbers over an interval, and torques from them."""
+
+    # whether a block is a state of the nodes, continuous within a phase
+    has_state: bool = False
+    # whether torques depend on more than the first block of a stage
+    needs_state: bool = False
+
+    def for_chain(self, chain: Chain) -> "AbstractControls":
+        """Return the controls with everything that they leave to the chain."""
+        return self
+
+    @abc.abstractmethod
+    def blocks(self, scheme: Radau) -> int:
+        """Return the number of blocks of an interval, that of the node included."""
+
+    @property
+    def stage_blocks(self) -> int:
+        """Number of blocks of a stage."""
+        return 1 + self.has_state
+
+    @abc.abstractmethod
+    def coefficients(self, scheme: Radau, fractions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return D0, D1 [times stage_blocks blocks]: blocks at fractions of an interval."""
+
+    @abc.abstractmethod
+    def count(self, chain: Chain) -> int:
+        """Return the numbers in a block."""
+
+    @abc.abstractmethod
+    def names(self, chain: Chain) -> list[str]:
+        """Return the names of the numbers of a block."""
+
+    def driven(self, chain: Chain) -> np.ndarray:
+        """Return the mask [nv] of the coordinates that are known to have torques."""
+        return np.zeros(chain.nv, bool)
+
+    @abc.abstractmethod
+    def torques(
+        self, chain: Chain, t, state: State, blocks: Float[Array, "k n"], args: Any
+    ) -> Float[Array, " dofs"]:
+        """Return the joint torques (N m, N) of a stage over every coordinate."""
+
+    @abc.abstractmethod
+    def limits(self, chain: Chain) -> list[np.ndarray]:
+        """Return the lower and upper bounds [2 n] of each block of a stage."""
+
+
+def _bounds(name: str, limit: Any, joints: list[str]) -> np.ndarray:
+    """Return lower and upper bounds [2 n] from a number, an array, or numbers by joint name.
+
+    A pair (lower, upper) takes the place of a number.
+    """
+    if limit is None:
+        return np.full((2, len(joints)), [[-np.inf], [np.inf]])
+    if isinstance(limit, Mapping):
+        pairs = [_bounds(f"{name}[{joint!r}]", limit.get(joint), [joint]) for joint in joints]
+        return np.concatenate(pairs, 1) if pairs else np.zeros((2, 0))
+    if isinstance(limit, tuple) and len(limit) == 2:
+        pair = [np.broadcast_to(real_array(name, x, float), len(joints)) for x in limit]
+        return np.array(pair, float)
+    value = np.asarray(real_array(name, limit, float))
+    if value.shape not in ((), (len(joints),)):
+        raise ValueError(
+            f"{name}: got shape {value.shape}, expected one number, or {len(joints)}, one for each"
+            f" of {', '.join(joints)}"
+        )
+    return np.broadcast_to(np.array([-1.0, 1.0])[:, None] * value, (2, len(joints)))
+
+
+def _driven_joints(chain: Chain, joints: Names | None, *limits: Any) -> list[str]:
+    """Return the names of the driven joints: those named, those with limits, or the actuated."""
+    if joints is not None:
+        driven_joints = list(names("joints", joints))
+    elif named := [limit for limit in limits if isinstance(limit, Mapping)]:
+        driven_joints = list(named[0])
+    else:
+        driven = np.asarray(chain.actuated)
+        driven_joints = [j for j in chain.joint_names if np.all(driven[chain.v_index(j)])]
+    for joint in driven_joints:
+        at = chain.v_index(joint)
+        if at.stop > chain.nv:
+            raise ValueError(f"controls: {joint!r} is a virtual link; only joints of the tree are")
+    return driven_joints
+
+
+def _columns(chain: Chain, joints: Any) -> tuple[np.ndarray, list[str]]:
+    """Return the indices in v of joints, and the names of these coordinates."""
+    at = [i for joint in joints for i in range(chain.nv)[chain.v_index(joint)]]
+    return np.array(at, int), [chain.dof_names[i] for i in at]
+
+
+class _JointTorques(AbstractControls):
+    """Controls whose first block is the torques of driven joints."""
+
+    joints: Any = None
+
+    def _coordinates(self, chain: Chain) -> tuple[np.ndarray, list[str]]:
+        return _columns(chain, self.joints)
+
+    def driven(self, chain: Chain) -> np.ndarray:
+        return np.isin(np.arange(chain.nv), self._coordinates(chain)[0])
+
+    def count(self, chain: Chain) -> int:
+        return len(self._coordinates(chain)[0])
+
+    def names(self, chain: Chain) -> list[str]:
+        return self._coordinates(chain)[1]
+
+    def torques(self, chain: Chain, t, state: State, blocks, args: Any) -> Float[Array, " dofs"]:
+        at = self._coordinates(chain)[0]
+        return jnp.zeros(chain.dofs, blocks.dtype).at[at].set(blocks[0])
+
+
+@dataclasses.dataclass(frozen=True)
+class Torques(_JointTorques):
+    """Joint torques: a polynomial through one value at each stage, or constant over an interval.
+
+    limit: largest torque of each joint (N m, N): a number, an array over the driven coordinates, a
+        pair (lower, upper), or these by joint name. None: no limit.
+    joints: names of the driven joints; None: those named in `limit`, or all actuated ones.
+    constant: whether a torque is constant over an interval.
+    """
+
+    limit: Limits = None
+    joints: Names | None = None
+    constant: bool = False
+
+    def for_chain(self, chain: Chain) -> "Torques":
+        joints = _driven_joints(chain, self.joints, self.limit)
+        return dataclasses.replace(self, joints=tuple(joints))
+
+    def blocks(self, scheme: Radau) -> int:
+        return 1 if boolean("constant", self.constant) else scheme.stages
+
+    def coefficients(self, scheme: Radau, fractions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        constant = np.ones((len(fractions), 1))
+        D0 = (constant if self.constant else scheme.interpolation(fractions))[:, None]
+        return D0, np.zeros_like(D0)
+
+    def limits(self, chain: Chain) -> list[np.ndarray]:
+        return [_bounds("limit", self.limit, self.names(chain))]
+
+
+@dataclasses.dataclass(frozen=True)
+class TorqueRates(_JointTorques):
+    """Torque rates, constant over an interval; torques are states.
+
+    limit: largest rate of each joint's torque (N m/s, N/s), in the forms of `Torques.limit`.
+    torque: largest torque of each joint (N m, N), in the same forms.
+    joints: names of the driven joints; None: those named in a limit, or all actuated ones.
+    """
+
+    limit: Limits = None
+    torque: Limits = None
+    joints: Names | None = None
+    has_state = True
+
+    def for_chain(self, chain: Chain) -> "TorqueRates":
+        joints = _driven_joints(chain, self.joints, self.torque, self.limit)
+        return dataclasses.replace(self, joints=tuple(joints))
+
+    def blocks(self, scheme: Radau) -> int:
+        return 2
+
+    def coefficients(self, scheme: Radau, fractions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        D0, D1 = np.zeros((2, len(fractions), 2, 2))
+        D0[:, 0, 0] = D0[:, 1, 1] = 1
+        D1[:, 0, 1] = fractions
+        return D0, D1
+
+    def limits(self, chain: Chain) -> list[np.ndarray]:
+        over = self.names(chain)
+        return [_bounds("torque", self.torque, over), _bounds("limit", self.limit, over)]
+
+
+@dataclasses.dataclass(frozen=True)
+class Parametrized(AbstractControls):
+    """Torques as a function of the user's own numbers, which are free at each stage.
+
+    size: number of these numbers.
+    function: (t, state, u, args) -> joint torques (N m, N), as `control` of `svkc.simulate` returns
+        them.
+    limit: largest magnitude of each number, in the forms of `Torques.limit`, by the names u[0], ...
+    """
+
+    size: Integer
+    function: Function
+    limit: Limits = None
+    needs_state = True
+
+    def blocks(self, scheme: Radau) -> int:
+        return scheme.stages
+
+    def coefficients(self, scheme: Radau, fractions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        D0 = scheme.interpolation(fractions)[:, None]
+        return D0, np.zeros_like(D0)
+
+    def count(self, chain: Chain) -> int:
+        return int(self.size)
+
+    def names(self, chain: Chain) -> list[str]:
+        return [f"u[{i}]" for i in range(int(self.size))]
+
+    def torques(self, chain: Chain, t, state: State, blocks, args: Any) -> Float[Array, " dofs"]:
+        return torques_over_dofs(chain, self.function(t, state, blocks[0], args))
+
+    def limits(self, chain: Chain) -> list[np.ndarray]:
+        return [_bounds("limit", self.limit, self.names(chain))]

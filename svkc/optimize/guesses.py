@@ -1,0 +1,152 @@
+"""Guesses: motions from which a solver starts."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from svkc._jax.eager import eager_jit
+from svkc.model.chain import Chain, State
+from svkc.model.validation import finite_array
+from svkc.optimize.equations import equations_of_motion
+from svkc.optimize.loop_rows import LinkRows, gaps_at, possible_rows, rates_at
+from svkc.optimize.phases import Phase
+from svkc.optimize.points import tree_configuration, tree_velocity
+from svkc.transitions.initial_state import full_vector
+from svkc.tree.configuration import difference, integrate
+
+# Newton steps by which boundary poses are closed, and the longest (rad, m)
+_STEPS, _LARGEST_STEP = 30, 0.3
+# gaps (m, rad) at which the steps end, and above which the pose is left as it is
+_CLOSED, _NEARLY_CLOSED = 1e-12, 1e-6
+
+
+class PhaseMotion(eqx.Module):
+    """A phase of a motion on a mesh.
+
+    duration: s. q: [n + 1 nq], v: [n + 1 nv] at the nodes, of the tree.
+    blocks: [n blocks control] of `AbstractControls`. states: [n + 1 control] at the nodes, if
+    controls have states. vdot: [n s nv].
+    forces: [n s 6 links] multipliers of the links' rows. impulse: [6 links].
+    """
+
+    duration: Any
+    q: Any
+    v: Any
+    states: Any
+    blocks: Any
+    vdot: Any
+    forces: Any
+    impulse: Any
+
+
+@dataclasses.dataclass
+class Guess:
+    """A motion from which a solver starts.
+
+    phases: of the motion. noise: fraction of the range between bounds by which unknowns are moved
+        at random. key: of the random numbers.
+    """
+
+    phases: list[PhaseMotion]
+    noise: float = 0.0
+    key: int = 0
+
+
+class PoseLine:
+    """Straight lines between poses at the boundaries of phases."""
+
+    def __init__(self, chain: Chain, phases: Sequence[Phase], poses: Sequence[Any]):
+        if len(poses) != len(phases) + 1:
+            raise ValueError(
+                f"guess: got {len(poses)} poses, expected {len(phases) + 1}: at the start of each"
+                " phase, and at the end; None where a pose is not known"
+            )
+        if poses[0] is None or poses[-1] is None:
+            raise ValueError("guess: the first and the last pose must be known")
+        self.chain, self.phases = chain, phases
+        self.poses = [None if p is None else self._closed(i, p) for i, p in enumerate(poses)]
+
+    def _closed(self, i: int, pose: Any) -> np.ndarray:
+        """Return a pose [nq], moved by the least change that closes the loops there."""
+        chain = self.chain
+        if isinstance(pose, State):
+            pose = pose.q[: chain.nq]
+        start = jnp.asarray(chain.q_load)
+        pose = finite_array(f"pose {i}", pose) if not isinstance(pose, dict) else pose
+        q = np.asarray(full_vector(chain, "q", pose, start)[0])[: chain.nq]
+        names = [n for p in self.phases[max(i - 1, 0) : i + 1] if not p.here for n in p.connected]
+        rows = possible_rows(chain, np.isin(chain.link_names, names))
+        return close_loops(chain, q, rows) if len(rows) else q
+
+    def at(self, durations: Sequence[float], intervals: Sequence[int]) -> list[tuple]:
+        """Return (q [n + 1 nq], v [n + 1 nv]) of each phase."""
+        ends = np.concatenate([[0], np.cumsum(durations)])
+        known = [i for i, pose in enumerate(self.poses) if pose is not None]
+        out = []
+        for k, n in enumerate(intervals):
+            first = max(i for i in known if i <= k)
+            last = min(i for i in known if i > k)
+            span = ends[last] - ends[first]
+            times = (np.linspace(ends[k], ends[k + 1], n + 1) - ends[first]) / span
+            out.append(self._line(self.poses[first], self.poses[last], times, span))
+        return out
+
+    def _line(self, start, end, fractions: np.ndarray, span: float) -> tuple:
+        """Return q and v at fractions of the line between two poses, which takes `span` seconds."""
+        chain = self.chain
+        start, end = (tree_configuration(chain, jnp.asarray(x)) for x in (start, end))
+        step = difference(chain, start, end)
+        q = jax.vmap(lambda x: integrate(chain, start, x * step))(jnp.asarray(fractions))
+        v = np.broadcast_to(np.asarray(step)[: chain.nv] / span, (len(fractions), chain.nv))
+        return np.asarray(q)[:, : chain.nq], v.copy()
+
+
+def close_loops(chain: Chain, q: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Return q [nq] of the tree moved by Newton steps of least norm until the rows' gaps close."""
+    table = LinkRows.of(chain, rows)
+
+    @jax.jit
+    def linearize(q):
+        rates = lambda v: rates_at(chain, q, v, table)
+        return gaps_at(chain, q, table), jax.jacfwd(rates)(jnp.zeros(chain.nv, q.dtype))
+
+    moved, gaps = jnp.asarray(q), np.zeros(0)
+    for _ in range(_STEPS):
+        gaps, J = (np.asarray(x) for x in linearize(moved))
+        if np.max(np.abs(gaps)) < _CLOSED:
+            break
+        step = np.linalg.lstsq(J, -gaps, rcond=1e-6)[0]
+        step = step / max(1.0, np.max(np.abs(step)) / _LARGEST_STEP)
+        full = tree_velocity(chain, jnp.asarray(step))
+        moved = integrate(chain, tree_configuration(chain, moved), full)[: chain.nq]
+    return np.asarray(moved) if np.max(np.abs(gaps)) < _NEARLY_CLOSED else q
+
+
+def static_forces(
+    chain: Chain, connected: Sequence[str], driven: np.ndarray, q: np.ndarray
+) -> np.ndarray:
+    """Return multipliers [nodes 6 links] of connected links that carry the weight at rest.
+
+    They are those of least norm for the coordinates that no motor drives.
+    driven: mask [nv] of the others. q: [nodes nq].
+    """
+    out = np.zeros((len(q), 6 * len(chain.link_names)))
+    rows = possible_rows(chain, np.isin(chain.link_names, connected))
+    if not len(rows):
+        return out
+    table, zero = LinkRows.of(chain, rows), jnp.zeros(chain.nv)
+
+    def balance(q):
+        tau, f = jnp.zeros(chain.dofs), jnp.zeros(len(rows))
+        weight = equations_of_motion(chain, table, q, zero, zero, tau=tau, f=f)[0]
+        return weight, jax.jacfwd(lambda v: rates_at(chain, q, v, table))(zero)
+
+    weight, J = (np.asarray(x) for x in eager_jit(jax.vmap(balance))(jnp.asarray(q)))
+    for i in range(len(q)):
+        out[i, rows] = np.linalg.lstsq(J[i][:, ~driven].T, weight[i][~driven], rcond=1e-6)[0]
+    return out

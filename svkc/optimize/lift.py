@@ -1,0 +1,175 @@
+"""The polynomials of an interval, and derivatives of stages carried through them.
+
+A stage's coordinates, velocities and accelerations are linear in the interval's unknowns with
+scalar coefficients that are polynomials of the step h = T / n. Derivatives of a stage's rows are
+therefore carried to the unknowns by a few multiplications with scalars (Kronecker products).
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from svkc.optimize.schemes import Radau
+
+
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """Numbers of entries of an interval's unknowns and of a stage's variables.
+
+    An interval has the unknowns [t0, T, q, v, a_1 ... a_s, control blocks, f_1 ... f_s], a stage
+    the variables [t, T, q, v, a, control blocks, f].
+
+    nv: coordinates of the tree. stages: s. rows: multipliers of a stage.
+    control: numbers in a control block. blocks: control blocks of an interval.
+    stage_blocks: control blocks of a stage.
+    """
+
+    nv: int
+    stages: int
+    rows: int
+    control: int
+    blocks: int
+    stage_blocks: int
+
+    @property
+    def of_interval(self) -> int:
+        """Number of unknowns of an interval."""
+        motion = (2 + self.stages) * self.nv
+        return 2 + motion + self.blocks * self.control + self.stages * self.rows
+
+    @property
+    def of_stage(self) -> int:
+        """Number of variables of a stage."""
+        return 2 + 3 * self.nv + self.stage_blocks * self.control + self.rows
+
+    def split_interval(self, z):
+        """Return the unknowns as times [2], motion, control blocks and multipliers."""
+        ends = np.cumsum([2, (2 + self.stages) * self.nv, self.blocks * self.control])
+        times, x, w, f = (z[..., a:b] for a, b in zip((0, *ends), (*ends, self.of_interval)))
+        shape = z.shape[:-1]
+        return (
+            times,
+            x.reshape(*shape, 2 + self.stages, self.nv),
+            w.reshape(*shape, self.blocks, self.control),
+            f.reshape(*shape, self.stages, self.rows),
+        )
+
+    def split_stage(self, y):
+        """Return the variables of a stage as times [2], motion [3 nv], control blocks and f."""
+        ends = np.cumsum([2, 3 * self.nv, self.stage_blocks * self.control])
+        times, x, w, f = (y[..., a:b] for a, b in zip((0, *ends), (*ends, self.of_stage)))
+        shape = y.shape[:-1]
+        return (
+            times,
+            x.reshape(*shape, 3, self.nv),
+            w.reshape(*shape, self.stage_blocks, self.control),
+            f,
+        )
+
+
+class StagePolynomials(eqx.Module):
+    """Coefficients of one or several stages: y = (C0 + h C1 + h^2 C2) x, w = (D0 + h D1) omega.
+
+    c: fraction of the interval. b: weight in the quadrature.
+    slot: one-hot, which of the interval's multipliers are the stage's.
+    """
+
+    c: Float[Array | np.ndarray, "..."]
+    b: Float[Array | np.ndarray, "..."]
+    slot: Float[Array | np.ndarray, "... s"]
+    C0: Float[Array | np.ndarray, "... 3 m"]
+    C1: Float[Array | np.ndarray, "... 3 m"]
+    C2: Float[Array | np.ndarray, "... 3 m"]
+    D0: Float[Array | np.ndarray, "... d e"]
+    D1: Float[Array | np.ndarray, "... d e"]
+
+
+def polynomials(scheme: Radau, controls, stages: list[int]) -> StagePolynomials:
+    """Return the coefficients of stages; -1 is the start of the interval, which has no forces."""
+    s = scheme.stages
+    c = np.array([0.0 if i < 0 else scheme.c[i] for i in stages])
+    C0, C1, C2 = np.zeros((3, len(stages), 3, 2 + s))
+    C0[:, 0, 0] = C0[:, 1, 1] = 1
+    C1[:, 0, 1] = c
+    for k, i in enumerate(stages):
+        if i >= 0:
+            C0[k, 2, 2 + i] = 1
+            C1[k, 1, 2:] = scheme.A[i]
+            C2[k, 0, 2:] = (scheme.A @ scheme.A)[i]
+    D0, D1 = controls.coefficients(scheme, c)
+    # the first slot at the start of an interval is that of the impulse
+    slot = np.eye(s)[[max(i, 0) for i in stages]]
+    b = np.array([0.0 if i < 0 else scheme.b[i] for i in stages])
+    return StagePolynomials(c=c, b=b, slot=slot, C0=C0, C1=C1, C2=C2, D0=D0, D1=D1)
+
+
+def _combine(coefficients, blocks):
+    """Return the sums of blocks [m n] with coefficients [k m]: [k n], without a matrix product."""
+    return jnp.sum(coefficients[:, :, None] * blocks[None], 1)
+
+
+class Lift:
+    """The map from an interval's unknowns to one stage's variables, with its derivatives.
+
+    layout: numbers of entries. poly: of this stage alone. z: unknowns of the interval.
+    index, count: which interval of its phase, and how many the phase has.
+    """
+
+    def __init__(self, layout: Layout, poly: StagePolynomials, z, index, count):
+        self.layout, self.poly, self.count = layout, poly, count
+        self.fraction = (index + poly.c) / count
+        (self.t0, self.T), self.x, self.w, self.f = layout.split_interval(z)
+        h = self.T / count
+        self.C, self.D = poly.C0 + h * poly.C1 + h**2 * poly.C2, poly.D0 + h * poly.D1
+        # derivatives by T
+        self.dC, self.dD = (poly.C1 + 2 * h * poly.C2) / count, poly.D1 / count
+        self.ddC = 2 * poly.C2 / count**2
+
+    def variables(self) -> Float[Array, " y"]:
+        """Return the stage's variables."""
+        t = self.t0 + self.fraction * self.T
+        motion, control = _combine(self.C, self.x).ravel(), _combine(self.D, self.w).ravel()
+        f = jnp.sum(self.poly.slot[:, None] * self.f, 0)
+        return jnp.concatenate([jnp.stack([t, self.T]), motion, control, f])
+
+    def pull_back(self, A: Float[Array, "n y"]) -> Float[Array, "n z"]:
+        """Return A dy/dz."""
+        n = A.shape[0]
+        times, motion, control, f = self.layout.split_stage(A)
+        by_T = times[:, 1] + self.fraction * times[:, 0]
+        by_T = by_T + jnp.sum(motion * _combine(self.dC, self.x)[None], (1, 2))
+        by_T = by_T + jnp.sum(control * _combine(self.dD, self.w)[None], (1, 2))
+        through = lambda M, K: jnp.sum(M[:, :, None, :] * K[None, :, :, None], 1).reshape(n, -1)
+        return jnp.concatenate(
+            [
+                jnp.stack([times[:, 0], by_T], 1),
+                through(motion, self.C),
+                through(control, self.D),
+                (f[:, None, :] * self.poly.slot[None, :, None]).reshape(n, -1),
+            ],
+            1,
+        )
+
+    def curvature(self, g: Float[Array, " y"]) -> Float[Array, "z z"]:
+        """Return the sum over the stage's variables of g times their second derivatives."""
+        _, motion, control, _ = self.layout.split_stage(g)
+        transposed = lambda K, M: _combine(K.T, M).ravel()
+        row = jnp.concatenate(
+            [
+                jnp.zeros(2, g.dtype),
+                transposed(self.dC, motion),
+                transposed(self.dD, control),
+                jnp.zeros(self.layout.stages * self.layout.rows, g.dtype),
+            ]
+        )
+        by_T = jnp.arange(self.layout.of_interval) == 1
+        cross = jnp.where(by_T[:, None], row[None], 0)
+        second = jnp.sum(motion * _combine(self.ddC, self.x))
+        return cross + cross.T + jnp.where(by_T[:, None] & by_T[None], second, 0)
+
+    def hessian(self, H: Float[Array, "y y"], g: Float[Array, " y"]) -> Float[Array, "z z"]:
+        """Return the Hessian by the unknowns of a function with this Hessian and gradient."""
+        return self.pull_back(self.pull_back(H).T) + self.curvature(g)

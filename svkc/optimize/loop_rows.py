@@ -1,0 +1,263 @@
+"""The constraints of connected links without the freedoms of their joints.
+
+Each virtual link has six rows in the axes of its joint's frame: three rotations, three
+translations. A row along a freedom of the joint is not used. Multipliers of the rows are then
+components of the wrench on the real link, and coordinates of virtual joints are no unknowns.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from svkc._jax.static_gather import static_take
+from svkc.model.chain import Chain
+from svkc.tree.kinematics import Kinematics, kinematics, twists
+from svkc.tree.spatial import (
+    cross,
+    matvec,
+    quat_conjugate,
+    quat_matrix,
+    quat_multiply,
+    quat_normalize,
+    quat_rotate,
+)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class LinkRows:
+    """Selected rows of virtual links: everything static about them.
+
+    rows: as indices into six rows for each virtual link. links: the virtual links with such rows.
+    parent, real: rows of their bodies in `Topology`. freedoms: rotations that are free, of each.
+    """
+
+    rows: np.ndarray
+    links: np.ndarray
+    parent: np.ndarray
+    real: np.ndarray
+    freedoms: tuple[tuple[bool, ...], ...]
+
+    @classmethod
+    def of(cls, chain: Chain, rows: np.ndarray) -> "LinkRows":
+        """Return the table of some rows of a chain, whose arrays have values."""
+        links, s = np.unique(rows // 6), chain.structure
+        return cls(
+            rows=rows,
+            links=links,
+            parent=np.asarray(s.parent)[links],
+            real=np.asarray(s.real)[links],
+            freedoms=tuple(chain.topology.link_freedoms[i][:3] for i in links),
+        )
+
+    @property
+    def places(self) -> np.ndarray:
+        """Places of the rows among six of each of `links`."""
+        return 6 * np.searchsorted(self.links, self.rows // 6) + self.rows % 6
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+
+class LinkPoses(eqx.Module):
+    """Poses of the real links in the frames of their joints.
+
+    base: rotation matrix of each joint's frame, fixed in the parent.
+    quat: orientation of the real link's frame in it.
+    offset: position of the real link's frame in it (m).
+    of_parent, of_real: that position from the root of the parent and of the real link, in world
+        axes (m).
+    """
+
+    base: Float[Array, "links 3 3"]
+    quat: Float[Array, "links 4"]
+    offset: Float[Array, "links 3"]
+    of_parent: Float[Array, "links 3"]
+    of_real: Float[Array, "links 3"]
+
+
+def link_poses(chain: Chain, kin: Kinematics, table: LinkRows) -> LinkPoses:
+    """Return the poses of the real links in the frames of their joints."""
+    s, p, r = chain.structure, table.parent, table.real
+    quat, pos, real_quat, real_pos = (
+        static_take(x, table.links) for x in (s.quat, s.pos, s.real_quat, s.real_pos)
+    )
+    of = lambda x, rows: static_take(x, rows)
+    base_quat = quat_normalize(quat_multiply(of(kin.quat, p), quat))
+    turned = quat_normalize(quat_multiply(of(kin.quat, r), real_quat))
+    base = quat_matrix(base_quat)
+    of_real = of(kin.r, r) + matvec(of(kin.R, r), real_pos)
+    of_parent = of_real + (of(kin.root_position, r) - of(kin.root_position, p))
+    origin = of(kin.r, p) + matvec(of(kin.R, p), pos)
+    return LinkPoses(
+        base=base,
+        quat=quat_multiply(quat_conjugate(base_quat), turned),
+        offset=matvec(jnp.swapaxes(base, -1, -2), of_parent - origin),
+        of_parent=of_parent,
+        of_real=of_real,
+    )
+
+
+def _rotation_rows(quat, free: tuple[bool, ...], w=None):
+    """Return the three rotation rows of a joint; their rates if w (rad/s, joint's frame) is there.
+
+    A rate is the component of w about the row's axis where the loop is closed.
+    """
+    axes, eye = np.flatnonzero(free), np.eye(3)
+    if len(axes) == 3:
+        return jnp.zeros(3, quat.dtype)
+    if not len(axes):
+        quat = jnp.where(quat[0] < 0, -quat, quat)
+        return 2 * quat[1:] if w is None else quat[0] * w + cross(w, quat[1:])
+    column = quat_matrix(quat)[:, axes[-1]]
+    column = column if w is None else cross(w, column)
+    if len(axes) == 1:
+        return jnp.asarray(np.cross(eye, eye[axes[0]]), quat.dtype) @ column
+    (last,) = set(range(3)) - set(axes.tolist())
+    sign = np.cross(eye[axes[1]], eye[axes[0]])[last]
+    return jnp.asarray(sign * np.outer(eye[last], eye[axes[0]]), quat.dtype) @ column
+
+
+def _select(table: LinkRows, angular: list, linear) -> Float[Array, " rows"]:
+    """Return the selected rows from the rotation rows and the translations of links."""
+    six = jnp.concatenate([jnp.stack(angular), linear], -1).ravel()
+    return static_take(six, table.places)
+
+
+def row_gaps(chain: Chain, kin: Kinematics, table: LinkRows) -> Float[Array, " rows"]:
+    """Return the rows (rad, m), zero where a loop is closed."""
+    poses = link_poses(chain, kin, table)
+    angular = [_rotation_rows(poses.quat[i], free) for i, free in enumerate(table.freedoms)]
+    return _select(table, angular, poses.offset)
+
+
+def _relative(poses: LinkPoses, of_parent, of_real, relative) -> Float[Array, "links 3"]:
+    """Return of_real - of_parent - relative, in the joints' axes."""
+    return matvec(jnp.swapaxes(poses.base, -1, -2), of_real - of_parent - relative)
+
+
+def row_rates(
+    chain: Chain, kin: Kinematics, table: LinkRows, V: Float[Array, "tree_rows 6"]
+) -> Float[Array, " rows"]:
+    """Return the derivatives of the rows by time (rad/s, m/s). V: twists of the tree."""
+    poses = link_poses(chain, kin, table)
+    of_parent, of_real = static_take(V, table.parent), static_take(V, table.real)
+    velocity = lambda twist, at: twist[:, 3:] + cross(twist[:, :3], at)
+    linear = _relative(
+        poses, velocity(of_parent, poses.of_parent), velocity(of_real, poses.of_real), 0
+    )
+    w = _relative(poses, of_parent[:, :3], of_real[:, :3], 0)
+    angular = [_rotation_rows(poses.quat[i], free, w[i]) for i, free in enumerate(table.freedoms)]
+    return _select(table, angular, linear)
+
+
+def row_accelerations(
+    chain: Chain, kin: Kinematics, table: LinkRows, V, A: Float[Array, "tree_rows 6"]
+) -> Float[Array, " rows"]:
+    """Return the second derivatives of the rows by time (rad/s^2, m/s^2).
+
+    V: twists of the tree. A: spatial accelerations without gravity.
+    """
+    poses = link_poses(chain, kin, table)
+    of_parent, of_real = static_take(V, table.parent), static_take(V, table.real)
+    second_parent, second_real = static_take(A, table.parent), static_take(A, table.real)
+    velocity = lambda V, at: V[:, 3:] + cross(V[:, :3], at)
+    acceleration = lambda V, A, at: velocity(A, at) + cross(V[:, :3], velocity(V, at))
+    turning = of_parent[:, :3]
+    apart = velocity(of_real, poses.of_real) - velocity(of_parent, poses.of_parent)
+    linear = _relative(
+        poses,
+        acceleration(of_parent, second_parent, poses.of_parent),
+        acceleration(of_real, second_real, poses.of_real),
+        2 * cross(turning, apart),
+    )
+    relative = of_real[:, :3] - turning
+    w = _relative(poses, turning, of_real[:, :3], 0)
+    wdot = _relative(poses, second_parent[:, :3], second_real[:, :3], cross(turning, relative))
+    quat_dot = quat_multiply(jnp.concatenate([jnp.zeros_like(w[:, :1]), w], -1), poses.quat) / 2
+    angular = [
+        jax.jvp(
+            lambda quat, w, free=free: _rotation_rows(quat, free, w),
+            (poses.quat[i], w[i]),
+            (quat_dot[i], wdot[i]),
+        )[1]
+        for i, free in enumerate(table.freedoms)
+    ]
+    return _select(table, angular, linear)
+
+
+def _torque(quat, free: tuple[bool, ...], multipliers) -> Float[Array, "3"]:
+    """Return the torque of the multipliers of rotation rows, in the joint's axes (N m)."""
+    if all(free):
+        return jnp.zeros(3, multipliers.dtype)
+    return jax.vjp(lambda w: _rotation_rows(quat, free, w), jnp.zeros_like(quat[1:]))[1](
+        multipliers
+    )[0]
+
+
+def _six_rows(table: LinkRows, multipliers) -> Float[Array, "links 6"]:
+    """Return the multipliers of all rows of the table's links, zero where not selected."""
+    place = np.full(6 * len(table.links), len(table))
+    place[table.places] = np.arange(len(table))
+    return static_take(multipliers, place).reshape(-1, 6)
+
+
+def link_wrenches(
+    chain: Chain, kin: Kinematics, table: LinkRows, multipliers: Float[Array, " rows"]
+) -> Float[Array, "tree_rows 6"]:
+    """Return the wrenches of the multipliers on the rows of the tree, about their roots' origins.
+
+    Torque (N m), then force (N), in world axes.
+    """
+    poses = link_poses(chain, kin, table)
+    six = _six_rows(table, multipliers)
+    torques = [_torque(poses.quat[i], free, six[i, :3]) for i, free in enumerate(table.freedoms)]
+    force, torque = (matvec(poses.base, x) for x in (six[:, 3:], jnp.stack(torques)))
+    on = lambda at: jnp.concatenate([torque + cross(at, force), force], -1)
+    count = len(chain.topology.parent)
+    both = jnp.concatenate([on(poses.of_real), -on(poses.of_parent)])
+    receives = np.arange(count)[:, None] == np.concatenate([table.real, table.parent])[None]
+    return jnp.sum(jnp.where(receives[:, :, None], both[None], 0), 1)
+
+
+def gaps_at(chain: Chain, q: Float[Array, " nq"], table: LinkRows) -> Float[Array, " rows"]:
+    """Return the gaps of the rows at q of the tree."""
+    return row_gaps(chain, kinematics(chain, q), table)
+
+
+def rates_at(
+    chain: Chain, q: Float[Array, " nq"], v: Float[Array, " nv"], table: LinkRows
+) -> Float[Array, " rows"]:
+    """Return the rates of the rows at q and v of the tree."""
+    kin = kinematics(chain, q)
+    return row_rates(chain, kin, table, twists(chain, kin, v))
+
+
+def link_force(chain: Chain, table: LinkRows, link: int, multipliers) -> Float[Array, "3"]:
+    """Return the force (N) on the real link, in axes of the parent body. link: of the chain."""
+    six = _six_rows(table, multipliers)[np.searchsorted(table.links, link)]
+    return quat_rotate(chain.structure.quat[link], six[3:])
+
+
+def link_torque(
+    chain: Chain, q: Float[Array, " nq"], table: LinkRows, link: int, multipliers
+) -> Float[Array, "3"]:
+    """Return the torque (N m) on the real link, in axes of the parent body, about the joint.
+
+    The joint is at the origin of the real link's frame. link: of the chain.
+    """
+    poses, i = link_poses(chain, kinematics(chain, q), table), np.searchsorted(table.links, link)
+    torque = _torque(poses.quat[i], table.freedoms[i], _six_rows(table, multipliers)[i, :3])
+    return quat_rotate(chain.structure.quat[link], torque)
+
+
+def possible_rows(chain: Chain, links: np.ndarray) -> np.ndarray:
+    """Return the rows of links in a mask that are no freedoms of their joints.
+
+    Two free rotations of a joint leave one row, at the place of the third.
+    """
+    free = np.array(chain.topology.link_freedoms, bool).reshape(-1, 6)
+    return np.flatnonzero((~free & np.asarray(links, bool)[:, None]).ravel())

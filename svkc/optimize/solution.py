@@ -1,0 +1,241 @@
+"""The result of an optimization (`Solution`), and how it ended (`OUTCOME`)."""
+
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from svkc.model.chain import State, Structure
+from svkc.model.names import link_index, unknown_name
+from svkc.model.tables import Block, Printed, Table, as_text, number
+from svkc.model.validation import positive_scalar
+from svkc.optimize.certificate import SolutionReport, report
+from svkc.optimize.encoding import decode
+from svkc.optimize.guesses import PhaseMotion
+from svkc.optimize.ipopt import SolverResult
+from svkc.optimize.points import full_state
+from svkc.optimize.program import Program
+from svkc.optimize.replay import replay
+from svkc.simulation.trajectory import Trajectory
+from svkc.tree.spatial import quat_matrix
+
+if TYPE_CHECKING:  # as equinox annotates the metaclass of its enumerations
+    from enum import EnumMeta as NamedMeta
+else:
+    from svkc._jax.enumerations import NamedMeta
+
+# rows named in the message of a run that failed
+_ROWS_SHOWN = 6
+
+
+class OUTCOME(eqx.Enumeration, metaclass=NamedMeta):  # pyright: ignore
+    """How an optimization ended."""
+
+    successful = "The optimality conditions hold to the tolerance."
+    acceptable = "The optimality conditions hold to IPOPT's acceptable tolerance."
+    infeasible = "The solver converged to a point that violates constraints."
+    max_iterations = "The solver reached its largest number of iterations."
+    max_time = "The solver reached its largest wall time."
+    interrupted = "The run was interrupted; the motion is the last iterate."
+    not_finite = "A row or a derivative is not finite."
+    failed = "The solver could not go on from its last iterate."
+
+
+class Multipliers(eqx.Module):
+    """Multipliers of the solver, in its units.
+
+    rows: of the rows. lower, upper: of the bounds of unknowns.
+    """
+
+    rows: Any
+    lower: Any
+    upper: Any
+
+
+class Solution(Printed):
+    """An optimized motion.
+
+    cost: of the motion, on its mesh.
+    violation: largest violation of a row, in the solver's units.
+    durations: of the phases (s).
+    ts: [nodes] times (s). A time between phases occurs twice, before and after the change.
+    states: states at these times.
+    motion: unknowns of each phase.
+    multipliers: of rows and bounds.
+    iterations: of the solver. seconds: its wall time, and that part of it in functions.
+    result: how the optimization ended.
+    structures: of the phases.
+    cost_error: how far the cost moved between the last two meshes of `refined`; NaN before.
+    problem: of which this is a solution.
+    """
+
+    cost: Any
+    violation: Any
+    durations: Any
+    ts: Any
+    states: State
+    motion: tuple[PhaseMotion, ...]
+    multipliers: Multipliers
+    iterations: Any
+    seconds: Any
+    result: OUTCOME
+    structures: tuple[Structure, ...]
+    cost_error: Any
+    problem: Any = eqx.field(static=True)
+
+    def _blocks(self) -> list[Block]:
+        names = [phase.name for phase in self.problem.phases]
+        rows = [
+            (name, number(m.duration), str(len(m.vdot)))
+            for name, m in zip(names, self.motion, strict=True)
+        ]
+        words = (
+            f"cost {float(self.cost):.8g} on this mesh, largest violation"
+            f" {float(self.violation):.2g}, {int(self.iterations)} iterations in"
+            f" {float(self.seconds[0]):.3g} s ({float(self.seconds[1]):.3g} s in functions):"
+            f" {self.result}"
+        )
+        return [words, Table(("phase", "duration (s)", "intervals"), rows)]
+
+    def __str__(self) -> str:
+        return as_text(self._blocks())
+
+    def __repr__(self) -> str:
+        return f"<Solution: cost {float(self.cost):.8g}, {self.result}>"
+
+    def forces(self, link: str) -> Any:
+        """Return the force (N) of a virtual link at all stages of the phases that connect it.
+
+        [stages 3], on `real` from `parent`, in axes of the parent body.
+
+        link: name of the virtual link.
+        Raises ValueError for a link that no phase connects.
+        """
+        parts = [
+            self._force(link, m.forces).reshape(-1, 3)
+            for phase, m in zip(self.problem.phases, self.motion, strict=True)
+            if link in phase.connected
+        ]
+        if not parts:
+            connected = tuple(n for phase in self.problem.phases for n in phase.connected)
+            raise unknown_name("virtual link", link, connected)
+        return np.concatenate(parts)
+
+    def report(self) -> SolutionReport:
+        """Return the certificate: how far every interval is from a motion.
+
+        All intervals are simulated in one batched run, each from its own first node.
+        """
+        return report(self.problem, self.structures, self.motion)
+
+    def refined(
+        self, tol: float = 1e-3, *, rounds: int = 4, solver: Any = None, progress_meter: Any = None
+    ) -> "Solution":
+        """Return the motion solved again on finer meshes, until every interval is a motion.
+
+        Phases with defects above the tolerance get more intervals, those far below it fewer. Each
+        mesh starts from the solution before. `cost_error` of the result says how far the cost moved
+        between the last two meshes.
+
+        tol: largest defect of a position (rad, m); of a velocity it is ten times this number.
+        rounds: largest number of meshes.
+        solver, progress_meter: as in `Problem.solve`.
+        """
+        options = {"solver": solver, "progress_meter": progress_meter}
+        return self.problem.refine(self, positive_scalar("tol", tol), rounds, **options)
+
+    def trajectory(self, ts: Any = None, *, rate: float = 0.0, **options: Any) -> Trajectory:
+        """Return the motion as a run of `svkc.simulate`, with events between the phases.
+
+        Open loop an unstable phase leaves the plan: with a rate, torques of springs and dampers
+        towards the plan are added in the driven joints.
+
+        ts: save times (s); None: 101 times over the motion.
+        rate: of the feedback (1/s); zero: the plan's torques alone.
+        options: keyword arguments of `svkc.simulate`.
+        """
+        return replay(self, rate, ts, options)
+
+    def gradient(self) -> Any:
+        """Return the derivatives of the optimal cost by the chain's floats and by args.
+
+        A pair (chain, args) with the derivatives as leaves, None where there are none. They are
+        those of the Lagrangian (envelope theorem), valid while the active bounds do not change.
+        """
+        program, start = self.problem.start(self)
+        return program.parameter_gradient(start.x, self.multipliers.rows)
+
+    def impulse(self, phase: str, link: str | None = None) -> Any:
+        """Return the impulse (N s) [3] of a virtual link in the impact at the start of a phase.
+
+        phase: name of the phase. link: name of the link; None: the only one that is connected.
+        Raises ValueError for unknown names.
+        """
+        names = [p.name for p in self.problem.phases]
+        if phase not in names:
+            raise unknown_name("phase", phase, names)
+        i = names.index(phase)
+        connected, motion = self.problem.phases[i].connected, self.motion[i]
+        link = connected[0] if link is None and len(connected) == 1 else link
+        if link is None or link not in connected:
+            raise unknown_name("virtual link", str(link), connected)
+        return self._force(link, motion.impulse)
+
+    def _force(self, link: str, multipliers: np.ndarray) -> np.ndarray:
+        """Return the force [... 3] of multipliers of all links' rows, in the parent's axes."""
+        chain = self.problem.chain
+        i = link_index(chain.topology, link)
+        turn = np.asarray(quat_matrix(chain.structure.quat[i]))
+        return multipliers[..., 6 * i + 3 : 6 * i + 6] @ turn.T
+
+
+def solution(problem: Any, program: Program, result: SolverResult) -> Solution:
+    """Return the solution from what a solver returned."""
+    transcription, rows = program.transcription, program.rows(result.x)
+    motion = decode(transcription, result.x * program.unit)
+    ends = np.cumsum([m.duration for m in motion])
+    ts = [np.linspace(end - m.duration, end, len(m.q)) for end, m in zip(ends, motion, strict=True)]
+    states = [
+        jax.vmap(lambda q, v, s=s: full_state(problem.chain, s.structure, q, v))(m.q, m.v)
+        for m, s in zip(motion, transcription.structures, strict=True)
+    ]
+    return Solution(
+        cost=rows[-1] * program.row_unit[-1],
+        violation=np.max(program.violation(result.x), initial=0.0),
+        durations=np.array([m.duration for m in motion]),
+        ts=np.concatenate(ts),
+        states=jax.tree.map(lambda *x: jnp.concatenate(x), *states),
+        motion=motion,
+        multipliers=Multipliers(result.multipliers, lower=result.lower, upper=result.upper),
+        iterations=np.asarray(result.iterations),
+        seconds=np.array([result.seconds, result.functions]),
+        result=OUTCOME._name_to_item[result.status],
+        structures=tuple(s.structure for s in transcription.structures),
+        cost_error=np.asarray(np.nan),
+        problem=problem,
+    )
+
+
+def raise_on_failure(program: Program, result: SolverResult) -> None:
+    """Raise RuntimeError if the solver failed. The message names the most violated rows."""
+    if result.status in ("successful", "acceptable"):
+        return
+    words = OUTCOME[OUTCOME._name_to_item[result.status]]
+    raise RuntimeError(
+        f"solve: {words} After {result.iterations} iterations the largest violations are:"
+        f" {violated_rows(program, result.x) or 'none'}"
+    )
+
+
+def violated_rows(program: Program, x: np.ndarray, tolerance: float = 1e-6) -> str:
+    """Return the names of the rows that are violated most, with the amounts in SI units."""
+    violation = program.violation(x)
+    order = np.argsort(-np.nan_to_num(violation, nan=np.inf))[:_ROWS_SHOWN]
+    table = program.transcription.rows
+    return "; ".join(
+        f"{table.label(i)}: {violation[i] * table.unit[i]:.3g}"
+        for i in order
+        if not violation[i] <= tolerance
+    )

@@ -1,0 +1,91 @@
+"""The structures of phases: which rows of links are constraints, by their rank."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from svkc.loops.pivoting import rank_tolerance
+from svkc.model.chain import Chain
+from svkc.model.names import connection_mask, link_index
+from svkc.optimize.loop_rows import LinkRows, possible_rows, rates_at
+from svkc.optimize.phases import Phase
+from svkc.optimize.points import PhaseStructure, tree_configuration
+from svkc.transitions.newton import decide_rank
+
+
+def independent_rows(
+    chain: Chain, q: Sequence[np.ndarray], first: np.ndarray, candidates: np.ndarray
+) -> np.ndarray:
+    """Return independent rows of links, those of `first` before others, and the largest first.
+
+    q: configurations [nq] of the tree. The rows are those of the configuration with most of them.
+    """
+    if not len(candidates):
+        return candidates
+    table = LinkRows.of(chain, candidates)
+    scale = np.where(candidates % 6 < 3, 1.0, 1 / float(chain.length))
+    matrix = jax.jit(
+        lambda q: jax.jacfwd(lambda v: rates_at(chain, q, v, table))(jnp.zeros(chain.nv))
+    )
+    best = np.zeros(0, int)
+    for pose in q:
+        J = np.asarray(matrix(jnp.asarray(pose))) * scale[:, None]
+        rows = _greedy(J, np.isin(candidates, first))
+        best = candidates[rows] if len(rows) > len(best) else best
+    return np.sort(best)
+
+
+def _greedy(J: np.ndarray, preferred: np.ndarray) -> list[int]:
+    """Return rows of J by pivoted orthogonalization, the preferred ones first."""
+    rest, rows, largest = J.copy(), [], np.max(np.linalg.norm(J, axis=1), initial=1e-300)
+    for group in (preferred, ~preferred):
+        while True:
+            norms = np.where(group, np.linalg.norm(rest, axis=1), 0)
+            k = int(np.argmax(norms))
+            if norms[k] <= rank_tolerance(J.dtype) * largest:
+                break
+            rows.append(k)
+            direction = rest[k] / norms[k]
+            rest = rest - np.outer(rest @ direction, direction)
+    return rows
+
+
+def phase_structures(
+    chain: Chain, phases: Sequence[Phase], poses: Sequence[Sequence[np.ndarray]]
+) -> tuple[np.ndarray, list[PhaseStructure]]:
+    """Return the rows that are constraints in some phase, and the structure of each phase.
+
+    poses: of each phase, configurations [nq] at which its rank is decided.
+    """
+    none = np.zeros(len(chain.link_names), bool)
+    masks = [np.asarray(connection_mask(chain.topology, p.connected, none)) for p in phases]
+    own, before = [], np.zeros(0, int)
+    for mask, q in zip(masks, poses):
+        candidates = possible_rows(chain, mask)
+        before = independent_rows(chain, q, before, candidates)
+        own.append(before)
+    rows = np.unique(np.concatenate([np.zeros(0, int), *own]))
+    structures = []
+    for i, (phase, mask) in enumerate(zip(phases, masks)):
+        active = np.isin(rows, own[i])
+        old = masks[i - 1][rows // 6] if i else np.zeros(len(rows), bool)
+        structure = eqx.tree_at(lambda s: s.connected, chain.structure, jnp.asarray(mask))
+        if len(mask):
+            q = tree_configuration(chain, jnp.asarray(poses[i][0]))
+            structure = decide_rank(chain, structure, q)
+        structures.append(PhaseStructure(structure, active=active, new=active & ~old))
+        _check_spare(chain, phase)
+    return rows, structures
+
+
+def _check_spare(chain: Chain, phase: Phase) -> None:
+    """Raise ValueError if a phase connects a spare slot, which has no bodies."""
+    for name in phase.connected:
+        if chain.topology.link_spare[link_index(chain.topology, name)]:
+            raise ValueError(
+                f"phase {phase.name!r}: {name!r} is a spare slot; load the chain with the virtual"
+                " link between its bodies"
+            )

@@ -1,0 +1,239 @@
+"""The transcription: a problem's unknowns and rows, with the blocks of the equations of motion."""
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from svkc.optimize.blocks import Block, PlainBlock, StageBlock
+from svkc.optimize.equations import (
+    IntervalData,
+    Model,
+    connection,
+    end_of_interval,
+    projection,
+    stage_equations,
+)
+from svkc.optimize.lift import polynomials
+from svkc.optimize.phases import Phase
+from svkc.optimize.points import PhaseStructure
+from svkc.optimize.schemes import Radau
+from svkc.optimize.tables import Table
+from svkc.optimize.unknowns import UnknownsBuilder
+
+EQUATION = {"lower": 0.0, "upper": 0.0}
+
+
+class Transcription:
+    """A problem as unknowns x and rows g(x).
+
+    builder: of the unknowns. rows: their table. phases: indices of each phase's unknowns.
+    blocks: functions whose values are added to the rows. The row after the last is the cost.
+    references: of each phase, configurations [n + 1 nq] whose quaternions are its charts' origins.
+    """
+
+    def __init__(
+        self,
+        builder: UnknownsBuilder,
+        phases: Sequence[Phase],
+        model: Model,
+        *,
+        scheme: Radau,
+        structures: Sequence[PhaseStructure],
+        references: Sequence[np.ndarray],
+    ):
+        self.builder, self.model, self.scheme = builder, model, scheme
+        self.specification, self.structures, self.references = phases, structures, references
+        self.rows, self.blocks = Table(), []
+        # functions of the blocks' lanes, which are evaluated again for other references
+        self._sources: list[Callable] = []
+        self._linear: list[tuple] = []
+        self.phases = [
+            builder.add_phase(phase, structure, first=i == 0, impact=self.has_impact(i))
+            for i, (phase, structure) in enumerate(zip(phases, structures))
+        ]
+        self._add_times()
+        self._add_motion()
+        self._add_connections()
+        if builder.project:
+            self._add_projections()
+
+    def has_impact(self, i: int) -> bool:
+        """Return whether a phase starts with an impact."""
+        return bool(i and self.specification[i].impact and np.any(self.structures[i].new))
+
+    @property
+    def linear(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(row, unknown, factor) of terms that are added to the rows."""
+        triplets = [np.broadcast_arrays(*parts) for parts in self._linear]
+        empty = np.zeros(0)
+        row, column, factor = (
+            np.concatenate([empty, *(np.ravel(part[k]) for part in triplets)]) for k in range(3)
+        )
+        return row.astype(int), column.astype(int), factor
+
+    def _add_linear(self, rows: Any, unknowns: Any, factor: float) -> None:
+        """Add factor times unknowns to rows."""
+        self._linear.append((np.asarray(rows), np.asarray(unknowns), factor))
+
+    def data(self, i: int) -> IntervalData:
+        """Return the data [n + 1 ...] of a phase's nodes; the first n are its intervals' own."""
+        n, structure = self.specification[i].intervals, self.structures[i]
+        repeat = lambda x: np.broadcast_to(np.asarray(x), (n + 1, *np.shape(x)))
+        reference = np.asarray(self.references[i])
+        return IntervalData(
+            reference=reference,
+            following=np.concatenate([reference[1:], reference[-1:]]),
+            active=repeat(structure.active),
+            structure=jax.tree.map(repeat, structure.structure),
+        )
+
+    def add_block(self, block: Block, source: Callable) -> None:
+        """Append a block. source: () -> its lanes' data, as they follow from the references."""
+        self.blocks.append(block)
+        self._sources.append(source)
+
+    def set_references(self, references: Sequence[np.ndarray]) -> None:
+        """Set the origins of the charts, and the data of the blocks that follow from them."""
+        self.references = references
+        for block, source in zip(self.blocks, self._sources, strict=True):
+            block.set_lanes(source())
+
+    def lanes(self, i: int, nodes: slice) -> IntervalData:
+        """Return the data of some nodes of a phase."""
+        return jax.tree.map(lambda x: x[nodes], self.data(i))
+
+    def _add_rows(self, name: str, i: int, shape: tuple[int, ...], **options: Any) -> np.ndarray:
+        """Append equations of a phase and return their indices."""
+        return self.rows.add(name, self.specification[i].name, shape, **EQUATION, **options)
+
+    def _add_link_rows(self, name: str, i: int, shape, active, unit: float = 1.0) -> np.ndarray:
+        """Append equations for the active rows of links; return indices [... rows], -1: others."""
+        at = np.flatnonzero(active)
+        out = np.full((*shape, len(self.model.rows)), -1)
+        entries = [self.builder.names.rows[k] for k in at]
+        out[..., at] = self._add_rows(name, i, (*shape, len(at)), unit=unit, entries=entries)
+        return out
+
+    def _add_times(self) -> None:
+        """Append the rows by which each phase starts at the end of the one before."""
+        for i, (before, after) in enumerate(zip(self.phases, self.phases[1:]), 1):
+            row = self._add_rows("start time", i, (1,))
+            self._add_linear(row, after.start_time, 1.0)
+            self._add_linear(row, [before.start_time, before.duration], -1.0)
+
+    def _add_motion(self) -> None:
+        """Append the rows of the stages' equations and of continuity, for all phases at once."""
+        layout, s, names = self.model.layout, self.scheme.stages, self.builder.names
+        units, needs_state = self.builder.units, self.model.controls.needs_state
+        equations, self.continuity = [], []
+        for i, phase in enumerate(self.specification):
+            n = phase.intervals
+            dynamics = self._add_rows(
+                "dynamics", i, (n, s, layout.nv), unit=units.torque, entries=names.dofs
+            )
+            active = self.structures[i].active
+            links = self._add_link_rows("link", i, (n, s), active, units.acceleration)
+            equations.append(np.concatenate([dynamics, links], -1).reshape(n, -1))
+            nodes = self.phases[i].nodes
+            self.continuity.append(
+                self._add_rows(
+                    "continuity",
+                    i,
+                    (n, nodes.shape[1]),
+                    unit=self.builder.node_units,
+                    entries=names.node(self.model.controls.has_state),
+                )
+            )
+            self._add_linear(self.continuity[-1], nodes[1:], -1.0)
+        first_control, motion = 2 + 3 * layout.nv, 2 + np.arange(2 * layout.nv)
+        control = np.arange(first_control, layout.of_stage - layout.rows)
+        tangents = np.concatenate([[0], motion, control]) if needs_state else motion
+        self.add_stages(stage_equations, list(range(s)), equations, tangents)
+        has_quaternions = len(self.builder.chain.topology.quaternion_starts[0])
+        self.add_stages(
+            end_of_interval, [s - 1], self.continuity, motion if has_quaternions else motion[:0]
+        )
+
+    def add_stages(self, function: Callable, stages: list[int], rows, tangents) -> None:
+        """Append a block of stages over the intervals of all phases. rows: of each phase."""
+        counts, model = [phase.intervals for phase in self.specification], self.model
+        source = lambda: join_lanes(self.lanes(i, slice(-1)) for i in range(len(counts)))
+        self.add_block(
+            StageBlock(
+                lambda *args: function(model, *args),
+                model.layout,
+                polynomials(self.scheme, model.controls, stages),
+                data=source(),
+                index=np.concatenate([np.arange(n) for n in counts]),
+                count=np.repeat(counts, counts),
+                unknowns=np.concatenate([phase.intervals() for phase in self.phases]),
+                rows=np.concatenate(rows),
+                tangents=tangents,
+            ),
+            source,
+        )
+
+    def _add_plain(self, function: Callable, parts: list, nodes: slice) -> None:
+        """Append a block of nodes. parts: of each phase with such nodes, (i, unknowns, rows)."""
+        if parts:
+            source = lambda: join_lanes(self.lanes(i, nodes) for i, _, _ in parts)
+            call = lambda *args: function(self.model, *args)
+            unknowns, rows = (np.concatenate([part[k] for part in parts]) for k in (1, 2))
+            self.add_block(PlainBlock(call, source(), unknowns, rows), source)
+
+    def _add_connections(self) -> None:
+        """Append the rows by which phases start from the ones before, and links connect."""
+        nv, units, builder = self.model.layout.nv, self.builder.units, self.builder
+        parts = []
+        for i, phase in enumerate(self.specification):
+            impact, own, structure = self.has_impact(i), self.phases[i], self.structures[i]
+            if i:
+                before, after = self.phases[i - 1].nodes[-1], own.nodes[0]
+                same = np.arange(len(after)) < (2 - impact) * nv
+                same |= (np.arange(len(after)) >= 2 * nv) & phase.continuous_torques
+                names = np.array(builder.names.node(self.model.controls.has_state))[same]
+                row = self._add_rows(
+                    "start", i, (int(same.sum()),), unit=builder.node_units[same],
+                    entries=list(names),
+                )  # fmt: skip
+                self._add_linear(row, after[same], 1.0)
+                self._add_linear(row, before[same], -1.0)
+            if not np.any(structure.new):
+                continue
+            gaps = self._add_link_rows("gap", i, (), structure.new)
+            self._add_linear(gaps[own.offset >= 0], own.offset[own.offset >= 0], -1.0)
+            stopped = structure.active if impact else structure.new
+            rates = self._add_link_rows("gap rate", i, (), stopped, units.velocity)
+            momentum = np.full(nv, -1)
+            if impact:
+                unit = units.torque * units.velocity / units.acceleration
+                momentum = self._add_rows("impact", i, (nv,), unit=unit, entries=builder.names.dofs)
+            v_before = self.phases[i - 1].nodes[-1, nv : 2 * nv] if impact else np.full(nv, -1)
+            unknowns = [[*own.nodes[0, : 2 * nv], *v_before, *own.impulse]]
+            parts.append((i, unknowns, [[*gaps, *rates, *momentum]]))
+        self._add_plain(connection, parts, slice(1))
+
+    def _add_projections(self) -> None:
+        """Append the rows that keep the loops closed at the nodes after the first of a phase."""
+        nv, units = self.model.layout.nv, self.builder.units
+        parts = []
+        for i, phase in enumerate(self.specification):
+            active, own, n = self.structures[i].active, self.phases[i], phase.intervals
+            if not np.any(active):
+                continue
+            gaps = self._add_link_rows("gap", i, (n,), active)
+            at = np.flatnonzero(own.offset >= 0)
+            self._add_linear(gaps[:, at], own.offset[at], -1.0)
+            rates = self._add_link_rows("gap rate", i, (n,), active, units.velocity)
+            changes = self.continuity[i][:, : 2 * nv]
+            unknowns = [own.nodes[1:, : 2 * nv], own.change_q, own.change_v]
+            rows = np.concatenate([changes, gaps, rates], 1)
+            parts.append((i, np.concatenate(unknowns, 1), rows))
+        self._add_plain(projection, parts, slice(1, None))
+
+
+def join_lanes(parts: Iterable[IntervalData]) -> IntervalData:
+    """Return the lanes of several parts as one."""
+    return jax.tree.map(lambda *x: np.concatenate(x), *parts)

@@ -1,0 +1,191 @@
+"""Rows of the user's functions: costs and constraints of points."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from svkc._jax.eager import eager_jit
+from svkc._jax.pytrees import is_concrete
+from svkc.model.validation import as_array, description, is_real
+from svkc.optimize.blocks import StageBlock, find_tangents
+from svkc.optimize.equations import Params, point_of_stage
+from svkc.optimize.lift import polynomials
+from svkc.optimize.phases import Constraint
+from svkc.optimize.points import Point
+from svkc.optimize.transcription import Transcription
+
+
+class Values(NamedTuple):
+    """What a user's function returned: numbers, and bounds that it gave with them."""
+
+    numbers: Any
+    lower: Any
+    upper: Any
+
+
+def _evaluate(entry: Constraint, point: Point) -> Values:
+    """Return the values of a constraint at a point. Raises ValueError if they are no numbers."""
+    result, lower, upper = entry.function(point), entry.lower, entry.upper
+    if isinstance(result, tuple) and len(result) == 3:
+        result, lower, upper = result
+    if not is_real(as_array(result)):
+        raise ValueError(f"constraint {entry.name!r}: expected numbers, got {description(result)}")
+    return Values(jnp.ravel(jnp.asarray(result)), lower, upper)
+
+
+def _cost(function: Callable, name: str, point: Point) -> Any:
+    """Return the value of a cost at a point. Raises ValueError if it is not one number."""
+    value = function(point)
+    if not is_real(as_array(value)) or jnp.shape(value) != ():
+        raise ValueError(f"{name}: expected a cost of one number, got {description(value)}")
+    return value
+
+
+class UserRows:
+    """Appends the rows and costs of users' functions to a transcription.
+
+    params: for which the functions are evaluated. draws: [draws unknowns] at which they are probed.
+    costs: lists of (place, block, local row) of the cost.
+    """
+
+    def __init__(self, transcription: Transcription, params: Params, draws: np.ndarray):
+        self.transcription, self.params, self.draws = transcription, params, draws
+        # rows of the cost are known when all others are
+        self.cost_places: list[tuple[StageBlock, np.ndarray]] = []
+
+    def add_phase(self, i: int, running: Sequence[Callable], final: Sequence[Callable]) -> None:
+        """Append the constraints and costs of a phase."""
+        phase, n, s = self.transcription.specification[i], 0, self.transcription.scheme.stages
+        n = phase.intervals
+        path, every = phase.constraints("path"), np.arange(n)
+        self._add("path", i, path, running, stages=list(range(s)), intervals=every)
+        at_start = [c for c in path if self._holds_at_start(i, c)] + phase.constraints("start")
+        self._add("start", i, at_start, (), stages=[-1], intervals=every[:1])
+        end = phase.constraints("end")
+        self._add("end", i, end, final, stages=[s - 1], intervals=every[-1:])
+
+    def _point(self, i: int, params: Params, data, y, **options: Any) -> Point:
+        active = np.asarray(self.transcription.structures[i].active)
+        return point_of_stage(self.transcription.model, params, data, y, active, **options)
+
+    def _reads_links(self, block: StageBlock) -> bool:
+        """Return whether a block's function reads coordinates of virtual joints."""
+        block.options = {"fill": np.nan}
+        values = eager_jit(lambda *x: block.values(*x))
+        lanes = lambda x: jax.tree.map(lambda x: jnp.asarray(x[:1]), x)
+        rows = values(self.params, lanes(block.data), lanes(self._local(block.unknowns)[0]))
+        return bool(np.isnan(np.asarray(rows)).any())
+
+    def _holds_at_start(self, i: int, entry: Constraint) -> bool:
+        """Return whether a path constraint is a function of what the start of a phase has."""
+        try:
+            self._shapes(i, [entry], at_start=True)
+        except ValueError:
+            return False
+        return True
+
+    def _shapes(self, i: int, entries: Sequence[Constraint], at_start: bool) -> list[Values]:
+        """Return shapes and bounds of constraints' values, without computing them."""
+        out: list[Values] = []
+        data = jax.tree.map(lambda x: x[0], self.transcription.data(i))
+
+        def evaluate(y):
+            point = self._point(i, self.params, data, y, at_start=at_start)
+            values = [_evaluate(entry, point) for entry in entries]
+            out.extend(values)
+            return [v.numbers for v in values]
+
+        y = jnp.zeros(self.transcription.model.layout.of_stage, self.params.chain.q_load.dtype)
+        shapes = jax.eval_shape(evaluate, y)
+        return [Values(x.shape, v.lower, v.upper) for x, v in zip(shapes, out)]
+
+    def _add(self, place, i: int, entries, costs, *, stages, intervals) -> None:
+        """Append a block of constraints and costs at some stages of some intervals."""
+        if not entries and not costs:
+            return
+        transcription, at_start, is_running = self.transcription, stages == [-1], place == "path"
+        phase, lanes = transcription.specification[i], len(intervals)
+        rows = self._rows_of(place, i, entries, (lanes, len(stages)))
+        cost_rows = np.full((lanes, len(stages), len(costs)), -1)
+
+        def function(params, data, weight, y):
+            point = self._point(i, params, data, y, at_start=at_start, **block.options)
+            parts = [_evaluate(entry, point).numbers for entry in entries]
+            scale = weight * point.duration if is_running else 1.0
+            name = "running" if is_running else "final"
+            return jnp.concatenate([*parts, *(scale * _cost(f, name, point)[None] for f in costs)])
+
+        forces = np.full_like(transcription.phases[i].forces, -1)
+        forces[:, 0] = transcription.phases[i].impulse
+        unknowns = transcription.phases[i].intervals(forces if at_start else None)[intervals]
+        source = lambda: jax.tree.map(lambda x: x[intervals], transcription.data(i))
+        block = StageBlock(
+            function,
+            transcription.model.layout,
+            polynomials(transcription.scheme, transcription.model.controls, stages),
+            data=source(),
+            index=intervals,
+            count=np.full(lanes, phase.intervals),
+            unknowns=unknowns,
+            rows=np.concatenate([*rows, cost_rows], -1).reshape(lanes, -1),
+            tangents=np.arange(0),
+        )
+        block.options = {} if self._reads_links(block) else {"fill": 0.0}
+        block.tangents = find_tangents(block, self.params, self._local(unknowns))
+        if costs:
+            is_cost = np.zeros((lanes, len(stages), sum(r.shape[-1] for r in rows) + len(costs)))
+            is_cost[..., -len(costs) :] = 1
+            self.cost_places.append((block, is_cost.reshape(lanes, -1) > 0))
+        transcription.add_block(block, source)
+
+    def _rows_of(self, place: str, i: int, entries, lanes: tuple[int, int]) -> list[np.ndarray]:
+        """Append the rows of constraints; return their indices [lanes stages values]."""
+        rows, phase = [], self.transcription.specification[i]
+        for entry, shape in zip(entries, self._shapes(i, entries, place == "start")):
+            lower, upper = self._bounds(entry, shape)
+            name = entry.name if entry.name.startswith(place) else f"{place} {entry.name!r}"
+            count = shape.numbers[0]
+            rows.append(
+                self.transcription.rows.add(
+                    name,
+                    phase.name,
+                    (*lanes, count),
+                    lower=lower,
+                    upper=upper,
+                    unit=np.nan,
+                    entries=[str(k) for k in range(count)] * (count > 1),
+                )
+            )
+        return rows
+
+    def _bounds(self, entry: Constraint, shape: Values) -> list[np.ndarray]:
+        """Return a constraint's bounds over its values. Raises ValueError for wrong bounds."""
+        bounds = []
+        for bound in (shape.lower, shape.upper):
+            if not is_concrete(bound):
+                raise ValueError(
+                    f"constraint {entry.name!r}: its bounds depend on the point; put what depends"
+                    " on it into the function"
+                )
+            bounds.append(np.ravel(np.asarray(as_array(bound), float)))
+        if not all(b.shape in ((1,), shape.numbers) for b in bounds) or not np.all(
+            bounds[0] <= bounds[1]
+        ):
+            raise ValueError(
+                f"constraint {entry.name!r}: got the bounds {shape.lower} to {shape.upper} for"
+                f" {shape.numbers[0]} values"
+            )
+        return bounds
+
+    def _local(self, unknowns: np.ndarray) -> np.ndarray:
+        """Return values of local unknowns [draws lanes n] at the draws."""
+        padded = np.concatenate([self.draws, np.zeros((len(self.draws), 1))], 1)
+        return padded[:, unknowns]
+
+    def set_cost_row(self, row: int) -> None:
+        """Set the row of the cost, which is the last."""
+        for block, is_cost in self.cost_places:
+            block.rows = np.where(is_cost, row, block.rows)
