@@ -1,0 +1,146 @@
+"""Optimization of a backflip with a loop that closes in flight: svkc beside CasADi.
+
+Both solve the same transcription (Radau IIA, two stages, 130 intervals) of the statement in
+backflip.py with IPOPT and MUMPS, on one thread: from the straight-line guess, and from the same
+noisy starts. The cost is J / 1e6.
+
+`python benchmarks/optimize.py [--starts 20] [--by CasADi svkc]` (extras `bench`, `optimize`) prints
+the rows and writes results/optimize.csv. The last solves start CasADi's IPOPT from the best point of
+each other solver; `--confirm FILE` does so from a stored point of the layout of backflip.py.
+
+Seconds are of the processor, from IPOPT's own statistics: functions, its primal-dual system (linear
+algebra), all of it. `ready` is what comes before: graphs, derivatives, compilation. Milliseconds of
+functions are medians of calls in turns at the straight-line guess.
+"""
+
+import argparse
+import csv
+import importlib
+import os
+import pathlib
+import platform
+import statistics
+import time
+
+# threads of small dense blocks cost more than they save
+os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+import backflip
+import casadi
+import numpy as np
+import optimize_casadi
+
+RESULTS = pathlib.Path(__file__).parent / "results"
+# the module of a solver holds `Backflip`; a further solver is a row here
+SOLVERS = {"CasADi": "optimize_casadi", "svkc": "optimize_svkc"}
+HEAD = [
+    "start",
+    "by",
+    "result",
+    "cost",
+    "violation",
+    "iterations",
+    "functions s",
+    "linear algebra s",
+    "total s",
+    "functions ms",
+    "linear algebra ms",
+    "ready s",
+]
+ROUNDS = 15
+
+
+def row(start: str, by: str, solve: optimize_casadi.Solve, ready: float) -> list:
+    """Return the row of a solve. Milliseconds are per iteration."""
+    per_iteration = 1e3 / max(solve.iterations, 1)
+    return [
+        start,
+        by,
+        solve.status,
+        f"{solve.cost / 1e6:.6g}",
+        f"{solve.violation:.1e}",
+        solve.iterations,
+        f"{solve.functions_s:.2f}",
+        f"{solve.linear_algebra_s:.2f}",
+        f"{solve.total_s:.2f}",
+        f"{solve.functions_s * per_iteration:.1f}",
+        f"{solve.linear_algebra_s * per_iteration:.1f}",
+        f"{ready:.1f}",
+    ]
+
+
+def time_functions(problems: dict):
+    """Yield (function, by, ms) of the functions of all solvers, called in turns."""
+    calls = {by: p.functions(backflip.straight_line_guess()) for by, p in problems.items()}
+    for name in ("rows", "Jacobian", "Hessian"):
+        times = {by: [] for by in calls}
+        for _ in range(ROUNDS + 1):
+            for by, functions in calls.items():
+                begin = time.process_time()
+                functions[name]()
+                times[by].append(time.process_time() - begin)
+        for by, values in times.items():
+            yield name, by, statistics.median(values[1:]) * 1e3
+
+
+def machine() -> dict:
+    """Return versions, processor and number of cores."""
+    names = [line for line in open("/proc/cpuinfo") if line.startswith("model name")]
+    return {
+        "python": platform.python_version(),
+        "casadi": casadi.__version__,
+        "processor": names[0].split(":")[1].strip(),
+        "cores": os.cpu_count(),
+    }
+
+
+def main(starts: int, solvers: list[str]):
+    """Measure, print and write all rows."""
+    problems = {by: importlib.import_module(SOLVERS[by]).Backflip() for by in solvers}
+    guesses = {"straight lines": backflip.straight_line_guess()}
+    guesses |= {f"noise {seed}": backflip.noisy_guess(seed) for seed in range(starts)}
+    rows, best = [], {}
+    print("| " + " | ".join(HEAD) + " |")
+    for start, guess in guesses.items():
+        for by, problem in problems.items():
+            solve = problem.solve(guess)
+            rows.append(row(start, by, solve, problem.seconds))
+            print("| " + " | ".join(map(str, rows[-1])) + " |", flush=True)
+            if solve.violation < 1e-6 and (by not in best or solve.cost < best[by].cost):
+                best[by] = solve
+    for by in best.keys() - {"CasADi"}:
+        solve = optimize_casadi.confirm(best[by].point)
+        rows.append([*row(f"best of {by}", "CasADi", solve, 0)[:-1], ""])
+        print("| " + " | ".join(map(str, rows[-1])) + " |", flush=True)
+    for name, by, ms in time_functions(problems):
+        rows.append([name, by, *[""] * 7, f"{ms:.2f}", "", ""])
+        print(f"| {name} | {by} | {ms:.2f} ms |")
+    with (RESULTS / "optimize.csv").open("w", newline="") as file:
+        versions = machine()
+        table = [[*HEAD, *versions], *([*x, *versions.values()] for x in rows)]
+        csv.writer(file, lineterminator="\n").writerows(table)
+    print(machine())
+
+
+def confirm(path: str):
+    """Print what CasADi's IPOPT converges to from a stored point."""
+    with np.load(path) as file:
+        point = {name: file[name] for name in backflip.SHAPES}
+    solve = optimize_casadi.confirm(point)
+    print(
+        f"J = {solve.cost:.6g}, violation {solve.violation:.1e}, {solve.iterations} iterations,"
+        f" {solve.status}"
+    )
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--starts", type=int, default=20, help="noisy starts")
+    parser.add_argument("--by", nargs="+", default=list(SOLVERS), choices=SOLVERS)
+    parser.add_argument("--confirm", metavar="FILE")
+    options = parser.parse_args()
+    if options.confirm:
+        confirm(options.confirm)
+    else:
+        main(options.starts, options.by)
