@@ -175,11 +175,8 @@ def constraint_rows(
     near: whether the rows are reduced, as near a singular configuration (None: never).
     """
     J, column = jax.lax.stop_gradient((J, jacobian_scales(chain)[1]))
-    rows = ConstraintRows(
-        virtual_joints(chain, J / column[None]),
-        delassus_rows(chain, structure.locked is not None),
-        J,
-    )
+    in_D = delassus_rows(chain, structure.locked is not None)
+    rows = ConstraintRows(virtual_joints(chain, J / column[None]), in_D, J)
     J_D = static_take(J[:, : chain.nv], in_D.rows)
     scaled, unscale = rows.reject(J_D.T).T, 1 / column[None, : chain.nv]
     if near is None:

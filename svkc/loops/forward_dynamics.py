@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -73,18 +74,10 @@ def velocity_and_acceleration(
     if chain.topology.link_names:
         loops = loop_kinematics(chain, structure, q)
         kin, J = loops.kin, loops.J
-        selection = (
-            select_pivots(structure, J, pivots)
-            if project_velocity or dynamics.uses_pivots
-            else None
-        )
-        if project_velocity:
-            assert selection is not None
-            v = _projected_if_near_singular(chain, structure, selection, J, v)
-        if not dynamics.uses_pivots:
-            selection = constraint_rows(chain, structure, J, near)
-            if near is not None:
-                v = _with_consistent_velocities_if(near, chain, structure, J, v, selection)
+        selection, v = _select_rows(
+            chain, structure, J, v, dynamics=dynamics, project_velocity=project_velocity,
+            pivots=pivots, near=near,
+        )  # fmt: skip
     else:
         kin, loops = kinematics(chain, q), None
     V = twists(chain, kin, v)
@@ -99,6 +92,25 @@ def velocity_and_acceleration(
     if added_inertia is not None:
         solve = _with_cuttable_inertia(chain, solve, added_inertia)
     return v, solve(force, loop_bias)
+
+
+def _select_rows(
+    chain: Chain, structure: Structure, J, v, *, dynamics: AbstractDynamics, project_velocity: bool,
+    pivots, near,
+) -> tuple[Any, Float[Array, " dofs"]]:  # fmt: skip
+    """Return the `selection` of `AbstractDynamics.prepare`, and v or, near a singular
+    configuration, consistent velocities. The options are those of `velocity_and_acceleration`."""
+    selection = None
+    if project_velocity or dynamics.uses_pivots:
+        selection = select_pivots(structure, J, pivots)
+    if project_velocity:
+        assert selection is not None
+        v = _projected_if_near_singular(chain, structure, selection, J, v)
+    if not dynamics.uses_pivots:
+        selection = constraint_rows(chain, structure, J, near)
+        if near is not None:
+            v = _with_consistent_velocities_if(near, chain, structure, J, v, selection)
+    return selection, v
 
 
 def _projected_if_near_singular(
