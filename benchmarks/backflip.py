@@ -82,11 +82,11 @@ class Phase(typing.NamedTuple):
 
 
 PHASES = (
-    Phase("push", "toe", (0.1, 0.4), 20),
-    Phase("flight", None, (0.1, 0.3), 20),
-    Phase("tuck", "shank", (0.1, 0.4), 30),
-    Phase("open", None, (0.1, 0.3), 30),
-    Phase("landing", "toe", (0.2, 1.0), 30),
+    Phase(name="push", connection="toe", duration=(0.1, 0.4), intervals=20),
+    Phase(name="flight", connection=None, duration=(0.1, 0.3), intervals=20),
+    Phase(name="tuck", connection="shank", duration=(0.1, 0.4), intervals=30),
+    Phase(name="open", connection=None, duration=(0.1, 0.3), intervals=30),
+    Phase(name="landing", connection="toe", duration=(0.2, 1.0), intervals=30),
 )
 INTERVALS = sum(phase.intervals for phase in PHASES)
 NODES = INTERVALS + len(PHASES)

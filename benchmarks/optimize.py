@@ -5,8 +5,8 @@ backflip.py with IPOPT and MUMPS, on one thread: from the straight-line guess, a
 noisy starts. The cost is J / 1e6.
 
 `python benchmarks/optimize.py [--starts 20] [--by CasADi svkc]` (extras `bench`, `optimize`) prints
-the rows and writes results/optimize.csv. The last solves start CasADi's IPOPT from the best point of
-each other solver; `--confirm FILE` does so from a stored point of the layout of backflip.py.
+the rows and writes results/optimize.csv. The last solves start CasADi's IPOPT from the best point
+of each other solver; `--confirm FILE` does so from a stored point of the layout of backflip.py.
 
 Seconds are of the processor, from IPOPT's own statistics: functions, its primal-dual system (linear
 algebra), all of it. `ready` is what comes before: graphs, derivatives, compilation. Milliseconds of

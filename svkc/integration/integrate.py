@@ -11,13 +11,14 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array
 
 from svkc._jax.control_flow import buffer_at_set, while_loop
 from svkc._jax.pytrees import tree_where
 from svkc.integration.dense_output import ProjectedInterpolation, make_interpolation
 from svkc.integration.event_location import EventSearch, event_info
 from svkc.integration.guard_scan import locate_event
+from svkc.integration.near_singular import redone_if_near
 from svkc.integration.ode import ODEState, Times, is_finite, rms_norm
 from svkc.integration.solution import (
     EVENT,
@@ -40,7 +41,6 @@ from svkc.integration.step_size import (
     with_projection_error,
 )
 from svkc.integration.vector_field import initial_projection_info, project_state
-from svkc.loops.pivoting import has_redundant_rows, singularity_threshold
 
 
 def integrate_phase(
@@ -199,28 +199,6 @@ def _attempt_step(
     )
 
 
-def _redone_if_near(
-    s: StepperState, attempt: StepAttempt, problem: PhaseProblem
-) -> tuple[StepAttempt, Bool[Array, ""] | None, Bool[Array, ""]]:
-    """Return the attempt, whether the next one has reduced rows, and whether this one is redone.
-
-    An attempt that ends near a singular configuration, or that does not close the loops, is not
-    kept: it is taken again with reduced rows. Rows are reduced until a step is kept that ends away
-    from singular configurations, and throughout a phase whose loops are redundant.
-    """
-    if s.near is None:
-        return attempt, None, jnp.zeros((), bool)
-    assert attempt.projection_info is not None
-    structure = problem.field_args.structure
-    # false for NaN
-    away = attempt.projection_info.margin > singularity_threshold(structure)
-    away = away & ~has_redundant_rows(structure)
-    redo = ~s.near & ~(away & attempt.closed)
-    near = jnp.where(s.near, ~(attempt.keep_step & away), redo)
-    keep_step = attempt.keep_step & ~redo
-    return dataclasses.replace(attempt, keep_step=keep_step), near, redo
-
-
 def _interpolation(
     step: tuple[Array, Array],
     dense_info: Any,
@@ -270,7 +248,7 @@ def _body_fun(
         )
     problem = eqx.tree_at(lambda p: p.field_args.near, problem, s.near, is_leaf=lambda x: x is None)
     t1 = s.tnext if s.search is None else s.search.end_of_attempt(s.tnext)
-    attempt, near, redo = _redone_if_near(s, _attempt_step(s, t1, problem, options), problem)
+    attempt, near, redo = redone_if_near(s, _attempt_step(s, t1, problem, options), problem)
     guard_values, search, hold = None, None, jnp.zeros((), bool)
     if s.search is not None:
         attempt, guard_values, search, hold = locate_event(s, attempt, t1, problem, options)
