@@ -219,7 +219,7 @@ def turned(angle: float, points: np.ndarray) -> np.ndarray:
     return np.array([[cos, -sin], [sin, cos]]) @ points
 
 
-def moving_segments() -> list[Segment]:
+def segment_motions() -> list[Segment]:
     """Return one body for each segment with a joint and those that are fixed to it."""
     frames, groups = {None: (None, np.zeros(2), 0.0)}, {}
     for segment in SEGMENTS:

@@ -30,7 +30,7 @@ def moment(arm, force):
     return arm[0] * force[1] - arm[1] * force[0]
 
 
-BODIES = backflip.moving_segments()
+BODIES = backflip.segment_motions()
 SLIDES = ca.DM(backflip.turned(backflip.PELVIS_TURN, np.eye(2)))
 
 

@@ -152,8 +152,8 @@ def _attempt_step(
     """Take one step of the solver to t1, project it, and let the controller judge its error."""
     field, field_args, controller = problem.field, problem.field_args, options.controller
     term = diffrax.ODETerm(field)
-    # Projection moved the state, so the FSAL derivative is stale: re-evaluate.
-    stale = True if needs_projection(field.stabilization, field_args.chain) else s.made_jump
+    # After a projection the FSAL derivative is stale: re-evaluate.
+    stale = needs_projection(field.stabilization, field_args.chain) or s.made_jump
     y_solver, error, dense_info, solver_state, solver_result = options.solver.step(
         term, s.t, t1, s.y, field_args, s.solver_state, made_jump=stale
     )
@@ -176,8 +176,7 @@ def _attempt_step(
             controller_state=s.controller_state,
         )
     )
-    keep_step = jnp.asarray(keep_step)
-    failed = keep_step & (solver_result._value != SUCCESSFUL)
+    failed = jnp.asarray(keep_step) & (solver_result._value != SUCCESSFUL)
     result = jnp.where(failed, solver_result._value, controller_result._value)
     # A step that is not ok ends the phase if the controller keeps it or has no shorter one.
     result = jnp.where(~ok & (keep_step | (result != SUCCESSFUL)), failure, result)
