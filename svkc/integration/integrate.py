@@ -252,11 +252,10 @@ def _body_fun(
     if s.search is not None:
         attempt, guard_values, search, hold = locate_event(s, attempt, t1, problem, options)
         search = tree_where(redo, s.search, search)
+    rejected = (~attempt.keep_step & ~hold) | redo
     hold = hold | redo
-    rejected = ~attempt.keep_step & ~hold
     if search is not None:
-        rejected = rejected | jnp.isfinite(search.retry_time) & ~redo
-    rejected = rejected | redo
+        rejected = rejected | jnp.isfinite(search.retry_time)
     if_advancing = lambda new, old: tree_where(attempt.keep_step, new, old)
     unless_held = lambda new, old: tree_where(hold, old, new)
     t, accepted = if_advancing(attempt.t, s.t), s.accepted + attempt.keep_step.astype(jnp.int32)

@@ -21,9 +21,11 @@ def redone_if_near(
     if s.near is None:
         return attempt, None, jnp.zeros((), bool)
     assert attempt.projection_info is not None
+    margin = attempt.projection_info.margin
+    assert margin is not None
     structure = problem.field_args.structure
     # false for NaN
-    away = attempt.projection_info.margin > singularity_threshold(structure)
+    away = margin > singularity_threshold(structure)
     away = away & ~has_redundant_rows(structure)
     redo = ~s.near & ~(away & attempt.closed)
     near = jnp.where(s.near, ~(attempt.keep_step & away), redo)

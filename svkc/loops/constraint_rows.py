@@ -246,6 +246,7 @@ def with_consistent_velocities(
 
     J: the scaled J_C. v: zero where inactive.
     """
+    assert rows.pivots is not None
     nv, column = chain.nv, jacobian_scales(chain)[1]
     frozen = jax.lax.stop_gradient(column)
     # The second correction is round-off. With it, derivatives are exact although T is constant.
