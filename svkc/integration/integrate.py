@@ -275,7 +275,6 @@ def _body_fun(
         step_size=unless_held(attempt.step_size, s.step_size),
         controller_state=unless_held(attempt.controller_state, s.controller_state),
         result=result,
-        # These are updated by every attempt.
         progress_meter_state=options.progress_meter.step(s.progress_meter_state, progress),
         search=search,
         near=near,
