@@ -142,7 +142,6 @@ def _dot_general(*sides, dimension_numbers, preferred_element_type, **_):
 
     axes = len(batch[0])
     middle, end = axes + len(free[0]), axes + len(free[0]) + len(free[1])
-    # broadcast: each side has axes of length one for the free axes of the other side
     left, right = (
         jnp.transpose(x, (*b, *f, *c, x.ndim - 1))
         for x, b, f, c in zip(sides, batch, free, contracted, strict=True)
@@ -168,16 +167,10 @@ def _solve(inputs: list, lanes: int, *, const_lengths, jaxprs, **_):
 
 def _cond(inputs: list, lanes: int, *, branches, **_) -> list:
     """Evaluate a `cond` whose index all lanes share, with lanes last in its branches."""
-    index, *operands = inputs
-    batched = [isinstance(v, Batched) for v in operands]
-
-    def evaluate(closed, arrays):
-        values = [Batched(x) if b else x for x, b in zip(arrays, batched, strict=True)]
-        return [broadcast_to_lanes(x, lanes) for x in evaluate_jaxpr(closed, values, lanes)]
-
-    arrays = [v.x if isinstance(v, Batched) else v for v in operands]
-    branches = [functools.partial(evaluate, closed) for closed in branches]
-    return lax.switch(index, branches, arrays)
+    outputs = lambda closed, values: [
+        broadcast_to_lanes(x, lanes) for x in evaluate_jaxpr(closed, values, lanes)
+    ]
+    return lax.switch(inputs[0], [functools.partial(outputs, c) for c in branches], inputs[1:])
 
 
 def _apply_vmap(primitive, inputs: list, params: dict, lanes: int):
@@ -203,7 +196,6 @@ def _apply_rule(primitive, inputs: list, params: dict, shape: tuple[int, ...], l
     if name in CONCATENATIONS:
         return primitive.bind(*(broadcast_to_lanes(v, lanes) for v in inputs), **params)
     if name in ELEMENTWISE:
-        # elementwise primitives broadcast neither scalars nor axes of length one
         return primitive.bind(
             *(jnp.broadcast_to(broadcast_to_lanes(v, lanes), (*shape, lanes)) for v in inputs),
             **params,
@@ -211,7 +203,6 @@ def _apply_rule(primitive, inputs: list, params: dict, shape: tuple[int, ...], l
     if name in SHAPE_RULES and len(inputs) == 1:
         return SHAPE_RULES[name](inputs[0].x, lanes, **params)
     if name == "static_take":
-        # the parameter `axis` counts from the front
         return primitive.bind(inputs[0].x, **params)
     if name == "gather":
         return _gather(inputs[0], inputs[1], lanes, **params)
