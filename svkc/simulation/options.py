@@ -25,15 +25,12 @@ from svkc.integration.step_size import (
 from svkc.integration.vector_field import VectorField
 from svkc.loops.constrained_dynamics import (
     AbstractDynamics,
-    ArticulatedBodies,
-    Dynamics,
-    default_dynamics,
 )
 from svkc.loops.constraint import gap_tolerance
-from svkc.loops.delassus import LAPACK_MIN_ROWS
 from svkc.model.annotations import DType, Scalar
 from svkc.model.chain import Chain, State
 from svkc.model.validation import check_function, integer
+from svkc.simulation.default_dynamics import resolve_dynamics
 from svkc.simulation.option_checks import (
     check_initial_state,
     check_instance,
@@ -140,7 +137,7 @@ def prepare_options(
         control=control,
         solver=_resolve_solver(solver, None if dt is not None else controller, dtype),
         stabilization=stabilization,
-        dynamics=_resolve_dynamics(chain, dynamics, stabilization),
+        dynamics=resolve_dynamics(chain, dynamics, stabilization),
         controller=controller,
         adjoint=_resolve_adjoint(adjoint, controller if dt is None else None),
         progress_meter=diffrax.NoProgressMeter() if progress_meter is None else progress_meter,
@@ -184,32 +181,6 @@ def _resolve_stabilization(stabilization) -> AbstractStabilization:
             f" svkc.stabilization.Projection(), got {stabilization!r}"
         )
     return stabilization
-
-
-def _resolve_dynamics(
-    chain: Chain, dynamics, stabilization: AbstractStabilization
-) -> AbstractDynamics:
-    """Return the dynamics. Raises ValueError for another type.
-
-    The default is articulated bodies, which reduce the rows of the loops near singular
-    configurations if steps are projected by `Projection`. With other stabilizations, and for many
-    loops, where a reduction costs more than pivots that are held, it is that of the chain.
-    """
-    if dynamics is None:
-        few_rows = 6 * len(chain.link_names) < LAPACK_MIN_ROWS
-        return (
-            ArticulatedBodies()
-            if type(stabilization) is Projection and few_rows
-            else default_dynamics(chain)
-        )
-    if isinstance(dynamics, Dynamics):
-        return dynamics.resolved(chain)
-    if not isinstance(dynamics, AbstractDynamics):
-        raise ValueError(
-            "dynamics: expected an object of svkc.dynamics, such as"
-            f" svkc.dynamics.CompositeBodies(), got {dynamics!r}"
-        )
-    return dynamics
 
 
 def _resolve_solver(solver, controller, dtype) -> diffrax.AbstractSolver[Any]:
