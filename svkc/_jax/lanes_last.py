@@ -16,14 +16,12 @@ from jax import lax
 from jax.extend import core
 from jaxtyping import Array
 
+from svkc._jax.chunked_sum import sum_in_chunks
 from svkc._jax.primitive import custom_primitive
 
 # lanes evaluated together on a CPU: intermediate values of 32 lanes stay in the processor's cache
 # (benchmarks/README.md)
 TILE = 32
-# terms of a sum in one loop: with 46 terms that loop took a quarter of the time of a step with two
-# grips, with 22 terms a third of that of the high bar's 16-joint figure
-TERMS_PER_SUM = 8
 ELEMENTWISE = set(
     "abs add add_any and atan2 ceil clamp convert_element_type copy copy_p cos div eq exp exp2"
     " expm1 floor ge gt integer_pow is_finite le log log1p lt max min mul ne neg not or pow rem"
@@ -116,21 +114,6 @@ def _gather(x, index, lanes: int, *, dimension_numbers, slice_sizes, **rest):
     )
 
 
-def sum_in_chunks(x: Array, axes: tuple[int, ...]) -> Array:
-    """Sum over axes, `TERMS_PER_SUM` terms at a time.
-
-    XLA unrolls a sum this short, and can then vectorise the loop over the last axis.
-    """
-    for axis in sorted(axes, reverse=True):
-        size = x.shape[axis]
-        parts = [
-            jnp.sum(lax.slice_in_dim(x, i, min(i + TERMS_PER_SUM, size), axis=axis), axis, x.dtype)
-            for i in range(0, max(size, 1), TERMS_PER_SUM)
-        ]
-        x = functools.reduce(jnp.add, parts)
-    return x
-
-
 def _dot_general(*sides, dimension_numbers, preferred_element_type, **_):
     """Evaluate `dot_general` by products and sums, as XLA has no batch axis last for `dot`."""
     sides = [v.x if isinstance(v, Batched) else jnp.asarray(v)[..., None] for v in sides]
@@ -142,6 +125,7 @@ def _dot_general(*sides, dimension_numbers, preferred_element_type, **_):
 
     axes = len(batch[0])
     middle, end = axes + len(free[0]), axes + len(free[0]) + len(free[1])
+    # broadcast: each side has axes of length one for the free axes of the other side
     left, right = (
         jnp.transpose(x, (*b, *f, *c, x.ndim - 1))
         for x, b, f, c in zip(sides, batch, free, contracted, strict=True)
@@ -196,6 +180,7 @@ def _apply_rule(primitive, inputs: list, params: dict, shape: tuple[int, ...], l
     if name in CONCATENATIONS:
         return primitive.bind(*(broadcast_to_lanes(v, lanes) for v in inputs), **params)
     if name in ELEMENTWISE:
+        # elementwise primitives broadcast neither scalars nor axes of length one
         return primitive.bind(
             *(jnp.broadcast_to(broadcast_to_lanes(v, lanes), (*shape, lanes)) for v in inputs),
             **params,
@@ -203,6 +188,7 @@ def _apply_rule(primitive, inputs: list, params: dict, shape: tuple[int, ...], l
     if name in SHAPE_RULES and len(inputs) == 1:
         return SHAPE_RULES[name](inputs[0].x, lanes, **params)
     if name == "static_take":
+        # the parameter `axis` counts from the front
         return primitive.bind(inputs[0].x, **params)
     if name == "gather":
         return _gather(inputs[0], inputs[1], lanes, **params)

@@ -8,7 +8,6 @@ import dataclasses
 from typing import Any
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
@@ -38,7 +37,6 @@ from svkc.integration.stabilization import needs_projection
 from svkc.integration.step_size import (
     clip_step,
     unclipped_step_size,
-    with_projection_error,
 )
 from svkc.integration.vector_field import initial_projection_info, project_state
 
@@ -158,8 +156,6 @@ def _attempt_step(
         term, s.t, t1, s.y, field_args, s.solver_state, made_jump=stale
     )
     y, info = project_state(field, field_args, y_solver)
-    if error is not None and field.projects_by_loop_forces and s.near is None:
-        error = with_projection_error(error, y, y_solver)
     failure = jnp.where(ok := is_finite(y), LOOP_OPEN, NON_FINITE)
     if info is not None:
         ok = ok & (jnp.max(info.gap) <= options.gap_tolerance)
@@ -236,16 +232,20 @@ def _write_states(
     return ys, checkpoints
 
 
+def _with_field_args(problem: PhaseProblem, **changes: Any) -> PhaseProblem:
+    """Return the problem with other arguments of its vector field."""
+    field_args = dataclasses.replace(problem.field_args, **changes)
+    return dataclasses.replace(problem, field_args=field_args)
+
+
 def _body_fun(
     s: StepperState, times, problem: PhaseProblem, options: StepperOptions
 ) -> StepperState:
     """Attempt one step and advance if it is kept; or evaluate the guards once to locate a root."""
     (t0, stop, save_ts), info = times, s.projection_info
     if info is not None and info.pivots is not None and problem.field.dynamics.hold is not None:
-        problem = eqx.tree_at(
-            lambda p: p.field_args.pivots, problem, info.pivots, is_leaf=lambda x: x is None
-        )
-    problem = eqx.tree_at(lambda p: p.field_args.near, problem, s.near, is_leaf=lambda x: x is None)
+        problem = _with_field_args(problem, pivots=info.pivots)
+    problem = _with_field_args(problem, near=s.near)
     t1 = s.tnext if s.search is None else s.search.end_of_attempt(s.tnext)
     attempt, near, redo = redone_if_near(s, _attempt_step(s, t1, problem, options), problem)
     guard_values, search, hold = None, None, jnp.zeros((), bool)
@@ -275,6 +275,7 @@ def _body_fun(
         step_size=unless_held(attempt.step_size, s.step_size),
         controller_state=unless_held(attempt.controller_state, s.controller_state),
         result=result,
+        # These are updated by every attempt.
         progress_meter_state=options.progress_meter.step(s.progress_meter_state, progress),
         search=search,
         near=near,

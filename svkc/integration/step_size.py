@@ -1,19 +1,16 @@
-"""Step-size control: fixed steps, steps clipped at save times, and errors by projection."""
+"""Step-size control: fixed steps, the default controller, and steps clipped at save times."""
 
 from collections.abc import Callable
 from typing import Any
 
 import diffrax
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from svkc.integration.ode import ODEState, Times, is_finite
+from svkc.integration.ode import Times, is_finite
 
 # A step is stretched by up to this fraction of its length if it then ends at a save time.
 MAX_STRETCH = 1e-6
-# A step has at least this fraction of its change by projection as its estimated error.
-PROJECTION_ERROR_WEIGHT = 1e-3
 
 # A new step has this fraction of the length at which its error would meet the tolerance.
 SAFETY = 0.8
@@ -71,10 +68,10 @@ class FixedSteps(diffrax.AbstractStepSizeController[None, Any]):
 
 
 class LimitedPIDController(diffrax.PIDController):
-    """A PID controller after whose rejections the next kept step is followed by none longer.
+    """A PID controller that does not lengthen the step right after a rejected one.
 
-    The step after a rejected one is as long as the error allowed, so that growing at once often
-    ends in the next rejection (Hairer, Norsett and Wanner, Solving Ordinary Differential Equations
+    After a rejection the step is as long as its error allows. A longer step at once would often be
+    rejected again (Hairer, Norsett and Wanner, Solving Ordinary Differential Equations
     I, section II.4).
     """
 
@@ -135,17 +132,3 @@ def unclipped_step_size(
         return proposed
     at_bound = keep_step & (proposed >= 0.99 * controller.factormax * taken)
     return jnp.where(at_bound, jnp.maximum(proposed, before), proposed)
-
-
-def with_projection_error(error: ODEState, y: ODEState, y_solver: ODEState) -> ODEState:
-    """Return the error estimate, raised in proportion to the change by projection.
-
-    The controller then rejects a step that projection moves by more than 1000 times its tolerance:
-    without pivots nothing else shows that loops lose rank.
-    """
-    return jax.tree.map(
-        lambda e, new, old: jnp.maximum(jnp.abs(e), PROJECTION_ERROR_WEIGHT * jnp.abs(new - old)),
-        error,
-        y,
-        y_solver,
-    )

@@ -46,7 +46,7 @@ class VectorField(eqx.Module):
 
     @property
     def projects_by_loop_forces(self) -> bool:
-        """Whether steps are projected by articulated bodies, which use pivots where they must."""
+        """Whether steps are projected by the forces of the loops, by articulated bodies."""
         return (
             not self.dynamics.uses_pivots
             and isinstance(self.stabilization, Projection)

@@ -1,5 +1,8 @@
 """The dynamics of a run, by default the fastest that hold for its chain."""
 
+from typing import Any
+
+from svkc.integration.replay import Replay
 from svkc.integration.stabilization import AbstractStabilization, Projection
 from svkc.loops.constrained_dynamics import (
     AbstractDynamics,
@@ -12,21 +15,19 @@ from svkc.model.chain import Chain
 
 
 def resolve_dynamics(
-    chain: Chain, dynamics, stabilization: AbstractStabilization
+    chain: Chain, dynamics: Any, stabilization: AbstractStabilization, adjoint: Any
 ) -> AbstractDynamics:
     """Return the dynamics. Raises ValueError for another type.
 
-    The default is articulated bodies, which reduce the rows of the loops near singular
-    configurations if steps are projected by `Projection`. With other stabilizations, and for many
-    loops, where a reduction costs more than pivots that are held, it is that of the chain.
+    The default is articulated bodies where the stepping loop of svkc can reduce the rows of the
+    loops: steps are projected by `Projection`, and the adjoint is `Replay`. With at least
+    `LAPACK_MIN_ROWS` rows a reduction costs more than pivots that are held. Then, and with other
+    stabilizations or adjoints, the default is that of the chain.
     """
     if dynamics is None:
-        few_rows = 6 * len(chain.link_names) < LAPACK_MIN_ROWS
-        return (
-            ArticulatedBodies()
-            if type(stabilization) is Projection and few_rows
-            else default_dynamics(chain)
-        )
+        can_reduce = type(stabilization) is Projection and isinstance(adjoint, Replay)
+        has_few_rows = 6 * len(chain.link_names) < LAPACK_MIN_ROWS
+        return ArticulatedBodies() if can_reduce and has_few_rows else default_dynamics(chain)
     if isinstance(dynamics, Dynamics):
         return dynamics.resolved(chain)
     if not isinstance(dynamics, AbstractDynamics):

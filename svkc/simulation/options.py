@@ -133,13 +133,14 @@ def prepare_options(
         smallest = np.finfo(dtype).eps * host.maximum(host.abs(span), host.abs(cast(t1)))
         controller = _default_controller(rtol, atol, smallest, dtmax, dtype)
     stabilization = _resolve_stabilization(stabilization)
+    adjoint = _resolve_adjoint(adjoint, controller if dt is None else None)
     options = Options(
         control=control,
         solver=_resolve_solver(solver, None if dt is not None else controller, dtype),
         stabilization=stabilization,
-        dynamics=resolve_dynamics(chain, dynamics, stabilization),
+        dynamics=resolve_dynamics(chain, dynamics, stabilization, adjoint),
         controller=controller,
-        adjoint=_resolve_adjoint(adjoint, controller if dt is None else None),
+        adjoint=adjoint,
         progress_meter=diffrax.NoProgressMeter() if progress_meter is None else progress_meter,
         dt=None if dt is None else jnp.asarray(dt, dtype),
         first_step=jnp.asarray(host.maximum(span, np.finfo(dtype).tiny) * 1e-3, dtype),

@@ -146,7 +146,7 @@ class Report(Printed):
             else "changes of the dependent coordinates not recorded"
         )
         if self.reduced_steps >= 0:
-            swaps = f"loop rows reduced in {int(self.reduced_steps)} steps"
+            swaps = f"steps with reduced rows: {int(self.reduced_steps)}"
         if self.halved is not None:
             error += f"; by a finer run {float(self.halved):.2e} rad, m"
         gap = f"{float(self.gap):.2e} m, {float(self.angular_gap):.2e} rad"

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from svkc._jax.lanes_last import sum_in_chunks
+from svkc._jax.chunked_sum import sum_in_chunks
 from svkc._jax.static_gather import static_take
 from svkc.model.chain import Chain
 from svkc.model.topology import Topology
