@@ -1,6 +1,6 @@
 """Single steps of a solver, in the form that is differentiated."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
@@ -13,6 +13,17 @@ from svkc.integration.ode import FieldArgs, ODEState
 from svkc.integration.vector_field import VectorField, project_state
 
 
+def _without_last_stage(tableau: diffrax.ButcherTableau) -> diffrax.ButcherTableau:
+    """Return an explicit tableau without its last stage, whose weights are zero."""
+    assert tableau.b_sol[-1] == tableau.b_error[-1] == 0
+    return diffrax.ButcherTableau(
+        c=tableau.c[:-1],
+        b_sol=tableau.b_sol[:-1],
+        b_error=tableau.b_error[:-1],
+        a_lower=tableau.a_lower[:-1],
+    )
+
+
 def with_scan_kind(
     solver: diffrax.AbstractSolver[Any], kind: str | None
 ) -> diffrax.AbstractSolver[Any]:
@@ -23,6 +34,25 @@ def with_scan_kind(
     if not isinstance(solver, diffrax.AbstractRungeKutta):
         return solver
     return eqx.tree_at(lambda s: s.scan_kind, solver, kind, is_leaf=lambda x: x is None)
+
+
+class _Dopri8WithoutDenseOutput(diffrax.Dopri8):
+    """Dopri8 without its fourteenth stage, which serves the dense output alone."""
+
+    tableau: ClassVar[diffrax.ButcherTableau] = _without_last_stage(diffrax.Dopri8.tableau)
+    interpolation_cls: ClassVar[Any] = diffrax.LocalLinearInterpolation
+
+
+def without_dense_output(solver: diffrax.AbstractSolver[Any]) -> diffrax.AbstractSolver[Any]:
+    """Return a solver with these steps and error estimates that evaluates no stage for its dense
+    output alone.
+
+    Only Dopri8 has such a stage, its last. It is also the first of the next step, but not after a
+    projection, which changes the state.
+    """
+    if type(solver) is not diffrax.Dopri8:
+        return solver
+    return _Dopri8WithoutDenseOutput(scan_kind=solver.scan_kind)
 
 
 def replay_step(

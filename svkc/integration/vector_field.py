@@ -20,8 +20,9 @@ from svkc.loops.forward_dynamics import (
     velocity_and_acceleration,
     velocity_and_acceleration_lanes_last,
 )
+from svkc.loops.loop_force_projection import project_by_loop_forces
 from svkc.loops.pivoting import has_redundant_rows, singularity_threshold
-from svkc.loops.projection import ProjectionInfo, project, project_by_loop_forces
+from svkc.loops.projection import ProjectionInfo, project
 from svkc.model.annotations import Scalar
 from svkc.model.chain import Chain, State, Structure, active_dofs
 from svkc.model.checked_jit import torques_over_dofs

@@ -180,10 +180,9 @@ def count_rank(diag_R: Float[Array, " steps"]) -> Int[Array, ""]:
 
 def pivot_ratio(qr: PivotedQR) -> Float[Array, ""]:
     """Return the least |R_kk| of the active steps over the largest, and 1 if no step is active."""
-    diag_R, active = qr.diag_R, qr.active
-    return jnp.min(jnp.where(active, diag_R, jnp.inf), initial=1, where=active) / jnp.where(
-        jnp.any(active), jnp.max(diag_R), 1
-    )
+    diag_R, has_active = qr.diag_R, jnp.any(qr.active)
+    least = jnp.min(diag_R, initial=jnp.inf, where=qr.active)
+    return jnp.where(has_active, least, 1) / jnp.where(has_active, jnp.max(diag_R), 1)
 
 
 def pivoted_qr_with_rank(J: Float[Array, "rows dofs"]) -> tuple[PivotedQR, Int[Array, ""]]:

@@ -1,4 +1,4 @@
-"""Projection of configuration and velocity onto closed loops."""
+"""Projection of configuration and velocity onto closed loops, with pivots."""
 
 import functools
 
@@ -7,10 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from svkc._jax.lanes_last import with_lanes_last
-from svkc.loops.constrained_dynamics import ArticulatedBodies, CompositeBodies
+from svkc.loops.constrained_dynamics import CompositeBodies
 from svkc.loops.constraint import LoopKinematics, gap_norms, jacobian_scales, loop_kinematics
-from svkc.loops.constraint_rows import constraint_rows
 from svkc.loops.pivoting import (
     PivotedQR,
     drop_below,
@@ -191,80 +189,3 @@ def _step_by_pivots(
     if dependent_only:
         return -dependent_change(chain, qr, J, residual), gap
     return -inertia_metric_change(chain, structure, loops, qr, residual), gap
-
-
-@functools.partial(jax.jit, static_argnames=("iterations", "differentiated"))
-def project_by_loop_forces(
-    chain: Chain,
-    structure: Structure,
-    q,
-    v,
-    near: Bool[Array, ""] | None = None,
-    *,
-    iterations: int,
-    differentiated: bool = True,
-) -> tuple[Float[Array, " q"], Float[Array, " dofs"], ProjectionInfo]:
-    """Return `project` in the metric of the mass matrix, by `ArticulatedBodies`.
-
-    near: whether the rows of the loops are reduced (None: never).
-    differentiated: whether derivatives are taken through the projection. If not, a `vmap` keeps
-    lanes last, and the info has the margin unless `near` is None.
-    """
-    compute_step = _step_by_loop_forces if differentiated else _step_and_margin_lanes_last
-    has_margin = not differentiated and near is not None
-
-    @functools.partial(jax.checkpoint, prevent_cse=False)
-    def newton_step(i, carry):
-        q, v, _ = carry
-        is_velocity_iteration = i == iterations
-        step, gap, margin = compute_step(chain, structure, q, v, is_velocity_iteration, near)
-        q = integrate(chain, q, jnp.where(is_velocity_iteration, 0, step))
-        v = jnp.where(is_velocity_iteration, v + step, v)
-        return q, v, jax.lax.stop_gradient(ProjectionInfo(gap=gap, margin=margin))
-
-    info = ProjectionInfo.initial(chain, q.dtype, with_margin=has_margin, with_pivots=False)
-    start = normalize(chain, q), v, info
-    return jax.lax.fori_loop(0, iterations + 1, newton_step, start)
-
-
-def _step_by_loop_forces(
-    chain: Chain,
-    structure: Structure,
-    q,
-    v,
-    is_velocity_iteration: Bool[Array, ""],
-    near: Bool[Array, ""] | None,
-    has_margin: bool = False,
-) -> tuple[Float[Array, " dofs"], Float[Array, "links 2"], Float[Array, ""] | None]:
-    """Return the change of q that closes the loops, the gaps at q, and the margin.
-
-    In the velocity's iteration it is the change of v that makes their rates zero. The change is the
-    least in the metric of the mass matrix.
-
-    has_margin: whether to compute the margin, in the velocity's iteration alone (otherwise: None).
-    """
-    column = jacobian_scales(chain)[1]
-    loops = loop_kinematics(chain, structure, q)
-    J, gap, active = loops.J, loops.gap, active_dofs(chain, structure)
-    residual = jnp.where(is_velocity_iteration, J @ jnp.where(active, v / column, 0), gap)
-    rows = constraint_rows(chain, structure, J, near)
-    solve = ArticulatedBodies().prepare(chain, structure, loops, rows)
-    step = solve(jnp.zeros(chain.dofs, q.dtype), residual)
-    margin = None
-    if has_margin:
-        margin = jax.lax.cond(
-            is_velocity_iteration,
-            lambda: pivot_ratio(pivoted_qr(J, structure.rank, structure.independent)),
-            lambda: jnp.ones((), J.dtype),
-        )
-    return step, jax.lax.stop_gradient(gap_norms(gap)), margin
-
-
-@with_lanes_last
-def _step_and_margin_lanes_last(
-    chain: Chain, structure: Structure, q, v, is_velocity_iteration, near
-):
-    """Return `_step_by_loop_forces`, with the margin unless `near` is None; lanes are last."""
-    return _step_by_loop_forces(
-        chain, structure, q, v, is_velocity_iteration, near, has_margin=near is not None
-    )

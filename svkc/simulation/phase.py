@@ -15,7 +15,7 @@ from svkc.integration.event_location import ArmedGuards, GuardValues
 from svkc.integration.integrate import integrate_phase
 from svkc.integration.ode import FieldArgs, ODEState, is_finite
 from svkc.integration.replay import Replay, integrate_with_replay
-from svkc.integration.runge_kutta import with_scan_kind
+from svkc.integration.runge_kutta import with_scan_kind, without_dense_output
 from svkc.integration.solution import (
     EVENT,
     LOOP_OPEN,
@@ -140,8 +140,10 @@ def _stepper_options(options: Options, armed: ArmedGuards | None) -> StepperOpti
     """Return the options of the stepping loop, which is never differentiated."""
     adjoint = options.adjoint
     replays = isinstance(adjoint, Replay)
+    # guards alone need the dense output
+    solver = options.solver if armed is not None else without_dense_output(options.solver)
     solver, armed_guards, (controller, first_step) = stop_gradient_tree(
-        (with_scan_kind(options.solver, "lax"), armed, options.step_size_control())
+        (with_scan_kind(solver, "lax"), armed, options.step_size_control())
     )
     max_step = None
     if armed_guards is not None and armed_guards.evaluate.plan.max_steps is not None:

@@ -93,16 +93,16 @@ index                                 s         s         s
     0  hook       -       512  0.100000  0.100000  0.100000
     1  -          hook    512  0.200000  0.200000  0.200000
 
-                                   min  median     max  lane of max
-end (s)                            0.3     0.3     0.3            0
-steps                               32      32      32            0
-rejected steps                       0       0       0            0
-energy drift, without sign (J)   0.003   0.003   0.003            0
-energy lost in impacts (J)      0.9087  0.9087     100            3
-largest loop gap (m)                 0       0       0            0
-largest loop gap (rad)               0       0       0            0
-errors of steps, summed          3e-09   3e-09   3e-09            0
-rank margin                     0.7071  0.7071  0.7071            0
+                                   min  median    max  lane of max
+end (s)                            0.3     0.3    0.3            0
+steps                               32      32     32            0
+rejected steps                       0       0      0            0
+energy drift, without sign (J)   0.003   0.003  0.003            0
+energy lost in impacts (J)      0.9087  0.9087    100            3
+largest loop gap (m)                 0       0      0            0
+largest loop gap (rad)               0       0      0            0
+errors of steps, summed          3e-09   3e-09  3e-09            0
+rank margin                          1       1      1            0
 
 ended        successful: 510, max_steps: 2 (first lane 17)
 derivatives  successful: 512

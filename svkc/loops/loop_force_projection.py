@@ -1,0 +1,173 @@
+"""Projection onto closed loops by the forces of the loops, without pivots."""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from svkc._jax.control_flow import unvmap_any
+from svkc._jax.lanes_last import with_lanes_last
+from svkc.loops.constrained_dynamics import ArticulatedBodies
+from svkc.loops.constraint import gap_norms, jacobian_scales, loop_kinematics
+from svkc.loops.constraint_rows import constraint_rows
+from svkc.loops.pivoting import rank_tolerance
+from svkc.loops.projection import ProjectionInfo
+from svkc.model.chain import Chain, Structure, active_dofs
+from svkc.tree.configuration import integrate, normalize
+
+# scaled gaps below so many eps are round-off
+_ROUND_OFF = 100
+
+
+@functools.partial(jax.jit, static_argnames=("iterations", "differentiated"))
+def project_by_loop_forces(
+    chain: Chain,
+    structure: Structure,
+    q,
+    v,
+    near: Bool[Array, ""] | None = None,
+    *,
+    iterations: int,
+    differentiated: bool = True,
+) -> tuple[Float[Array, " q"], Float[Array, " dofs"], ProjectionInfo]:
+    """Return `project` in the metric of the mass matrix, by `ArticulatedBodies`.
+
+    near: whether the rows of the loops are reduced (None: never).
+    differentiated: whether derivatives are taken through the projection. If not, a `vmap` keeps
+    lanes last, and the info has the margin unless `near` is None.
+    """
+    info = ProjectionInfo.initial(
+        chain, q.dtype, with_margin=not differentiated and near is not None, with_pivots=False
+    )
+    q = normalize(chain, q)
+    if not differentiated:
+        return _project_until_closed(chain, structure, (q, v, info), near, iterations)
+
+    @functools.partial(jax.checkpoint, prevent_cse=False)
+    def newton_step(i, carry):
+        q, v, _ = carry
+        is_last = i == iterations
+        step = _step_by_loop_forces(chain, structure, q, v, is_last, near)
+        q = integrate(chain, q, jnp.where(is_last, 0, step.change))
+        v = jnp.where(is_last, v + step.change, v)
+        return q, v, jax.lax.stop_gradient(ProjectionInfo(gap=step.gap))
+
+    return jax.lax.fori_loop(0, iterations + 1, newton_step, (q, v, info))
+
+
+def _project_until_closed(
+    chain: Chain, structure: Structure, start: tuple, near: Bool[Array, ""] | None, iterations: int
+) -> tuple[Float[Array, " q"], Float[Array, " dofs"], ProjectionInfo]:
+    """Take Newton steps on q until the gaps are round-off, then project v.
+
+    start: q, v and info before the first step. iterations: largest number of Newton steps.
+    """
+
+    def cond_fun(carry):
+        i, _ = carry
+        return i <= iterations
+
+    def body_fun(carry):
+        i, (q, v, info) = carry
+        step = _step_lanes_last(chain, structure, q, v, i == iterations, near)
+        on_velocity = step.on_velocity
+        q = integrate(chain, q, jnp.where(on_velocity, 0, step.change))
+        v = jnp.where(on_velocity, v + step.change, v)
+        info = ProjectionInfo(gap=step.gap, margin=step.margin)
+        return jnp.where(on_velocity, iterations, i) + 1, (q, v, info)
+
+    return jax.lax.while_loop(cond_fun, body_fun, (jnp.zeros((), jnp.int32), start))[1]
+
+
+class _ProjectionStep(eqx.Module):
+    """One Newton step of a projection.
+
+    change: of v if `on_velocity`, else of q.
+    gap: of the loops at q.
+    margin: see `ProjectionInfo`; 1 unless `on_velocity`.
+    """
+
+    change: Float[Array, " dofs"]
+    gap: Float[Array, "links 2"]
+    margin: Float[Array, ""] | None
+    on_velocity: Bool[Array, ""]
+
+
+def _step_by_loop_forces(
+    chain: Chain,
+    structure: Structure,
+    q,
+    v,
+    is_last: Bool[Array, ""],
+    near: Bool[Array, ""] | None,
+    may_be_last: bool = False,
+) -> _ProjectionStep:
+    """Return the change of q that closes the loops, or in the last step the change of v that makes
+    the rates of their gaps zero.
+
+    The change is the least in the metric of the mass matrix.
+
+    may_be_last: whether the step is the last, too, if the gaps are round-off. The margin is then
+    computed, unless `near` is None.
+    """
+    column = jacobian_scales(chain)[1]
+    loops = loop_kinematics(chain, structure, q)
+    J, active = loops.J, active_dofs(chain, structure)
+    gap = jax.lax.stop_gradient(gap_norms(loops.gap))
+    on_velocity, margin = is_last, None
+    if may_be_last:
+        # under `vmap`, one open lane lets all lanes take a step on q
+        on_velocity = is_last | ~unvmap_any(jnp.max(gap) > _ROUND_OFF * jnp.finfo(J.dtype).eps)
+    residual = jnp.where(on_velocity, J @ jnp.where(active, v / column, 0), loops.gap)
+    rows = constraint_rows(chain, structure, J, near)
+    solve = ArticulatedBodies().prepare(chain, structure, loops, rows)
+    change = solve(jnp.zeros(chain.dofs, q.dtype), residual)
+    if may_be_last and near is not None:
+        margin = jax.lax.cond(
+            on_velocity,
+            lambda: margin_of_rows(J, structure.rank, structure.independent),
+            lambda: jnp.ones((), J.dtype),
+        )
+    return _ProjectionStep(change=change, gap=gap, margin=margin, on_velocity=on_velocity)
+
+
+@with_lanes_last
+def _step_lanes_last(chain: Chain, structure: Structure, q, v, is_last, near) -> _ProjectionStep:
+    """Return `_step_by_loop_forces`, which may be the last; a `vmap` keeps lanes last."""
+    return _step_by_loop_forces(chain, structure, q, v, is_last, near, may_be_last=True)
+
+
+def margin_of_rows(
+    J: Float[Array, "rows dofs"], rank: Int[Array, ""], independent: Bool[Array, " dofs"] | None
+) -> Float[Array, ""]:
+    """Return `pivot_ratio` of `pivoted_qr`, from the pivoted Cholesky factor of J^T J.
+
+    The pivots of J^T J are the squares |R_kk|^2, so that a ratio is exact to
+    `rank_tolerance`. An iteration has a third of the operations of one of the QR.
+
+    rank, independent: as in `pivoted_qr`.
+    """
+    dofs = J.shape[1]
+    weight = 1.0
+    if independent is not None:
+        weight = jnp.where(independent, rank_tolerance(J.dtype) ** 2, 1).astype(J.dtype)
+    J = jax.lax.stop_gradient(J)
+
+    def step(k, carry):
+        G, least, largest = carry
+        norms = jnp.diag(G) * weight
+        pivot = jnp.arange(dofs) == jnp.argmax(
+            norms >= (1 - rank_tolerance(J.dtype)) * jnp.max(norms)
+        )
+        row = jnp.sum(jnp.where(pivot[:, None], G, 0), 0)
+        r = jnp.sum(jnp.where(pivot, row, 0))
+        used = pivot[:, None] | pivot[None]
+        G = jnp.where(used, 0, G - row[:, None] * (row / jnp.where(r > 0, r, 1))[None])
+        return G, jnp.where(k < rank, jnp.minimum(least, r), least), jnp.maximum(largest, r)
+
+    start = J.T @ J, jnp.asarray(jnp.inf, J.dtype), jnp.zeros((), J.dtype)
+    _, least, largest = jax.lax.fori_loop(0, min(J.shape), step, start)
+    ratio = jnp.sqrt(jnp.maximum(least, 0) / jnp.where(largest > 0, largest, 1))
+    return jnp.where(rank > 0, ratio, 1)
