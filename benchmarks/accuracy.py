@@ -65,6 +65,7 @@ STABILIZATIONS = {
 }
 # each is measured on problems with loops, with Dopri8
 METHODS = STABILIZATIONS | {
+    "composite bodies": {"dynamics": svkc.dynamics.CompositeBodies()},
     "pivots fixed": {"dynamics": svkc.dynamics.CompositeBodies(hold=0.0)},
     "pivots re-selected": {"dynamics": svkc.dynamics.CompositeBodies(hold=None)},
     "articulated bodies": {"dynamics": svkc.dynamics.ArticulatedBodies()},

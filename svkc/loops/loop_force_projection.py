@@ -18,7 +18,7 @@ from svkc.model.chain import Chain, Structure, active_dofs
 from svkc.tree.configuration import integrate, normalize
 
 # scaled gaps below so many eps are round-off
-_ROUND_OFF = 100
+_ROUND_OFF = 30
 
 
 @functools.partial(jax.jit, static_argnames=("iterations", "differentiated"))
