@@ -75,11 +75,10 @@ class AbstractDynamics(eqx.Module):
 
 
 class ArticulatedBodies(AbstractDynamics):
-    """Articulated bodies and loop forces by Delassus' matrix, without pivots.
+    """Articulated bodies and loop forces by Delassus' matrix, without pivots: the fastest method.
 
-    The fastest method, and the one for batches. Delassus' matrix squares the condition number of
-    J_C near singular configurations. There, and where loops are redundant, a run that uses
-    `svkc.stabilization.Projection` reduces the rows of J_C first.
+    Delassus' matrix squares the condition number of J_C. Near singular configurations, and where
+    loops are redundant, a run with `svkc.stabilization.Projection` reduces the rows of J_C first.
 
     Massless bodies that loops hold cost one more solve for each coordinate of their joints. They
     are those whose mass, or moment of inertia about a joint, is below 1e-7 of the model's largest
@@ -87,9 +86,12 @@ class ArticulatedBodies(AbstractDynamics):
     `non_finite` or `step_too_small`: load a tiny mass, or use `CompositeBodies`.
 
     hold: for stabilizations that choose pivots whatever the method; see `AbstractDynamics`.
+    refine: whether a run refines accelerations where the masses of a loop make Delassus' matrix
+    ill-conditioned. A run does by default, unless it is compiled for known, similar masses.
     """
 
     uses_pivots: ClassVar[bool] = False
+    refine: bool = eqx.field(static=True, default=False)
 
     def prepare(
         self, chain: Chain, structure: Structure, loops: LoopKinematics, selection: Any = None
@@ -104,6 +106,7 @@ class ArticulatedBodies(AbstractDynamics):
             jnp.where(active[None], J / column[None], 0),
             rows,
             None if locked is None else active[: chain.nv],
+            self.refine,
         )
         every = jnp.ones(len(loops.J), bool)
         return _implicit_solve(chain, structure, loops, solve, lambda x: x, every)

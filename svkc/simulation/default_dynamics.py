@@ -2,6 +2,9 @@
 
 from typing import Any
 
+import numpy as np
+
+from svkc._jax.pytrees import is_concrete
 from svkc.integration.replay import Replay
 from svkc.integration.stabilization import AbstractStabilization, Projection
 from svkc.loops.constrained_dynamics import (
@@ -12,6 +15,18 @@ from svkc.loops.constrained_dynamics import (
 )
 from svkc.loops.delassus import LAPACK_MIN_ROWS
 from svkc.model.chain import Chain
+
+# largest ratio of two masses of a chain whose accelerations are not refined
+SIMILAR_MASSES = 1e4
+
+
+def _has_similar_masses(chain: Chain) -> bool:
+    """Return whether the masses have values while the run is compiled, and are similar."""
+    if not is_concrete(chain.mass):
+        return False
+    masses = np.asarray(chain.mass)
+    masses = masses[masses > 0]
+    return not masses.size or float(np.max(masses)) < SIMILAR_MASSES * float(np.min(masses))
 
 
 def resolve_dynamics(
@@ -27,7 +42,9 @@ def resolve_dynamics(
     if dynamics is None:
         can_reduce = type(stabilization) is Projection and isinstance(adjoint, Replay)
         has_few_rows = 6 * len(chain.link_names) < LAPACK_MIN_ROWS
-        return ArticulatedBodies() if can_reduce and has_few_rows else default_dynamics(chain)
+        if not can_reduce or not has_few_rows:
+            return default_dynamics(chain)
+        return ArticulatedBodies(refine=bool(chain.link_names) and not _has_similar_masses(chain))
     if isinstance(dynamics, Dynamics):
         return dynamics.resolved(chain)
     if not isinstance(dynamics, AbstractDynamics):
