@@ -48,7 +48,7 @@ def test_refined_until_it_is_a_motion(solution):
     assert velocity < 1e-3
     assert len(fine.ts) > len(solution.ts)
     assert 0 < fine.cost_error < 0.05 * fine.cost
-    traj = fine.trajectory(rate=20.0)
+    traj = fine.trajectory()
     assert abs(float(fine.problem.chain.joint(traj.final, "pivot").q) - np.pi) < 1e-3
     assert "worst of" in str(coarse)
 
