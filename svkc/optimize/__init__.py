@@ -11,6 +11,7 @@ from svkc.optimize.controls import (
 from svkc.optimize.guesses import Guess as Guess, PhaseMotion as PhaseMotion
 from svkc.optimize.ipopt import AbstractSolver as AbstractSolver, Ipopt as Ipopt
 from svkc.optimize.loading import load_solution as load_solution
+from svkc.optimize.multistart import Solutions as Solutions
 from svkc.optimize.phases import (
     Phase as Phase,
     between as between,

@@ -8,18 +8,17 @@ import numpy as np
 from svkc.model.annotations import Path
 from svkc.optimize.archive import MOTION, MULTIPLIERS, NUMBERS, SCHEMA, description_of
 from svkc.optimize.guesses import PhaseMotion
-from svkc.optimize.problem import Problem
 from svkc.optimize.solution import OUTCOME, Multipliers, Solution, solution_of
 from svkc.optimize.structures import phase_structures
 
 
-def load_solution(path: Path, problem: Problem) -> Solution:
+def load_solution(path: Path, problem: Any) -> Solution:
     """Return a solution that `Solution.save` wrote.
 
     The problem of the result has the mesh of the file. Nothing is compiled.
 
     path: of the file.
-    problem: of which the file holds a solution, on any mesh. Functions are not stored.
+    problem: `Problem` of which the file holds a solution, on any mesh. Functions are not stored.
 
     Raises ValueError if the file is none of a solution, has another schema, or is of another
     problem; FileNotFoundError if there is no file.

@@ -9,23 +9,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from svkc.model.annotations import Checked, Function
+from svkc.model.annotations import Checked, Function, Integer
 from svkc.model.chain import Chain
 from svkc.model.checked_jit import check_chain
-from svkc.model.validation import boolean, check_function
+from svkc.model.validation import boolean, check_function, integer
 from svkc.optimize.checks import Check, check, check_finite
 from svkc.optimize.controls import AbstractControls
 from svkc.optimize.encoding import encode
 from svkc.optimize.equations import Model, Params
+from svkc.optimize.failures import raise_on_failure
 from svkc.optimize.guesses import Guess, PhaseMotion, PoseLine, static_forces
 from svkc.optimize.ipopt import AbstractSolver, Ipopt, SolverResult
 from svkc.optimize.lift import Layout
 from svkc.optimize.loop_rows import LinkRows
+from svkc.optimize.multistart import Solutions, multistart
 from svkc.optimize.phases import Phase, as_constraint
 from svkc.optimize.program import Program
 from svkc.optimize.resampling import as_guess
 from svkc.optimize.schemes import Radau
-from svkc.optimize.solution import Solution, raise_on_failure, solution
+from svkc.optimize.solution import Solution, solution
 from svkc.optimize.structures import phase_structures
 from svkc.optimize.transcription import Transcription
 from svkc.optimize.units import Units, units_of
@@ -193,18 +195,28 @@ class Problem:
         self,
         guesses: Sequence[Guess | Solution],
         *,
+        processes: Integer = 1,
         solver: AbstractSolver | None = None,
         progress_meter: Any = None,
-    ) -> list[Solution]:
-        """Return the solutions from several guesses, one after another in one compiled program.
+    ) -> Solutions:
+        """Return the solutions from several guesses, in their order, as a list with `best`.
 
         Those that failed are among them: `result` says how each ended.
 
         guesses: as of `solve`.
+        processes: one: starts are solved here, one after the other in one compiled program. More:
+            at once in so many new processes, which compile the problem first; needs cloudpickle.
         solver, progress_meter: as in `solve`.
+        Raises RuntimeError, with the exception in it, if a process fails.
         """
-        options = {"solver": solver, "progress_meter": progress_meter, "throw": False}
-        return [self.solve(guess, **options) for guess in guesses]
+        count = integer("processes", processes, 1)
+        return multistart(
+            self, guesses, processes=count, solver=solver, progress_meter=progress_meter
+        )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what another process needs; compiled functions are made anew."""
+        return self.__dict__ | {"_programs": {}, "functions": {}}
 
     def start(self, guess: Guess | Solution) -> tuple[Program, SolverResult]:
         """Return the compiled problem, and a guess in the solver's units."""

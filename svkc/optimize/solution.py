@@ -20,6 +20,7 @@ from svkc.optimize.feedback import riccati_gains
 from svkc.optimize.guesses import PhaseMotion
 from svkc.optimize.ipopt import SolverResult
 from svkc.optimize.linearization import LinearMaps, linear_maps
+from svkc.optimize.phases import Phase
 from svkc.optimize.points import states_of
 from svkc.optimize.program import Program
 from svkc.optimize.refinement import refined
@@ -31,9 +32,6 @@ if TYPE_CHECKING:  # as equinox annotates the metaclass of its enumerations
     from enum import EnumMeta as NamedMeta
 else:
     from svkc._jax.enumerations import NamedMeta
-
-# rows named in the message of a run that failed
-_ROWS_SHOWN = 6
 
 
 class OUTCOME(eqx.Enumeration, metaclass=NamedMeta):  # pyright: ignore
@@ -111,23 +109,42 @@ class Solution(Printed):
     def __repr__(self) -> str:
         return f"<Solution: cost {float(self.cost):.8g}, {self.result}>"
 
-    def forces(self, link: str) -> Any:
+    def forces(self, link: str, phase: str | None = None) -> Any:
         """Return the force (N) of a virtual link at all stages of the phases that connect it.
 
         [stages 3], on `real` from `parent`, in axes of the parent body.
 
-        link: name of the virtual link.
-        Raises ValueError for a link that no phase connects.
+        link: name of the virtual link. phase: name of the phase; None: all that connect the link.
+        Raises ValueError for unknown names, and for a link that is not connected.
         """
+        pairs = list(zip(self.problem.phases, self.motion, strict=True))
+        if phase is not None:
+            pairs = [self._phase(phase)[:2]]
         parts = [
-            self._force(link, m.forces).reshape(-1, 3)
-            for phase, m in zip(self.problem.phases, self.motion, strict=True)
-            if link in phase.connected
+            self._force(link, m.forces).reshape(-1, 3) for own, m in pairs if link in own.connected
         ]
         if not parts:
-            connected = tuple(n for phase in self.problem.phases for n in phase.connected)
+            connected = tuple(name for own, _ in pairs for name in own.connected)
             raise unknown_name("virtual link", link, connected)
         return np.concatenate(parts)
+
+    def stage_times(self, phase: str) -> np.ndarray:
+        """Return the times (s) [stages] of a phase's stages, at which `forces` are.
+
+        phase: name of the phase.
+        Raises ValueError for an unknown name.
+        """
+        _, m, start = self._phase(phase)
+        steps = np.diff(m.times)[:, None]
+        return start + (m.times[:-1, None] + steps * self.problem.scheme.c).ravel()
+
+    def _phase(self, name: str) -> tuple[Phase, PhaseMotion, float]:
+        """Return a phase, its motion and its start (s). Raises ValueError for unknown names."""
+        names = [p.name for p in self.problem.phases]
+        if name not in names:
+            raise unknown_name("phase", name, names)
+        i = names.index(name)
+        return self.problem.phases[i], self.motion[i], float(np.sum(self.durations[:i]))
 
     def report(self, replay: bool = True) -> SolutionReport:
         """Return the certificate: how far every interval is from a motion.
@@ -218,11 +235,8 @@ class Solution(Printed):
         phase: name of the phase. link: name of the link; None: the only one that is connected.
         Raises ValueError for unknown names.
         """
-        names = [p.name for p in self.problem.phases]
-        if phase not in names:
-            raise unknown_name("phase", phase, names)
-        i = names.index(phase)
-        connected, motion = self.problem.phases[i].connected, self.motion[i]
+        own, motion, _ = self._phase(phase)
+        connected = own.connected
         link = connected[0] if link is None and len(connected) == 1 else link
         if link is None or link not in connected:
             raise unknown_name("virtual link", str(link), connected)
@@ -271,27 +285,4 @@ def solution_of(
         structures=tuple(structures),
         problem=problem,
         **fields,
-    )
-
-
-def raise_on_failure(program: Program, result: SolverResult) -> None:
-    """Raise RuntimeError if the solver failed. The message names the most violated rows."""
-    if result.status in ("successful", "acceptable"):
-        return
-    words = OUTCOME[OUTCOME._name_to_item[result.status]]
-    raise RuntimeError(
-        f"solve: {words} After {result.iterations} iterations the largest violations are:"
-        f" {violated_rows(program, result.x) or 'none'}"
-    )
-
-
-def violated_rows(program: Program, x: np.ndarray, tolerance: float = 1e-6) -> str:
-    """Return the names of the rows that are violated most, with the amounts in SI units."""
-    violation = program.violation(x)
-    order = np.argsort(-np.nan_to_num(violation, nan=np.inf))[:_ROWS_SHOWN]
-    table = program.transcription.rows
-    return "; ".join(
-        f"{table.label(i)}: {violation[i] * table.unit[i]:.3g}"
-        for i in order
-        if not violation[i] <= tolerance
     )
