@@ -81,26 +81,30 @@ def _planned(chain: Chain, q, v, step: Any, s: Any) -> tuple[Any, Any]:
 def control_of(problem: Any) -> Any:
     """Return the control (t, state, plan) -> tau that follows a `Plan`.
 
-    It is the same function for all meshes of a problem, so that runs are compiled once.
+    It is the same object for all meshes of a problem, so that runs are compiled once.
     """
-    known = problem.functions
-    if "control" not in known:
-        known["control"] = _control(problem)
-    return known["control"]
+    return problem.functions.setdefault("control", PlanControl(problem))
 
 
-def _control(problem: Any) -> Any:
-    chain, controls = problem.chain, problem.controls
-    table, driven = control_table(controls, problem.scheme), driven_coordinates(problem)
+class PlanControl(eqx.Module):
+    """The control (t, state, plan) -> tau of a problem's plans.
 
-    def control(t, state: State, plan: Plan):
+    problem: compared by identity, as its functions are.
+    """
+
+    problem: Any = eqx.field(static=True)
+
+    def __call__(self, t: Any, state: State, plan: Plan) -> Any:
+        """Return the joint torques over every coordinate (N m, N)."""
+        problem, chain = self.problem, self.problem.chain
         k = jnp.searchsorted(plan.starts, t, side="right") - 1
         k = jnp.clip(k, *(jnp.asarray(i).astype(k.dtype) for i in (plan.first, plan.last)))
         of_interval = lambda x: jnp.asarray(x)[k]
         start, step, blocks = jax.tree.map(of_interval, (plan.starts, plan.steps, plan.blocks))
         fraction = jnp.clip((t - start) / step, 0, 1)
+        table = control_table(problem.controls, problem.scheme)
         blocks = blocks_at(table, step, fraction, blocks)
-        tau = controls.torques(chain, t, state, blocks, problem.args)
+        tau = problem.controls.torques(chain, t, state, blocks, problem.args)
         if not plan.gains.shape[2]:
             return tau
         at_q, at_v, gains = jax.tree.map(of_interval, (plan.q, plan.v, plan.gains))
@@ -108,9 +112,8 @@ def _control(problem: Any) -> Any:
         here, there = (tree_configuration(chain, x[: chain.nq]) for x in (state.q, q))
         error_q = difference(chain, here, there)[: chain.nv]
         error = jnp.concatenate([error_q, v - state.v[: chain.nv]])
-        return tau.at[driven].add(((1 - fraction) * gains[0] + fraction * gains[1]) @ error)
-
-    return control
+        feedback = ((1 - fraction) * gains[0] + fraction * gains[1]) @ error
+        return tau.at[driven_coordinates(problem)].add(feedback)
 
 
 def driven_coordinates(problem: Any) -> np.ndarray:

@@ -188,7 +188,7 @@ class Problem:
             dataclasses.replace(phase, **of_phase(mesh))
             for phase, mesh in zip(self.phases, meshes, strict=True)
         ]
-        problem._programs = {}
+        problem._programs, problem.functions = {}, self.functions
         return problem
 
     def multistart(
