@@ -58,6 +58,33 @@ def test_growth_of_an_inverted_rod_is_that_of_its_linear_equation():
     np.testing.assert_allclose(computed, [factor], rtol=1e-6)
 
 
+BALL = (
+    '<mujoco><option gravity="0 0 0"/><worldbody><body name="ball"><freejoint/><geom type="sphere"'
+    ' size="0.1"/></body></worldbody></mujoco>'
+)
+
+
+def test_errors_of_a_turning_ball_turn_back_in_its_axes():
+    """Its plan turns by 1.5 rad about z in 1 s; an error of its pose stays where it is in space.
+
+    Nothing is driven, so that there are no gains.
+    """
+    chain = svkc.load(BALL)
+    start, turned = chain.state(), np.array([np.cos(0.75), 0, 0, np.sin(0.75)])
+    end = svkc.State(start.q.at[3:7].set(turned), start.v, start.structure)
+    phase = optimize.Phase("turn", duration=1.0, intervals=4)
+    problem = optimize.Problem(
+        chain, [phase], controls=optimize.Torques(joints=()), scheme=optimize.Radau(3)
+    )
+    motion = tuple(problem.guess([start, end]).phases)
+    maps = linear_maps(problem, motion)
+    c, s = np.cos(1.5 / 4), np.sin(1.5 / 4)
+    back = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+    np.testing.assert_allclose(maps.A[:, 3:6, 3:6], np.tile(back, (4, 1, 1)), atol=1e-6)
+    np.testing.assert_allclose(maps.A[:, :3, 6:9], np.tile(np.eye(3) / 4, (4, 1, 1)), atol=1e-12)
+    assert riccati_gains(problem, motion, maps).shape == (4, 2, 0, 12)
+
+
 @pytest.mark.slow
 def test_links_project_errors():
     """What links leave of an error is left again, keeps the loop, and is what `connect` leaves."""

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import models
 import numpy as np
+import pytest
 import wrong_optimizations
 
 import svkc
@@ -80,6 +81,12 @@ def test_minimum_time_on_intervals_of_other_lengths():
     assert abs(float(solution.cost) - 2) < 1e-6
     np.testing.assert_allclose(solution.ts, 2 * np.array(MESH), atol=1e-6)
     np.testing.assert_allclose(solution.motion[0].blocks.ravel(), [1, 1, -1, -1], atol=1e-5)
+    # the second of two stages is the end of an interval
+    times = solution.stage_times("move").reshape(4, 2)
+    np.testing.assert_allclose(times[:, 1], solution.ts[1:])
+    np.testing.assert_allclose(times[:, 0], solution.ts[:-1] + np.diff(solution.ts) / 3)
+    with pytest.raises(ValueError, match="'fall'"):
+        solution.stage_times("fall")
     np.testing.assert_allclose(jnp.squeeze(solution.states.q[:, 0])[2], 0.5, atol=1e-6)
 
 
