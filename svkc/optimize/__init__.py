@@ -19,7 +19,7 @@ from svkc.optimize.phases import (
 )
 from svkc.optimize.points import Point as Point
 from svkc.optimize.problem import Problem as Problem
-from svkc.optimize.replay import Distance as Distance, Replay as Replay
+from svkc.optimize.replay import Distance as Distance, ReplayReport as ReplayReport
 from svkc.optimize.schemes import Radau as Radau
 from svkc.optimize.solution import OUTCOME as OUTCOME, Solution as Solution
 from svkc.optimize.units import Units as Units

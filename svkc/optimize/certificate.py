@@ -14,7 +14,7 @@ from svkc.optimize.feedback import growth
 from svkc.optimize.guesses import PhaseMotion
 from svkc.optimize.plans import Plan, control_of, plan_of
 from svkc.optimize.points import full_state, padded, states_of, tree_configuration, tree_velocity
-from svkc.optimize.replay import Distance, Replay, distance, replay_report
+from svkc.optimize.replay import Distance, ReplayReport, distance, replay_report
 from svkc.simulation.simulate import simulate
 from svkc.transitions.placement import place_at_current_pose
 from svkc.tree.kinematics import kinematics
@@ -50,7 +50,7 @@ class SolutionReport:
     failed: int
     open_loop: tuple[Distance, ...] | None = None
     growth: np.ndarray | None = None
-    replay: Replay | None = None
+    replay: ReplayReport | None = None
 
     def largest(self) -> tuple[float, float]:
         """Return the largest defects in position and in velocity over all intervals."""

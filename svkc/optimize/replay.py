@@ -45,7 +45,7 @@ class Distance:
 
 
 @dataclasses.dataclass(frozen=True)
-class Replay:
+class ReplayReport:
     """The whole motion simulated with feedback, with events between the phases.
 
     phases: of each, the largest distance from the plan over its nodes.
@@ -105,7 +105,7 @@ def replay(solution: Any, feedback: bool, ts: Any, options: Mapping[str, Any]) -
     )
 
 
-def replay_report(solution: Any, options: Mapping[str, Any]) -> Replay:
+def replay_report(solution: Any, options: Mapping[str, Any]) -> ReplayReport:
     """Return how far the motion with feedback leaves the plan. options: of `simulate`."""
     motion, chain = solution.motion, solution.problem.chain
     total = sum(float(m.duration) for m in motion)
@@ -121,4 +121,4 @@ def replay_report(solution: Any, options: Mapping[str, Any]) -> Replay:
     edges = np.cumsum([len(m.vdot) for m in motion])[:-1]
     parts = zip(np.split(np.asarray(of_q), edges), np.split(np.asarray(of_v), edges), strict=True)
     phases = tuple(Distance.of(chain.dof_names, q, v) for q, v in parts)
-    return Replay(phases=phases, report=traj.report())
+    return ReplayReport(phases=phases, report=traj.report())
