@@ -40,6 +40,8 @@ nitpick_ignore = [
     for name in """
     Any Array Bool Callable Float Int MuJoCo Sequence pathlib.Path
     At When Touch Leaves Overload Page
+    Guess AbstractSolver Program SolverResult Check Between Constraint Limits Mapping[str
+    PhaseMotion Multipliers LinearMaps LinkRows AbstractControls np.ndarray
     """.split()
 ]
 autodoc_typehints = "none"  # `format_signature` writes annotations as the sources have them

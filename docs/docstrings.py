@@ -6,6 +6,7 @@ code uses the name.
 """
 
 import ast
+import functools
 import inspect
 import pathlib
 import re
@@ -159,6 +160,10 @@ def parameters(thing) -> dict[str, str]:
         for base in thing.__bases__:
             found |= parameters(base) if base.__module__.startswith("svkc.") else {}
         fields = [node for node in definition.body if isinstance(node, ast.AnnAssign)]
+        own = [node for node in definition.body if getattr(node, "name", "") == "__init__"]
+        if own and not fields:
+            every = [node for node in ast.walk(own[0].args) if isinstance(node, ast.arg)]
+            return {node.arg: _annotation(node.annotation) for node in every}
         return found | {
             field.target.id: _annotation(field.annotation)
             for field in fields
@@ -252,8 +257,10 @@ def format_docstring(app, what, path, thing, options, lines):
 
     An entry ends with links to pages that use the name.
     """
-    is_property, is_class = isinstance(thing, property), inspect.isclass(thing)
-    own = parameters(thing.fget if is_property else thing)
+    cached = isinstance(thing, functools.cached_property)
+    is_property, is_class = cached or isinstance(thing, property), inspect.isclass(thing)
+    getter = thing.func if cached else thing.fget if is_property else thing
+    own = parameters(getter)
     returned = own.pop("return", "")
     heading = ["", f".. rubric:: {'Fields' if is_class else 'Parameters'}", ""]
     result = [f"``{returned}``", ""] if is_property else []

@@ -47,11 +47,16 @@ for i, phase in enumerate(problem.phases):
         shift = motion.ts[k]
         panels[0].plot(y + 1.5 * shift, z, color=f"C{i}", lw=1)
     panels[0].plot([], [], color=f"C{i}", label=phase.name)
-panels[0].set(aspect="equal", title="y + 1.5 m/s t, z (m)")
+panels[0].set(aspect="equal", xlabel="y (m), moved by 1.5 m/s", ylabel="z (m)")
 panels[0].legend()
-for link in ("toe", "tuck"):
-    panels[1].plot(motion.forces(link)[:, 1:], label=[f"{link} y", f"{link} z"])
-panels[1].set(title="forces at the stages (N)")
+for i, phase in enumerate(problem.phases):
+    for link in phase.connected:
+        t, forces = motion.stage_times(phase.name), motion.forces(link, phase.name)
+        for axis, style in ((1, "--"), (2, "-")):
+            label = f"{link}, {'xyz'[axis]}, {phase.name}"
+            panels[1].plot(t, forces[:, axis], style, color=f"C{i}", label=label)
+panels[1].set(title="forces on toe and hands", xlabel="time (s)", ylabel="force (N)")
+panels[1].grid(alpha=0.3)
 panels[1].legend()
 folder = pathlib.Path(sys.argv[1] if len(sys.argv) > 1 else ".")
 figure.savefig(folder / "09_backflip.png", dpi=110)

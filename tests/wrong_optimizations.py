@@ -1,6 +1,7 @@
 """Calls of `svkc.optimize` that raise, by the message that each raises."""
 
 import functools
+import json
 
 import jax.numpy as jnp
 import numpy as np
@@ -56,6 +57,17 @@ def too_few_iterations(_):
     move.solve(move.guess([{"x": 0.0}, {"x": 1.0}]), solver=solver)
 
 
+def load(**meta):
+    """Return a call that loads a file of metadata alone."""
+
+    def call(s):
+        path = s.folder / "solution.npz"
+        np.savez(path, metadata=np.array(json.dumps(meta)))
+        return optimize.load_solution(path, problem())
+
+    return call
+
+
 def on_point(call, where="end"):
     """Return a call that checks a problem with a constraint."""
     return lambda s: check(**{where: [call]})
@@ -63,6 +75,12 @@ def on_point(call, where="end"):
 
 CASES = {
     "... depends on fixed": lambda s: check(of=fixed_problem()),
+    "... has schema ... of solutions": load(optimize_schema=99),
+    "... is not a complete file of a solution: ...": load(),
+    "... is not a complete file of a solution: ... is missing": load(
+        optimize_schema=1, result="successful", problem={}
+    ),
+    "... is of another problem": load(optimize_schema=1, problem={"stages": 7}),
     "...: a point at the start": on_point(lambda p: p.vdot[0], "start"),
     "...: expected a cost": lambda s: check(running=lambda p: p.u),
     "...: got ..., expected a function of a point": on_point(3),
@@ -94,6 +112,7 @@ CASES = {
     "phase ...: bounds has": lambda s: phase(bounds=[lambda p: p.t]),
     "phase ...: got ... intervals": lambda s: phase(intervals=0),
     "phase ...: got the duration": lambda s: phase(duration=(2, 1)),
+    "phase ...: got the mesh": lambda s: phase(mesh=[0, 0.5]),
     "phase ...: path has": lambda s: phase(path=[optimize.between("x", 0, 1)]),
     "phase ...: the bounds of": lambda s: check(
         bounds=[optimize.between("x", 0, 1)], start=[optimize.between("x", 2, 3)]
@@ -101,4 +120,5 @@ CASES = {
     "phase: name": lambda s: phase(name=3),
     "phases: expected": lambda s: optimize.Problem(cart(), [], controls=optimize.Torques()),
     "solve: ...": too_few_iterations,
+    "with_mesh: got": lambda s: problem().with_mesh([2, 2]),
 }

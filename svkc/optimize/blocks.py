@@ -75,9 +75,10 @@ class PlainBlock(Block):
 class StageBlock(Block):
     """A block of a function of stages, carried to the unknowns of intervals by their polynomials.
 
-    function: (params, data, weight, y) -> rows of a stage; weight is b / n of the quadrature.
+    function: (params, data, weight, y) -> rows of a stage; weight is b / count of the quadrature.
     poly: of each stage at which the function is evaluated.
-    index, count: [lanes] which interval of its phase a lane is, and how many the phase has.
+    index, count: [lanes] start of a lane's interval and the phase's duration, both by the
+        interval's length; of equal intervals which one the lane is, and how many there are.
     tangents: stage's variables in which the function is not linear; others have no second
         derivatives among themselves.
     """

@@ -1,4 +1,4 @@
-"""The certificate of a solution: every interval simulated from its own first node."""
+"""The certificate of a solution: every interval simulated, then phases, then the whole motion."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -6,20 +6,23 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from svkc.model.chain import Chain, State, Structure
 from svkc.model.tables import Table, as_text
+from svkc.optimize.feedback import growth
 from svkc.optimize.guesses import PhaseMotion
-from svkc.optimize.points import full_state, tree_configuration, tree_velocity
+from svkc.optimize.plans import Plan, control_of, plan_of
+from svkc.optimize.points import full_state, padded, states_of, tree_configuration, tree_velocity
+from svkc.optimize.replay import Distance, ReplayReport, distance, replay_report
 from svkc.simulation.simulate import simulate
 from svkc.transitions.placement import place_at_current_pose
-from svkc.tree.configuration import difference
 from svkc.tree.kinematics import kinematics
 
 # tolerances of the simulations, far below the defects that matter
-_RTOL, _ATOL = 1e-8, 1e-10
+TOLERANCES: dict[str, Any] = {"rtol": 1e-8, "atol": 1e-10}
+# lanes of a batch, which waits for its slowest lane
+_BATCH = 16
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,7 +35,12 @@ class SolutionReport:
     position, velocity: of each phase, [intervals] largest defects over the coordinates (rad, m;
         rad/s, m/s).
     names: of the phases. worst: of each phase, the coordinate of the largest defect in velocity.
-    failed: number of intervals whose simulation did not reach its end.
+    failed: number of intervals and phases whose simulation did not reach its end.
+    open_loop: of each phase, simulated from its first node with the plan's torques alone: the
+        distance of its end from the plan. None: without replay.
+    growth: of each phase, the largest factor by which it multiplies a small error without feedback,
+        in the problem's units. None: without replay.
+    replay: the whole motion simulated with feedback. None: without replay.
     """
 
     position: tuple[np.ndarray, ...]
@@ -40,6 +48,9 @@ class SolutionReport:
     names: tuple[str, ...]
     worst: tuple[str, ...]
     failed: int
+    open_loop: tuple[Distance, ...] | None = None
+    growth: np.ndarray | None = None
+    replay: ReplayReport | None = None
 
     def largest(self) -> tuple[float, float]:
         """Return the largest defects in position and in velocity over all intervals."""
@@ -56,63 +67,48 @@ class SolutionReport:
                 self.names, self.position, self.velocity, self.worst, strict=True
             )
         ]
-        failed = [f"{self.failed} intervals could not be simulated"] * (self.failed > 0)
-        return as_text(["largest defects of the intervals", Table(header, rows), *failed])
+        failed = [f"{self.failed} intervals or phases could not be simulated"] * (self.failed > 0)
+        blocks = ["largest defects of the intervals", Table(header, rows), *failed]
+        return as_text([*blocks, *self._replayed()])
 
-
-class _Torques(eqx.Module):
-    """The torques of one interval as a control of `simulate`.
-
-    blocks: of the interval. start, step: its start and its length (s).
-    """
-
-    blocks: Any
-    start: Any
-    step: Any
-
-
-def _control(controls: Any, chain: Chain, table: np.ndarray, args: Any):
-    """Return the control (t, state, torques) -> tau of one interval.
-
-    table: [powers blocks_of_stage blocks] coefficients of the blocks by the fraction's powers.
-    """
-
-    def control(t, state, own: _Torques):
-        blocks = blocks_at(table, own.step, (t - own.start) / own.step, own.blocks)
-        return controls.torques(chain, t, state, blocks, args)
-
-    return control
-
-
-def blocks_at(table: np.ndarray, step: Any, fraction: Any, blocks: Any) -> Any:
-    """Return the blocks of a stage at a fraction of an interval, from the interval's blocks."""
-    powers = jnp.stack([fraction**k for k in range(table.shape[1])])
-    D = jnp.tensordot(powers, table[0], 1) + step * jnp.tensordot(powers, table[1], 1)
-    return D @ blocks
-
-
-def control_table(controls: Any, scheme: Any) -> np.ndarray:
-    """Return D0 and D1 of `AbstractControls.coefficients` as polynomials of the fraction."""
-    fractions = np.linspace(0, 1, scheme.stages + 1)
-    inverse = np.linalg.inv(fractions[:, None] ** np.arange(len(fractions)))
-    return np.stack([np.tensordot(inverse, D, 1) for D in controls.coefficients(scheme, fractions)])
+    def _replayed(self) -> list[Any]:
+        """Return the table of the replay."""
+        if self.replay is None or self.open_loop is None or self.growth is None:
+            return []
+        header = (
+            "phase", "growth of\nan error", "open loop:\nend (rad, m)", "worst of",
+            "feedback:\n(rad, m)", "feedback:\n(rad/s, m/s)", "worst of",
+        )  # fmt: skip
+        rows = [
+            (name, f"{factor:.3g}", f"{alone.position:.2e}", alone.worst,
+             f"{near.position:.2e}", f"{near.velocity:.2e}", near.worst)
+            for name, factor, alone, near in zip(
+                self.names, self.growth, self.open_loop, self.replay.phases, strict=True
+            )
+        ]  # fmt: skip
+        return ["largest distances from the plan", Table(header, rows), str(self.replay)]
 
 
 def _lanes(problem: Any, structures: Sequence[Structure], motion: tuple[PhaseMotion, ...]) -> tuple:
-    """Return first states, ends (q, v) and torques of all intervals."""
-    chain, starts, parts = problem.chain, 0.0, []
-    for m, structure in zip(motion, structures, strict=True):
-        n, h = len(m.vdot), m.duration / len(m.vdot)
-        states = jax.vmap(lambda q, v, s=structure: _at_own_place(chain, s, q, v))(
-            jnp.asarray(m.q[:-1]), jnp.asarray(m.v[:-1])
-        )
-        own = _Torques(m.blocks, start=starts + h * np.arange(n), step=np.full(n, h))
-        parts.append((states, (m.q[1:], m.v[1:]), own))
-        starts = starts + m.duration
-    return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
+    """Return lanes of all intervals, and of all phases.
+
+    A lane has a first state, start, end, the end's (q, v), and the first and the last interval.
+    """
+    chain, parts, wholes, k, start = problem.chain, [], [], 0, 0.0
+    places = [(m.q[:-1], m.v[:-1]) for m in motion]
+    of_phases = states_of(chain, structures, places, at_own_place)
+    for m, states in zip(motion, of_phases, strict=True):
+        n, times = len(m.vdot), start + m.times
+        parts.append((states, times[:-1], times[1:], (m.q[1:], m.v[1:]), *[k + np.arange(n)] * 2))
+        first = jax.tree.map(lambda x: x[:1], states)
+        ends, last = (m.q[-1:], m.v[-1:]), np.array([k + n - 1])
+        wholes.append((first, times[:1], times[-1:], ends, np.array([k]), last))
+        k, start = k + n, start + m.duration
+    join = lambda parts: jax.tree.map(lambda *x: np.concatenate(x), *parts)
+    return join(parts), join(wholes)
 
 
-def _at_own_place(chain: Chain, structure: Structure, q, v) -> State:
+def at_own_place(chain: Chain, structure: Structure, q, v) -> State:
     """Return a state whose links are where its bodies are, so that drift of the loops is none."""
     full = tree_configuration(chain, q)
     if not chain.link_names:
@@ -122,39 +118,52 @@ def _at_own_place(chain: Chain, structure: Structure, q, v) -> State:
     return full_state(eqx.tree_at(lambda c: c.structure, chain, placed), placed, q, v)
 
 
+def _distances(chain: Chain, plan: Plan, lanes: tuple, control: Any) -> tuple:
+    """Return distances [lanes nv] from the ends in q and v, and results of the runs."""
+    count, lanes, parts = len(lanes[-1]), padded(lanes, _BATCH), []
+    for k in range(0, count, _BATCH):
+        own = jax.tree.map(lambda x, k=k: x[k : k + _BATCH], lanes)
+        parts.append(_simulate_all(chain, plan, own, control))
+    return tuple(np.concatenate(x)[:count] for x in zip(*parts, strict=True))
+
+
 @eqx.filter_jit
-def _simulate_all(chain: Chain, states: State, ends, torques: _Torques, control) -> tuple:
-    """Return defects in q and v of all lanes, and which runs reached their end."""
+def _simulate_all(chain: Chain, plan: Plan, lanes: tuple, control: Any) -> tuple:
+    """Return distances from the ends in q and v of all lanes, and which runs reached their end."""
 
-    def run(state, end, own):
+    def run(state, start, stop, end, first, last):
+        own = dataclasses.replace(plan, first=first, last=last)
         traj = simulate(
-            chain, state, own.start + own.step, t0=own.start, control=control, args=own,
-            rtol=_RTOL, atol=_ATOL, throw=False,
-        )  # fmt: skip
-        last = tree_configuration(chain, end[0])
-        reached = tree_configuration(chain, traj.final.q[: chain.nq])
-        of_q = difference(chain, reached, last)[: chain.nv]
-        return of_q, traj.final.v[: chain.nv] - end[1], traj.result._value
+            chain, state, stop, t0=start, control=control, args=own, throw=False, **TOLERANCES
+        )
+        return *distance(chain, traj.final, *end), traj.result._value
 
-    return jax.vmap(run)(states, ends, torques)
+    return jax.vmap(run)(*lanes)
 
 
-def report(problem: Any, structures: Sequence[Structure], motion) -> SolutionReport:
-    """Return the certificate of a motion."""
-    chain = problem.chain
-    table = control_table(problem.controls, problem.scheme)
-    control = _control(problem.controls, chain, table, problem.args)
-    states, ends, torques = _lanes(problem, structures, motion)
-    of_q, of_v, results = (
-        np.asarray(x) for x in _simulate_all(chain, states, ends, torques, control)
-    )
+def report(solution: Any, replay: bool) -> SolutionReport:
+    """Return the certificate that `Solution.report` describes."""
+    problem, motion = solution.problem, solution.motion
+    chain, names = problem.chain, problem.chain.dof_names
+    intervals, phases = _lanes(problem, solution.structures, motion)
+    distances = lambda lanes: _distances(chain, plan_of(motion), lanes, control_of(problem))
+    *errors, results = distances(intervals)
     edges = np.cumsum([len(m.vdot) for m in motion])[:-1]
-    split = lambda x: tuple(np.split(np.abs(x), edges))
-    worst = [chain.dof_names[int(np.argmax(np.max(v, 0)))] for v in split(of_v)]
-    return SolutionReport(
-        position=tuple(np.max(q, 1) for q in split(of_q)),
-        velocity=tuple(np.max(v, 1) for v in split(of_v)),
+    of_q, of_v = (np.split(np.abs(x), edges) for x in errors)
+    local = SolutionReport(
+        position=tuple(np.max(q, 1) for q in of_q),
+        velocity=tuple(np.max(v, 1) for v in of_v),
         names=tuple(phase.name for phase in problem.phases),
-        worst=tuple(worst),
+        worst=tuple(names[int(np.argmax(np.max(v, 0)))] for v in of_v),
         failed=int(np.sum(results != 0)),
+    )
+    if not replay:
+        return local
+    *ends, results = distances(phases)
+    return dataclasses.replace(
+        local,
+        failed=local.failed + int(np.sum(results != 0)),
+        open_loop=tuple(Distance.of(names, *x) for x in zip(*ends, strict=True)),
+        growth=growth(problem, motion, solution.linear_maps()),
+        replay=replay_report(solution, TOLERANCES),
     )

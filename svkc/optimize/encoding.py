@@ -64,7 +64,8 @@ def decode(transcription: Transcription, x: np.ndarray) -> tuple[PhaseMotion, ..
     )
     padded, links = np.append(x, 0.0), 6 * len(chain.link_names)
     motions = []
-    for at, reference in zip(transcription.phases, transcription.references):
+    specified = zip(transcription.specification, transcription.phases, transcription.references)
+    for phase, at, reference in specified:
         coordinates = x[at.nodes[:, :nv]], x[at.nodes[:, nv : 2 * nv]]
         q, v = jax.vmap(lambda r, y, w: motion_from_chart(chain, r, y, w, w)[:2])(
             *(jnp.asarray(y) for y in (reference, *coordinates))
@@ -80,6 +81,7 @@ def decode(transcription: Transcription, x: np.ndarray) -> tuple[PhaseMotion, ..
                 vdot=x[at.vdot],
                 forces=on_links(at.forces),
                 impulse=on_links(at.impulse),
+                mesh=phase.places,
             )
         )
     return tuple(motions)

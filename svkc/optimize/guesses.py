@@ -32,6 +32,7 @@ class PhaseMotion(eqx.Module):
     blocks: [n blocks control] of `AbstractControls`. states: [n + 1 control] at the nodes, if
     controls have states. vdot: [n s nv].
     forces: [n s 6 links] multipliers of the links' rows. impulse: [6 links].
+    mesh: [n + 1] places of the nodes, as fractions of the duration; None: equal intervals.
     """
 
     duration: Any
@@ -42,6 +43,13 @@ class PhaseMotion(eqx.Module):
     vdot: Any
     forces: Any
     impulse: Any
+    mesh: Any = None
+
+    @property
+    def times(self) -> np.ndarray:
+        """Times [n + 1] of the nodes from the start of the phase (s)."""
+        mesh = np.linspace(0, 1, len(self.q)) if self.mesh is None else np.asarray(self.mesh)
+        return self.duration * mesh
 
 
 @dataclasses.dataclass
@@ -83,16 +91,16 @@ class PoseLine:
         rows = possible_rows(chain, np.isin(chain.link_names, names))
         return close_loops(chain, q, rows) if len(rows) else q
 
-    def at(self, durations: Sequence[float], intervals: Sequence[int]) -> list[tuple]:
+    def at(self, durations: Sequence[float]) -> list[tuple]:
         """Return (q [n + 1 nq], v [n + 1 nv]) of each phase."""
         ends = np.concatenate([[0], np.cumsum(durations)])
         known = [i for i, pose in enumerate(self.poses) if pose is not None]
         out = []
-        for k, n in enumerate(intervals):
+        for k, phase in enumerate(self.phases):
             first = max(i for i in known if i <= k)
             last = min(i for i in known if i > k)
             span = ends[last] - ends[first]
-            times = (np.linspace(ends[k], ends[k + 1], n + 1) - ends[first]) / span
+            times = (ends[k] + durations[k] * phase.places - ends[first]) / span
             out.append(self._line(self.poses[first], self.poses[last], times, span))
         return out
 

@@ -115,7 +115,7 @@ class Lift:
     """The map from an interval's unknowns to one stage's variables, with its derivatives.
 
     layout: numbers of entries. poly: of this stage alone. z: unknowns of the interval.
-    index, count: which interval of its phase, and how many the phase has.
+    index, count: start of the interval and the phase's duration, by the interval's length.
     """
 
     def __init__(self, layout: Layout, poly: StagePolynomials, z, index, count):

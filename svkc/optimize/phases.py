@@ -92,7 +92,9 @@ class Phase:
     name: name of the phase.
     connected: names of the virtual links that are connected in the phase.
     duration: least and largest duration (s), or one number for a fixed one.
-    intervals: number of collocation intervals.
+    intervals: number of collocation intervals of equal length.
+    mesh: places of the nodes as fractions of the duration, from 0 to 1, in place of `intervals`;
+        None: equal intervals.
     bounds: of coordinates at the nodes, from `between`.
     path: constraints at every stage: functions g of a `Point` with g >= 0, (g, lower, upper), or
         `constraint(...)`. Those that depend on the state alone hold at the start too.
@@ -121,6 +123,7 @@ class Phase:
     running: Checked[Function | None] = None
     final: Checked[Function | None] = None
     continuous_torques: bool = True
+    mesh: Any = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):
@@ -128,6 +131,9 @@ class Phase:
         put = lambda name, value: object.__setattr__(self, name, value)
         put("connected", tuple(names("connected", self.connected)))
         put("duration", self._checked_duration())
+        if self.mesh is not None:
+            put("mesh", self._checked_mesh())
+            put("intervals", len(self.mesh) - 1)
         count = as_array(self.intervals)
         if count.shape != () or count.dtype.kind not in "iu" or count < 1:
             raise ValueError(
@@ -151,6 +157,26 @@ class Phase:
                 " upper) with 0 < lower <= upper, or one number"
             )
         return float(value[0]), float(value[1])
+
+    def _checked_mesh(self) -> tuple[float, ...]:
+        mesh = np.asarray(real_array(f"phase {self.name!r}: mesh", self.mesh, float))
+        if (
+            mesh.ndim != 1
+            or len(mesh) < 2
+            or mesh[0] != 0
+            or mesh[-1] != 1
+            or any(mesh[1:] <= mesh[:-1])
+        ):
+            raise ValueError(
+                f"phase {self.name!r}: got the mesh {self.mesh!r}, expected increasing places of"
+                " nodes from 0 to 1"
+            )
+        return tuple(mesh.tolist())
+
+    @property
+    def places(self) -> np.ndarray:
+        """Places [intervals + 1] of the nodes, as fractions of the duration."""
+        return np.linspace(0, 1, self.intervals + 1) if self.mesh is None else np.array(self.mesh)
 
     def _checked_list(self, name: str) -> tuple[Any, ...]:
         entries, where = getattr(self, name), f"{name} of {self.name}"

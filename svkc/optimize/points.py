@@ -1,6 +1,7 @@
 """A point of a motion, as costs and constraints see it."""
 
 import functools
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -9,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from svkc._jax.eager import eager_jit
 from svkc._jax.static_gather import static_take
 from svkc.model.chain import Chain, State, Structure
 from svkc.model.names import link_index
@@ -37,6 +39,39 @@ def full_state(chain: Chain, structure: Structure, q, v) -> State:
     place = lambda q: joint_coordinates(chain, structure, kinematics(chain, q), q)
     q, rate = jax.jvp(place, (q,), (configuration_derivative(chain, q, v),))
     return State(q, _velocity_of(chain, q, rate), structure)
+
+
+def states_of(
+    chain: Chain, structures: Sequence[Structure], motion: Sequence[tuple], function: Any = None
+) -> list[State]:
+    """Return the states of all phases, of each with a leading axis over its nodes.
+
+    motion: of each phase, (q, v) [nodes ...] of the tree. function: in place of `full_state`.
+    """
+    repeat = lambda s, n: jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), (n, *x.shape)), s)
+    lanes = [(repeat(s, len(q)), q, v) for s, (q, v) in zip(structures, motion, strict=True)]
+    lanes = jax.tree.map(lambda *x: np.concatenate(x), *lanes)
+    ends = np.cumsum([len(q) for q, _ in motion])
+    states = _over_lanes(full_state if function is None else function, chain, padded(lanes))
+    return [
+        jax.tree.map(lambda x, a=a, b=b: np.asarray(x)[a:b], states)
+        for a, b in zip((0, *ends), ends)
+    ]
+
+
+@functools.partial(eager_jit, jit=eqx.filter_jit)
+def _over_lanes(function: Any, chain: Chain, lanes: tuple) -> State:
+    return jax.vmap(lambda lane: function(chain, *lane))(lanes)
+
+
+def padded(lanes: Any, multiple: int = 64) -> Any:
+    """Return lanes with the last one repeated up to a multiple of a number.
+
+    Other numbers of intervals are then seldom compiled again.
+    """
+    count = len(jax.tree.leaves(lanes)[0])
+    at = np.minimum(np.arange(-(-count // multiple) * multiple), count - 1)
+    return jax.tree.map(lambda x: np.asarray(x)[at], lanes)
 
 
 def _velocity_of(chain: Chain, q, rate) -> Float[Array, " dofs"]:

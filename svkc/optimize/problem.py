@@ -9,24 +9,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from svkc.model.annotations import Checked, Function
+from svkc.model.annotations import Checked, Function, Integer
 from svkc.model.chain import Chain
 from svkc.model.checked_jit import check_chain
-from svkc.model.validation import boolean, check_function
+from svkc.model.validation import boolean, check_function, integer
 from svkc.optimize.checks import Check, check, check_finite
 from svkc.optimize.controls import AbstractControls
 from svkc.optimize.encoding import encode
 from svkc.optimize.equations import Model, Params
+from svkc.optimize.failures import raise_on_failure
 from svkc.optimize.guesses import Guess, PhaseMotion, PoseLine, static_forces
 from svkc.optimize.ipopt import AbstractSolver, Ipopt, SolverResult
 from svkc.optimize.lift import Layout
 from svkc.optimize.loop_rows import LinkRows
+from svkc.optimize.multistart import Solutions, multistart
 from svkc.optimize.phases import Phase, as_constraint
 from svkc.optimize.program import Program
-from svkc.optimize.refinement import is_fine, new_counts
 from svkc.optimize.resampling import as_guess
 from svkc.optimize.schemes import Radau
-from svkc.optimize.solution import Solution, raise_on_failure, solution
+from svkc.optimize.solution import Solution, solution
 from svkc.optimize.structures import phase_structures
 from svkc.optimize.transcription import Transcription
 from svkc.optimize.units import Units, units_of
@@ -89,6 +90,8 @@ class Problem:
         self.units = units_of(chain, middle) if units is None else units
         self.project = boolean("project", project)
         self._programs: dict[Any, Program] = {}
+        # functions that are made once, also for other meshes
+        self.functions: dict[str, Any] = {}
 
     def guess(
         self,
@@ -113,9 +116,7 @@ class Problem:
         durations = np.asarray(middle if durations is None else durations, float)
         if durations.shape != (count,):
             raise ValueError(f"guess: got {durations.size} durations, expected {count}")
-        lines = PoseLine(self.chain, self.phases, poses).at(
-            durations, [p.intervals for p in self.phases]
-        )
+        lines = PoseLine(self.chain, self.phases, poses).at(durations)
         return Guess([self._at_rest(*x) for x in zip(self.phases, durations, lines)], noise, key)
 
     def _at_rest(self, phase: Phase, duration: float, line: tuple) -> PhaseMotion:
@@ -132,6 +133,7 @@ class Problem:
             vdot=np.zeros((n, s, self.chain.nv)),
             forces=np.repeat(forces[:-1, None], s, 1),
             impulse=np.zeros(links),
+            mesh=phase.places,
         )
 
     def solve(
@@ -169,51 +171,52 @@ class Problem:
             raise_on_failure(program, result)
         return solution(self, program, result)
 
-    def with_intervals(self, counts: Sequence[int]) -> "Problem":
-        """Return the problem with other numbers of intervals.
+    def with_mesh(self, meshes: Sequence[Any]) -> "Problem":
+        """Return the problem with other intervals.
 
-        counts: for each phase.
+        meshes: for each phase, the number of equal intervals, or the places of the nodes as
+            fractions of the duration, from 0 to 1.
+        Raises ValueError for another number of meshes, and for a wrong mesh.
         """
+        if len(meshes) != len(self.phases):
+            raise ValueError(f"with_mesh: got {len(meshes)} meshes, expected {len(self.phases)}")
         problem = copy.copy(self)
+        of_phase = lambda mesh: (
+            {"mesh": mesh} if np.ndim(mesh) else {"mesh": None, "intervals": mesh}
+        )
         problem.phases = [
-            dataclasses.replace(phase, intervals=n)
-            for phase, n in zip(self.phases, counts, strict=True)
+            dataclasses.replace(phase, **of_phase(mesh))
+            for phase, mesh in zip(self.phases, meshes, strict=True)
         ]
-        problem._programs = {}
+        problem._programs, problem.functions = {}, self.functions
         return problem
-
-    def refine(self, solution: Solution, tol: float, rounds: int, **options: Any) -> Solution:
-        """Return the solution that `Solution.refined` describes.
-
-        solution: of this problem. tol, rounds: as there. options: of `solve`.
-        """
-        order = 2 * self.scheme.stages - 1
-        for _ in range(rounds):
-            report = solution.report()
-            if is_fine(report, tol):
-                break
-            problem = self.with_intervals(new_counts(report, order, tol))
-            finer = problem.solve(solution, **options)
-            change = abs(float(finer.cost) - float(solution.cost))
-            solution = dataclasses.replace(finer, cost_error=np.asarray(change))
-        return solution
 
     def multistart(
         self,
         guesses: Sequence[Guess | Solution],
         *,
+        processes: Integer = 1,
         solver: AbstractSolver | None = None,
         progress_meter: Any = None,
-    ) -> list[Solution]:
-        """Return the solutions from several guesses, one after another in one compiled program.
+    ) -> Solutions:
+        """Return the solutions from several guesses, in their order, as a list with `best`.
 
         Those that failed are among them: `result` says how each ended.
 
         guesses: as of `solve`.
+        processes: one: starts are solved here, one after the other in one compiled program. More:
+            at once in so many new processes, which compile the problem first; needs cloudpickle.
         solver, progress_meter: as in `solve`.
+        Raises RuntimeError, with the exception in it, if a process fails.
         """
-        options = {"solver": solver, "progress_meter": progress_meter, "throw": False}
-        return [self.solve(guess, **options) for guess in guesses]
+        count = integer("processes", processes, 1)
+        return multistart(
+            self, guesses, processes=count, solver=solver, progress_meter=progress_meter
+        )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what another process needs; compiled functions are made anew."""
+        return self.__dict__ | {"_programs": {}, "functions": {}}
 
     def start(self, guess: Guess | Solution) -> tuple[Program, SolverResult]:
         """Return the compiled problem, and a guess in the solver's units."""

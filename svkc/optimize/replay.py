@@ -1,5 +1,7 @@
 """A solution as a run of `simulate`: with events between phases, and feedback to the plan."""
 
+import dataclasses
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -8,88 +10,79 @@ import jax.numpy as jnp
 import numpy as np
 
 from svkc.model.chain import Chain, State
-from svkc.optimize.certificate import blocks_at, control_table
-from svkc.optimize.points import full_state, tree_configuration, tree_velocity
+from svkc.model.tables import as_text
+from svkc.optimize.plans import Plan, control_of, plan_of
+from svkc.optimize.points import full_state, tree_configuration
+from svkc.simulation.codes import RESULTS
+from svkc.simulation.report import Report
 from svkc.simulation.simulate import simulate
 from svkc.simulation.trajectory import Trajectory
 from svkc.transitions.events import at
 from svkc.transitions.transition import connect
-from svkc.tree.configuration import difference, integrate
-from svkc.tree.mass_matrix import mass_matrix
+from svkc.tree.configuration import difference
+
+# how long before the end of a phase it is compared with the plan, by the duration of the motion
+_JUST_BEFORE = 1e-9
 
 
-class Plan(eqx.Module):
-    """The intervals of a solution, one after another.
+@dataclasses.dataclass(frozen=True)
+class Distance:
+    """Largest distance from the plan over the coordinates and over some times.
 
-    starts, steps: of each (s). blocks: of controls. q, v: at both ends [intervals 2 ...], of the
-    tree. stiffness, damping: gains of the feedback (N m/rad, N m s/rad), of each coordinate.
+    position: rad, m. velocity: rad/s, m/s. worst: coordinate of the largest distance in position.
     """
 
-    starts: Any
-    steps: Any
-    blocks: Any
-    q: Any
-    v: Any
-    stiffness: Any
-    damping: Any
+    position: float
+    velocity: float
+    worst: str
+
+    @classmethod
+    def of(cls, names: Sequence[str], q: np.ndarray, v: np.ndarray) -> "Distance":
+        """Return the largest of distances [... nv] in q and v."""
+        q, v = (np.abs(x).reshape(-1, x.shape[-1]) for x in (q, v))
+        worst = names[int(np.argmax(np.max(q, 0)))]
+        return cls(position=float(np.max(q)), velocity=float(np.max(v)), worst=worst)
 
 
-def plan_of(solution: Any, rate: float) -> Plan:
-    """Return the plan of a solution. rate: of the feedback (1/s); zero: open loop."""
-    motion, problem = solution.motion, solution.problem
-    chain = problem.chain
-    steps = np.concatenate([np.full(len(m.vdot), m.duration / len(m.vdot)) for m in motion])
-    ends = lambda x: np.stack([x[:-1], x[1:]], 1)
-    first = jax.tree.map(lambda x: x[0], solution.states)
-    inertia = np.diag(np.asarray(mass_matrix(chain, first)))
-    inertia = np.where(problem.controls.driven(chain), inertia, 0)
-    return Plan(
-        starts=np.cumsum(steps) - steps,
-        steps=steps,
-        blocks=np.concatenate([m.blocks for m in motion]),
-        q=np.concatenate([ends(m.q) for m in motion]),
-        v=np.concatenate([ends(m.v) for m in motion]),
-        stiffness=rate**2 * inertia,
-        damping=2 * rate * inertia,
-    )
+@dataclasses.dataclass(frozen=True)
+class ReplayReport:
+    """The whole motion simulated with feedback, with events between the phases.
+
+    phases: of each, the largest distance from the plan over its nodes.
+    report: of the run, with its loop gaps and its energy balance.
+    """
+
+    phases: tuple[Distance, ...]
+    report: Report
+
+    def __str__(self) -> str:
+        run = self.report
+        ended = "" if run.result == RESULTS.successful else f"; ended with {run.result}"
+        return as_text(
+            [
+                f"with feedback: largest loop gap {float(run.gap):.2e} m,"
+                f" {float(run.angular_gap):.2e} rad; energy drift {float(run.energy_drift):.2e} J,"
+                f" lost in impacts {float(run.energy_lost):.4g} J{ended}"
+            ]
+        )
 
 
-def _planned(chain: Chain, q, v, step, s) -> tuple[Any, Any]:
-    """Return q and v of the tree at a fraction s of an interval, by Hermite's cubic polynomial."""
-    start = tree_configuration(chain, q[0])
-    step_to = difference(chain, start, tree_configuration(chain, q[1]))[: chain.nv]
-    moved = (3 * s**2 - 2 * s**3) * step_to
-    moved = moved + step * ((s - 2 * s**2 + s**3) * v[0] + (s**3 - s**2) * v[1])
-    rate = (6 * s - 6 * s**2) * step_to / step
-    rate = rate + (1 - 4 * s + 3 * s**2) * v[0] + (3 * s**2 - 2 * s) * v[1]
-    return integrate(chain, start, tree_velocity(chain, moved))[: chain.nq], rate
+def distance(chain: Chain, state: State, q, v) -> tuple[Any, Any]:
+    """Return the distance [nv] of a state from q and v of the tree."""
+    here, there = (tree_configuration(chain, x) for x in (state.q[: chain.nq], q))
+    return difference(chain, here, there)[: chain.nv], state.v[: chain.nv] - v
 
 
-def control_of(problem: Any) -> Any:
-    """Return the control (t, state, plan) -> tau that follows a `Plan`."""
-    chain, controls = problem.chain, problem.controls
-    table = control_table(controls, problem.scheme)
-
-    def control(t, state: State, plan: Plan):
-        k = jnp.searchsorted(plan.starts, t, side="right") - 1
-        k = jnp.clip(k, 0, len(plan.steps) - 1)
-        own = jax.tree.map(lambda x: jnp.asarray(x)[k], (plan.starts, plan.steps))
-        fraction = jnp.clip((t - own[0]) / own[1], 0, 1)
-        blocks = blocks_at(table, own[1], fraction, jnp.asarray(plan.blocks)[k])
-        tau = controls.torques(chain, t, state, blocks, problem.args)
-        q, v = _planned(chain, jnp.asarray(plan.q)[k], jnp.asarray(plan.v)[k], own[1], fraction)
-        here, there = (tree_configuration(chain, x[: chain.nq]) for x in (state.q, q))
-        error = difference(chain, here, there)[: chain.nv]
-        feedback = plan.stiffness * error + plan.damping * (v - state.v[: chain.nv])
-        return tau + tree_velocity(chain, feedback)
-
-    return control
+def control_and_plan(solution: Any, feedback: bool) -> tuple[Any, Plan]:
+    """Return what `Solution.control` describes."""
+    gains = solution.gains() if feedback else None
+    return control_of(solution.problem), plan_of(solution.motion, gains)
 
 
-def replay(solution: Any, rate: float, ts: Any, options: dict[str, Any]) -> Trajectory:
+def replay(solution: Any, feedback: bool, ts: Any, options: Mapping[str, Any]) -> Trajectory:
     """Return the run of a solution with events between its phases."""
     problem, motion = solution.problem, solution.motion
-    chain, plan = problem.chain, plan_of(solution, rate)
+    chain, (control, plan) = problem.chain, control_and_plan(solution, feedback)
     events, end = [], 0.0
     for before, after, m in zip(problem.phases, problem.phases[1:], motion):
         end += float(m.duration)
@@ -105,9 +98,27 @@ def replay(solution: Any, rate: float, ts: Any, options: dict[str, Any]) -> Traj
     state = full_state(chain, opened, jnp.asarray(motion[0].q[0]), jnp.asarray(motion[0].v[0]))
     if problem.phases[0].connected:
         state = connect(chain, state, *problem.phases[0].connected, here=True)
-    total = float(np.sum(plan.steps))
+    total = end + float(motion[-1].duration)
     ts = np.linspace(0, total, 101) if ts is None else ts
-    control = control_of(problem)
     return simulate(
         chain, state, total, ts=ts, events=events, control=control, args=plan, **options
     )
+
+
+def replay_report(solution: Any, options: Mapping[str, Any]) -> ReplayReport:
+    """Return how far the motion with feedback leaves the plan. options: of `simulate`."""
+    motion, chain = solution.motion, solution.problem.chain
+    total = sum(float(m.duration) for m in motion)
+    starts = np.cumsum([0.0, *(float(m.duration) for m in motion)])
+    # an event changes velocities at the end of a phase
+    times = [s + np.append(m.times[1:-1], m.duration - _JUST_BEFORE * total)
+             for s, m in zip(starts, motion)]  # fmt: skip
+    traj = replay(solution, True, np.concatenate(times), {"throw": False, **options})
+    q, v = (np.concatenate([getattr(m, name)[1:] for m in motion]) for name in "qv")
+    of_q, of_v = jax.vmap(lambda *x: distance(chain, *x))(
+        traj.states, jnp.asarray(q), jnp.asarray(v)
+    )
+    edges = np.cumsum([len(m.vdot) for m in motion])[:-1]
+    parts = zip(np.split(np.asarray(of_q), edges), np.split(np.asarray(of_v), edges), strict=True)
+    phases = tuple(Distance.of(chain.dof_names, q, v) for q, v in parts)
+    return ReplayReport(phases=phases, report=traj.report())

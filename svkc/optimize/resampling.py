@@ -11,7 +11,7 @@ from svkc.optimize.guesses import Guess, PhaseMotion
 from svkc.optimize.points import tree_configuration, tree_velocity
 from svkc.optimize.schemes import Radau
 from svkc.optimize.solution import Solution
-from svkc.tree.configuration import difference, integrate
+from svkc.tree.configuration import integrate
 
 
 def as_guess(guess: Any, problem: Any) -> Guess:
@@ -30,6 +30,9 @@ def as_guess(guess: Any, problem: Any) -> Guess:
     phases = []
     for phase, motion in zip(problem.phases, motions, strict=True):
         same = (phase.intervals, problem.scheme.stages) == motion.vdot.shape[:2]
+        same = same and np.allclose(
+            motion.times, motion.duration * phase.places, rtol=0, atol=1e-12
+        )
         if not same or motion.blocks.shape[1] != blocks:
             motion = resample(problem.chain, problem.scheme, problem.controls, motion, phase)
         phases.append(motion)
@@ -49,46 +52,67 @@ def _linear(x: np.ndarray, y: np.ndarray, at: np.ndarray) -> np.ndarray:
 def resample(
     chain: Chain, scheme: Radau, controls: Any, motion: PhaseMotion, phase: Any
 ) -> PhaseMotion:
-    """Return a phase of a motion with another number of intervals or stages."""
-    old, s, n = len(motion.vdot), motion.vdot.shape[1], phase.intervals
-    nodes, new = np.linspace(0, 1, old + 1), np.linspace(0, 1, n + 1)
-    of_old = ((np.arange(old)[:, None] + Radau(s).c) / old).ravel()
-    of_new = ((np.arange(n)[:, None] + scheme.c) / n).ravel()
-    at_stages = lambda y: _linear(of_old, y.reshape(old * s, *y.shape[2:]), of_new).reshape(
+    """Return a phase of a motion on another mesh, or with another number of stages."""
+    s, n = motion.vdot.shape[1], phase.intervals
+    nodes, new = motion.times / motion.duration, phase.places
+    stages = (new[:-1, None] + np.diff(new)[:, None] * scheme.c).ravel()
+    k, share = _within(nodes, stages, "left")
+    weights = Radau(s).interpolation(share)
+    at_stages = lambda y: np.einsum("ij,ij...->i...", weights, y[k]).reshape(
         n, scheme.stages, *y.shape[2:]
     )
+    q, v = _nodes(chain, motion, nodes, new)
     # of controls: the values in the middle of the new intervals
-    has_state, middle = int(controls.has_state), (np.arange(n) + 0.5) / n
-    centers = (np.arange(old) + 0.5) / old
+    has_state, middle = int(controls.has_state), (new[:-1] + new[1:]) / 2
     states = _linear(nodes, motion.states, new)
     free = motion.blocks[:, has_state:]
     if free.shape[1] == s and controls.blocks(scheme) - has_state == scheme.stages:
         blocks = at_stages(free)
     else:
-        nearest = np.abs(middle[:, None] - centers).argmin(1)
-        blocks = np.repeat(free[nearest, :1], controls.blocks(scheme) - has_state, 1)
+        blocks = np.repeat(
+            free[_within(nodes, middle, "left")[0], :1], controls.blocks(scheme) - has_state, 1
+        )
     of_states = states[:-1, None] if has_state else blocks[:, :0]
     return PhaseMotion(
         duration=motion.duration,
-        q=_configurations(chain, motion.q, nodes, new),
-        v=_linear(nodes, motion.v, new),
+        q=q,
+        v=v,
         states=states,
         blocks=np.concatenate([of_states, blocks], 1),
         vdot=at_stages(motion.vdot),
         forces=at_stages(motion.forces),
         impulse=motion.impulse,
+        mesh=new,
     )
 
 
-def _configurations(chain: Chain, q: np.ndarray, nodes: np.ndarray, new: np.ndarray) -> np.ndarray:
-    """Return configurations of the tree at new nodes, along straight lines between old ones."""
-    left = np.clip(np.searchsorted(nodes, new, side="right") - 1, 0, len(nodes) - 2)
-    share = (new - nodes[left]) / (nodes[left + 1] - nodes[left])
+def _within(nodes: np.ndarray, at: np.ndarray, side: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return the interval of each place, and which fraction of this interval it is.
 
-    def between(start, end, share):
-        start, end = tree_configuration(chain, start), tree_configuration(chain, end)
-        step = tree_velocity(chain, difference(chain, start, end)[: chain.nv])
-        return integrate(chain, start, share * step)[: chain.nq]
+    side: "left" for a place on a node to be the end of an interval, "right" for a start.
+    """
+    k = np.clip(np.searchsorted(nodes, at, side=side) - 1, 0, len(nodes) - 2)
+    return k, (at - nodes[k]) / (nodes[k + 1] - nodes[k])
 
-    arrays = (jnp.asarray(x) for x in (q[left], q[left + 1], share))
-    return np.asarray(jax.vmap(between)(*arrays))
+
+def _nodes(
+    chain: Chain, motion: PhaseMotion, nodes: np.ndarray, new: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return q and v of the tree at new nodes, along the polynomials of the old intervals."""
+    k, share = _within(nodes, new, "right")
+    s = motion.vdot.shape[1]
+    powers, degree = np.arange(s), Radau(s).c[:, None] ** np.arange(s)
+    once = (share[:, None] ** (powers + 1) / (powers + 1)) @ np.linalg.inv(degree)
+    twice = share[:, None] ** (powers + 2) / ((powers + 1) * (powers + 2)) @ np.linalg.inv(degree)
+    h = (motion.duration * np.diff(nodes))[k][:, None]
+    change = lambda weights: np.einsum("ij,ijk->ik", weights, motion.vdot[k])
+    v = motion.v[k] + h * change(once)
+    step = h * share[:, None] * motion.v[k] + h**2 * change(twice)
+
+    def moved(q, step):
+        full = tree_configuration(chain, q)
+        return integrate(chain, full, tree_velocity(chain, step))[: chain.nq]
+
+    q = np.array(jax.vmap(moved)(jnp.asarray(motion.q[k]), jnp.asarray(step)))
+    q[-1], v[-1] = motion.q[-1], motion.v[-1]
+    return q, v

@@ -7,17 +7,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from svkc._jax.enumerations import member_names
+from svkc.model.annotations import Path
 from svkc.model.chain import State, Structure
 from svkc.model.names import link_index, unknown_name
 from svkc.model.tables import Block, Printed, Table, as_text, number
-from svkc.model.validation import positive_scalar
+from svkc.model.validation import boolean, positive_scalar
+from svkc.optimize.archive import save_solution
 from svkc.optimize.certificate import SolutionReport, report
 from svkc.optimize.encoding import decode
+from svkc.optimize.feedback import riccati_gains
 from svkc.optimize.guesses import PhaseMotion
 from svkc.optimize.ipopt import SolverResult
-from svkc.optimize.points import full_state
+from svkc.optimize.linearization import LinearMaps, linear_maps
+from svkc.optimize.phases import Phase
+from svkc.optimize.points import states_of
 from svkc.optimize.program import Program
-from svkc.optimize.replay import replay
+from svkc.optimize.refinement import refined
+from svkc.optimize.replay import control_and_plan, replay
 from svkc.simulation.trajectory import Trajectory
 from svkc.tree.spatial import quat_matrix
 
@@ -25,9 +32,6 @@ if TYPE_CHECKING:  # as equinox annotates the metaclass of its enumerations
     from enum import EnumMeta as NamedMeta
 else:
     from svkc._jax.enumerations import NamedMeta
-
-# rows named in the message of a run that failed
-_ROWS_SHOWN = 6
 
 
 class OUTCOME(eqx.Enumeration, metaclass=NamedMeta):  # pyright: ignore
@@ -105,58 +109,116 @@ class Solution(Printed):
     def __repr__(self) -> str:
         return f"<Solution: cost {float(self.cost):.8g}, {self.result}>"
 
-    def forces(self, link: str) -> Any:
+    def forces(self, link: str, phase: str | None = None) -> Any:
         """Return the force (N) of a virtual link at all stages of the phases that connect it.
 
         [stages 3], on `real` from `parent`, in axes of the parent body.
 
-        link: name of the virtual link.
-        Raises ValueError for a link that no phase connects.
+        link: name of the virtual link. phase: name of the phase; None: all that connect the link.
+        Raises ValueError for unknown names, and for a link that is not connected.
         """
+        pairs = list(zip(self.problem.phases, self.motion, strict=True))
+        if phase is not None:
+            pairs = [self._phase(phase)[:2]]
         parts = [
-            self._force(link, m.forces).reshape(-1, 3)
-            for phase, m in zip(self.problem.phases, self.motion, strict=True)
-            if link in phase.connected
+            self._force(link, m.forces).reshape(-1, 3) for own, m in pairs if link in own.connected
         ]
         if not parts:
-            connected = tuple(n for phase in self.problem.phases for n in phase.connected)
+            connected = tuple(name for own, _ in pairs for name in own.connected)
             raise unknown_name("virtual link", link, connected)
         return np.concatenate(parts)
 
-    def report(self) -> SolutionReport:
+    def stage_times(self, phase: str) -> np.ndarray:
+        """Return the times (s) [stages] of a phase's stages, at which `forces` are.
+
+        phase: name of the phase.
+        Raises ValueError for an unknown name.
+        """
+        _, m, start = self._phase(phase)
+        steps = np.diff(m.times)[:, None]
+        return start + (m.times[:-1, None] + steps * self.problem.scheme.c).ravel()
+
+    def _phase(self, name: str) -> tuple[Phase, PhaseMotion, float]:
+        """Return a phase, its motion and its start (s). Raises ValueError for unknown names."""
+        names = [p.name for p in self.problem.phases]
+        if name not in names:
+            raise unknown_name("phase", name, names)
+        i = names.index(name)
+        return self.problem.phases[i], self.motion[i], float(np.sum(self.durations[:i]))
+
+    def report(self, replay: bool = True) -> SolutionReport:
         """Return the certificate: how far every interval is from a motion.
 
-        All intervals are simulated in one batched run, each from its own first node.
+        All intervals are simulated in one batched run, each from its own first node. So is each
+        phase, with the plan's torques alone, and then the whole motion, with feedback.
+
+        replay: whether phases and the whole motion are simulated too.
         """
-        return report(self.problem, self.structures, self.motion)
+        return report(self, replay)
 
     def refined(
         self, tol: float = 1e-3, *, rounds: int = 4, solver: Any = None, progress_meter: Any = None
     ) -> "Solution":
         """Return the motion solved again on finer meshes, until every interval is a motion.
 
-        Phases with defects above the tolerance get more intervals, those far below it fewer. Each
-        mesh starts from the solution before. `cost_error` of the result says how far the cost moved
-        between the last two meshes.
+        Intervals with defects above the tolerance are split, neighbours far below it are joined.
+        Each mesh starts from the solution before. `cost_error` of the result says how far
+        the cost moved between the last two meshes.
 
         tol: largest defect of a position (rad, m); of a velocity it is ten times this number.
         rounds: largest number of meshes.
         solver, progress_meter: as in `Problem.solve`.
         """
         options = {"solver": solver, "progress_meter": progress_meter}
-        return self.problem.refine(self, positive_scalar("tol", tol), rounds, **options)
+        return refined(self.problem, self, positive_scalar("tol", tol), rounds, options)
 
-    def trajectory(self, ts: Any = None, *, rate: float = 0.0, **options: Any) -> Trajectory:
+    def trajectory(self, ts: Any = None, *, feedback: bool = True, **options: Any) -> Trajectory:
         """Return the motion as a run of `svkc.simulate`, with events between the phases.
 
-        Open loop an unstable phase leaves the plan: with a rate, torques of springs and dampers
-        towards the plan are added in the driven joints.
-
         ts: save times (s); None: 101 times over the motion.
-        rate: of the feedback (1/s); zero: the plan's torques alone.
+        feedback: whether torques towards the plan are added, as in `control`.
         options: keyword arguments of `svkc.simulate`.
         """
-        return replay(self, rate, ts, options)
+        return replay(self, boolean("feedback", feedback), ts, options)
+
+    def control(self, *, feedback: bool = True) -> tuple[Any, Any]:
+        """Return a control (t, state, args) -> tau of `svkc.simulate`, and its args.
+
+        It is the same function for every solution of a problem; the args are the plan. With
+        feedback, torques of the driven coordinates are added, linear in the distance from the plan
+        in q and v. Their gains change over time, and come from Riccati's recursion along the plan:
+        they minimize, to first order, the integral of the squared distance (1 rad, 1 m, and
+        `units.velocity` count as one) plus 0.01 of the squared torques (by `units.torque`), plus
+        the squared distance at the end times 1 s. Connected links and impacts are part of the
+        linear model. The sum is not limited to bounds of torques. `Parametrized` has no feedback,
+        as its torques are known by a function alone.
+
+        feedback: False for the plan's torques alone: an unstable phase then leaves the plan.
+        """
+        return control_and_plan(self, boolean("feedback", feedback))
+
+    def linear_maps(self) -> LinearMaps:
+        """Return the linear maps of the intervals, for small errors of the state."""
+        return linear_maps(self.problem, self.motion)
+
+    def gains(self) -> np.ndarray:
+        """Return the gains of the feedback [intervals 2 driven 2nv], at both ends of intervals.
+
+        They map errors of q and v of the tree (plan minus state; N m/rad, N m s/rad) to torques of
+        the driven coordinates.
+        """
+        return riccati_gains(self.problem, self.motion, self.linear_maps())
+
+    def save(self, path: Path) -> None:
+        """Write the solution to one .npz file, which `optimize.load_solution` reads.
+
+        The file holds numbers and names, but no functions: reading needs the problem.
+
+        path: of the file.
+        Raises OSError if the file cannot be written.
+        """
+        names = member_names(OUTCOME)
+        save_solution(self, names[int(np.asarray(self.result._value))], path)
 
     def gradient(self) -> Any:
         """Return the derivatives of the optimal cost by the chain's floats and by args.
@@ -173,11 +235,8 @@ class Solution(Printed):
         phase: name of the phase. link: name of the link; None: the only one that is connected.
         Raises ValueError for unknown names.
         """
-        names = [p.name for p in self.problem.phases]
-        if phase not in names:
-            raise unknown_name("phase", phase, names)
-        i = names.index(phase)
-        connected, motion = self.problem.phases[i].connected, self.motion[i]
+        own, motion, _ = self._phase(phase)
+        connected = own.connected
         link = connected[0] if link is None and len(connected) == 1 else link
         if link is None or link not in connected:
             raise unknown_name("virtual link", str(link), connected)
@@ -194,48 +253,36 @@ class Solution(Printed):
 def solution(problem: Any, program: Program, result: SolverResult) -> Solution:
     """Return the solution from what a solver returned."""
     transcription, rows = program.transcription, program.rows(result.x)
-    motion = decode(transcription, result.x * program.unit)
-    ends = np.cumsum([m.duration for m in motion])
-    ts = [np.linspace(end - m.duration, end, len(m.q)) for end, m in zip(ends, motion, strict=True)]
-    states = [
-        jax.vmap(lambda q, v, s=s: full_state(problem.chain, s.structure, q, v))(m.q, m.v)
-        for m, s in zip(motion, transcription.structures, strict=True)
-    ]
-    return Solution(
+    return solution_of(
+        problem,
+        decode(transcription, result.x * program.unit),
+        [s.structure for s in transcription.structures],
         cost=rows[-1] * program.row_unit[-1],
         violation=np.max(program.violation(result.x), initial=0.0),
-        durations=np.array([m.duration for m in motion]),
-        ts=np.concatenate(ts),
-        states=jax.tree.map(lambda *x: jnp.concatenate(x), *states),
-        motion=motion,
         multipliers=Multipliers(result.multipliers, lower=result.lower, upper=result.upper),
         iterations=np.asarray(result.iterations),
         seconds=np.array([result.seconds, result.functions]),
         result=OUTCOME._name_to_item[result.status],
-        structures=tuple(s.structure for s in transcription.structures),
         cost_error=np.asarray(np.nan),
+    )
+
+
+def solution_of(
+    problem: Any, motion: tuple[PhaseMotion, ...], structures: list[Structure], **fields: Any
+) -> Solution:
+    """Return the solution with this motion.
+
+    structures: of the phases. fields: of `Solution` that do not follow from the motion.
+    """
+    ends = np.cumsum([m.duration for m in motion])
+    ts = [end - m.duration + m.times for end, m in zip(ends, motion, strict=True)]
+    states = states_of(problem.chain, structures, [(m.q, m.v) for m in motion])
+    return Solution(
+        durations=np.array([m.duration for m in motion]),
+        ts=np.concatenate(ts),
+        states=jax.tree.map(lambda *x: jnp.concatenate(x), *states),
+        motion=motion,
+        structures=tuple(structures),
         problem=problem,
-    )
-
-
-def raise_on_failure(program: Program, result: SolverResult) -> None:
-    """Raise RuntimeError if the solver failed. The message names the most violated rows."""
-    if result.status in ("successful", "acceptable"):
-        return
-    words = OUTCOME[OUTCOME._name_to_item[result.status]]
-    raise RuntimeError(
-        f"solve: {words} After {result.iterations} iterations the largest violations are:"
-        f" {violated_rows(program, result.x) or 'none'}"
-    )
-
-
-def violated_rows(program: Program, x: np.ndarray, tolerance: float = 1e-6) -> str:
-    """Return the names of the rows that are violated most, with the amounts in SI units."""
-    violation = program.violation(x)
-    order = np.argsort(-np.nan_to_num(violation, nan=np.inf))[:_ROWS_SHOWN]
-    table = program.transcription.rows
-    return "; ".join(
-        f"{table.label(i)}: {violation[i] * table.unit[i]:.3g}"
-        for i in order
-        if not violation[i] <= tolerance
+        **fields,
     )

@@ -159,6 +159,7 @@ class Transcription:
     def add_stages(self, function: Callable, stages: list[int], rows, tangents) -> None:
         """Append a block of stages over the intervals of all phases. rows: of each phase."""
         counts, model = [phase.intervals for phase in self.specification], self.model
+        index, count = zip(*(interval_places(phase) for phase in self.specification))
         source = lambda: join_lanes(self.lanes(i, slice(-1)) for i in range(len(counts)))
         self.add_block(
             StageBlock(
@@ -166,8 +167,8 @@ class Transcription:
                 model.layout,
                 polynomials(self.scheme, model.controls, stages),
                 data=source(),
-                index=np.concatenate([np.arange(n) for n in counts]),
-                count=np.repeat(counts, counts),
+                index=np.concatenate(index),
+                count=np.concatenate(count),
                 unknowns=np.concatenate([phase.intervals() for phase in self.phases]),
                 rows=np.concatenate(rows),
                 tangents=tangents,
@@ -232,6 +233,15 @@ class Transcription:
             rows = np.concatenate([changes, gaps, rates], 1)
             parts.append((i, np.concatenate(unknowns, 1), rows))
         self._add_plain(projection, parts, slice(1, None))
+
+
+def interval_places(phase: Phase) -> tuple[np.ndarray, np.ndarray]:
+    """Return the start of each interval, and the phase's duration, by the interval's length.
+
+    With n equal intervals they are 0 ... n - 1, and n.
+    """
+    lengths = np.diff(phase.places)
+    return phase.places[:-1] / lengths, 1 / lengths
 
 
 def join_lanes(parts: Iterable[IntervalData]) -> IntervalData:

@@ -15,7 +15,7 @@ from svkc.optimize.equations import Params, point_of_stage
 from svkc.optimize.lift import polynomials
 from svkc.optimize.phases import Constraint
 from svkc.optimize.points import Point
-from svkc.optimize.transcription import Transcription
+from svkc.optimize.transcription import Transcription, interval_places
 
 
 class Values(NamedTuple):
@@ -107,7 +107,8 @@ class UserRows:
         if not entries and not costs:
             return
         transcription, at_start, is_running = self.transcription, stages == [-1], place == "path"
-        phase, lanes = transcription.specification[i], len(intervals)
+        index, count = interval_places(transcription.specification[i])
+        lanes = len(intervals)
         rows = self._rows_of(place, i, entries, (lanes, len(stages)))
         cost_rows = np.full((lanes, len(stages), len(costs)), -1)
 
@@ -127,8 +128,8 @@ class UserRows:
             transcription.model.layout,
             polynomials(transcription.scheme, transcription.model.controls, stages),
             data=source(),
-            index=intervals,
-            count=np.full(lanes, phase.intervals),
+            index=index[intervals],
+            count=count[intervals],
             unknowns=unknowns,
             rows=np.concatenate([*rows, cost_rows], -1).reshape(lanes, -1),
             tangents=np.arange(0),

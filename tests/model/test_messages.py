@@ -22,6 +22,9 @@ ELSEWHERE = {
     "out: ... holds another": ("tools/test_rollout.py", "holds another rollout"),
     "expected NAME@TIME": ("project/test_commands.py", "expected NAME@TIME"),
     "optimize needs IPOPT": ("optimize/test_ipopt.py", "optimize needs IPOPT"),
+    "multistart in several": ("optimize/test_solution.py", "needs cloudpickle"),
+    "multistart: start": ("optimize/test_solution.py", "failed in its process"),
+    "multistart: all": ("optimize/test_solution.py", "all processes ended"),
     "module ... has no": ("project/test_public_api.py", "has no attribute"),
 }
 

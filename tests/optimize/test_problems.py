@@ -176,6 +176,8 @@ def test_redundant_loops_are_solved():
     )
     solution = problem.solve(problem.guess([high, low]))
     assert solution.violation < 1e-6
+    of_phase = solution.forces("left_foot", "squat")
+    np.testing.assert_array_equal(of_phase, solution.forces("left_foot"))
     weight = 9.81 * float(np.sum(chain.mass))
     total = solution.forces("left_foot")[:, 2] + solution.forces("right_foot")[:, 2]
     assert 0.3 * weight < np.mean(total) < 2 * weight

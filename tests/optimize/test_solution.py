@@ -1,5 +1,7 @@
 """The certificate, refinement, replay and gradient of a solution."""
 
+from unittest import mock
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -48,7 +50,7 @@ def test_refined_until_it_is_a_motion(solution):
     assert velocity < 1e-3
     assert len(fine.ts) > len(solution.ts)
     assert 0 < fine.cost_error < 0.05 * fine.cost
-    traj = fine.trajectory(rate=20.0)
+    traj = fine.trajectory()
     assert abs(float(fine.problem.chain.joint(traj.final, "pivot").q) - np.pi) < 1e-3
     assert "worst of" in str(coarse)
 
@@ -85,6 +87,42 @@ def test_many_starts():
     guesses = [problem.guess([{"x": 0.0}, {"x": 1.0}], noise=0.2, key=key) for key in range(3)]
     many = problem.multistart(guesses)
     np.testing.assert_allclose([m.cost for m in many], float(many[0].cost), rtol=1e-6)
+    assert many.solved.all()
+    assert "3 of 3 solved" in str(many)
+    # the functions are lambdas, one guess is a solution, and one process is given two starts
+    apart = problem.multistart([many[0], *guesses[1:]], processes=2)
+    np.testing.assert_allclose([m.cost for m in apart], float(many[0].cost), rtol=1e-6)
+    assert float(apart.best.cost) == min(float(m.cost) for m in apart)
+    assert apart[0].iterations <= 3
+    assert optimize.Solutions().best is None
+
+
+def broken(point):
+    raise ZeroDivisionError("mine")
+
+
+@pytest.mark.slow
+def test_exceptions_in_other_processes_are_raised():
+    problem = wrong_optimizations.problem()
+    problem.running = broken
+    guesses = [problem.guess([{"x": 0.0}, {"x": 1.0}])] * 2
+    with pytest.raises(RuntimeError, match=r"(?s)failed in its process.*mine"):
+        problem.multistart(guesses, processes=2)
+
+
+def test_other_processes_need_cloudpickle_and_must_stay_alive():
+    problem = wrong_optimizations.problem()
+    guesses = [problem.guess([{"x": 0.0}, {"x": 1.0}])] * 2
+    with (
+        mock.patch("svkc.optimize.workers.importlib", **{"import_module.side_effect": ImportError}),
+        pytest.raises(ImportError, match="needs cloudpickle: pip install cloudpickle"),
+    ):
+        problem.multistart(guesses, processes=2)
+    with (
+        mock.patch("svkc.optimize.workers._MAIN", "raise SystemExit"),
+        pytest.raises(RuntimeError, match="all processes ended with 0 of 2 starts done"),
+    ):
+        problem.multistart(guesses, processes=2)
 
 
 BACKFLIP = """

@@ -1,0 +1,55 @@
+"""Solutions on disk: one .npz file for each."""
+
+import json
+import os
+import pathlib
+from typing import Any
+
+import numpy as np
+
+from svkc.model.annotations import Path
+from svkc.optimize.guesses import PhaseMotion
+
+# increase the schema whenever a stored array is added, renamed or changes its meaning
+SCHEMA = 1
+MOTION = tuple(PhaseMotion.__dataclass_fields__)
+NUMBERS = ("cost", "violation", "iterations", "seconds", "cost_error")
+MULTIPLIERS = ("rows", "lower", "upper")
+
+
+def description_of(problem: Any) -> dict[str, Any]:
+    """Return what a problem must have in common with that of a stored solution."""
+    return {
+        "phases": [[p.name, *p.connected] for p in problem.phases],
+        "coordinates": list(problem.chain.dof_names),
+        "controls": [type(problem.controls).__name__, *problem.controls.names(problem.chain)],
+        "stages": problem.scheme.stages,
+    }
+
+
+def save_solution(solution: Any, result: str, path: Path) -> None:
+    """Write one .npz file; see `Solution.save`. result: name of the solution's result."""
+    import svkc
+
+    arrays: dict[str, Any] = {name: np.asarray(getattr(solution, name)) for name in NUMBERS}
+    for name in MULTIPLIERS:
+        arrays[f"multipliers.{name}"] = getattr(solution.multipliers, name)
+    for i, (phase, motion) in enumerate(zip(solution.problem.phases, solution.motion)):
+        arrays |= {f"{i}.{name}": np.asarray(getattr(motion, name)) for name in MOTION}
+        arrays[f"{i}.mesh"] = phase.places
+    meta = {
+        "optimize_schema": SCHEMA,
+        "svkc": svkc.__version__,
+        "result": result,
+        "problem": description_of(solution.problem),
+    }
+    arrays["metadata"] = np.array(json.dumps(meta))
+    path = pathlib.Path(path)
+    # in the same folder, so that os.replace is atomic
+    temporary = path.with_name(f"{path.name}.{os.getpid()}.part")
+    try:
+        with open(temporary, "wb") as file:
+            np.savez_compressed(file, **arrays)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
