@@ -79,15 +79,14 @@ class ArticulatedBodies(AbstractDynamics):
 
     Delassus' matrix squares the condition number of J_C. Near singular configurations, and where
     loops are redundant, a run with `svkc.stabilization.Projection` reduces the rows of J_C first.
+    Massless bodies that loops hold cost one more solve for each coordinate of their joints. Their
+    mass, or moment of inertia about a joint, is below 1e-7 of the model's largest when loaded; both
+    may be zero. If another body's mass is set to zero, runs may end with `non_finite` or
+    `step_too_small`: load a tiny mass, or use `CompositeBodies`.
 
-    Massless bodies that loops hold cost one more solve for each coordinate of their joints. They
-    are those whose mass, or moment of inertia about a joint, is below 1e-7 of the model's largest
-    when loaded; both may then be zero too. If another body's mass is set to zero, runs may end with
-    `non_finite` or `step_too_small`: load a tiny mass, or use `CompositeBodies`.
-
-    hold: for stabilizations that choose pivots whatever the method; see `AbstractDynamics`.
+    hold: for stabilizations that choose pivots; see `AbstractDynamics`.
     refine: whether a run refines accelerations where the masses of a loop make Delassus' matrix
-    ill-conditioned. A run does by default, unless it is compiled for known, similar masses.
+    ill-conditioned. The default of a run is to do so unless it knows the masses to be similar.
     """
 
     uses_pivots: ClassVar[bool] = False
