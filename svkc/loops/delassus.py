@@ -79,39 +79,51 @@ def loop_force_solver(
     rows are independent, as where the masses of a loop differ by many orders of magnitude.
     """
     massless = np.array(chain.topology.massless_dofs, int)
-    nv = chain.nv
-
-    def refine(solve, force, loop_bias, x, mu):
-        rest = force - pad_to_dofs(chain, mass_matrix_product(chain, kin, x[:nv])) - mu @ J
-        if free is not None:
-            rest = jnp.concatenate([jnp.where(free, rest[:nv], 0), rest[nv:]])
-        dx, dmu = solve(rest, loop_bias - J @ x)
-        return x + dx, mu + dmu
-
+    step = lambda solve, sides, x: _refinement_step(chain, kin, J, free, solve, (sides, x))
     if len(massless):
         inertia = auxiliary_inertia(chain)
         solve, _ = _solver_of_regular_mass_matrix(with_armature(chain, inertia), kin, J, rows, free)
         removed = -inertia if free is None else jnp.where(free, -inertia, 0)
         solve = with_inertia(chain, solve, massless, removed[massless])
-        return lambda *sides: refine(solve, *sides, *solve(*sides))
+        return lambda *sides: step(solve, sides, solve(*sides))
     solve, condition = _solver_of_regular_mass_matrix(chain, kin, J, rows, free)
     if not refine_if_ill or rows.T is None or condition is None:
         return solve
     is_ill = condition > ILL_CONDITIONED
 
     def solve_and_refine(*sides):
-        solution = solve(*sides)
-        refined = lambda: jax.lax.fori_loop(
-            0, REFINEMENTS, lambda _, x: refine(solve, *sides, *x), solution
+        first = solve(*sides)
+        refine = lambda: jax.lax.fori_loop(
+            0, REFINEMENTS, lambda _, x: step(solve, sides, x), first
         )
         # under `vmap`, one ill-conditioned lane lets all lanes compute the refinement
         return jax.lax.cond(
             unvmap_any(is_ill),
-            lambda: jax.tree.map(lambda a, b: jnp.where(is_ill, a, b), refined(), solution),
-            lambda: solution,
+            lambda: jax.tree.map(lambda a, b: jnp.where(is_ill, a, b), refine(), first),
+            lambda: first,
         )
 
     return solve_and_refine
+
+
+def _refinement_step(
+    chain: Chain,
+    kin: Kinematics,
+    J: Float[Array, "rows dofs"],
+    free: Bool[Array, " nv"] | None,
+    solve: Callable,
+    system: tuple,
+):
+    """Return the solution after one step of iterative refinement.
+
+    system: right-hand sides (force, loop_bias), and the solution (x, mu) before.
+    """
+    ((force, loop_bias), (x, mu)), nv = system, chain.nv
+    rest = force - pad_to_dofs(chain, mass_matrix_product(chain, kin, x[:nv])) - mu @ J
+    if free is not None:
+        rest = jnp.concatenate([jnp.where(free, rest[:nv], 0), rest[nv:]])
+    dx, dmu = solve(rest, loop_bias - J @ x)
+    return x + dx, mu + dmu
 
 
 def _solver_of_regular_mass_matrix(
