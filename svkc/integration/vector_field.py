@@ -66,7 +66,7 @@ class VectorField(eqx.Module):
         )
         if self._batches_lanes_last(chain) and not project_velocity:
             v, vdot = velocity_and_acceleration_lanes_last(
-                chain, structure, (y.q, y.v), tau, self.dynamics, (baumgarte, field_args.near)
+                chain, structure, (y.q, y.v), tau, baumgarte, field_args.near
             )
         else:
             v, vdot = velocity_and_acceleration(

@@ -75,22 +75,21 @@ class AbstractDynamics(eqx.Module):
 
 
 class ArticulatedBodies(AbstractDynamics):
-    """Articulated bodies and loop forces by Delassus' matrix, without pivots: the fastest method.
+    """Articulated bodies and loop forces by Delassus' matrix, without pivots.
 
-    Delassus' matrix squares the condition number of J_C. Near singular configurations, and where
-    loops are redundant, a run with `svkc.stabilization.Projection` reduces the rows of J_C first.
-    Massless bodies that loops hold cost one more solve for each coordinate of their joints. Their
-    mass, or moment of inertia about a joint, is below 1e-7 of the model's largest when loaded; both
-    may be zero. If another body's mass is set to zero, runs may end with `non_finite` or
-    `step_too_small`: load a tiny mass, or use `CompositeBodies`.
+    The fastest method, and the one for batches. Delassus' matrix squares the condition number of
+    J_C near singular configurations. There, and where loops are redundant, a run that uses
+    `svkc.stabilization.Projection` reduces the rows of J_C first.
 
-    hold: for stabilizations that choose pivots; see `AbstractDynamics`.
-    refine: whether a run refines accelerations where the masses of a loop make Delassus' matrix
-    ill-conditioned. The default of a run is to do so unless it knows the masses to be similar.
+    Massless bodies that loops hold cost one more solve for each coordinate of their joints. They
+    are those whose mass, or moment of inertia about a joint, is below 1e-7 of the model's largest
+    when loaded; both may then be zero too. If another body's mass is set to zero, runs may end with
+    `non_finite` or `step_too_small`: load a tiny mass, or use `CompositeBodies`.
+
+    hold: for stabilizations that choose pivots whatever the method; see `AbstractDynamics`.
     """
 
     uses_pivots: ClassVar[bool] = False
-    refine: bool = eqx.field(static=True, default=False)
 
     def prepare(
         self, chain: Chain, structure: Structure, loops: LoopKinematics, selection: Any = None
@@ -105,7 +104,6 @@ class ArticulatedBodies(AbstractDynamics):
             jnp.where(active[None], J / column[None], 0),
             rows,
             None if locked is None else active[: chain.nv],
-            self.refine,
         )
         every = jnp.ones(len(loops.J), bool)
         return _implicit_solve(chain, structure, loops, solve, lambda x: x, every)

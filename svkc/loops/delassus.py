@@ -6,13 +6,11 @@ force in each, where A are the `constraint_rows` of the loops over the tree's co
 
 from collections.abc import Callable
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from svkc._jax.batched_lapack import cholesky_solver
-from svkc._jax.control_flow import unvmap_any
 from svkc.loops.constraint_rows import ConstraintRows
 from svkc.loops.diagonal_inertia import auxiliary_inertia, with_armature, with_inertia
 from svkc.model.chain import Chain
@@ -26,36 +24,24 @@ from svkc.tree.inverse_dynamics import mass_matrix_product, pad_to_dofs
 from svkc.tree.kinematics import Kinematics
 from svkc.tree.spatial import inverse_positive, matvec
 
-# Steps of iterative refinement with D. In float64, each multiplies by 1e-4 the error of the force
-# along a row whose inverse inertia is 1e-6 of the others'.
+# Steps of iterative refinement. In float64, each multiplies by 1e-4 the error of the force along a
+# row whose inverse inertia is 1e-6 of the others'.
 REFINEMENTS = 2
-# Condition number of D, as estimated, above which forces are refined with the equations themselves:
-# round-off of D then exceeds 1e-10 of them in float64.
-ILL_CONDITIONED = 1e6
 # Least number of rows for which LAPACK factors D. Smaller ones are inverted by blocks, in a program
 # that grows with the rows.
 LAPACK_MIN_ROWS = 36
 
 
-def _regularized_inverse(
-    D: Float[Array, "delassus delassus"], exponent: float
-) -> tuple[Callable, Float[Array, ""] | None]:
-    """Return x -> (D + r)^-1 x, and an estimate of the condition number of D + r.
-
-    r is eps^exponent of D's largest entry. The estimate is None where LAPACK factors D.
-    """
-    diagonal = np.eye(D.shape[0], dtype=bool)
-    largest = jnp.max(jnp.where(diagonal, D, 0))
+def _regularized_inverse(D: Float[Array, "delassus delassus"]) -> Callable:
+    """Return x -> (D + regularization)^-1 x, regularized by a multiple of D's largest entry."""
+    largest = jnp.max(jnp.where(np.eye(D.shape[0], dtype=bool), D, 0))
     # the largest entry is zero if no loop is closed
-    largest = jnp.where(largest > 0, largest, 1)
-    regularization = jnp.finfo(D.dtype).eps ** exponent * largest
+    regularization = jnp.finfo(D.dtype).eps ** 0.625 * jnp.where(largest > 0, largest, 1)
     regularized = D + regularization * jnp.eye(D.shape[0], dtype=D.dtype)
     if D.shape[0] >= LAPACK_MIN_ROWS:
-        return cholesky_solver(regularized), None
+        return cholesky_solver(regularized)
     inverse = inverse_positive(regularized)
-    # rows of zeros are of links that are not connected
-    of_rows = jnp.where(diagonal & (D > 0), inverse, 0)
-    return lambda x: matvec(inverse, x), largest * jnp.max(of_rows)
+    return lambda x: matvec(inverse, x)
 
 
 def loop_force_solver(
@@ -64,7 +50,6 @@ def loop_force_solver(
     J: Float[Array, "rows dofs"],
     rows: ConstraintRows,
     free: Bool[Array, " nv"] | None,
-    refine_if_ill: bool = False,
 ) -> Callable:
     """Return (force, loop_bias) -> (x, mu) with M x + J^T mu = force and J x = loop_bias.
 
@@ -75,55 +60,25 @@ def loop_force_solver(
 
     J: loop Jacobian with scaled rows. rows: its `constraint_rows`.
     free: coordinates that are not locked (None: all).
-    refine_if_ill: whether the solution is refined, too, where D is ill-conditioned although the
-    rows are independent, as where the masses of a loop differ by many orders of magnitude.
     """
     massless = np.array(chain.topology.massless_dofs, int)
-    step = lambda solve, sides, x: _refinement_step(chain, kin, J, free, solve, (sides, x))
-    if len(massless):
-        inertia = auxiliary_inertia(chain)
-        solve, _ = _solver_of_regular_mass_matrix(with_armature(chain, inertia), kin, J, rows, free)
-        removed = -inertia if free is None else jnp.where(free, -inertia, 0)
-        solve = with_inertia(chain, solve, massless, removed[massless])
-        return lambda *sides: step(solve, sides, solve(*sides))
-    solve, condition = _solver_of_regular_mass_matrix(chain, kin, J, rows, free)
-    if not refine_if_ill or rows.T is None or condition is None:
-        return solve
-    is_ill = condition > ILL_CONDITIONED
+    if not len(massless):
+        return _solver_of_regular_mass_matrix(chain, kin, J, rows, free)
+    inertia = auxiliary_inertia(chain)
+    solve = _solver_of_regular_mass_matrix(with_armature(chain, inertia), kin, J, rows, free)
+    removed = -inertia if free is None else jnp.where(free, -inertia, 0)
+    solve = with_inertia(chain, solve, massless, removed[massless])
+    nv = chain.nv
 
-    def solve_and_refine(*sides):
-        first = solve(*sides)
-        refine = lambda: jax.lax.fori_loop(
-            0, REFINEMENTS, lambda _, x: step(solve, sides, x), first
-        )
-        # under `vmap`, one ill-conditioned lane lets all lanes compute the refinement
-        return jax.lax.cond(
-            unvmap_any(is_ill),
-            lambda: jax.tree.map(lambda a, b: jnp.where(is_ill, a, b), refine(), first),
-            lambda: first,
-        )
+    def refined_solve(force, loop_bias):
+        x, mu = solve(force, loop_bias)
+        rest = force - pad_to_dofs(chain, mass_matrix_product(chain, kin, x[:nv])) - mu @ J
+        if free is not None:
+            rest = jnp.concatenate([jnp.where(free, rest[:nv], 0), rest[nv:]])
+        dx, dmu = solve(rest, loop_bias - J @ x)
+        return x + dx, mu + dmu
 
-    return solve_and_refine
-
-
-def _refinement_step(
-    chain: Chain,
-    kin: Kinematics,
-    J: Float[Array, "rows dofs"],
-    free: Bool[Array, " nv"] | None,
-    solve: Callable,
-    system: tuple,
-):
-    """Return the solution after one step of iterative refinement.
-
-    system: right-hand sides (force, loop_bias), and the solution (x, mu) before.
-    """
-    ((force, loop_bias), (x, mu)), nv = system, chain.nv
-    rest = force - pad_to_dofs(chain, mass_matrix_product(chain, kin, x[:nv])) - mu @ J
-    if free is not None:
-        rest = jnp.concatenate([jnp.where(free, rest[:nv], 0), rest[nv:]])
-    dx, dmu = solve(rest, loop_bias - J @ x)
-    return x + dx, mu + dmu
+    return refined_solve
 
 
 def _solver_of_regular_mass_matrix(
@@ -132,9 +87,8 @@ def _solver_of_regular_mass_matrix(
     J: Float[Array, "rows dofs"],
     rows: ConstraintRows,
     free: Bool[Array, " nv"] | None,
-) -> tuple[Callable, Float[Array, ""] | None]:
-    """Return `loop_force_solver` of a chain whose mass matrix M is regular, without refinement by
-    the equations, and an estimate of the condition number of D (None: not known).
+) -> Callable:
+    """Return `loop_force_solver` of a chain whose mass matrix M is regular.
 
     The rows of J may be dependent. D is regularized and factored, and the forces are refined with
     the residual of D itself (the proximal form). Forces of dependent rows stay finite, and the
@@ -146,10 +100,7 @@ def _solver_of_regular_mass_matrix(
     bodies = articulated_factors(chain, kin, free)
     passed = pass_inward(top, bodies, rows.A.T)
     D = inner_product(passed, passed)
-    # dependent rows need more regularization; reduced ones are independent, and so are others of a
-    # run, which reduces its rows where they may be dependent
-    exponent = 0.625 if rows.T is None else 0.875
-    solve_regularized, condition = _regularized_inverse(D, exponent)
+    solve_regularized = _regularized_inverse(D)
 
     def solve(force, loop_bias):
         # a force on a virtual joint, which has no inertia, is transmitted by its loop
@@ -165,4 +116,4 @@ def _solver_of_regular_mass_matrix(
         x = pass_outward(top, bodies, applied.x + matvec(passed.x, z))
         return jnp.concatenate([x, joints.scatter(joints.joint_rates(loop_bias - J_tree @ x))]), -mu
 
-    return solve, condition
+    return solve

@@ -146,15 +146,15 @@ def _with_cuttable_inertia(
 
 @with_lanes_last
 def velocity_and_acceleration_lanes_last(
-    chain: Chain, structure: Structure, state, tau, dynamics: ArticulatedBodies, options
+    chain: Chain, structure: Structure, state, tau, baumgarte, near
 ) -> tuple[Float[Array, " dofs"], Float[Array, " dofs"]]:
     """Return `velocity_and_acceleration` by articulated bodies; a `vmap` keeps lanes last.
 
-    state: q and v. options: `baumgarte` and `near`.
+    state: q and v.
     """
-    (q, v), (baumgarte, near) = state, options
+    q, v = state
     return velocity_and_acceleration(
-        chain, structure, q, v, tau, dynamics=dynamics, baumgarte=baumgarte, near=near
+        chain, structure, q, v, tau, dynamics=ArticulatedBodies(), baumgarte=baumgarte, near=near
     )
 
 

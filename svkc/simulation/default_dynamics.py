@@ -16,17 +16,18 @@ from svkc.loops.constrained_dynamics import (
 from svkc.loops.delassus import LAPACK_MIN_ROWS
 from svkc.model.chain import Chain
 
-# largest ratio of two masses of a chain whose accelerations are not refined
-SIMILAR_MASSES = 1e4
+# Largest ratio of two masses at which articulated bodies compute forces of loops to 1e-9 of them:
+# the condition number of Delassus' matrix grows with that ratio.
+SIMILAR_MASSES = 1e5
 
 
 def _has_similar_masses(chain: Chain) -> bool:
-    """Return whether the masses have values while the run is compiled, and are similar."""
+    """Return whether the masses are similar. They are not known while they are traced."""
     if not is_concrete(chain.mass):
         return False
     masses = np.asarray(chain.mass)
     masses = masses[masses > 0]
-    return not masses.size or float(np.max(masses)) < SIMILAR_MASSES * float(np.min(masses))
+    return not masses.size or float(np.max(masses)) <= SIMILAR_MASSES * float(np.min(masses))
 
 
 def resolve_dynamics(
@@ -36,15 +37,16 @@ def resolve_dynamics(
 
     The default is articulated bodies where the stepping loop of svkc can reduce the rows of the
     loops: steps are projected by `Projection`, and the adjoint is `Replay`. With at least
-    `LAPACK_MIN_ROWS` rows a reduction costs more than pivots that are held. Then, and with other
-    stabilizations or adjoints, the default is that of the chain.
+    `LAPACK_MIN_ROWS` rows a reduction costs more than pivots that are held. Then, with other
+    stabilizations or adjoints, and where masses may differ by more than `SIMILAR_MASSES`, the
+    default is that of the chain.
     """
     if dynamics is None:
         can_reduce = type(stabilization) is Projection and isinstance(adjoint, Replay)
         has_few_rows = 6 * len(chain.link_names) < LAPACK_MIN_ROWS
-        if not can_reduce or not has_few_rows:
-            return default_dynamics(chain)
-        return ArticulatedBodies(refine=bool(chain.link_names) and not _has_similar_masses(chain))
+        if can_reduce and has_few_rows and _has_similar_masses(chain):
+            return ArticulatedBodies()
+        return default_dynamics(chain)
     if isinstance(dynamics, Dynamics):
         return dynamics.resolved(chain)
     if not isinstance(dynamics, AbstractDynamics):
