@@ -153,6 +153,17 @@ class ConstraintRows(NamedTuple):
         full_joints = self.joints.subset(self.in_D.full_links)
         return jnp.concatenate([full_joints.reject(x[..., :n]), x[..., n:]], -1)
 
+    def along_joints(self) -> Float[Array, "delassus delassus"]:
+        """Return I - R, or zero for reduced rows: the projector onto what the joints can follow."""
+        n = len(self.in_D.rows)
+        eye = jnp.eye(n, dtype=self.A.dtype)
+        if not len(self.in_D.full_links):
+            return jnp.zeros_like(eye)
+        projector = eye - self.reject(eye)
+        if self.pivots is None:
+            return projector
+        return jnp.where(jnp.any(self.pivots > 0), 0, projector)
+
     def reduce(self, bias: Float[Array, " rows"]) -> Float[Array, " delassus"]:
         """Return T R bias."""
         x = self.reject(static_take(bias, self.in_D.rows))

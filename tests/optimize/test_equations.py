@@ -22,6 +22,9 @@ from svkc.optimize.loop_rows import (
 )
 from svkc.optimize.points import full_state
 
+# MuJoCo warns so of gymnasium's half_cheetah.xml
+pytestmark = pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass' is deprecated")
+
 # an issue of the same algebra in another order, amplified by the condition of the mass matrix
 KERNEL = 1e-10
 
