@@ -108,7 +108,9 @@ def test_the_tour_runs_and_prints_what_is_stored():
         for line, again in zip(
             printed_text(old).split("\n"), printed_text(new).split("\n"), strict=True
         ):
-            assert NUMBER.sub("#", line) == NUMBER.sub("#", again)
+            # the widths of columns depend on signs of round-off
+            words, words_again = (NUMBER.sub("#", x).split() for x in (line, again))
+            assert words == words_again
             line, again = (NUMBER.findall(ROUGH.sub("", x)) for x in (line, again))
             np.testing.assert_allclose(
                 np.array(again, float), np.array(line, float), rtol=1e-5, atol=1e-6
