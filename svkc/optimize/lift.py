@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from svkc._jax.static_gather import static_take
 from svkc.optimize.schemes import Radau
 
 
@@ -173,3 +174,57 @@ class Lift:
     def hessian(self, H: Float[Array, "y y"], g: Float[Array, " y"]) -> Float[Array, "z z"]:
         """Return the Hessian by the unknowns of a function with this Hessian and gradient."""
         return self.pull_back(self.pull_back(H).T) + self.curvature(g)
+
+    def motion_hessian(self, gradient, controls, blocks, by_f) -> Float[Array, " entries"]:
+        """Return the Hessian by the unknowns, at `motion_places`, of a function whose second
+        derivatives are those of `StageDerivatives.hessian`.
+
+        gradient, controls, blocks, by_f: as returned there.
+        """
+        qq, qv, vv, qa = blocks
+        d, dd = _combine(self.dC, self.x), _combine(self.ddC, self.x)
+        times = lambda M, x: jnp.sum(M * x[None], 1)
+        along = jnp.stack(
+            [
+                times(qq, d[0]) + times(qv, d[1]) + times(qa, d[2]),
+                times(qv.T, d[0]) + times(vv, d[1]),
+                times(qa.T, d[0]),
+            ]
+        )
+        of_forces = by_f[:, None] * self.C[0][None, :, None]
+        of_forces = [jnp.sum(by_f * d[0], 1)[:, None], of_forces.reshape(len(by_f), -1)]
+        parts = [
+            jnp.sum(d * along + gradient * dd)[None],
+            _combine(self.C.T, along) + _combine(self.dC.T, gradient),
+            _combine(self.dD.T, controls),
+            self.poly.slot[:, None, None] * jnp.concatenate(of_forces, 1),
+            self._motion_pairs(qq, qv, vv, qa),
+        ]
+        return jnp.concatenate([x.ravel() for x in parts])
+
+    def _motion_pairs(self, qq, qv, vv, qa) -> Float[Array, "pairs nv nv"]:
+        """Return the second derivatives by pairs of the interval's vectors."""
+        scaled = lambda coefficients, M: coefficients[:, None, None] * M[None]
+        n, m = np.tril_indices(len(self.x))
+        halves = (
+            scaled(self.C[0], qq) + scaled(self.C[1], qv) + scaled(self.C[2], qa),
+            scaled(self.C[0], qv.T) + scaled(self.C[1], vv),
+            scaled(self.C[0], qa.T),
+        )
+        left = lambda k: static_take(self.C[k], n)[:, None, None]
+        first, second, third = (left(k) * static_take(x, m) for k, x in enumerate(halves))
+        return first + second + third
+
+
+def motion_places(layout: Layout) -> tuple[np.ndarray, np.ndarray]:
+    """Return the unknowns (row, column) of the entries of `Lift.motion_hessian`."""
+    at = np.arange(layout.of_interval)
+    _, x, w, f = layout.split_interval(at)
+    n, m = np.tril_indices(2 + layout.stages)
+    motion = np.broadcast_arrays(x[n][:, :, None], x[m][:, None])
+    first = np.concatenate([[1], x.ravel()])
+    of_forces = np.broadcast_arrays(f[..., None], first)
+    by_T = np.concatenate([[1], x.ravel(), w.ravel()])
+    parts = [(by_T, np.ones_like(by_T)), of_forces, motion]
+    row, column = (np.concatenate([np.ravel(part[k]) for part in parts]) for k in (0, 1))
+    return row, column
