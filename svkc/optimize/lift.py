@@ -192,12 +192,12 @@ class Lift:
             ]
         )
         of_forces = by_f[:, None] * self.C[0][None, :, None]
-        of_forces = [jnp.sum(by_f * d[0], 1)[:, None], of_forces.reshape(len(by_f), -1)]
+        of_forces = [jnp.sum(by_f * d[:1], 1)[:, None], of_forces.reshape(len(by_f), self.x.size)]
         parts = [
             jnp.sum(d * along + gradient * dd)[None],
             _combine(self.C.T, along) + _combine(self.dC.T, gradient),
             _combine(self.dD.T, controls),
-            self.poly.slot[:, None, None] * jnp.concatenate(of_forces, 1),
+            self.poly.slot[:, None, None] * jnp.concatenate(of_forces, 1)[None],
             self._motion_pairs(qq, qv, vv, qa),
         ]
         return jnp.concatenate([x.ravel() for x in parts])

@@ -38,6 +38,11 @@ class Path(NamedTuple):
         return cls(np.concatenate([up[::-1], down]), np.repeat([-1.0, 1.0], [len(up), len(down)]))
 
 
+def _like(x: Array, y: Array) -> Array:
+    """Return y with axes of size 1 in front, as many axes as x."""
+    return y.reshape((1,) * (x.ndim - y.ndim) + y.shape)
+
+
 class Turned(NamedTuple):
     """Values y = (scalar, vector), and how motion vectors turn them: points and directions.
 
@@ -49,36 +54,31 @@ class Turned(NamedTuple):
 
     def by(self, X: Float[Array, "*n 6"]) -> "Turned":
         """Return G y."""
-        vector = cross(X[..., :3], self.vector) + X[..., 3:] * self.scalar
+        scalar, vector = _like(X, self.scalar), _like(X, self.vector)
+        vector = cross(X[..., :3], vector) + X[..., 3:] * scalar
         return type(self)(jnp.zeros_like(vector[..., :1]), vector)
 
     def pairing(self, E: Float[Array, "*#n 3"]) -> Float[Array, "*n 6"]:
         """Return the force whose product with a motion vector is E G y."""
-        return jnp.concatenate(jnp.broadcast_arrays(cross(self.vector, E), self.scalar * E), -1)
+        E = _like(self.vector, E)
+        return jnp.concatenate([cross(self.vector, E), self.scalar * E], -1)
 
     def plus(self, *others: "Turned") -> "Turned":
         """Return a sum."""
         scalar = sum((x.scalar for x in others), self.scalar)
         return type(self)(scalar, sum((x.vector for x in others), self.vector))
 
-    def times(self, factors: Float[Array, "*n"]) -> "Turned":
-        """Return products with scalars."""
-        return type(self)(self.scalar * factors[..., None], self.vector * factors[..., None])
-
-    def sum(self) -> "Turned":
-        """Return the sum over the first axis."""
-        return type(self)(jnp.sum(self.scalar, 0), jnp.sum(self.vector, 0))
-
 
 class Quaternion(Turned):
     """Quaternions, which turn by half of an angular velocity."""
 
     def by(self, X: Float[Array, "*n 6"]) -> "Quaternion":
-        w = X[..., :3] / 2
-        scalar = -jnp.sum(w * self.vector, -1, keepdims=True)
-        return Quaternion(scalar, self.scalar * w + cross(w, self.vector))
+        w, vector = X[..., :3] / 2, _like(X, self.vector)
+        scalar = -jnp.sum(w * vector, -1, keepdims=True)
+        return Quaternion(scalar, _like(X, self.scalar) * w + cross(w, vector))
 
     def pairing(self, E: Float[Array, "*#n 3"]) -> Float[Array, "*n 6"]:
+        E = _like(self.vector, E)
         turning = (self.scalar * E + cross(self.vector, E)) / 2
         return jnp.concatenate([turning, jnp.zeros_like(turning)], -1)
 
@@ -155,9 +155,9 @@ class RowsOfLink:
         velocity = y.by(jnp.sum(rates, 0))
         by_q = velocity.by(S).plus(y.by(of_virtual))
         gradient = [
-            dot(self.of_acceleration.vector, E) - dot(by_q.vector, force),
-            2 * dot(self.of_velocity.vector, E),
-            dot(self.of_y.vector, E),
+            dot(self.of_acceleration.vector, E[None]) - dot(by_q.vector, force[None]),
+            2 * dot(self.of_velocity.vector, E[None]),
+            dot(self.of_y.vector, E[None]),
         ]
         along = self.of_acceleration.pairing(E) - by_q.pairing(force)
         of_y, of_velocity = self.of_y.pairing(E), self.of_velocity.pairing(E)
@@ -191,7 +191,7 @@ def _subspaces(chain: Chain, kin: Kinematics, path: Path, real: int) -> Float[Ar
     """Return the signed motion subspaces of a path, about the origin of the real link's root."""
     S, row = static_take(kin.S, path.dofs), chain.topology.dof_row[path.dofs]
     if np.any(np.array(chain.topology.root)[row] != chain.topology.root[real]):
-        away = kin.root_position[real] - static_take(kin.root_position, row)
+        away = kin.root_position[real][None] - static_take(kin.root_position, row)
         S = jnp.concatenate([S[:, :3], S[:, 3:] + cross(S[:, :3], away)], -1)
     return S * path.sign[:, None]
 

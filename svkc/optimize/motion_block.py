@@ -1,15 +1,16 @@
 """The block of the equations of motion, with its derivatives in closed form."""
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from svkc.optimize.blocks import StageBlock
-from svkc.optimize.closed_forms import StageDerivatives
-from svkc.optimize.equations import Model, stage_equations
+from svkc.optimize.blocks import PlainBlock, StageBlock
+from svkc.optimize.closed_forms import ConnectionDerivatives, StageDerivatives
+from svkc.optimize.equations import Model, connection, stage_equations
 from svkc.optimize.lift import StagePolynomials, motion_places
 
 
@@ -44,3 +45,29 @@ class MotionBlock(StageBlock):
     @property
     def hessian_places(self) -> tuple[np.ndarray, np.ndarray]:
         return motion_places(self.layout)
+
+
+class NodeBlock(PlainBlock):
+    """A block of nodes of a chain with closed forms.
+
+    function: (model, params, data, unknowns) -> rows. derivatives: class of its derivatives.
+    """
+
+    def __init__(self, model: Model, function: Callable, derivatives: Any, *args: Any):
+        super().__init__(functools.partial(function, model), *args)
+        self.model, self.derivatives = model, derivatives
+
+    def jacobian(self, params: Any, data: Any, z) -> jax.Array:
+        def at_lane(data, z):
+            return self.derivatives(self.model, params, data, z).jacobian().ravel()
+
+        return jax.vmap(at_lane)(data, z)
+
+    def hessian(self, params: Any, data: Any, z, multipliers) -> jax.Array:
+        def at_lane(data, z, m):
+            return self.derivatives(self.model, params, data, z).hessian(m).ravel()
+
+        return jax.vmap(at_lane)(data, z, multipliers)
+
+
+CLOSED_FORMS = {connection: ConnectionDerivatives}

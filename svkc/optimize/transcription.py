@@ -18,7 +18,7 @@ from svkc.optimize.equations import (
     stage_equations,
 )
 from svkc.optimize.lift import polynomials
-from svkc.optimize.motion_block import MotionBlock
+from svkc.optimize.motion_block import CLOSED_FORMS, MotionBlock, NodeBlock
 from svkc.optimize.phases import Phase
 from svkc.optimize.points import PhaseStructure
 from svkc.optimize.schemes import Radau
@@ -183,9 +183,14 @@ class Transcription:
         """Append a block of nodes. parts: of each phase with such nodes, (i, unknowns, rows)."""
         if parts:
             source = lambda: join_lanes(self.lanes(i, nodes) for i, _, _ in parts)
-            call = lambda *args: function(self.model, *args)
             unknowns, rows = (np.concatenate([part[k] for part in parts]) for k in (1, 2))
-            self.add_block(PlainBlock(call, source(), unknowns, rows), source)
+            lanes, model = (source(), unknowns, rows), self.model
+            closed = has_closed_forms(self.builder.chain, model.controls)
+            if closed and function in CLOSED_FORMS:
+                block = NodeBlock(model, function, CLOSED_FORMS[function], *lanes)
+            else:
+                block = PlainBlock(functools.partial(function, model), *lanes)
+            self.add_block(block, source)
 
     def _add_connections(self) -> None:
         """Append the rows by which phases start from the ones before, and links connect."""

@@ -97,16 +97,17 @@ def sorted_pairs(values: Float[Array, "nv nv"], above: np.ndarray) -> Float[Arra
 class TreeMotion:
     """A motion of a tree, with the derivatives of its inverse dynamics.
 
-    kin: at q. v, vdot: of the tree's coordinates.
+    kin: at q. v, vdot: of the tree's coordinates. gravity: whether forces include the weight.
     """
 
-    def __init__(self, chain: Chain, kin: Kinematics, v, vdot):
+    def __init__(self, chain: Chain, kin: Kinematics, v, vdot, gravity: bool = True):
         self.chain, self.kin, self.top, S = chain, kin, chain.topology, kin.S
         self.above = ancestors(self.top)
         V = twists(chain, kin, v)
         joint = sum_dofs_per_row(self.top, S * vdot[:, None]) + velocity_products(chain, kin, V, v)
-        gravity = jnp.concatenate([jnp.zeros_like(chain.gravity), chain.gravity])
-        A = accumulate_from_root(self.top, joint) - gravity[None]
+        A = accumulate_from_root(self.top, joint)
+        if gravity:
+            A = A - jnp.concatenate([jnp.zeros_like(chain.gravity), chain.gravity])[None]
         self.S, self.V = S, V
         V_p, A_p = self._above(V), self._above(A)
         self.first = motion_cross(V_p, S)
@@ -127,7 +128,7 @@ class TreeMotion:
         """Return the derivative of the rows' inertia along twists, less the momentum's product."""
         half = jnp.sum(skew(X[:, :3])[..., :, :, None] * self.J[..., None, :, :], -2)
         half = half - _outer(self.c, p)
-        square = 2 * dot(self.c, p)[:, None, None] * np.eye(3)
+        square = 2 * dot(self.c, p)[:, None, None] * np.eye(3)[None]
         return half + jnp.swapaxes(half, -1, -2) + square - skew(L)
 
     def _set_bodies(self, V, A) -> None:
@@ -142,7 +143,7 @@ class TreeMotion:
         moment = matvec(self.J, alpha) + cross(w, matvec(self.J, w)) + cross(c, force)
         p, L = self._momenta(V)
         self.row_turning, self.row_momentum = self._turning(V, p, L), p
-        square = dot(c, c)[:, None, None] * np.eye(3) - _outer(c, c)
+        square = dot(c, c)[:, None, None] * np.eye(3)[None] - _outer(c, c)
         wrench = jnp.concatenate([moment, force], -1)
         inertia = self.J + mass[..., None] * square
         parts = [mass, mass * c, inertia, wrench, self.row_turning, p]
