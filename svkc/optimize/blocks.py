@@ -11,11 +11,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from svkc._jax.eager import eager_jit
 from svkc._jax.lanes_last import with_lanes_last
 from svkc._jax.static_gather import static_take
-from svkc.optimize.lift import Layout, Lift, StagePolynomials
+from svkc.optimize.lift import Layout, Lift, StagePolynomials, dependencies
 
 # fewest lanes for which a block's execution time outweighs its compile time
 MANY_LANES = 8
@@ -48,7 +49,7 @@ class Block:
 
     def hessian(self, params: Any, data: Any, z, multipliers) -> jax.Array:
         """Return the Hessians [lanes entries] of the rows' sum with multipliers [lanes m], at
-        `hessian_places`, which have the lower half at least."""
+        `hessian_places`."""
         raise NotImplementedError
 
     @property
@@ -58,8 +59,13 @@ class Block:
 
     @property
     def hessian_places(self) -> tuple[np.ndarray, np.ndarray]:
-        """Local unknowns of each entry."""
-        return _every_place(self.unknowns.shape[1], self.unknowns.shape[1])
+        """Local unknowns of each entry; of two that are symmetric there is one."""
+        return np.tril_indices(self.unknowns.shape[1])
+
+
+def lower_half(H: Float[Array, "n n"]) -> Float[Array, " entries"]:
+    """Return the entries of the lower half of a matrix."""
+    return static_take(H.ravel(), np.ravel_multi_index(np.tril_indices(len(H)), H.shape))
 
 
 def _every_place(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
@@ -85,7 +91,7 @@ class PlainBlock(Block):
         return self._over_lanes(lambda f, z: jax.jacrev(f)(z).ravel(), params, data, z)
 
     def hessian(self, params: Any, data: Any, z, multipliers) -> jax.Array:
-        product = lambda f, z, m: jax.jacfwd(jax.grad(lambda z: f(z) @ m))(z).ravel()
+        product = lambda f, z, m: lower_half(jax.jacfwd(jax.grad(lambda z: f(z) @ m))(z))
         return self._over_lanes(product, params, data, z, multipliers)
 
 
@@ -97,6 +103,7 @@ class StageBlock(Block):
     index, count: [lanes] which interval of its phase a lane is, and how many the phase has.
     tangents: stage's variables in which the function is not linear; others have no second
         derivatives among themselves.
+    variables: those that have second derivatives.
     """
 
     def __init__(
@@ -115,6 +122,7 @@ class StageBlock(Block):
         self.function, self.layout, self.poly = function, layout, poly
         self.data = (data, np.asarray(index, float), np.asarray(count, float))
         self.unknowns, self.rows, self.tangents = unknowns, rows, tangents
+        self.variables = np.arange(layout.of_stage)
         self.options: dict[str, Any] = {}
 
     def set_lanes(self, lanes: Any) -> None:
@@ -168,18 +176,31 @@ class StageBlock(Block):
                 return lift.curvature(gradient(y))
             g, product = jax.linearize(gradient, y)
             directions = jnp.eye(len(y), dtype=y.dtype)[self.tangents]
-            return lift.hessian(self._symmetric(jax.vmap(product)(directions)), g)
+            H = self._symmetric(jax.vmap(product)(directions))
+            of_variables = lower_half(lift.hessian(H, self.variables))
+            return jnp.concatenate([lift.curvature(g), of_variables])
 
         multipliers = multipliers.reshape(len(z), len(self.poly.c), -1)
         at_stage, total = self._at_stage(of_stage), lambda x: jnp.sum(x, 0)
-        matrix = self._join_stages(total, at_stage, params, data, z, multipliers)
-        return matrix.reshape(len(z), -1)
+        return self._join_stages(total, at_stage, params, data, z, multipliers)
+
+    @property
+    def hessian_places(self) -> tuple[np.ndarray, np.ndarray]:
+        row = np.arange(self.layout.of_interval)
+        first = row, np.ones_like(row)
+        if not len(self.tangents):
+            return first
+        columns = dependencies(self.layout, self.variables)
+        second = (columns[x] for x in np.tril_indices(len(columns)))
+        row, column = (np.concatenate(x) for x in zip(first, second))
+        return row, column
 
     def _symmetric(self, rows):
-        """Return the Hessian from its rows of `tangents`, which hold all its nonzero entries."""
+        """Return the Hessian by `variables` from its rows of `tangents`."""
         place = np.full(self.layout.of_stage, len(self.tangents))
         place[self.tangents] = np.arange(len(self.tangents))
-        some = static_take(rows, place)
+        place, some = place[self.variables], static_take(rows.T, self.variables).T
+        some = static_take(some, place)
         return jnp.where((place < len(self.tangents))[:, None], some, some.T)
 
 

@@ -139,9 +139,8 @@ class StageDerivatives(LinkDerivatives):
         of_dynamics, of_rows = multipliers[:nv], multipliers[nv:]
         gradient, blocks = self.tree.hessian(of_dynamics)
         if self.chain.armature is not None:
-            gradient = (
-                gradient + (np.arange(3) == 2)[:, None] * (self.chain.armature * of_dynamics)[None]
-            )
+            of_vdot = self.chain.armature * of_dynamics
+            gradient = gradient + jnp.where(np.arange(3)[:, None] == 2, of_vdot[None], 0)
         if self.joints is not None:
             first, second = self.joints
             zero = jnp.zeros_like(first[0])

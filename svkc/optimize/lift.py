@@ -154,26 +154,29 @@ class Lift:
             1,
         )
 
-    def curvature(self, g: Float[Array, " y"]) -> Float[Array, "z z"]:
-        """Return the sum over the stage's variables of g times their second derivatives."""
+    def curvature(self, g: Float[Array, " y"]) -> Float[Array, " z"]:
+        """Return the second derivatives by T and each unknown of the stage's variables times g."""
         _, motion, control, _ = self.layout.split_stage(g)
         transposed = lambda K, M: _combine(K.T, M).ravel()
-        row = jnp.concatenate(
-            [
-                jnp.zeros(2, g.dtype),
-                transposed(self.dC, motion),
-                transposed(self.dD, control),
-                jnp.zeros(self.layout.stages * self.layout.rows, g.dtype),
-            ]
-        )
-        by_T = jnp.arange(self.layout.of_interval) == 1
-        cross = jnp.where(by_T[:, None], row[None], 0)
         second = jnp.sum(motion * _combine(self.ddC, self.x))
-        return cross + cross.T + jnp.where(by_T[:, None] & by_T[None], second, 0)
+        parts = [
+            jnp.stack([jnp.zeros_like(second), second]),
+            transposed(self.dC, motion),
+            transposed(self.dD, control),
+            jnp.zeros(self.layout.stages * self.layout.rows, g.dtype),
+        ]
+        return jnp.concatenate(parts)
 
-    def hessian(self, H: Float[Array, "y y"], g: Float[Array, " y"]) -> Float[Array, "z z"]:
-        """Return the Hessian by the unknowns of a function with this Hessian and gradient."""
-        return self.pull_back(self.pull_back(H).T) + self.curvature(g)
+    def hessian(self, H: Float[Array, "k k"], variables: np.ndarray) -> Float[Array, "m m"]:
+        """Return the second derivatives by the unknowns at `dependencies`, without `curvature`.
+
+        H: by some of the stage's variables.
+        """
+        columns = dependencies(self.layout, variables)
+        some = self.pull_back(jnp.eye(self.layout.of_stage, dtype=H.dtype)[variables])
+        some = static_take(some.T, columns)
+        half = jnp.sum(some[:, :, None] * H[None], 1)
+        return jnp.sum(half[:, None] * some[None], 2)
 
     def motion_hessian(self, gradient, controls, blocks, by_f) -> Float[Array, " entries"]:
         """Return the Hessian by the unknowns, at `motion_places`, of a function whose second
@@ -214,6 +217,17 @@ class Lift:
         left = lambda k: static_take(self.C[k], n)[:, None, None]
         first, second, third = (left(k) * static_take(x, m) for k, x in enumerate(halves))
         return first + second + third
+
+
+def dependencies(layout: Layout, variables: np.ndarray) -> np.ndarray:
+    """Return the unknowns of an interval on which some of a stage's variables depend."""
+    _, x, w, f = layout.split_interval(np.arange(layout.of_interval))
+    of_stage = np.isin(np.arange(layout.of_stage), variables)
+    times, motion, control, forces = layout.split_stage(of_stage)
+    start, duration = times[0], times.any() or motion.any() or control.any()
+    parts = [x[:, motion.any(0)], w[:, control.any(0)], f[:, forces]]
+    rest = np.concatenate([x.ravel() for x in parts])
+    return np.concatenate([np.flatnonzero([start, duration]), np.sort(rest)])
 
 
 def motion_places(layout: Layout) -> tuple[np.ndarray, np.ndarray]:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from svkc.optimize.blocks import PlainBlock, StageBlock
+from svkc.optimize.blocks import PlainBlock, StageBlock, lower_half
 from svkc.optimize.closed_forms import ConnectionDerivatives, StageDerivatives
 from svkc.optimize.equations import Model, connection, stage_equations
 from svkc.optimize.lift import StagePolynomials, motion_places
@@ -65,7 +65,7 @@ class NodeBlock(PlainBlock):
 
     def hessian(self, params: Any, data: Any, z, multipliers) -> jax.Array:
         def at_lane(data, z, m):
-            return self.derivatives(self.model, params, data, z).hessian(m).ravel()
+            return lower_half(self.derivatives(self.model, params, data, z).hessian(m))
 
         return jax.vmap(at_lane)(data, z, multipliers)
 

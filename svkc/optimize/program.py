@@ -200,9 +200,12 @@ class Program:
         used = used if len(used) < MANY_LANES else np.broadcast_to(used.any(0), used.shape)
         row, column = rows[:, at[0]], columns[:, at[1]]
         keep = used & (row >= 0) & (column >= 0)
-        if lower:
-            keep &= row >= column
-        return np.flatnonzero(keep), row[keep], column[keep]
+        place, row, column = np.flatnonzero(keep), row[keep], column[keep]
+        return (
+            (place, np.maximum(row, column), np.minimum(row, column))
+            if lower
+            else (place, row, column)
+        )
 
     def length(self, name: str) -> int:
         """Return the number of values that a method returns."""
