@@ -201,7 +201,7 @@ class Lift:
             _combine(self.C.T, along) + _combine(self.dC.T, gradient),
             _combine(self.dD.T, controls),
             self.poly.slot[:, None, None] * jnp.concatenate(of_forces, 1)[None],
-            self._motion_pairs(qq, qv, vv, qa),
+            static_take(self._motion_pairs(qq, qv, vv, qa).ravel(), _once(self.layout)),
         ]
         return jnp.concatenate([x.ravel() for x in parts])
 
@@ -230,12 +230,20 @@ def dependencies(layout: Layout, variables: np.ndarray) -> np.ndarray:
     return np.concatenate([np.flatnonzero([start, duration]), np.sort(rest)])
 
 
+def _once(layout: Layout) -> np.ndarray:
+    """Return the places, among pairs of vectors, of one of each two symmetric entries."""
+    n, m = (x[:, None, None] for x in np.tril_indices(2 + layout.stages))
+    i, k = np.indices((layout.nv, layout.nv))
+    return np.flatnonzero((n > m) | (i >= k))
+
+
 def motion_places(layout: Layout) -> tuple[np.ndarray, np.ndarray]:
     """Return the unknowns (row, column) of the entries of `Lift.motion_hessian`."""
     at = np.arange(layout.of_interval)
     _, x, w, f = layout.split_interval(at)
     n, m = np.tril_indices(2 + layout.stages)
     motion = np.broadcast_arrays(x[n][:, :, None], x[m][:, None])
+    motion = [x.ravel()[_once(layout)] for x in motion]
     first = np.concatenate([[1], x.ravel()])
     of_forces = np.broadcast_arrays(f[..., None], first)
     by_T = np.concatenate([[1], x.ravel(), w.ravel()])

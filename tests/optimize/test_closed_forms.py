@@ -10,7 +10,7 @@ import svkc
 from svkc.optimize.closed_forms import StageDerivatives
 from svkc.optimize.controls import Torques
 from svkc.optimize.equations import IntervalData, Model, Params, stage_equations
-from svkc.optimize.lift import Layout
+from svkc.optimize.lift import Layout, motion_places
 from svkc.optimize.loop_rows import LinkRows, possible_rows
 
 # an issue of sums in another order
@@ -91,3 +91,10 @@ def test_derivatives_of_a_stage(joint, parent, real):
     expected[:, 2 : 2 + nv] = by_f
     close(expected[:, :-n], H[-n:, :-n], scale=H)
     assert not np.any(H[-n:, -n:])
+
+
+def test_entries_of_the_hessian_are_there_once():
+    """Of two symmetric entries there is one, as the solver adds what has one place."""
+    layout = Layout(nv=3, stages=2, rows=2, control=2, blocks=2, stage_blocks=2)
+    pairs = np.sort(np.stack(motion_places(layout), 1), 1)
+    assert len(np.unique(pairs, axis=0)) == len(pairs)
