@@ -11,11 +11,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from svkc._jax.eager import eager_jit
 from svkc._jax.lanes_last import with_lanes_last
 from svkc._jax.static_gather import static_take
-from svkc.optimize.lift import Layout, Lift, StagePolynomials
+from svkc.optimize.lift import Layout, Lift, StagePolynomials, dependencies
 
 # fewest lanes for which a block's execution time outweighs its compile time
 MANY_LANES = 8
@@ -43,12 +44,34 @@ class Block:
         raise NotImplementedError
 
     def jacobian(self, params: Any, data: Any, z) -> jax.Array:
-        """Return the derivatives [lanes m n] of the rows by the unknowns."""
+        """Return the derivatives [lanes entries] of the rows, at `jacobian_places`."""
         raise NotImplementedError
 
     def hessian(self, params: Any, data: Any, z, multipliers) -> jax.Array:
-        """Return the Hessians [lanes n n] of the rows' sum with multipliers [lanes m]."""
+        """Return the Hessians [lanes entries] of the rows' sum with multipliers [lanes m], at
+        `hessian_places`."""
         raise NotImplementedError
+
+    @property
+    def jacobian_places(self) -> tuple[np.ndarray, np.ndarray]:
+        """Local row and local unknown of each entry."""
+        return _every_place(self.rows.shape[1], self.unknowns.shape[1])
+
+    @property
+    def hessian_places(self) -> tuple[np.ndarray, np.ndarray]:
+        """Local unknowns of each entry; of two that are symmetric there is one."""
+        return np.tril_indices(self.unknowns.shape[1])
+
+
+def lower_half(H: Float[Array, "n n"]) -> Float[Array, " entries"]:
+    """Return the entries of the lower half of a matrix."""
+    return static_take(H.ravel(), np.ravel_multi_index(np.tril_indices(len(H)), H.shape))
+
+
+def _every_place(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the row and column of each entry of a full matrix."""
+    row, column = np.indices((rows, columns))
+    return row.ravel(), column.ravel()
 
 
 class PlainBlock(Block):
@@ -65,10 +88,10 @@ class PlainBlock(Block):
         return self._over_lanes(lambda f, z: f(z), params, data, z)
 
     def jacobian(self, params: Any, data: Any, z) -> jax.Array:
-        return self._over_lanes(lambda f, z: jax.jacrev(f)(z), params, data, z)
+        return self._over_lanes(lambda f, z: jax.jacrev(f)(z).ravel(), params, data, z)
 
     def hessian(self, params: Any, data: Any, z, multipliers) -> jax.Array:
-        product = lambda f, z, m: jax.jacfwd(jax.grad(lambda z: f(z) @ m))(z)
+        product = lambda f, z, m: lower_half(jax.jacfwd(jax.grad(lambda z: f(z) @ m))(z))
         return self._over_lanes(product, params, data, z, multipliers)
 
 
@@ -81,6 +104,7 @@ class StageBlock(Block):
         interval's length; of equal intervals which one the lane is, and how many there are.
     tangents: stage's variables in which the function is not linear; others have no second
         derivatives among themselves.
+    variables: those that have second derivatives.
     """
 
     def __init__(
@@ -99,31 +123,40 @@ class StageBlock(Block):
         self.function, self.layout, self.poly = function, layout, poly
         self.data = (data, np.asarray(index, float), np.asarray(count, float))
         self.unknowns, self.rows, self.tangents = unknowns, rows, tangents
+        self.variables = np.arange(layout.of_stage)
         self.options: dict[str, Any] = {}
 
     def set_lanes(self, lanes: Any) -> None:
         self.data = (lanes, *self.data[1:])
 
     def _over_stages(self, function: Callable, params: Any, data: Any, z, *arrays) -> jax.Array:
-        """Return function(rows of y, lift, ...) over lanes and stages."""
+        """Return function(rows of y, lift, ...) over lanes and stages.
 
-        def at_stage(params, lane, poly, z, *x):
-            own, index, count = lane
-            lift = Lift(self.layout, poly, z, index, count)
-            weight = poly.b / count
+        arrays: further arguments [lanes stages ...].
+        """
+        return self._join_stages(lambda x: x, self._at_stage(function), params, data, z, *arrays)
+
+    def _at_stage(self, function: Callable) -> Callable:
+        """Return a function of stages from function(rows of y, lift, ...)."""
+
+        def at_stage(params, own, lift, *x):
+            weight = lift.poly.b / lift.count
             return function(lambda y: self.function(params, own, weight, y), lift, *x)
 
-        lanes, stages = len(z), len(self.poly.c)
-        if lanes >= MANY_LANES:
-            at_stage = with_lanes_last(at_stage)
-        # one axis of lanes and stages
-        of_lane = lambda x: jnp.repeat(x, stages, axis=0)
-        poly = jax.tree.map(lambda x: jnp.tile(x, (lanes, *(1,) * (x.ndim - 1))), self.poly)
-        lane, z = jax.tree.map(of_lane, (data, z))
-        arrays = [x.reshape(lanes * stages, *x.shape[2:]) for x in arrays]
-        over_all = jax.vmap(at_stage, (None, 0, 0, 0, *(0 for _ in arrays)))
-        results = over_all(params, lane, poly, z, *arrays)
-        return results.reshape(lanes, stages, *results.shape[1:])
+        return at_stage
+
+    def _join_stages(self, join: Callable, at_stage: Callable, params: Any, data: Any, z, *arrays):
+        """Return join(values of all stages) of at_stage(params, data, lift, ...) over lanes."""
+
+        def at_lane(params, lane, z, *x):
+            own, index, count = lane
+            lift = lambda poly: Lift(self.layout, poly, z, index, count)
+            over_stages = jax.vmap(lambda poly, *x: at_stage(params, own, lift(poly), *x))
+            return join(over_stages(self.poly, *x))
+
+        if len(z) >= MANY_LANES:
+            at_lane = with_lanes_last(at_lane)
+        return jax.vmap(at_lane, (None, 0, 0, *(0 for _ in arrays)))(params, data, z, *arrays)
 
     def values(self, params: Any, data: Any, z) -> jax.Array:
         rows = self._over_stages(lambda f, lift: f(lift.variables()), params, data, z)
@@ -134,7 +167,7 @@ class StageBlock(Block):
             return lift.pull_back(jax.jacrev(f)(lift.variables()))
 
         matrix = self._over_stages(of_stage, params, data, z)
-        return matrix.reshape(len(z), -1, self.layout.of_interval)
+        return matrix.reshape(len(z), -1)
 
     def hessian(self, params: Any, data: Any, z, multipliers) -> jax.Array:
         def of_stage(f, lift, m):
@@ -144,16 +177,31 @@ class StageBlock(Block):
                 return lift.curvature(gradient(y))
             g, product = jax.linearize(gradient, y)
             directions = jnp.eye(len(y), dtype=y.dtype)[self.tangents]
-            return lift.hessian(self._symmetric(jax.vmap(product)(directions)), g)
+            H = self._symmetric(jax.vmap(product)(directions))
+            of_variables = lower_half(lift.hessian(H, self.variables))
+            return jnp.concatenate([lift.curvature(g), of_variables])
 
         multipliers = multipliers.reshape(len(z), len(self.poly.c), -1)
-        return jnp.sum(self._over_stages(of_stage, params, data, z, multipliers), 1)
+        at_stage, total = self._at_stage(of_stage), lambda x: jnp.sum(x, 0)
+        return self._join_stages(total, at_stage, params, data, z, multipliers)
+
+    @property
+    def hessian_places(self) -> tuple[np.ndarray, np.ndarray]:
+        row = np.arange(self.layout.of_interval)
+        first = row, np.ones_like(row)
+        if not len(self.tangents):
+            return first
+        columns = dependencies(self.layout, self.variables)
+        second = (columns[x] for x in np.tril_indices(len(columns)))
+        row, column = (np.concatenate(x) for x in zip(first, second))
+        return row, column
 
     def _symmetric(self, rows):
-        """Return the Hessian from its rows of `tangents`, which hold all its nonzero entries."""
+        """Return the Hessian by `variables` from its rows of `tangents`."""
         place = np.full(self.layout.of_stage, len(self.tangents))
         place[self.tangents] = np.arange(len(self.tangents))
-        some = static_take(rows, place)
+        place, some = place[self.variables], static_take(rows.T, self.variables).T
+        some = static_take(some, place)
         return jnp.where((place < len(self.tangents))[:, None], some, some.T)
 
 

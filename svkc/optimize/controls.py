@@ -5,10 +5,10 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from svkc._jax.static_gather import static_take
 from svkc.model.annotations import Checked, Function, Integer, Names, Numbers, Scalar
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import torques_over_dofs
@@ -129,7 +129,9 @@ class _JointTorques(AbstractControls):
 
     def torques(self, chain: Chain, t, state: State, blocks, args: Any) -> Float[Array, " dofs"]:
         at = self._coordinates(chain)[0]
-        return jnp.zeros(chain.dofs, blocks.dtype).at[at].set(blocks[0])
+        place = np.full(chain.dofs, len(at))
+        place[at] = np.arange(len(at))
+        return static_take(blocks[0], place)
 
 
 @dataclasses.dataclass(frozen=True)

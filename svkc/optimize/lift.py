@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from svkc._jax.static_gather import static_take
 from svkc.optimize.schemes import Radau
 
 
@@ -153,23 +154,99 @@ class Lift:
             1,
         )
 
-    def curvature(self, g: Float[Array, " y"]) -> Float[Array, "z z"]:
-        """Return the sum over the stage's variables of g times their second derivatives."""
+    def curvature(self, g: Float[Array, " y"]) -> Float[Array, " z"]:
+        """Return the second derivatives by T and each unknown of the stage's variables times g."""
         _, motion, control, _ = self.layout.split_stage(g)
         transposed = lambda K, M: _combine(K.T, M).ravel()
-        row = jnp.concatenate(
+        second = jnp.sum(motion * _combine(self.ddC, self.x))
+        parts = [
+            jnp.stack([jnp.zeros_like(second), second]),
+            transposed(self.dC, motion),
+            transposed(self.dD, control),
+            jnp.zeros(self.layout.stages * self.layout.rows, g.dtype),
+        ]
+        return jnp.concatenate(parts)
+
+    def hessian(self, H: Float[Array, "k k"], variables: np.ndarray) -> Float[Array, "m m"]:
+        """Return the second derivatives by the unknowns at `dependencies`, without `curvature`.
+
+        H: by some of the stage's variables.
+        """
+        columns = dependencies(self.layout, variables)
+        some = self.pull_back(jnp.eye(self.layout.of_stage, dtype=H.dtype)[variables])
+        some = static_take(some.T, columns)
+        half = jnp.sum(some[:, :, None] * H[None], 1)
+        return jnp.sum(half[:, None] * some[None], 2)
+
+    def motion_hessian(self, gradient, controls, blocks, by_f) -> Float[Array, " entries"]:
+        """Return the Hessian by the unknowns, at `motion_places`, of a function whose second
+        derivatives are those of `StageDerivatives.hessian`.
+
+        gradient, controls, blocks, by_f: as returned there.
+        """
+        qq, qv, vv, qa = blocks
+        d, dd = _combine(self.dC, self.x), _combine(self.ddC, self.x)
+        times = lambda M, x: jnp.sum(M * x[None], 1)
+        along = jnp.stack(
             [
-                jnp.zeros(2, g.dtype),
-                transposed(self.dC, motion),
-                transposed(self.dD, control),
-                jnp.zeros(self.layout.stages * self.layout.rows, g.dtype),
+                times(qq, d[0]) + times(qv, d[1]) + times(qa, d[2]),
+                times(qv.T, d[0]) + times(vv, d[1]),
+                times(qa.T, d[0]),
             ]
         )
-        by_T = jnp.arange(self.layout.of_interval) == 1
-        cross = jnp.where(by_T[:, None], row[None], 0)
-        second = jnp.sum(motion * _combine(self.ddC, self.x))
-        return cross + cross.T + jnp.where(by_T[:, None] & by_T[None], second, 0)
+        of_forces = by_f[:, None] * self.C[0][None, :, None]
+        of_forces = [jnp.sum(by_f * d[:1], 1)[:, None], of_forces.reshape(len(by_f), self.x.size)]
+        parts = [
+            jnp.sum(d * along + gradient * dd)[None],
+            _combine(self.C.T, along) + _combine(self.dC.T, gradient),
+            _combine(self.dD.T, controls),
+            self.poly.slot[:, None, None] * jnp.concatenate(of_forces, 1)[None],
+            static_take(self._motion_pairs(qq, qv, vv, qa).ravel(), _once(self.layout)),
+        ]
+        return jnp.concatenate([x.ravel() for x in parts])
 
-    def hessian(self, H: Float[Array, "y y"], g: Float[Array, " y"]) -> Float[Array, "z z"]:
-        """Return the Hessian by the unknowns of a function with this Hessian and gradient."""
-        return self.pull_back(self.pull_back(H).T) + self.curvature(g)
+    def _motion_pairs(self, qq, qv, vv, qa) -> Float[Array, "pairs nv nv"]:
+        """Return the second derivatives by pairs of the interval's vectors."""
+        scaled = lambda coefficients, M: coefficients[:, None, None] * M[None]
+        n, m = np.tril_indices(len(self.x))
+        halves = (
+            scaled(self.C[0], qq) + scaled(self.C[1], qv) + scaled(self.C[2], qa),
+            scaled(self.C[0], qv.T) + scaled(self.C[1], vv),
+            scaled(self.C[0], qa.T),
+        )
+        left = lambda k: static_take(self.C[k], n)[:, None, None]
+        first, second, third = (left(k) * static_take(x, m) for k, x in enumerate(halves))
+        return first + second + third
+
+
+def dependencies(layout: Layout, variables: np.ndarray) -> np.ndarray:
+    """Return the unknowns of an interval on which some of a stage's variables depend."""
+    _, x, w, f = layout.split_interval(np.arange(layout.of_interval))
+    of_stage = np.isin(np.arange(layout.of_stage), variables)
+    times, motion, control, forces = layout.split_stage(of_stage)
+    start, duration = times[0], times.any() or motion.any() or control.any()
+    parts = [x[:, motion.any(0)], w[:, control.any(0)], f[:, forces]]
+    rest = np.concatenate([x.ravel() for x in parts])
+    return np.concatenate([np.flatnonzero([start, duration]), np.sort(rest)])
+
+
+def _once(layout: Layout) -> np.ndarray:
+    """Return the places, among pairs of vectors, of one of each two symmetric entries."""
+    n, m = (x[:, None, None] for x in np.tril_indices(2 + layout.stages))
+    i, k = np.indices((layout.nv, layout.nv))
+    return np.flatnonzero((n > m) | (i >= k))
+
+
+def motion_places(layout: Layout) -> tuple[np.ndarray, np.ndarray]:
+    """Return the unknowns (row, column) of the entries of `Lift.motion_hessian`."""
+    at = np.arange(layout.of_interval)
+    _, x, w, f = layout.split_interval(at)
+    n, m = np.tril_indices(2 + layout.stages)
+    motion = np.broadcast_arrays(x[n][:, :, None], x[m][:, None])
+    motion = [x.ravel()[_once(layout)] for x in motion]
+    first = np.concatenate([[1], x.ravel()])
+    of_forces = np.broadcast_arrays(f[..., None], first)
+    by_T = np.concatenate([[1], x.ravel(), w.ravel()])
+    parts = [(by_T, np.ones_like(by_T)), of_forces, motion]
+    row, column = (np.concatenate([np.ravel(part[k]) for part in parts]) for k in (0, 1))
+    return row, column

@@ -106,19 +106,27 @@ def _rotation_rows(quat, free: tuple[bool, ...], w=None):
 
     A rate is the component of w about the row's axis where the loop is closed.
     """
-    axes, eye = np.flatnonzero(free), np.eye(3)
-    if len(axes) == 3:
+    if all(free):
         return jnp.zeros(3, quat.dtype)
-    if not len(axes):
+    if not any(free):
         quat = jnp.where(quat[0] < 0, -quat, quat)
         return 2 * quat[1:] if w is None else quat[0] * w + cross(w, quat[1:])
-    column = quat_matrix(quat)[:, axes[-1]]
-    column = column if w is None else cross(w, column)
+    axis, rows = rotation_table(free)
+    column = quat_matrix(quat)[:, axis]
+    return jnp.asarray(rows, quat.dtype) @ (column if w is None else cross(w, column))
+
+
+def rotation_table(free: tuple[bool, ...]) -> tuple[int, np.ndarray]:
+    """Return what makes rotation rows of one or two free rotations.
+
+    These are an axis of the real link, and a matrix by which the axis gives the three rows.
+    """
+    axes, eye = np.flatnonzero(free), np.eye(3)
     if len(axes) == 1:
-        return jnp.asarray(np.cross(eye, eye[axes[0]]), quat.dtype) @ column
+        return int(axes[0]), np.cross(eye, eye[axes[0]])
     (last,) = set(range(3)) - set(axes.tolist())
     sign = np.cross(eye[axes[1]], eye[axes[0]])[last]
-    return jnp.asarray(sign * np.outer(eye[last], eye[axes[0]]), quat.dtype) @ column
+    return int(axes[1]), sign * np.outer(eye[last], eye[axes[0]])
 
 
 def _select(table: LinkRows, angular: list, linear) -> Float[Array, " rows"]:

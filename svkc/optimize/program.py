@@ -54,6 +54,16 @@ def _not_round_off(dense: np.ndarray, axes) -> np.ndarray:
     return ~finite | (size > _ROUND_OFF * np.max(size, axis=axes, keepdims=True, initial=0.0))
 
 
+def _not_round_off_of_rows(values: np.ndarray, row: np.ndarray, rows: int) -> np.ndarray:
+    """Return the mask of entries [lanes entries] above round-off of the largest of their row."""
+    largest = np.zeros((len(values), rows))
+    finite = np.isfinite(values)
+    size = np.where(finite, np.abs(values), 0)
+    for i in range(rows):
+        largest[:, i] = np.max(size[:, row == i], axis=1, initial=0.0)
+    return ~finite | (size > _ROUND_OFF * largest[:, row])
+
+
 def _over_blocks(blocks: Sequence[Block], call: Callable) -> Callable:
     """Return (params, data, *x) -> results of a function of each block, compiled.
 
@@ -137,9 +147,10 @@ class Program:
         unit = np.append(self.unit, 0.0)
         largest = np.zeros(self.cost_row + 2)
         for dense in jacobians:
-            for block, index, matrix in zip(self.blocks, self._index, dense, strict=True):
-                size = np.max(np.abs(matrix) * unit[index][:, None], axis=2, initial=0.0)
-                np.maximum.at(largest, block.rows, np.where(np.isfinite(size), size, 0))
+            for block, index, values in zip(self.blocks, self._index, dense, strict=True):
+                row, column = block.jacobian_places
+                size = np.abs(values) * unit[index][:, column]
+                np.maximum.at(largest, block.rows[:, row], np.where(np.isfinite(size), size, 0))
         table = self.transcription.rows
         for segment in table.segments:
             own = slice(segment.start, segment.stop)
@@ -149,24 +160,30 @@ class Program:
     def _patterns(self, draws: np.ndarray, jacobians) -> tuple[Entries, Entries]:
         """Return the entries of the Jacobian and of the lower half of the Hessian."""
         random = np.random.default_rng(1)
-        first = [np.zeros(b.rows.shape + b.unknowns.shape[1:], bool) for b in self.blocks]
-        second = [np.zeros(b.unknowns.shape + b.unknowns.shape[1:], bool) for b in self.blocks]
+        places = [b.jacobian_places for b in self.blocks], [b.hessian_places for b in self.blocks]
+        first: list[Any] = [False] * len(self.blocks)
+        second: list[Any] = [False] * len(self.blocks)
         unit = np.append(self.unit, 1.0)
-        units = [unit[index] for index in self._index]
         for x, jacobian in zip(draws, jacobians, strict=True):
-            z = self._local(x)
             multipliers = [
                 np.where(b.rows < 0, 0, random.normal(size=b.rows.shape)) for b in self.blocks
             ]
-            for used, dense, u in zip(first, jacobian, units):
-                used |= _not_round_off(np.asarray(dense) * u[:, None], axes=2)
-            dense_hessians = self._second(self.params, self._data, z, multipliers)
-            for used, dense, u in zip(second, dense_hessians, units):
-                used |= _not_round_off(np.asarray(dense) * u[:, None] * u[:, :, None], axes=(1, 2))
-        jacobian = [self._places(u, b.rows, b.unknowns) for u, b in zip(first, self.blocks)]
+            hessian = self._second(self.params, self._data, self._local(x), multipliers)
+            for i, (index, block) in enumerate(zip(self._index, self.blocks)):
+                (row, column), u = places[0][i], unit[index]
+                scaled = np.asarray(jacobian[i]) * u[:, column]
+                first[i] = first[i] | _not_round_off_of_rows(scaled, row, block.rows.shape[1])
+                row, column = places[1][i]
+                scaled = np.asarray(hessian[i]) * u[:, row] * u[:, column]
+                second[i] = second[i] | _not_round_off(scaled, axes=1)
+        jacobian = [
+            self._places(u, b.rows, b.unknowns, at)
+            for u, b, at in zip(first, self.blocks, places[0])
+        ]
         jacobian.append((np.arange(len(self._linear[0])), *self._linear[:2]))
         hessian = [
-            self._places(u, b.unknowns, b.unknowns, lower=True) for u, b in zip(second, self.blocks)
+            self._places(u, b.unknowns, b.unknowns, at, lower=True)
+            for u, b, at in zip(second, self.blocks, places[1])
         ]
         return (
             Entries(jacobian, (self.cost_row + 1, self.count), (self.row_unit, self.unit)),
@@ -174,16 +191,21 @@ class Program:
         )
 
     @staticmethod
-    def _places(used: np.ndarray, rows: np.ndarray, columns: np.ndarray, lower: bool = False):
-        """Return flat places, rows and columns of entries that are used."""
+    def _places(used: np.ndarray, rows: np.ndarray, columns: np.ndarray, at, lower: bool = False):
+        """Return flat places, rows and columns of entries that are used.
+
+        used: [lanes entries]. at: local row and column of each entry.
+        """
         # few lanes may differ from one another, as in what is fixed at the start
         used = used if len(used) < MANY_LANES else np.broadcast_to(used.any(0), used.shape)
-        keep = used & (rows[:, :, None] >= 0) & (columns[:, None] >= 0)
-        if lower:
-            keep &= rows[:, :, None] >= columns[:, None]
-        lane, i, k = np.nonzero(keep)
-        place = np.ravel_multi_index((lane, i, k), used.shape)
-        return place, rows[lane, i], columns[lane, k]
+        row, column = rows[:, at[0]], columns[:, at[1]]
+        keep = used & (row >= 0) & (column >= 0)
+        place, row, column = np.flatnonzero(keep), row[keep], column[keep]
+        return (
+            (place, np.maximum(row, column), np.minimum(row, column))
+            if lower
+            else (place, row, column)
+        )
 
     def length(self, name: str) -> int:
         """Return the number of values that a method returns."""

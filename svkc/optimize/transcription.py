@@ -1,5 +1,6 @@
 """The transcription: a problem's unknowns and rows, with the blocks of the equations of motion."""
 
+import functools
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -7,6 +8,7 @@ import jax
 import numpy as np
 
 from svkc.optimize.blocks import Block, PlainBlock, StageBlock
+from svkc.optimize.closed_forms import has_closed_forms
 from svkc.optimize.equations import (
     IntervalData,
     Model,
@@ -16,6 +18,7 @@ from svkc.optimize.equations import (
     stage_equations,
 )
 from svkc.optimize.lift import polynomials
+from svkc.optimize.motion_block import CLOSED_FORMS, MotionBlock, NodeBlock
 from svkc.optimize.phases import Phase
 from svkc.optimize.points import PhaseStructure
 from svkc.optimize.schemes import Radau
@@ -158,31 +161,37 @@ class Transcription:
 
     def add_stages(self, function: Callable, stages: list[int], rows, tangents) -> None:
         """Append a block of stages over the intervals of all phases. rows: of each phase."""
-        counts, model = [phase.intervals for phase in self.specification], self.model
+        model, phases = self.model, range(len(self.specification))
         index, count = zip(*(interval_places(phase) for phase in self.specification))
-        source = lambda: join_lanes(self.lanes(i, slice(-1)) for i in range(len(counts)))
-        self.add_block(
-            StageBlock(
-                lambda *args: function(model, *args),
-                model.layout,
-                polynomials(self.scheme, model.controls, stages),
-                data=source(),
-                index=np.concatenate(index),
-                count=np.concatenate(count),
-                unknowns=np.concatenate([phase.intervals() for phase in self.phases]),
-                rows=np.concatenate(rows),
-                tangents=tangents,
-            ),
-            source,
-        )
+        source = lambda: join_lanes(self.lanes(i, slice(-1)) for i in phases)
+        poly = polynomials(self.scheme, model.controls, stages)
+        options = {
+            "data": source(),
+            "index": np.concatenate(index),
+            "count": np.concatenate(count),
+            "unknowns": np.concatenate([phase.intervals() for phase in self.phases]),
+            "rows": np.concatenate(rows),
+            "tangents": tangents,
+        }
+        if function is stage_equations and has_closed_forms(self.builder.chain, model.controls):
+            block = MotionBlock(model, poly, **options)
+        else:
+            call = functools.partial(function, model)
+            block = StageBlock(call, model.layout, poly, **options)
+        self.add_block(block, source)
 
     def _add_plain(self, function: Callable, parts: list, nodes: slice) -> None:
         """Append a block of nodes. parts: of each phase with such nodes, (i, unknowns, rows)."""
         if parts:
             source = lambda: join_lanes(self.lanes(i, nodes) for i, _, _ in parts)
-            call = lambda *args: function(self.model, *args)
             unknowns, rows = (np.concatenate([part[k] for part in parts]) for k in (1, 2))
-            self.add_block(PlainBlock(call, source(), unknowns, rows), source)
+            lanes, model = (source(), unknowns, rows), self.model
+            closed = has_closed_forms(self.builder.chain, model.controls)
+            if closed and function in CLOSED_FORMS:
+                block = NodeBlock(model, function, CLOSED_FORMS[function], *lanes)
+            else:
+                block = PlainBlock(functools.partial(function, model), *lanes)
+            self.add_block(block, source)
 
     def _add_connections(self) -> None:
         """Append the rows by which phases start from the ones before, and links connect."""

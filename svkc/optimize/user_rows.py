@@ -135,7 +135,7 @@ class UserRows:
             tangents=np.arange(0),
         )
         block.options = {} if self._reads_links(block) else {"fill": 0.0}
-        block.tangents = find_tangents(block, self.params, self._local(unknowns))
+        block.tangents = block.variables = find_tangents(block, self.params, self._local(unknowns))
         if costs:
             is_cost = np.zeros((lanes, len(stages), sum(r.shape[-1] for r in rows) + len(costs)))
             is_cost[..., -len(costs) :] = 1

@@ -57,7 +57,10 @@ def articulated_factors(
         level, I_A, s, rotor = level_data
         I_A = I_A if from_children is None else I_A + sum_children(level.children, from_children)
         U = jnp.sum(s[:, :, :, None] * I_A[:, None], 2)
-        D = jnp.sum(U[:, :, None] * s[:, None], -1) + rotor[:, :, None] * np.eye(s.shape[1], dtype=s.dtype)[None]
+        D = (
+            jnp.sum(U[:, :, None] * s[:, None], -1)
+            + rotor[:, :, None] * np.eye(s.shape[1], dtype=s.dtype)[None]
+        )
         D_inverse = inverse_positive(D)
         D_inverse_U = jnp.sum(D_inverse[..., None] * U[:, None], 2)
         to_parent = I_A - jnp.sum(U[:, :, :, None] * D_inverse_U[:, :, None, :], 1)

@@ -1,0 +1,203 @@
+"""Derivatives of a stage's rows in closed form, for trees of hinges and slides.
+
+They have a thirtieth of the operations of automatic differentiation of the rows.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from svkc._jax.static_gather import static_take
+from svkc.model.chain import Chain
+from svkc.optimize.charts import quaternion_starts
+from svkc.optimize.equations import IntervalData, Model, Params
+from svkc.optimize.link_derivatives import rows_of_links
+from svkc.optimize.points import tree_configuration, tree_velocity
+from svkc.optimize.tree_derivatives import TreeMotion
+from svkc.tree.inverse_dynamics import limit_forces, passive_forces
+from svkc.tree.kinematics import kinematics
+
+
+def has_closed_forms(chain: Chain, controls) -> bool:
+    """Return whether the derivatives of this module hold.
+
+    The tree has no quaternions, and joint torques are linear in the controls.
+    """
+    return not len(quaternion_starts(chain)[0]) and not controls.needs_state
+
+
+def _joint_derivatives(chain: Chain, q, v):
+    """Return derivatives of springs, dampers and limits, each joint's by its own coordinate.
+
+    First by q and v; then by q and q, q and v, v and v. None if the chain has no such forces.
+    """
+    if chain.damping is None and chain.stiffness is None and chain.limit_spring is None:
+        return None
+    one, nv = jnp.ones_like(q), chain.nv
+
+    def force(q, v):
+        full = tree_configuration(chain, q), tree_velocity(chain, v)
+        return (passive_forces(chain, *full) + limit_forces(chain, *full))[:nv]
+
+    by_q = lambda q, v: jax.jvp(lambda q: force(q, v), (q,), (one,))[1]
+    by_v = lambda q, v: jax.jvp(lambda v: force(q, v), (v,), (one,))[1]
+    qq, qv = (jax.jvp(by_q, (q, v), x)[1] for x in ((one, 0 * one), (0 * one, one)))
+    vv = jax.jvp(lambda v: by_v(q, v), (v,), (one,))[1]
+    return (by_q(q, v), by_v(q, v)), (qq, qv, vv)
+
+
+def _diagonal(x) -> jax.Array:
+    """Return diagonal matrices from their diagonals in the last axis."""
+    eye = np.eye(x.shape[-1], dtype=bool)
+    return jnp.where(eye.reshape((1,) * (x.ndim - 1) + eye.shape), x[..., None], 0)
+
+
+class LinkDerivatives:
+    """Links' rows along a motion of the tree, with multipliers f of those that are active."""
+
+    def __init__(self, model: Model, chain: Chain, active, *, q, v, vdot, f):
+        self.model, self.chain, self.kin = model, chain, kinematics(chain, q)
+        self.active, self.f = active, jnp.where(active, f, 0)
+        has_rows = len(model.rows) > 0
+        self.links = rows_of_links(chain, self.kin, model.rows, v, vdot) if has_rows else []
+
+    def _over_rows(self, parts: list):
+        """Return arrays of the links' rows, each a list over links, in the order of the table."""
+        order = np.argsort(np.concatenate([places for places, _ in self.links]))
+        return static_take(jnp.concatenate(parts), order)
+
+    def _stiffness(self, f):
+        """Return the derivatives [nv nv] of the links' force by q."""
+        parts = [rows.force_stiffness(static_take(f, places)) for places, rows in self.links]
+        return functools.reduce(jnp.add, parts)
+
+    def _of_links(self, multipliers, f, virtual):
+        """Return the sum over links of the blocks of `RowsOfLink.hessian`, and its by_f."""
+        take = lambda x, places: static_take(x, places)
+        parts = [r.hessian(take(multipliers, at), take(f, at), virtual) for at, r in self.links]
+        blocks = functools.reduce(jnp.add, [blocks for _, blocks, _ in parts])
+        return blocks, self._over_rows([by_f for _, _, by_f in parts])
+
+
+class StageDerivatives(LinkDerivatives):
+    """Derivatives of `stage_equations`.
+
+    y: the stage's variables.
+    """
+
+    def __init__(self, model: Model, params: Params, data: IntervalData, y):
+        self.params = params
+        (self.t, _), (q, v, vdot), self.blocks, f = model.layout.split_stage(y)
+        super().__init__(model, params.chain, data.active, q=q, v=v, vdot=vdot, f=f)
+        self.tree = TreeMotion(self.chain, self.kin, v, vdot)
+        self.joints = _joint_derivatives(self.chain, q, v)
+
+    def _torques_by_blocks(self):
+        """Return the derivatives [nv blocks control] of the joint torques, which are linear."""
+        controls, chain = self.model.controls, self.chain
+        torques = lambda w: controls.torques(chain, self.t, None, w, self.params.args)[: chain.nv]
+        return jax.jacrev(torques)(jnp.zeros_like(self.blocks))
+
+    def _forces_by_motion(self):
+        """Return the derivatives [nv 3 nv] of the forces by q, v and vdot."""
+        J, at = self.tree.jacobian(), np.arange(3)[None, :, None]
+        diagonals = []
+        if self.chain.armature is not None:
+            diagonals.append((2, self.chain.armature))
+        if self.joints is not None:
+            diagonals += [(0, -self.joints[0][0]), (1, -self.joints[0][1])]
+        for k, x in diagonals:
+            J = J + jnp.where(at == k, _diagonal(x)[:, None], 0)
+        if self.links:
+            J = J - jnp.where(at == 0, self._stiffness(self.f)[:, None], 0)
+        return J
+
+    def jacobian(self):
+        """Return the derivatives [rows y]."""
+        nv, J = self.chain.nv, self._forces_by_motion()
+        controls = -self._torques_by_blocks().reshape(nv, -1)
+        upper = [jnp.zeros((nv, 2)), J.reshape(nv, -1), controls]
+        if not self.links:
+            return jnp.concatenate(upper, 1)
+        of_rows = self._over_rows([rows.jacobian() for _, rows in self.links])
+        rates = self._over_rows([rows.rates() for _, rows in self.links])
+        upper.append(jnp.where(self.active[None], -rates.T, 0))
+        count = len(of_rows)
+        zeros = jnp.zeros((count, controls.shape[1] + count))
+        lower = [jnp.zeros((count, 2)), of_rows.reshape(count, -1), zeros]
+        return jnp.concatenate([jnp.concatenate(upper, 1), jnp.concatenate(lower, 1)])
+
+    def hessian(self, multipliers):
+        """Return derivatives of the rows' sum with multipliers.
+
+        Gradients by the motion [3 nv] and by the control blocks; second derivatives by q and q, q
+        and v, v and v, q and vdot [4 nv nv], and by the links' multipliers and q [rows nv].
+        """
+        nv = self.chain.nv
+        of_dynamics, of_rows = multipliers[:nv], multipliers[nv:]
+        gradient, blocks = self.tree.hessian(of_dynamics)
+        if self.chain.armature is not None:
+            of_vdot = self.chain.armature * of_dynamics
+            gradient = gradient + jnp.where(np.arange(3)[:, None] == 2, of_vdot[None], 0)
+        if self.joints is not None:
+            first, second = self.joints
+            zero = jnp.zeros_like(first[0])
+            gradient = gradient - of_dynamics[None] * jnp.stack([*first, zero])
+            blocks = blocks - _diagonal(of_dynamics[None] * jnp.stack([*second, zero]))
+        controls = -jnp.sum(of_dynamics[:, None, None] * self._torques_by_blocks(), 0)
+        parts = []
+        for places, rows in self.links:
+            m, f = static_take(of_rows, places), static_take(self.f, places)
+            of_link, pairs, by_f = rows.hessian(m, f, of_dynamics)
+            gradient, blocks = gradient + of_link, blocks + pairs
+            parts.append(by_f)
+        by_f = jnp.zeros((0, nv))
+        if parts:
+            by_f = jnp.where(self.active[:, None], self._over_rows(parts), 0)
+        return gradient, controls, blocks, by_f
+
+
+class ConnectionDerivatives(LinkDerivatives):
+    """Derivatives of `connection`. y: as there."""
+
+    def __init__(self, model: Model, params: Params, data: IntervalData, y):
+        chain, nv = params.chain, model.layout.nv
+        q, after, before, f = jnp.split(y, [nv, 2 * nv, 3 * nv])
+        super().__init__(model, chain, data.active, q=q, v=after, vdot=jnp.zeros_like(q), f=f)
+        self.tree = TreeMotion(chain, self.kin, jnp.zeros_like(q), after - before, gravity=False)
+
+    def jacobian(self):
+        """Return the derivatives [rows y]."""
+        by_motion = self.tree.jacobian()
+        mass = by_motion[:, 2]
+        if self.chain.armature is not None:
+            mass = mass + _diagonal(self.chain.armature)
+        rates = self._over_rows([rows.rates() for _, rows in self.links])
+        of_rates = self._over_rows([rows.jacobian()[:, 1] / 2 for _, rows in self.links])
+        zero, square = jnp.zeros_like(rates), jnp.zeros((len(rates),) * 2)
+        by_q = by_motion[:, 0] - self._stiffness(self.f)
+        by_f = jnp.where(self.active[None], -rates.T, 0)
+        parts = [
+            [rates, zero, zero, square],
+            [of_rates, rates, zero, square],
+            [by_q, mass, -mass, by_f],
+        ]
+        return jnp.concatenate([jnp.concatenate(x, 1) for x in parts])
+
+    def hessian(self, multipliers):
+        """Return the second derivatives [y y] of the rows' sum with multipliers."""
+        count = len(self.f)
+        gaps, rates, momentum = jnp.split(multipliers, [count, 2 * count])
+        none = jnp.zeros_like(gaps)
+        _, (qq, _, _, of_mass) = self.tree.hessian(momentum)
+        of_gaps, _ = self._of_links(gaps, none, momentum)
+        of_rates, _ = self._of_links(rates, none, momentum)
+        of_force, by_f = self._of_links(none, self.f, momentum)
+        by_f = jnp.where(self.active[:, None], by_f, 0)
+        qq = qq + of_gaps[3] + of_rates[1] / 2 + of_force[0]
+        first = jnp.concatenate([qq, of_mass + of_rates[3], -of_mass, by_f.T], 1)
+        nv, size = first.shape
+        below = jnp.concatenate([first[:, nv:].T, jnp.zeros((size - nv, size - nv))], 1)
+        return jnp.concatenate([first, below])

@@ -1,0 +1,73 @@
+"""The block of the equations of motion, with its derivatives in closed form."""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from svkc.optimize.blocks import PlainBlock, StageBlock, lower_half
+from svkc.optimize.closed_forms import ConnectionDerivatives, StageDerivatives
+from svkc.optimize.equations import Model, connection, stage_equations
+from svkc.optimize.lift import StagePolynomials, motion_places
+
+
+class MotionBlock(StageBlock):
+    """A block of `stage_equations` of a chain with closed forms.
+
+    model: of the equations. options: of `StageBlock`.
+    """
+
+    def __init__(self, model: Model, poly: StagePolynomials, **options: Any):
+        call = functools.partial(stage_equations, model)
+        super().__init__(call, model.layout, poly, **options)
+        self.model = model
+
+    def _derivatives(self, params: Any, own: Any, lift: Any) -> StageDerivatives:
+        return StageDerivatives(self.model, params, own, lift.variables())
+
+    def jacobian(self, params: Any, data: Any, z) -> jax.Array:
+        def at_stage(params, own, lift):
+            return lift.pull_back(self._derivatives(params, own, lift).jacobian())
+
+        return self._join_stages(jnp.ravel, at_stage, params, data, z)
+
+    def hessian(self, params: Any, data: Any, z, multipliers) -> jax.Array:
+        def at_stage(params, own, lift, m):
+            return lift.motion_hessian(*self._derivatives(params, own, lift).hessian(m))
+
+        multipliers = multipliers.reshape(len(z), len(self.poly.c), -1)
+        total = lambda x: jnp.sum(x, 0)
+        return self._join_stages(total, at_stage, params, data, z, multipliers)
+
+    @property
+    def hessian_places(self) -> tuple[np.ndarray, np.ndarray]:
+        return motion_places(self.layout)
+
+
+class NodeBlock(PlainBlock):
+    """A block of nodes of a chain with closed forms.
+
+    function: (model, params, data, unknowns) -> rows. derivatives: class of its derivatives.
+    """
+
+    def __init__(self, model: Model, function: Callable, derivatives: Any, *args: Any):
+        super().__init__(functools.partial(function, model), *args)
+        self.model, self.derivatives = model, derivatives
+
+    def jacobian(self, params: Any, data: Any, z) -> jax.Array:
+        def at_lane(data, z):
+            return self.derivatives(self.model, params, data, z).jacobian().ravel()
+
+        return jax.vmap(at_lane)(data, z)
+
+    def hessian(self, params: Any, data: Any, z, multipliers) -> jax.Array:
+        def at_lane(data, z, m):
+            return lower_half(self.derivatives(self.model, params, data, z).hessian(m))
+
+        return jax.vmap(at_lane)(data, z, multipliers)
+
+
+CLOSED_FORMS = {connection: ConnectionDerivatives}
