@@ -18,6 +18,8 @@ from svkc._jax.eager import eager_jit
 from svkc._jax.functions import call_with_comparable
 from svkc._jax.primitive import ClosureConverted
 from svkc._jax.pytrees import is_concrete, stop_gradient_tree
+from svkc.integration.replay import Replay
+from svkc.integration.runge_kutta import without_dense_output
 from svkc.model.annotations import Function, Integer, Numbers, Scalar
 from svkc.model.chain import Chain, State
 from svkc.simulation.certificate import certificate, evaluations_per_step
@@ -182,7 +184,10 @@ def _certified(chain: Chain, run: RunState, times, options: Options) -> Trajecto
     """Return the trajectory of a run with its certificate. times: start, end and save times."""
     _, t1, ts = times
     certify = _certify_eagerly if len(ts) <= MAX_EAGER_STATES else _certify
-    stages = evaluations_per_step(options.solver)
+    solver = options.solver
+    if run.guard_values is None and isinstance(options.adjoint, Replay):
+        solver = without_dense_output(solver)
+    stages = evaluations_per_step(solver)
     return certify(chain, run, ts, t1, options.gap_tolerance, stages)
 
 
