@@ -17,7 +17,7 @@ from svkc._jax.pytrees import tree_where
 from svkc.integration.dense_output import ProjectedInterpolation, make_interpolation
 from svkc.integration.event_location import EventSearch, event_info
 from svkc.integration.guard_scan import locate_event
-from svkc.integration.near_singular import redone_if_near
+from svkc.integration.near_singular import redone_if_near, with_rows_of_projection
 from svkc.integration.ode import ODEState, Times, is_finite, rms_norm
 from svkc.integration.solution import (
     EVENT,
@@ -111,7 +111,8 @@ def _init_stepper(
     )
     rows = lambda n: jax.tree.map(lambda x: jnp.broadcast_to(x[None], (n, *x.shape)), start)
     info = initial_projection_info(field, field_args, start.q)
-    near = problem.field_args.near
+    choice = problem.field_args.row_choice
+    near = None if choice is None else choice.near
     guard_values, search = None, None
     if options.armed_guards is not None:
         guard_values = options.armed_guards.initial_values
@@ -232,20 +233,12 @@ def _write_states(
     return ys, checkpoints
 
 
-def _with_field_args(problem: PhaseProblem, **changes: Any) -> PhaseProblem:
-    """Return the problem with other arguments of its vector field."""
-    field_args = dataclasses.replace(problem.field_args, **changes)
-    return dataclasses.replace(problem, field_args=field_args)
-
-
 def _body_fun(
     s: StepperState, times, problem: PhaseProblem, options: StepperOptions
 ) -> StepperState:
     """Attempt one step and advance if it is kept; or evaluate the guards once to locate a root."""
     (t0, stop, save_ts), info = times, s.projection_info
-    if info is not None and info.pivots is not None and problem.field.dynamics.hold is not None:
-        problem = _with_field_args(problem, pivots=info.pivots)
-    problem = _with_field_args(problem, near=s.near)
+    problem = with_rows_of_projection(s, problem)
     t1 = s.tnext if s.search is None else s.search.end_of_attempt(s.tnext)
     attempt, near, redo = redone_if_near(s, _attempt_step(s, t1, problem, options), problem)
     guard_values, search, hold = None, None, jnp.zeros((), bool)

@@ -1,4 +1,4 @@
-"""Steps near singular configurations, which are taken again with reduced rows of the loops."""
+"""Pivots and rows of the loops that a step uses, and steps that are taken again with others."""
 
 import dataclasses
 
@@ -6,7 +6,21 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from svkc.integration.solution import PhaseProblem, StepAttempt, StepperState
-from svkc.loops.pivoting import has_redundant_rows, singularity_threshold
+from svkc.loops.pivoting import singularity_threshold
+
+
+def with_rows_of_projection(s: StepperState, problem: PhaseProblem) -> PhaseProblem:
+    """Return the problem with the pivots, or the rows of the loops, of the last projection."""
+    info = s.projection_info
+    if info is None:
+        return problem
+    changes = {}
+    if info.pivots is not None and problem.field.dynamics.hold is not None:
+        changes["pivots"] = info.pivots
+    if s.near is not None:
+        changes["row_choice"] = info.row_choice(s.near)
+    field_args = dataclasses.replace(problem.field_args, **changes)
+    return dataclasses.replace(problem, field_args=field_args)
 
 
 def redone_if_near(
@@ -16,7 +30,7 @@ def redone_if_near(
 
     An attempt that ends near a singular configuration, or that does not close the loops, is not
     kept: it is taken again with reduced rows. Rows are reduced until a step is kept that ends away
-    from singular configurations, and throughout a phase whose loops are redundant.
+    from singular configurations.
     """
     if s.near is None:
         return attempt, None, jnp.zeros((), bool)
@@ -26,7 +40,6 @@ def redone_if_near(
     structure = problem.field_args.structure
     # false for NaN
     away = margin > singularity_threshold(structure)
-    away = away & ~has_redundant_rows(structure)
     redo = ~s.near & ~(away & attempt.closed)
     near = jnp.where(s.near, ~(attempt.keep_step & away), redo)
     keep_step = attempt.keep_step & ~redo

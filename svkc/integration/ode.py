@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from svkc.loops.constraint_rows import RowChoice
 from svkc.model.chain import Chain, Structure
 
 # start, end and save times of a phase (s)
@@ -30,15 +31,14 @@ class FieldArgs(eqx.Module):
     args: the user's `args`, passed on to control and guards.
     pivots: pivots of the loops' rows that are reused instead of selected anew
         (`AbstractDynamics.hold`). None: select pivots at every evaluation.
-    near: whether articulated bodies reduce the rows of the loops, as near a singular configuration.
-        None: never.
+    row_choice: rows of the loops that articulated bodies use. None: all.
     """
 
     chain: Chain
     structure: Structure
     args: Any
     pivots: Float[Array, "steps dofs"] | None = None
-    near: Bool[Array, ""] | None = None
+    row_choice: RowChoice | None = None
 
 
 def is_finite(y: ODEState) -> Bool[Array, ""]:

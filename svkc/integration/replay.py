@@ -20,9 +20,10 @@ from svkc._jax.primitive import custom_primitive
 from svkc._jax.pytrees import materialise_zeros, stop_gradient_tree, tree_where
 from svkc.integration.event_adjoint import end_of_phase_tangent, transport_tangent
 from svkc.integration.integrate import integrate_phase
-from svkc.integration.ode import ODEState
+from svkc.integration.ode import FieldArgs, ODEState
 from svkc.integration.runge_kutta import replay_step
 from svkc.integration.solution import SUCCESSFUL, PhaseProblem, PhaseSolution, StepperOptions
+from svkc.loops.constraint_rows import choose_rows
 from svkc.model.validation import integer
 
 # Blocks of steps are skipped in groups of this size past the end of a run.
@@ -70,11 +71,24 @@ def _replay_block(y: ODEState, steps, problem: PhaseProblem, solver) -> tuple[OD
 
     def replay(y, step):
         start, stop, near = step
-        field_args = dataclasses.replace(problem.field_args, near=near)
+        field_args = _at(y.q, problem.field_args, near)
         y = replay_step(solver, problem.field, start, stop, y, field_args)
         return y, y
 
     return jax.lax.scan(replay, y, steps)
+
+
+def _at(q, field_args: FieldArgs, near: Any = None) -> FieldArgs:
+    """Return the arguments of the vector field with the rows of the loops for a step from q.
+
+    near: as in `RowChoice` (None: as at the start of the phase).
+    """
+    choice = field_args.row_choice
+    if choice is None:
+        return field_args
+    near = choice.near if near is None else near
+    rows = choose_rows(field_args.chain, field_args.structure, q, near)
+    return dataclasses.replace(field_args, row_choice=rows)
 
 
 def _integrate(start: ODEState, times, problem: PhaseProblem, options: StepperOptions, guards):
@@ -98,7 +112,7 @@ def _integrate_with_replay_jvp(primals, tangents):
     (t0, stop, save_ts), (d_t0, d_stop, d_save_ts) = times, d_times
     # One program evaluates the field at both ends.
     rates = jax.lax.map(
-        lambda x: problem.field(*x, problem.field_args),
+        lambda x: problem.field(*x, _at(x[1].q, problem.field_args)),
         (jnp.stack([t0, t]), jax.tree.map(lambda *x: jnp.stack(x), start, y)),
     )
     rate_start, rate_end = (jax.tree.map(lambda x, i=i: x[i], rates) for i in range(2))

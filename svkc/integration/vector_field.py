@@ -16,12 +16,13 @@ from svkc.integration.stabilization import (
     needs_projection,
 )
 from svkc.loops.constrained_dynamics import AbstractDynamics, ArticulatedBodies
+from svkc.loops.constraint_rows import RowChoice
 from svkc.loops.forward_dynamics import (
     velocity_and_acceleration,
     velocity_and_acceleration_lanes_last,
 )
 from svkc.loops.loop_force_projection import project_by_loop_forces
-from svkc.loops.pivoting import has_redundant_rows, singularity_threshold
+from svkc.loops.pivoting import singularity_threshold
 from svkc.loops.projection import ProjectionInfo, project
 from svkc.model.annotations import Scalar
 from svkc.model.chain import Chain, State, Structure, active_dofs
@@ -66,7 +67,7 @@ class VectorField(eqx.Module):
         )
         if self._batches_lanes_last(chain) and not project_velocity:
             v, vdot = velocity_and_acceleration_lanes_last(
-                chain, structure, (y.q, y.v), tau, baumgarte, field_args.near
+                chain, structure, (y.q, y.v), tau, baumgarte, field_args.row_choice
             )
         else:
             v, vdot = velocity_and_acceleration(
@@ -79,7 +80,7 @@ class VectorField(eqx.Module):
                 baumgarte=baumgarte,
                 project_velocity=project_velocity,
                 pivots=field_args.pivots,
-                near=field_args.near,
+                choice=field_args.row_choice,
             )
         return ODEState(
             configuration_derivative(chain, y.q, jnp.where(active_dofs(chain, structure), v, 0)),
@@ -143,24 +144,21 @@ def phase_field_args(
 
     args: the user's.
     """
-    near = None
+    choice = None
     if needs_projection(field.stabilization, chain) and field.projects_by_loop_forces:
-        near = has_redundant_rows(structure) | ~(
-            structure.margin > singularity_threshold(structure)
-        )
-    return FieldArgs(chain, structure, args, near=near)
+        away = structure.margin > singularity_threshold(structure)
+        choice = RowChoice.of_first_step(chain, structure, ~away)
+    return FieldArgs(chain, structure, args, row_choice=choice)
 
 
 def initial_projection_info(field: VectorField, field_args: FieldArgs, q) -> ProjectionInfo | None:
     """Return the projection's result before the first step. None: steps are not projected."""
-    if not needs_projection(field.stabilization, field_args.chain):
+    chain, choice = field_args.chain, field_args.row_choice
+    if not needs_projection(field.stabilization, chain):
         return None
-    return ProjectionInfo.initial(
-        field_args.chain,
-        q.dtype,
-        with_margin=True,
-        with_pivots=not field.projects_by_loop_forces,
-    )
+    if not field.projects_by_loop_forces:
+        return ProjectionInfo.of_pivots(chain, q.dtype)
+    return ProjectionInfo.of_loop_forces(chain, q.dtype, None if choice is None else choice.kept)
 
 
 def project_state(
@@ -181,7 +179,7 @@ def project_state(
             structure,
             y.q,
             y.v,
-            field_args.near,
+            field_args.row_choice,
             iterations=stabilization.iterations,
             differentiated=field.differentiated,
         )

@@ -78,8 +78,9 @@ class ArticulatedBodies(AbstractDynamics):
     """Articulated bodies and loop forces by Delassus' matrix, without pivots.
 
     The fastest method, and the one for batches. Delassus' matrix squares the condition number of
-    J_C near singular configurations. There, and where loops are redundant, a run that uses
-    `svkc.stabilization.Projection` reduces the rows of J_C first.
+    J_C near singular configurations. There, a run that uses
+    `svkc.stabilization.Projection` reduces the rows of J_C first. Of redundant loops, its steps use
+    independent rows only.
 
     Massless bodies that loops hold cost one more solve for each coordinate of their joints. They
     are those whose mass, or moment of inertia about a joint, is below 1e-7 of the model's largest

@@ -7,7 +7,6 @@ subspaces. The three angular rows of a ball vanish there and are left out.
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,55 +14,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.control_flow import unvmap_any
 from svkc._jax.static_gather import static_take
-from svkc.loops.constraint import jacobian_scales
-from svkc.loops.pivoting import rank_tolerance, release_threshold
+from svkc.loops.constraint import jacobian_scales, loop_kinematics
+from svkc.loops.pivoting import has_redundant_rows, rank_tolerance, release_threshold
+from svkc.loops.virtual_joints import VirtualJoints, virtual_joints
 from svkc.model.chain import Chain, Structure
-from svkc.tree.spatial import inverse_positive, matvec
+from svkc.tree.spatial import matvec
 
 BALL_FREEDOMS = (True, True, True, False, False, False)
-
-
-class VirtualJoints(eqx.Module):
-    """Motion subspaces of the virtual joints, padded to the d freedoms of the freest.
-
-    S: motion subspace of each link. gram_inverse: (S^T S)^-1.
-    dof: index of each freedom among the virtual joints' coordinates (padding: `count` or more).
-    count: number of these coordinates.
-    """
-
-    S: Float[Array, "links 6 d"]
-    gram_inverse: Float[Array, "links d d"]
-    dof: np.ndarray
-    count: int
-
-    def joint_rates(self, x: Float[Array, "*n rows"]) -> Float[Array, "*n links d"]:
-        """Return S^+ x, the joint rates that fit the loop rows x best."""
-        x = x.reshape(*x.shape[:-1], -1, 6)
-        return matvec(
-            _align_batch_axes(self.gram_inverse, x),
-            matvec(_align_batch_axes(jnp.swapaxes(self.S, -1, -2), x), x),
-        )
-
-    def reject(self, x: Float[Array, "*n rows"]) -> Float[Array, "*n rows"]:
-        """Return x - S S^+ x, the part of the loop rows that the joints cannot follow."""
-        rates = self.joint_rates(x)
-        return x - matvec(_align_batch_axes(self.S, rates), rates).reshape(x.shape)
-
-    def subset(self, links: np.ndarray) -> "VirtualJoints":
-        """Return the virtual joints of some links."""
-        S, gram_inverse, dof = self.S[links], self.gram_inverse[links], self.dof[links]
-        return VirtualJoints(S=S, gram_inverse=gram_inverse, dof=dof, count=self.count)
-
-    def gather(self, x: Float[Array, " virtual"]) -> Float[Array, "links d"]:
-        """Return x, over the virtual joints' coordinates, by link; zero for padding."""
-        return static_take(x, np.minimum(self.dof, self.count))
-
-    def scatter(self, rates: Float[Array, "links d"]) -> Float[Array, " virtual"]:
-        """Return rates, by link, over the virtual joints' coordinates."""
-        flat = self.dof.ravel()
-        return static_take(
-            rates.ravel(), np.argsort(flat, kind="stable")[: np.sum(flat < self.count)]
-        )
 
 
 class DelassusRows(NamedTuple):
@@ -104,39 +61,41 @@ def delassus_rows(chain: Chain, any_locked: bool) -> DelassusRows:
     return DelassusRows(np.flatnonzero(~is_free_ball), rows, position)
 
 
-def _align_batch_axes(
-    A: Float[Array, "links i j"], x: Float[Array, "*n links k"]
-) -> Float[Array, "*m links i j"]:
-    """Return A with an axis of size 1 for each batch axis of x."""
-    return A.reshape(*(1,) * (x.ndim - 2), *A.shape)
+class RowChoice(NamedTuple):
+    """Which rows of the loop constraints are used.
 
+    near: whether the rows are reduced at every evaluation, as near a singular configuration.
+    kept: the rows that are used otherwise. Of redundant loops these are as many as the phase's
+        rank, independent where they were chosen.
+    """
 
-def virtual_joints(chain: Chain, J: Float[Array, "rows dofs"]) -> VirtualJoints:
-    """Return the virtual joints, with the motion subspaces in the columns of J."""
-    dof, count = np.sort(chain.topology.links.dof - chain.nv, 1), chain.dofs - chain.nv
-    dof = dof[:, : max(1, np.max(np.sum(dof < count, 1)))]
-    columns = jnp.concatenate([J[:, chain.nv :], jnp.zeros_like(J[:, :1])], 1)
-    columns = columns.reshape(-1, 6, count + 1)
-    S = jnp.swapaxes(columns[np.arange(len(dof))[:, None], :, np.minimum(dof, count)], -1, -2)
-    is_padding = jnp.where(jnp.all(S == 0, 1), 1, 0).astype(J.dtype)
-    gram = (
-        jnp.sum(S[:, :, :, None] * S[:, :, None], 1)
-        + is_padding[:, :, None] * np.eye(dof.shape[1], dtype=J.dtype)[None]
-    )
-    return VirtualJoints(S=S, gram_inverse=inverse_positive(gram), dof=dof, count=count)
+    near: Bool[Array, ""]
+    kept: Bool[Array, " delassus"]
+
+    @classmethod
+    def of_first_step(
+        cls, chain: Chain, structure: Structure, near: Bool[Array, ""]
+    ) -> "RowChoice":
+        """Return the rows of a phase's first step, in which those of redundant loops are reduced.
+
+        near: whether the phase starts near a singular configuration.
+        """
+        count = len(delassus_rows(chain, structure.locked is not None).rows)
+        return cls(near | has_redundant_rows(structure), jnp.ones(count, bool))
 
 
 class ConstraintRows(NamedTuple):
     """The loop constraints J x + bias = 0 without the rates of the virtual joints.
 
     They are A x + T R bias = 0 over the tree's coordinates, with A = T R J_D. J_D are the rows of J
-    in D, and R rejects what the virtual joints can follow. T is the identity or, near a singular
-    configuration, the row reduction of R J_D.
+    in D, and R rejects what the virtual joints can follow. T is the identity, or the row reduction
+    of R J_D near a singular configuration, or it selects the rows that are kept of redundant loops.
 
     joints: the virtual joints. in_D: the rows of J in D.
     T: None for the identity.
-    pivots: one-hot rows: the pivot column of each row of A, zero where T is the identity. None if T
-        is None.
+    pivots: one-hot rows: the pivot column of each row of A, zero where T is no row reduction. None
+        if T is None.
+    kept: rows of A that are not dropped. None: all.
     """
 
     joints: VirtualJoints
@@ -144,6 +103,7 @@ class ConstraintRows(NamedTuple):
     A: Float[Array, "delassus nv"]
     T: Float[Array, "delassus delassus"] | None = None
     pivots: Float[Array, "delassus nv"] | None = None
+    kept: Bool[Array, " delassus"] | None = None
 
     def reject(self, x: Float[Array, "*n delassus"]) -> Float[Array, "*n delassus"]:
         """Return R x."""
@@ -154,15 +114,15 @@ class ConstraintRows(NamedTuple):
         return jnp.concatenate([full_joints.reject(x[..., :n]), x[..., n:]], -1)
 
     def along_joints(self) -> Float[Array, "delassus delassus"]:
-        """Return I - R, or zero for reduced rows: the projector onto what the joints can follow."""
-        n = len(self.in_D.rows)
-        eye = jnp.eye(n, dtype=self.A.dtype)
-        if not len(self.in_D.full_links):
-            return jnp.zeros_like(eye)
+        """Return the projector onto directions in which A is zero for every configuration.
+
+        These are the dropped rows or, if no row is dropped, what the joints can follow: I - R.
+        """
+        eye = jnp.eye(len(self.in_D.rows), dtype=self.A.dtype)
         projector = eye - self.reject(eye)
-        if self.pivots is None:
+        if self.kept is None:
             return projector
-        return jnp.where(jnp.any(self.pivots > 0), 0, projector)
+        return jnp.where(jnp.all(self.kept), projector, jnp.where(self.kept[:, None], 0, eye))
 
     def reduce(self, bias: Float[Array, " rows"]) -> Float[Array, " delassus"]:
         """Return T R bias."""
@@ -179,20 +139,22 @@ def constraint_rows(
     chain: Chain,
     structure: Structure,
     J: Float[Array, "rows dofs"],
-    near: Bool[Array, ""] | None = None,
+    choice: RowChoice | None = None,
 ) -> ConstraintRows:
     """Return the constraint rows of the scaled J_C, without derivatives.
 
-    near: whether the rows are reduced, as near a singular configuration (None: never).
+    choice: which rows are used (None: all of them).
     """
     J, column = jax.lax.stop_gradient((J, jacobian_scales(chain)[1]))
     in_D = delassus_rows(chain, structure.locked is not None)
     rows = ConstraintRows(virtual_joints(chain, J / column[None]), in_D, J)
     J_D = static_take(J[:, : chain.nv], in_D.rows)
     scaled, unscale = rows.reject(J_D.T).T, 1 / column[None, : chain.nv]
-    if near is None:
+    if choice is None:
         return rows._replace(A=scaled * unscale)
-    identity = scaled, jnp.eye(len(scaled), dtype=J.dtype), jnp.zeros_like(scaled)
+    near, kept = choice
+    selects = jnp.where(kept[:, None], jnp.eye(len(scaled), dtype=J.dtype), 0)
+    selected = jnp.where(kept[:, None], scaled, 0), selects, jnp.zeros_like(scaled)
     virtual = jnp.sum(jnp.any(J[:, chain.nv :] != 0, 0), dtype=jnp.int32)
     # under `vmap`, one lane near a singular configuration makes all lanes reduce their rows
     A, T, pivots = jax.lax.cond(
@@ -200,11 +162,32 @@ def constraint_rows(
         lambda: jax.tree.map(
             lambda a, b: jnp.where(near, a, b),
             reduce_rows(scaled, structure, structure.rank - virtual),
-            identity,
+            selected,
         ),
-        lambda: identity,
+        lambda: selected,
     )
-    return rows._replace(A=A * unscale, T=T, pivots=pivots)
+    kept = jnp.where(near, jnp.any(pivots > 0, 1), kept)
+    return rows._replace(A=A * unscale, T=T, pivots=pivots, kept=kept)
+
+
+def choose_rows(
+    chain: Chain, structure: Structure, q: Float[Array, " q"], near: Bool[Array, ""]
+) -> RowChoice:
+    """Return the rows that a step from q uses.
+
+    near: as in `RowChoice`.
+    """
+    q, redundant = jax.lax.stop_gradient(q), has_redundant_rows(structure)
+    first = RowChoice.of_first_step(chain, structure, near)
+
+    def independent() -> Bool[Array, " delassus"]:
+        J = loop_kinematics(chain, structure, q).J
+        reduced = constraint_rows(chain, structure, J, first)
+        assert reduced.kept is not None
+        return jnp.where(redundant, reduced.kept, first.kept)
+
+    # under `vmap`, one lane with redundant loops makes all lanes choose rows
+    return RowChoice(near, jax.lax.cond(unvmap_any(redundant), independent, lambda: first.kept))
 
 
 def reduce_rows(

@@ -20,6 +20,7 @@ from svkc.loops.constrained_dynamics import (
 from svkc.loops.constraint import constraint_bias, jacobian_scales, loop_kinematics
 from svkc.loops.constraint_rows import (
     ConstraintRows,
+    RowChoice,
     constraint_rows,
     with_consistent_velocities,
 )
@@ -54,7 +55,7 @@ def velocity_and_acceleration(
     baumgarte=None,
     project_velocity: bool = False,
     pivots=None,
-    near: Bool[Array, ""] | None = None,
+    choice: RowChoice | None = None,
     added_inertia: Float[Array, " dofs"] | None = None,
 ) -> tuple[Float[Array, " dofs"], Float[Array, " dofs"]]:
     """Return the velocity and the acceleration (paper, section III-B, steps 1 to 5).
@@ -66,8 +67,8 @@ def velocity_and_acceleration(
     project_velocity: near a singular configuration compute the dependent velocities from the
     independent ones, as the errors of v would grow there from stage to stage of a step.
     pivots: as in `select_pivots`.
-    near: whether articulated bodies reduce the rows of the loops, as near a singular configuration
-    (None: never). The dependent velocities are then computed from the independent ones, too.
+    choice: rows of the loops that articulated bodies use (None: all). Where they are reduced, the
+    dependent velocities are computed from the independent ones, too.
     added_inertia: added to the diagonal of the mass matrix (None: nothing), on the coordinates of
     the tree and of cuttable joints.
     """
@@ -76,7 +77,7 @@ def velocity_and_acceleration(
         kin, J = loops.kin, loops.J
         selection, v = _select_rows(
             chain, structure, J, v, dynamics=dynamics, project_velocity=project_velocity,
-            pivots=pivots, near=near,
+            pivots=pivots, choice=choice,
         )  # fmt: skip
     else:
         kin, loops = kinematics(chain, q), None
@@ -96,7 +97,7 @@ def velocity_and_acceleration(
 
 def _select_rows(
     chain: Chain, structure: Structure, J, v, *, dynamics: AbstractDynamics, project_velocity: bool,
-    pivots, near,
+    pivots, choice: RowChoice | None,
 ) -> tuple[Any, Float[Array, " dofs"]]:  # fmt: skip
     """Return the `selection` of `AbstractDynamics.prepare`, and v or, near a singular
     configuration, consistent velocities. The options are those of `velocity_and_acceleration`."""
@@ -107,9 +108,9 @@ def _select_rows(
         assert selection is not None
         v = _projected_if_near_singular(chain, structure, selection, J, v)
     if not dynamics.uses_pivots:
-        selection = constraint_rows(chain, structure, J, near)
-        if near is not None:
-            v = _with_consistent_velocities_if(near, chain, structure, J, v, selection)
+        selection = constraint_rows(chain, structure, J, choice)
+        if choice is not None:
+            v = _with_consistent_velocities_if(choice.near, chain, structure, J, v, selection)
     return selection, v
 
 
@@ -146,7 +147,7 @@ def _with_cuttable_inertia(
 
 @with_lanes_last
 def velocity_and_acceleration_lanes_last(
-    chain: Chain, structure: Structure, state, tau, baumgarte, near
+    chain: Chain, structure: Structure, state, tau, baumgarte, choice
 ) -> tuple[Float[Array, " dofs"], Float[Array, " dofs"]]:
     """Return `velocity_and_acceleration` by articulated bodies; a `vmap` keeps lanes last.
 
@@ -154,8 +155,9 @@ def velocity_and_acceleration_lanes_last(
     """
     q, v = state
     return velocity_and_acceleration(
-        chain, structure, q, v, tau, dynamics=ArticulatedBodies(), baumgarte=baumgarte, near=near
-    )
+        chain, structure, q, v, tau, dynamics=ArticulatedBodies(), baumgarte=baumgarte,
+        choice=choice,
+    )  # fmt: skip
 
 
 def acceleration(

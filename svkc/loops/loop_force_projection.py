@@ -11,8 +11,8 @@ from svkc._jax.control_flow import unvmap_any
 from svkc._jax.lanes_last import with_lanes_last
 from svkc.loops.constrained_dynamics import ArticulatedBodies
 from svkc.loops.constraint import gap_norms, jacobian_scales, loop_kinematics
-from svkc.loops.constraint_rows import constraint_rows
-from svkc.loops.pivoting import rank_tolerance
+from svkc.loops.constraint_rows import RowChoice, constraint_rows
+from svkc.loops.pivoting import has_redundant_rows, rank_tolerance
 from svkc.loops.projection import ProjectionInfo
 from svkc.model.chain import Chain, Structure, active_dofs
 from svkc.tree.configuration import integrate, normalize
@@ -27,29 +27,28 @@ def project_by_loop_forces(
     structure: Structure,
     q,
     v,
-    near: Bool[Array, ""] | None = None,
+    choice: RowChoice | None = None,
     *,
     iterations: int,
     differentiated: bool = True,
 ) -> tuple[Float[Array, " q"], Float[Array, " dofs"], ProjectionInfo]:
     """Return `project` in the metric of the mass matrix, by `ArticulatedBodies`.
 
-    near: whether the rows of the loops are reduced (None: never).
+    choice: rows of the loops that are used (None: all).
     differentiated: whether derivatives are taken through the projection. If not, a `vmap` keeps
-    lanes last, and the info has the margin unless `near` is None.
+    lanes last, and the info has the margin and the rows of the next step unless `choice` is None.
     """
-    info = ProjectionInfo.initial(
-        chain, q.dtype, with_margin=not differentiated and near is not None, with_pivots=False
-    )
+    kept = None if differentiated or choice is None else choice.kept
+    info = ProjectionInfo.of_loop_forces(chain, q.dtype, kept)
     q = normalize(chain, q)
     if not differentiated:
-        return _project_until_closed(chain, structure, (q, v, info), near, iterations)
+        return _project_until_closed(chain, structure, (q, v, info), choice, iterations)
 
     @functools.partial(jax.checkpoint, prevent_cse=False)
     def newton_step(i, carry):
         q, v, _ = carry
         is_last = i == iterations
-        step = _step_by_loop_forces(chain, structure, q, v, is_last, near)
+        step = _step_by_loop_forces(chain, structure, q, v, is_last, choice)
         q = integrate(chain, q, jnp.where(is_last, 0, step.change))
         v = jnp.where(is_last, v + step.change, v)
         return q, v, jax.lax.stop_gradient(ProjectionInfo(gap=step.gap))
@@ -58,7 +57,7 @@ def project_by_loop_forces(
 
 
 def _project_until_closed(
-    chain: Chain, structure: Structure, start: tuple, near: Bool[Array, ""] | None, iterations: int
+    chain: Chain, structure: Structure, start: tuple, choice: RowChoice | None, iterations: int
 ) -> tuple[Float[Array, " q"], Float[Array, " dofs"], ProjectionInfo]:
     """Take Newton steps on q until the gaps are round-off, then project v.
 
@@ -71,11 +70,11 @@ def _project_until_closed(
 
     def body_fun(carry):
         i, (q, v, info) = carry
-        step = _step_lanes_last(chain, structure, q, v, i == iterations, near)
+        step = _step_lanes_last(chain, structure, q, v, i == iterations, choice)
         on_velocity = step.on_velocity
         q = integrate(chain, q, jnp.where(on_velocity, 0, step.change))
         v = jnp.where(on_velocity, v + step.change, v)
-        info = ProjectionInfo(gap=step.gap, margin=step.margin)
+        info = ProjectionInfo(gap=step.gap, margin=step.margin, kept=step.kept)
         return jnp.where(on_velocity, iterations, i) + 1, (q, v, info)
 
     return jax.lax.while_loop(cond_fun, body_fun, (jnp.zeros((), jnp.int32), start))[1]
@@ -87,11 +86,13 @@ class _ProjectionStep(eqx.Module):
     change: of v if `on_velocity`, else of q.
     gap: of the loops at q.
     margin: see `ProjectionInfo`; 1 unless `on_velocity`.
+    kept: see `ProjectionInfo`; of redundant loops they are chosen anew if `on_velocity`.
     """
 
     change: Float[Array, " dofs"]
     gap: Float[Array, "links 2"]
     margin: Float[Array, ""] | None
+    kept: Bool[Array, " delassus"] | None
     on_velocity: Bool[Array, ""]
 
 
@@ -101,7 +102,7 @@ def _step_by_loop_forces(
     q,
     v,
     is_last: Bool[Array, ""],
-    near: Bool[Array, ""] | None,
+    choice: RowChoice | None,
     may_be_last: bool = False,
 ) -> _ProjectionStep:
     """Return the change of q that closes the loops, or in the last step the change of v that makes
@@ -110,7 +111,7 @@ def _step_by_loop_forces(
     The change is the least in the metric of the mass matrix.
 
     may_be_last: whether the step is the last, too, if the gaps are round-off. The margin is then
-    computed, unless `near` is None.
+    computed, unless `choice` is None.
     """
     column = jacobian_scales(chain)[1]
     loops = loop_kinematics(chain, structure, q)
@@ -121,22 +122,28 @@ def _step_by_loop_forces(
         # under `vmap`, one open lane lets all lanes take a step on q
         on_velocity = is_last | ~unvmap_any(jnp.max(gap) > jnp.finfo(J.dtype).eps ** _ROUND_OFF)
     residual = jnp.where(on_velocity, J @ jnp.where(active, v / column, 0), loops.gap)
-    rows = constraint_rows(chain, structure, J, near)
+    if may_be_last and choice is not None:
+        # where rows are reduced, those to keep are found
+        near = choice.near | (on_velocity & has_redundant_rows(structure))
+        choice = choice._replace(near=near)
+    rows = constraint_rows(chain, structure, J, choice)
     solve = ArticulatedBodies().prepare(chain, structure, loops, rows)
     change = solve(jnp.zeros(chain.dofs, q.dtype), residual)
-    if may_be_last and near is not None:
+    if may_be_last and choice is not None:
         margin = jax.lax.cond(
             on_velocity,
             lambda: margin_of_rows(J, structure.rank, structure.independent),
             lambda: jnp.ones((), J.dtype),
         )
-    return _ProjectionStep(change=change, gap=gap, margin=margin, on_velocity=on_velocity)
+    return _ProjectionStep(
+        change=change, gap=gap, margin=margin, kept=rows.kept, on_velocity=on_velocity
+    )
 
 
 @with_lanes_last
-def _step_lanes_last(chain: Chain, structure: Structure, q, v, is_last, near) -> _ProjectionStep:
+def _step_lanes_last(chain: Chain, structure: Structure, q, v, is_last, choice) -> _ProjectionStep:
     """Return `_step_by_loop_forces`, which may be the last; a `vmap` keeps lanes last."""
-    return _step_by_loop_forces(chain, structure, q, v, is_last, near, may_be_last=True)
+    return _step_by_loop_forces(chain, structure, q, v, is_last, choice, may_be_last=True)
 
 
 def margin_of_rows(

@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from svkc.loops.constrained_dynamics import CompositeBodies
 from svkc.loops.constraint import LoopKinematics, gap_norms, jacobian_scales, loop_kinematics
+from svkc.loops.constraint_rows import RowChoice
 from svkc.loops.pivoting import (
     PivotedQR,
     drop_below,
@@ -83,24 +84,37 @@ class ProjectionInfo(eqx.Module):
     gap: what each loop is still open by after the last Newton step (rad, units of `chain.length`).
     margin: |R_mm| / |R_11| of the pivoted QR of J_C. None: not computed.
     pivots: the pivots to use in the next step. None: no pivots were chosen.
+    kept: the rows to use in the next step, as in `RowChoice`. None: no rows were chosen.
     """
 
     gap: Float[Array, "links 2"]
     margin: Float[Array, ""] | None = None
     pivots: Float[Array, "steps dofs"] | None = None
+    kept: Bool[Array, " delassus"] | None = None
 
     @classmethod
-    def initial(
-        cls, chain: Chain, dtype: DType, *, with_margin: bool, with_pivots: bool
-    ) -> "ProjectionInfo":
-        """Return the value before the first projection."""
+    def of_pivots(cls, chain: Chain, dtype: DType) -> "ProjectionInfo":
+        """Return the value before the first projection that chooses pivots."""
         links, dofs = len(chain.link_names), chain.dofs
-        gap = jnp.zeros((links, 2), dtype)
-        if not with_pivots:
-            return cls(gap, jnp.ones((), dtype) if with_margin else None)
         # zero pivots are fewer than the rank, so that new ones are chosen
         pivots = jnp.zeros((min(6 * links, dofs), dofs), dtype)
-        return cls(gap=gap, margin=jnp.ones((), dtype), pivots=pivots)
+        return cls(jnp.zeros((links, 2), dtype), margin=jnp.ones((), dtype), pivots=pivots)
+
+    @classmethod
+    def of_loop_forces(
+        cls, chain: Chain, dtype: DType, kept: Bool[Array, " delassus"] | None
+    ) -> "ProjectionInfo":
+        """Return the value before the first projection by loop forces.
+
+        kept: the rows to use in the first step (None: no rows are chosen, nor is the margin known).
+        """
+        margin = None if kept is None else jnp.ones((), dtype)
+        return cls(jnp.zeros((len(chain.link_names), 2), dtype), margin=margin, kept=kept)
+
+    def row_choice(self, near: Bool[Array, ""]) -> RowChoice:
+        """Return the rows of the next step. near: as in `RowChoice`."""
+        assert self.kept is not None
+        return RowChoice(near, self.kept)
 
     @property
     def dependent(self) -> Bool[Array, " dofs"]:
@@ -151,7 +165,7 @@ def project(
     start = (
         normalize(chain, q),
         v,
-        ProjectionInfo.initial(chain, q.dtype, with_margin=True, with_pivots=True),
+        ProjectionInfo.of_pivots(chain, q.dtype),
     )
     return jax.lax.fori_loop(0, iterations + 1, newton_step, start)
 

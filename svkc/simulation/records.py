@@ -144,7 +144,7 @@ class Phases(eqx.Module):
     kinetic_energy: largest kinetic energy at the two ends of the phase and at the save times within
         (J); None in files of older versions.
     reduced_steps: steps by articulated bodies with reduced rows of the loops, as near a singular
-        configuration and where loops are redundant (-1: not by articulated bodies); None in files
+        configuration and at the start of phases with redundant loops (-1: not by articulated bodies); None in files
         of older versions.
     """
 

@@ -1,7 +1,8 @@
-"""Row reduction of the loop constraints, which articulated bodies use near singular configurations
-and where loops are redundant."""
+"""Rows of the loop constraints for articulated bodies: reduced near singular configurations, and
+independent ones of redundant loops."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ import pytest
 from tolerances import DIFFERENCE, ROUND_OFF
 
 import svkc
-from svkc.loops.constraint_rows import reduce_rows
+from svkc.loops.constraint_rows import RowChoice, choose_rows, reduce_rows
 from svkc.loops.forward_dynamics import velocity_and_acceleration
 
 BODIES = svkc.dynamics.ArticulatedBodies()
@@ -50,7 +51,13 @@ def test_accelerations_do_not_depend_on_the_reduction(four_bar):
     chain, state = four_bar
     accelerate = jax.jit(
         lambda near: velocity_and_acceleration(
-            chain, state.structure, state.q, state.v, jnp.ones(4), dynamics=BODIES, near=near
+            chain,
+            state.structure,
+            state.q,
+            state.v,
+            jnp.ones(4),
+            dynamics=BODIES,
+            choice=choose_rows(chain, state.structure, state.q, near),
         )
     )
     for reduced, plain in zip(accelerate(True), accelerate(False), strict=True):
@@ -69,7 +76,7 @@ def test_derivatives_of_reduced_rows(four_bar):
     def both(x):
         out = velocity_and_acceleration(
             chain, state.structure, state.q + x * dq, v + x * dv, jnp.ones(4), dynamics=BODIES,
-            near=jnp.asarray(True),
+            choice=RowChoice(jnp.asarray(True), jnp.ones(6, bool)),
         )  # fmt: skip
         return jnp.concatenate(out) @ jnp.tile(weight, 2)
 
@@ -78,3 +85,21 @@ def test_derivatives_of_reduced_rows(four_bar):
     difference = (value(h) - value(-h)) / (2 * h)
     np.testing.assert_allclose(forward, difference, rtol=DIFFERENCE)
     np.testing.assert_allclose(reverse, forward, rtol=ROUND_OFF)
+
+
+def test_redundant_loops_keep_as_many_rows_as_their_rank():
+    """Of two loops, one of which is wholly redundant, as many rows stay as there are constraints.
+
+    Accelerations are those of composite bodies, which eliminate rows by pivots.
+    """
+    chain = models.parallelogram()
+    state = chain.state({"leg0": 0.4}, {"leg0": 2.0})
+    choice = choose_rows(chain, state.structure, state.q, jnp.asarray(False))
+    virtual = chain.dofs - chain.nv
+    assert int(jnp.sum(choice.kept)) == int(state.structure.rank) - virtual == 3
+    of = functools.partial(
+        velocity_and_acceleration, chain, state.structure, state.q, state.v, jnp.ones(chain.dofs)
+    )
+    composites = of(dynamics=svkc.dynamics.CompositeBodies())
+    for few, every in zip(of(dynamics=BODIES, choice=choice), composites, strict=True):
+        np.testing.assert_allclose(few, every, rtol=ROUND_OFF, atol=ROUND_OFF)
