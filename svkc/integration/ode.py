@@ -9,6 +9,10 @@ from jaxtyping import Array, Bool, Float
 
 from svkc.model.chain import Chain, Structure
 
+# a time (s)
+Time: TypeAlias = Float[Array, ""]
+# the guards of a phase: one number for each
+Guards: TypeAlias = Float[Array, " guards"]
 # start, end and save times of a phase (s)
 Times: TypeAlias = tuple[Float[Array, ""], Float[Array, ""], Float[Array, " times"]]
 
