@@ -4,6 +4,7 @@ import argparse
 import math
 import pathlib
 import sys
+from collections.abc import Sequence
 
 from svkc.cli import inspect, run
 
@@ -92,7 +93,7 @@ def _kinds(words: list[str]) -> tuple[str, ...]:
     return tuple(kind for word in words for kind in word.split(",") if kind)
 
 
-def main(argv=None) -> int:
+def main(argv: Sequence[str] | None = None) -> int:
     """Parse the command line, run the command, and return the exit status."""
     argv = list(sys.argv[1:] if argv is None else argv)
     # `run` is the default command

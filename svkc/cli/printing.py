@@ -1,7 +1,9 @@
 """What several commands print: the report of a run, and why a command failed."""
 
+from svkc.simulation.trajectory import Trajectory
 
-def print_report(traj):
+
+def print_report(traj: Trajectory) -> None:
     """Print tables of the phases and of the events of a run, and the run's report."""
     from svkc.model.tables import as_text
     from svkc.simulation.run_tables import event_table, phase_table
@@ -13,7 +15,7 @@ def print_report(traj):
     print(as_text([*tables, energy, str(traj.report())]))
 
 
-def print_error(error: Exception, command: str, ignored: tuple[str, ...]):
+def print_error(error: Exception, command: str, ignored: tuple[str, ...]) -> None:
     """Print why a command failed; if elements of the model are not simulated, with the option that
     leaves them out.
 

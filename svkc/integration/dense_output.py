@@ -1,11 +1,13 @@
 """Dense output: the state within a step, by the solver's own interpolation."""
 
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import diffrax
 import jax
 
 from svkc.integration.ode import ODEState
+from svkc.model.annotations import Scalar
 
 
 class ProjectedInterpolation(diffrax.AbstractLocalInterpolation):
@@ -20,7 +22,7 @@ class ProjectedInterpolation(diffrax.AbstractLocalInterpolation):
     inner: Any
     shift: ODEState
 
-    def evaluate(self, t0, t1=None, left=True):
+    def evaluate(self, t0: Scalar, t1: Scalar | None = None, left: bool = True) -> ODEState:
         def at(t):
             fraction = (t - self.t0) / (self.t1 - self.t0)
             return jax.tree.map(
@@ -32,7 +34,14 @@ class ProjectedInterpolation(diffrax.AbstractLocalInterpolation):
         return jax.tree.map(lambda a, b: b - a, at(t0), at(t1))
 
 
-def make_interpolation(cls, *, t0, t1, inner, shift) -> ProjectedInterpolation:
+def make_interpolation(
+    cls: Callable[..., diffrax.AbstractLocalInterpolation],
+    *,
+    t0: Scalar,
+    t1: Scalar,
+    inner: Mapping[str, Any],
+    shift: ODEState,
+) -> ProjectedInterpolation:
     """Return the dense output of one step.
 
     cls: interpolation class of the solver.

@@ -208,7 +208,7 @@ class EventSearch(eqx.Module):
             retry_time=jnp.full_like(t0, jnp.inf),
         )
 
-    def end_of_attempt(self, tnext) -> Float[Array, ""]:
+    def end_of_attempt(self, tnext: Float[Array, ""]) -> Float[Array, ""]:
         """Return the end of the next attempted step.
 
         A search evaluates guards in the bracket and, once converged, just after its right end.
@@ -229,7 +229,7 @@ def update_search(
     t1: Float[Array, ""],
     y: ODEState,
     keep_step: Bool[Array, ""],
-    retry_time,
+    retry_time: Float[Array, ""],
     armed_guards: ArmedGuards,
 ) -> tuple[Float[Array, " guards"], EventSearch]:
     """Advance the event search after an attempted step from t0 to t1.

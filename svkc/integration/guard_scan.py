@@ -23,7 +23,7 @@ from svkc.integration.event_location import (
     event_tolerance,
     update_search,
 )
-from svkc.integration.ode import ODEState
+from svkc.integration.ode import Guards, ODEState, Time
 from svkc.integration.solution import (
     NON_FINITE,
     PhaseProblem,
@@ -78,7 +78,7 @@ class GuardScan(eqx.Module):
     done: Bool[Array, ""]
 
     @staticmethod
-    def from_end(before, at_end, intervals: int) -> "GuardScan":
+    def from_end(before: Guards, at_end: Guards, intervals: int) -> "GuardScan":
         """Return the scan before its first interval.
 
         before, at_end: guards at the two ends of the step.
@@ -105,7 +105,7 @@ class GuardScan(eqx.Module):
         """Return the point of the next evaluation: the interval's right end, then its midpoint."""
         return jnp.where(self.has_right, (self.left + self.right) / 2, self.right)
 
-    def update(self, values, armed, intervals: int) -> "GuardScan":
+    def update(self, values: Guards, armed: Bool[Array, " guards"], intervals: int) -> "GuardScan":
         """Return the scan after an evaluation at `next_point`.
 
         values: guards at this point.
@@ -261,7 +261,7 @@ def _state_within(interpolation: ProjectedInterpolation, t, chain) -> ODEState:
 
 
 def locate_event(
-    s: StepperState, attempt: StepAttempt, t1, problem: PhaseProblem, options: StepperOptions
+    s: StepperState, attempt: StepAttempt, t1: Time, problem: PhaseProblem, options: StepperOptions
 ) -> tuple[StepAttempt, Array, EventSearch, Array]:
     """Evaluate the guards after an attempt to t1 and advance the event search.
 

@@ -10,6 +10,10 @@ from jaxtyping import Array, Bool, Float
 from svkc.loops.constraint_rows import RowChoice
 from svkc.model.chain import Chain, Structure
 
+# a time (s)
+Time: TypeAlias = Float[Array, ""]
+# the guards of a phase: one number for each
+Guards: TypeAlias = Float[Array, " guards"]
 # start, end and save times of a phase (s)
 Times: TypeAlias = tuple[Float[Array, ""], Float[Array, ""], Float[Array, " times"]]
 

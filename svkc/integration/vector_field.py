@@ -151,7 +151,9 @@ def phase_field_args(
     return FieldArgs(chain, structure, args, row_choice=choice)
 
 
-def initial_projection_info(field: VectorField, field_args: FieldArgs, q) -> ProjectionInfo | None:
+def initial_projection_info(
+    field: VectorField, field_args: FieldArgs, q: Float[Array, " q"]
+) -> ProjectionInfo | None:
     """Return the projection's result before the first step. None: steps are not projected."""
     chain, choice = field_args.chain, field_args.row_choice
     if not needs_projection(field.stabilization, chain):

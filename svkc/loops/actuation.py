@@ -133,7 +133,7 @@ def actuation(
     return eqx.tree_at(lambda r: (r.tau, r.residual), result, (tau, residual))
 
 
-def weight_per_dof(chain: Chain, weight) -> Float[Array, " dofs"]:
+def weight_per_dof(chain: Chain, weight: Scalar | Numbers | None) -> Float[Array, " dofs"]:
     """Return the weight over every coordinate; raise ValueError if it is not positive."""
     weight = _per_dof(chain, "weight", weight, 1.0)
     if is_concrete(weight) and not np.all(

@@ -1,5 +1,7 @@
 """Elements of a MuJoCo model that svkc does not simulate, reported all at once."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from svkc.model.annotations import MuJoCo
@@ -135,10 +137,10 @@ class UnsupportedElements(ValueError):
 
     def __init__(self, message: str, kinds: list[str]):
         super().__init__(message)
-        self.kinds = tuple(kinds)
+        self.kinds: tuple[str, ...] = tuple(kinds)
 
 
-def left_out_elements(model, ignore) -> tuple[str, ...]:
+def left_out_elements(model: MuJoCo, ignore: Sequence[str]) -> tuple[str, ...]:
     """Return one line for each kind of element of the model that svkc cannot simulate.
 
     Raises ValueError, which lists every kind that is neither simulated nor ignored.

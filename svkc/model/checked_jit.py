@@ -17,7 +17,7 @@ from svkc.model.inertial_parameters import check_inertial_parameters
 from svkc.model.validation import real_array
 
 
-def check_chain(chain) -> None:
+def check_chain(chain: Any) -> None:
     """Raise ValueError if `chain` is not a `Chain`, or has an invalid mass, inertia or armature."""
     if not isinstance(chain, Chain):
         raise ValueError(

@@ -1,11 +1,16 @@
 """The link pointers of the paper (section III): parent, child, brother and real link by index."""
 
 import numpy as np
+from jaxtyping import Array, Int
 
 from svkc.model.topology import Topology
 
 
-def link_pointers(topology: Topology, link_parent, link_real) -> np.ndarray:
+def link_pointers(
+    topology: Topology,
+    link_parent: Int[Array | np.ndarray, " links"],
+    link_real: Int[Array | np.ndarray, " links"],
+) -> np.ndarray:
     """Return the table [4, bodies + links] of parent, child, brother and real link.
 
     Columns of bodies come first, then columns of virtual links; entries are column indices, and -1

@@ -93,12 +93,12 @@ def integer(name: str, value: Any, minimum: int, maximum: int = 2**31 - 1) -> in
     return int(number)
 
 
-def is_real(array) -> bool:
+def is_real(array: np.ndarray | jax.Array) -> bool:
     """Return whether an array holds real numbers: neither Booleans, complex numbers nor objects."""
     return any(jnp.issubdtype(array.dtype, kind) for kind in (np.integer, np.floating))
 
 
-def description(value) -> str:
+def description(value: Any) -> str:
     """Return what a function of the user returned, in words for a message."""
     array = as_array(value)
     if array.dtype == object:
@@ -106,7 +106,7 @@ def description(value) -> str:
     return f"{array.dtype} of shape {array.shape}"
 
 
-def check_function(name: str, value, *arguments: str) -> None:
+def check_function(name: str, value: Any, *arguments: str) -> None:
     """Raise ValueError if a value is no function of these positional arguments."""
     got = repr(value)
     if callable(value):

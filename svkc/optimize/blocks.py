@@ -6,7 +6,7 @@ problem is the cost.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +20,9 @@ from svkc.optimize.lift import Layout, Lift, StagePolynomials, dependencies
 
 # fewest lanes for which a block's execution time outweighs its compile time
 MANY_LANES = 8
+# local unknowns, and multipliers of local rows
+Unknowns: TypeAlias = Float[Array, "lanes n"]
+Multipliers: TypeAlias = Float[Array, "lanes m"]
 
 
 class Block:
@@ -39,15 +42,15 @@ class Block:
         """Set the data of the lanes."""
         self.data = lanes
 
-    def values(self, params: Any, data: Any, z) -> jax.Array:
+    def values(self, params: Any, data: Any, z: Unknowns) -> jax.Array:
         """Return the local rows [lanes m] at local unknowns [lanes n]."""
         raise NotImplementedError
 
-    def jacobian(self, params: Any, data: Any, z) -> jax.Array:
+    def jacobian(self, params: Any, data: Any, z: Unknowns) -> jax.Array:
         """Return the derivatives [lanes entries] of the rows, at `jacobian_places`."""
         raise NotImplementedError
 
-    def hessian(self, params: Any, data: Any, z, multipliers) -> jax.Array:
+    def hessian(self, params: Any, data: Any, z: Unknowns, multipliers: Multipliers) -> jax.Array:
         """Return the Hessians [lanes entries] of the rows' sum with multipliers [lanes m], at
         `hessian_places`."""
         raise NotImplementedError
@@ -77,20 +80,29 @@ def _every_place(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
 class PlainBlock(Block):
     """A block of any function (params, data of the lane, unknowns) -> rows."""
 
-    def __init__(self, function: Callable, data: Any, unknowns: np.ndarray, rows: np.ndarray):
-        self.function, self.data, self.unknowns, self.rows = function, data, unknowns, rows
+    def __init__(
+        self,
+        function: Callable[..., jax.Array],
+        data: Any,
+        unknowns: np.ndarray,
+        rows: np.ndarray,
+    ):
+        self.function = function
+        self.data: Any = data
+        self.unknowns: np.ndarray = unknowns
+        self.rows: np.ndarray = rows
 
     def _over_lanes(self, function: Callable, params: Any, data: Any, *arrays) -> jax.Array:
         call = lambda data, *x: function(lambda z: self.function(params, data, z), *x)
         return jax.vmap(call)(data, *arrays)
 
-    def values(self, params: Any, data: Any, z) -> jax.Array:
+    def values(self, params: Any, data: Any, z: Unknowns) -> jax.Array:
         return self._over_lanes(lambda f, z: f(z), params, data, z)
 
-    def jacobian(self, params: Any, data: Any, z) -> jax.Array:
+    def jacobian(self, params: Any, data: Any, z: Unknowns) -> jax.Array:
         return self._over_lanes(lambda f, z: jax.jacrev(f)(z).ravel(), params, data, z)
 
-    def hessian(self, params: Any, data: Any, z, multipliers) -> jax.Array:
+    def hessian(self, params: Any, data: Any, z: Unknowns, multipliers: Multipliers) -> jax.Array:
         product = lambda f, z, m: lower_half(jax.jacfwd(jax.grad(lambda z: f(z) @ m))(z))
         return self._over_lanes(product, params, data, z, multipliers)
 
@@ -109,7 +121,7 @@ class StageBlock(Block):
 
     def __init__(
         self,
-        function: Callable,
+        function: Callable[..., jax.Array],
         layout: Layout,
         poly: StagePolynomials,
         *,
@@ -120,10 +132,14 @@ class StageBlock(Block):
         rows: np.ndarray,
         tangents: np.ndarray,
     ):
-        self.function, self.layout, self.poly = function, layout, poly
-        self.data = (data, np.asarray(index, float), np.asarray(count, float))
-        self.unknowns, self.rows, self.tangents = unknowns, rows, tangents
-        self.variables = np.arange(layout.of_stage)
+        self.function = function
+        self.layout = layout
+        self.poly = poly
+        self.data: Any = (data, np.asarray(index, float), np.asarray(count, float))
+        self.unknowns: np.ndarray = unknowns
+        self.rows: np.ndarray = rows
+        self.tangents = tangents
+        self.variables: np.ndarray = np.arange(layout.of_stage)
         self.options: dict[str, Any] = {}
 
     def set_lanes(self, lanes: Any) -> None:
@@ -158,18 +174,18 @@ class StageBlock(Block):
             at_lane = with_lanes_last(at_lane)
         return jax.vmap(at_lane, (None, 0, 0, *(0 for _ in arrays)))(params, data, z, *arrays)
 
-    def values(self, params: Any, data: Any, z) -> jax.Array:
+    def values(self, params: Any, data: Any, z: Unknowns) -> jax.Array:
         rows = self._over_stages(lambda f, lift: f(lift.variables()), params, data, z)
         return rows.reshape(len(z), -1)
 
-    def jacobian(self, params: Any, data: Any, z) -> jax.Array:
+    def jacobian(self, params: Any, data: Any, z: Unknowns) -> jax.Array:
         def of_stage(f, lift):
             return lift.pull_back(jax.jacrev(f)(lift.variables()))
 
         matrix = self._over_stages(of_stage, params, data, z)
         return matrix.reshape(len(z), -1)
 
-    def hessian(self, params: Any, data: Any, z, multipliers) -> jax.Array:
+    def hessian(self, params: Any, data: Any, z: Unknowns, multipliers: Multipliers) -> jax.Array:
         def of_stage(f, lift, m):
             y = lift.variables()
             gradient = jax.grad(lambda y: f(y) @ m)
@@ -205,7 +221,7 @@ class StageBlock(Block):
         return jnp.where((place < len(self.tangents))[:, None], some, some.T)
 
 
-def find_tangents(block: StageBlock, params: Any, draws) -> np.ndarray:
+def find_tangents(block: StageBlock, params: Any, draws: np.ndarray) -> np.ndarray:
     """Return the stage's variables in which a block's function is not linear.
 
     draws: values [draws lanes n] of local unknowns. The Hessian is evaluated there, with random

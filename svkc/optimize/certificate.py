@@ -7,6 +7,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
+from jaxtyping import Array, Float
 
 from svkc.model.chain import Chain, State, Structure
 from svkc.model.tables import Table, as_text
@@ -108,7 +109,9 @@ def _lanes(problem: Any, structures: Sequence[Structure], motion: tuple[PhaseMot
     return join(parts), join(wholes)
 
 
-def at_own_place(chain: Chain, structure: Structure, q, v) -> State:
+def at_own_place(
+    chain: Chain, structure: Structure, q: Float[Array, " nq"], v: Float[Array, " nv"]
+) -> State:
     """Return a state whose links are where its bodies are, so that drift of the loops is none."""
     full = tree_configuration(chain, q)
     if not chain.link_names:

@@ -63,7 +63,11 @@ def _ordered(scalars, others, at_scalars: np.ndarray, at_others: np.ndarray) -> 
 
 
 def motion_from_chart(
-    chain: Chain, reference: Float[Array, " nq"], x, rate, second
+    chain: Chain,
+    reference: Float[Array, " nq"],
+    x: Float[Array, " nv"],
+    rate: Float[Array, " nv"],
+    second: Float[Array, " nv"],
 ) -> tuple[Float[Array, " nq"], Float[Array, " nv"], Float[Array, " nv"]]:
     """Return q, v and vdot of the tree from coordinates in a chart and their two derivatives.
 
@@ -86,7 +90,10 @@ def motion_from_chart(
 
 
 def chart_from_motion(
-    chain: Chain, reference: Float[Array, " nq"], q, v
+    chain: Chain,
+    reference: Float[Array, " nq"],
+    q: Float[Array, " nq"],
+    v: Float[Array, " nv"],
 ) -> tuple[Float[Array, " nv"], Float[Array, " nv"]]:
     """Return the coordinates in a chart, and their rates, from q and v of the tree."""
     at_q, at_v = quaternion_starts(chain)
@@ -110,7 +117,11 @@ def chart_from_motion(
 
 
 def to_next_chart(
-    chain: Chain, reference: Float[Array, " nq"], following: Float[Array, " nq"], x, rate
+    chain: Chain,
+    reference: Float[Array, " nq"],
+    following: Float[Array, " nq"],
+    x: Float[Array, " nv"],
+    rate: Float[Array, " nv"],
 ) -> tuple[Float[Array, " nv"], Float[Array, " nv"]]:
     """Return coordinates and rates of one chart in the chart about another reference."""
     if not len(quaternion_starts(chain)[0]):

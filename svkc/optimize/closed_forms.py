@@ -8,19 +8,21 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float
 
 from svkc._jax.static_gather import static_take
 from svkc.model.chain import Chain
 from svkc.optimize.charts import quaternion_starts
+from svkc.optimize.controls import AbstractControls
 from svkc.optimize.equations import IntervalData, Model, Params
-from svkc.optimize.link_derivatives import rows_of_links
+from svkc.optimize.link_derivatives import RowsOfLink, rows_of_links
 from svkc.optimize.points import tree_configuration, tree_velocity
 from svkc.optimize.tree_derivatives import TreeMotion
 from svkc.tree.inverse_dynamics import limit_forces, passive_forces
-from svkc.tree.kinematics import kinematics
+from svkc.tree.kinematics import Kinematics, kinematics
 
 
-def has_closed_forms(chain: Chain, controls) -> bool:
+def has_closed_forms(chain: Chain, controls: AbstractControls) -> bool:
     """Return whether the derivatives of this module hold.
 
     The tree has no quaternions, and joint torques are linear in the controls.
@@ -28,7 +30,9 @@ def has_closed_forms(chain: Chain, controls) -> bool:
     return not len(quaternion_starts(chain)[0]) and not controls.needs_state
 
 
-def _joint_derivatives(chain: Chain, q, v):
+def _joint_derivatives(
+    chain: Chain, q: Float[Array, " nv"], v: Float[Array, " nv"]
+) -> tuple[tuple[Array, Array], tuple[Array, Array, Array]] | None:
     """Return derivatives of springs, dampers and limits, each joint's by its own coordinate.
 
     First by q and v; then by q and q, q and v, v and v. None if the chain has no such forces.
@@ -57,11 +61,26 @@ def _diagonal(x) -> jax.Array:
 class LinkDerivatives:
     """Links' rows along a motion of the tree, with multipliers f of those that are active."""
 
-    def __init__(self, model: Model, chain: Chain, active, *, q, v, vdot, f):
-        self.model, self.chain, self.kin = model, chain, kinematics(chain, q)
-        self.active, self.f = active, jnp.where(active, f, 0)
+    def __init__(
+        self,
+        model: Model,
+        chain: Chain,
+        active: Bool[Array | np.ndarray, " rows"],
+        *,
+        q: Float[Array, " nv"],
+        v: Float[Array, " nv"],
+        vdot: Float[Array, " nv"],
+        f: Float[Array, " rows"],
+    ):
+        self.model = model
+        self.chain = chain
+        self.active = active
+        self.kin: Kinematics = kinematics(chain, q)
+        self.f: Float[Array, " rows"] = jnp.where(active, f, 0)
         has_rows = len(model.rows) > 0
-        self.links = rows_of_links(chain, self.kin, model.rows, v, vdot) if has_rows else []
+        self.links: list[tuple[np.ndarray, RowsOfLink]] = (
+            rows_of_links(chain, self.kin, model.rows, v, vdot) if has_rows else []
+        )
 
     def _over_rows(self, parts: list):
         """Return arrays of the links' rows, each a list over links, in the order of the table."""
@@ -87,12 +106,16 @@ class StageDerivatives(LinkDerivatives):
     y: the stage's variables.
     """
 
-    def __init__(self, model: Model, params: Params, data: IntervalData, y):
+    def __init__(self, model: Model, params: Params, data: IntervalData, y: Float[Array, " y"]):
         self.params = params
-        (self.t, _), (q, v, vdot), self.blocks, f = model.layout.split_stage(y)
+        (t, _), (q, v, vdot), blocks, f = model.layout.split_stage(y)
+        self.t: Float[Array, ""] = t
+        self.blocks: Float[Array, "blocks control"] = blocks
         super().__init__(model, params.chain, data.active, q=q, v=v, vdot=vdot, f=f)
-        self.tree = TreeMotion(self.chain, self.kin, v, vdot)
-        self.joints = _joint_derivatives(self.chain, q, v)
+        self.tree: TreeMotion = TreeMotion(self.chain, self.kin, v, vdot)
+        self.joints: tuple[tuple[Array, Array], tuple[Array, Array, Array]] | None = (
+            _joint_derivatives(self.chain, q, v)
+        )
 
     def _torques_by_blocks(self):
         """Return the derivatives [nv blocks control] of the joint torques, which are linear."""
@@ -114,8 +137,8 @@ class StageDerivatives(LinkDerivatives):
             J = J - jnp.where(at == 0, self._stiffness(self.f)[:, None], 0)
         return J
 
-    def jacobian(self):
-        """Return the derivatives [rows y]."""
+    def jacobian(self) -> Float[Array, "equations y"]:
+        """Return the derivatives."""
         nv, J = self.chain.nv, self._forces_by_motion()
         controls = -self._torques_by_blocks().reshape(nv, -1)
         upper = [jnp.zeros((nv, 2)), J.reshape(nv, -1), controls]
@@ -129,7 +152,14 @@ class StageDerivatives(LinkDerivatives):
         lower = [jnp.zeros((count, 2)), of_rows.reshape(count, -1), zeros]
         return jnp.concatenate([jnp.concatenate(upper, 1), jnp.concatenate(lower, 1)])
 
-    def hessian(self, multipliers):
+    def hessian(
+        self, multipliers: Float[Array, " equations"]
+    ) -> tuple[
+        Float[Array, "3 nv"],
+        Float[Array, "blocks control"],
+        Float[Array, "4 nv nv"],
+        Float[Array, "rows nv"],
+    ]:
         """Return derivatives of the rows' sum with multipliers.
 
         Gradients by the motion [3 nv] and by the control blocks; second derivatives by q and q, q
@@ -162,14 +192,16 @@ class StageDerivatives(LinkDerivatives):
 class ConnectionDerivatives(LinkDerivatives):
     """Derivatives of `connection`. y: as there."""
 
-    def __init__(self, model: Model, params: Params, data: IntervalData, y):
+    def __init__(self, model: Model, params: Params, data: IntervalData, y: Float[Array, " y"]):
         chain, nv = params.chain, model.layout.nv
         q, after, before, f = jnp.split(y, [nv, 2 * nv, 3 * nv])
         super().__init__(model, chain, data.active, q=q, v=after, vdot=jnp.zeros_like(q), f=f)
-        self.tree = TreeMotion(chain, self.kin, jnp.zeros_like(q), after - before, gravity=False)
+        self.tree: TreeMotion = TreeMotion(
+            chain, self.kin, jnp.zeros_like(q), after - before, gravity=False
+        )
 
-    def jacobian(self):
-        """Return the derivatives [rows y]."""
+    def jacobian(self) -> Float[Array, "equations y"]:
+        """Return the derivatives."""
         by_motion = self.tree.jacobian()
         mass = by_motion[:, 2]
         if self.chain.armature is not None:
@@ -186,8 +218,8 @@ class ConnectionDerivatives(LinkDerivatives):
         ]
         return jnp.concatenate([jnp.concatenate(x, 1) for x in parts])
 
-    def hessian(self, multipliers):
-        """Return the second derivatives [y y] of the rows' sum with multipliers."""
+    def hessian(self, multipliers: Float[Array, " equations"]) -> Float[Array, "y y"]:
+        """Return the second derivatives of the rows' sum with multipliers."""
         count = len(self.f)
         gaps, rates, momentum = jnp.split(multipliers, [count, 2 * count])
         none = jnp.zeros_like(gaps)

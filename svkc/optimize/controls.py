@@ -3,7 +3,7 @@
 import abc
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from jaxtyping import Array, Float
@@ -16,6 +16,8 @@ from svkc.model.validation import boolean, names, real_array
 from svkc.optimize.schemes import Radau
 
 Limits = Checked[Scalar | Numbers | Mapping[str, Any] | None]
+Time: TypeAlias = Float[Array, ""]
+Blocks: TypeAlias = Float[Array, "k n"]
 
 
 class AbstractControls(abc.ABC):
@@ -57,9 +59,12 @@ class AbstractControls(abc.ABC):
 
     @abc.abstractmethod
     def torques(
-        self, chain: Chain, t, state: State, blocks: Float[Array, "k n"], args: Any
+        self, chain: Chain, t: Time, state: State | None, blocks: Blocks, args: Any
     ) -> Float[Array, " dofs"]:
-        """Return the joint torques (N m, N) of a stage over every coordinate."""
+        """Return the joint torques (N m, N) of a stage over every coordinate.
+
+        state: None at stages of the transcription, unless `needs_state`.
+        """
 
     @abc.abstractmethod
     def limits(self, chain: Chain) -> list[np.ndarray]:
@@ -127,7 +132,9 @@ class _JointTorques(AbstractControls):
     def names(self, chain: Chain) -> list[str]:
         return self._coordinates(chain)[1]
 
-    def torques(self, chain: Chain, t, state: State, blocks, args: Any) -> Float[Array, " dofs"]:
+    def torques(
+        self, chain: Chain, t: Time, state: State | None, blocks: Blocks, args: Any
+    ) -> Float[Array, " dofs"]:
         at = self._coordinates(chain)[0]
         place = np.full(chain.dofs, len(at))
         place[at] = np.arange(len(at))
@@ -224,7 +231,9 @@ class Parametrized(AbstractControls):
     def names(self, chain: Chain) -> list[str]:
         return [f"u[{i}]" for i in range(int(self.size))]
 
-    def torques(self, chain: Chain, t, state: State, blocks, args: Any) -> Float[Array, " dofs"]:
+    def torques(
+        self, chain: Chain, t: Time, state: State | None, blocks: Blocks, args: Any
+    ) -> Float[Array, " dofs"]:
         return torques_over_dofs(chain, self.function(t, state, blocks[0], args))
 
     def limits(self, chain: Chain) -> list[np.ndarray]:

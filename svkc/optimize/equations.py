@@ -3,7 +3,7 @@
 No mass matrix is inverted: accelerations and forces are unknowns.
 """
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from svkc._jax.static_gather import static_take
 from svkc.model.chain import Chain
 from svkc.optimize.charts import chart_from_motion, motion_from_chart, to_next_chart
+from svkc.optimize.controls import AbstractControls
 from svkc.optimize.lift import Layout
 from svkc.optimize.loop_rows import LinkRows, gaps_at, link_wrenches, rates_at, row_accelerations
 from svkc.optimize.points import Point, full_state, tree_configuration, tree_velocity
@@ -25,6 +26,9 @@ from svkc.tree.inverse_dynamics import (
 )
 from svkc.tree.kinematics import Kinematics, kinematics, twists, velocity_products
 from svkc.tree.traversal import accumulate_from_root, accumulate_to_root, sum_dofs_per_row
+
+# of a stage in the quadrature over the motion
+Weight: TypeAlias = Float[Array, ""] | float
 
 
 class Params(NamedTuple):
@@ -43,7 +47,7 @@ class Model(NamedTuple):
 
     layout: Layout
     rows: LinkRows
-    controls: Any
+    controls: AbstractControls
 
 
 class IntervalData(eqx.Module):
@@ -69,7 +73,7 @@ def generalized_force(
 
 
 def links_force(
-    chain: Chain, q: Float[Array, " nq"], table: LinkRows, multipliers
+    chain: Chain, q: Float[Array, " nq"], table: LinkRows, multipliers: Float[Array, " rows"]
 ) -> Float[Array, " nv"]:
     """Return J^T f, the generalized force of the links' multipliers."""
     kin = kinematics(chain, q)
@@ -108,7 +112,9 @@ def equations_of_motion(
     return force, row_accelerations(chain, kin, table, V, A)
 
 
-def stage_equations(model: Model, params: Params, data: IntervalData, weight, y):
+def stage_equations(
+    model: Model, params: Params, data: IntervalData, weight: Weight, y: Float[Array, " y"]
+) -> Float[Array, " equations"]:
     """Return the rows of a stage: the equations of motion, and the links' accelerations."""
     (t, _), motion, blocks, f = model.layout.split_stage(y)
     chain, args = params
@@ -121,7 +127,9 @@ def stage_equations(model: Model, params: Params, data: IntervalData, weight, y)
     return jnp.concatenate([force, links])
 
 
-def end_of_interval(model: Model, params: Params, data: IntervalData, weight, y):
+def end_of_interval(
+    model: Model, params: Params, data: IntervalData, weight: Weight, y: Float[Array, " y"]
+) -> Float[Array, " node"]:
     """Return the node at the end of an interval, in the next node's chart: q, v, states."""
     _, (x, rate, _), blocks, _ = model.layout.split_stage(y)
     chain = params.chain
@@ -130,7 +138,9 @@ def end_of_interval(model: Model, params: Params, data: IntervalData, weight, y)
     return jnp.concatenate([x, rate, states])
 
 
-def connection(model: Model, params: Params, data: IntervalData, y):
+def connection(
+    model: Model, params: Params, data: IntervalData, y: Float[Array, " y"]
+) -> Float[Array, " equations"]:
     """Return the rows of a node at which links connect: gaps, rates, and the impact's momentum.
 
     y: q, v after, v before, in the node's chart, and the impulses of the rows.
@@ -147,7 +157,9 @@ def connection(model: Model, params: Params, data: IntervalData, y):
     )
 
 
-def projection(model: Model, params: Params, data: IntervalData, y):
+def projection(
+    model: Model, params: Params, data: IntervalData, y: Float[Array, " y"]
+) -> Float[Array, " equations"]:
     """Return the rows that project a node onto its loops: changes of q and v, gaps, rates.
 
     y: q, v in the node's chart, and the multipliers of the change of q and of v. The changes are
@@ -162,7 +174,12 @@ def projection(model: Model, params: Params, data: IntervalData, y):
 
 
 def point_of_stage(
-    model: Model, params: Params, data: IntervalData, y, active: np.ndarray, **options: Any
+    model: Model,
+    params: Params,
+    data: IntervalData,
+    y: Float[Array, " y"],
+    active: np.ndarray,
+    **options: Any,
 ) -> Point:
     """Return a stage as users' functions see it. active: mask of the phase's rows, static."""
     times, motion, blocks, f = model.layout.split_stage(y)
@@ -180,6 +197,11 @@ def point_of_stage(
     )
 
 
-def node_in_chart(chain: Chain, reference, q, v):
+def node_in_chart(
+    chain: Chain,
+    reference: Float[Array, "nodes nq"],
+    q: Float[Array, "nodes nq"],
+    v: Float[Array, "nodes nv"],
+) -> tuple[Float[Array, "nodes nv"], Float[Array, "nodes nv"]]:
     """Return coordinates and rates of nodes [nodes ...] in their charts."""
     return jax.vmap(lambda r, q, v: chart_from_motion(chain, r, q, v))(reference, q, v)

@@ -76,8 +76,11 @@ class PoseLine:
             )
         if poses[0] is None or poses[-1] is None:
             raise ValueError("guess: the first and the last pose must be known")
-        self.chain, self.phases = chain, phases
-        self.poses = [None if p is None else self._closed(i, p) for i, p in enumerate(poses)]
+        self.chain = chain
+        self.phases = phases
+        self.poses: list[np.ndarray | None] = [
+            None if p is None else self._closed(i, p) for i, p in enumerate(poses)
+        ]
 
     def _closed(self, i: int, pose: Any) -> np.ndarray:
         """Return a pose [nq], moved by the least change that closes the loops there."""
@@ -91,7 +94,7 @@ class PoseLine:
         rows = possible_rows(chain, np.isin(chain.link_names, names))
         return close_loops(chain, q, rows) if len(rows) else q
 
-    def at(self, durations: Sequence[float]) -> list[tuple]:
+    def at(self, durations: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return (q [n + 1 nq], v [n + 1 nv]) of each phase."""
         ends = np.concatenate([[0], np.cumsum(durations)])
         known = [i for i, pose in enumerate(self.poses) if pose is not None]
@@ -104,7 +107,9 @@ class PoseLine:
             out.append(self._line(self.poses[first], self.poses[last], times, span))
         return out
 
-    def _line(self, start, end, fractions: np.ndarray, span: float) -> tuple:
+    def _line(
+        self, start, end, fractions: np.ndarray, span: float
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return q and v at fractions of the line between two poses, which takes `span` seconds."""
         chain = self.chain
         start, end = (tree_configuration(chain, jnp.asarray(x)) for x in (start, end))

@@ -64,7 +64,7 @@ class AbstractSolver(abc.ABC):
 
     @abc.abstractmethod
     def solve(
-        self, program: Program, start: SolverResult, warm: bool, progress: Callable
+        self, program: Program, start: SolverResult, warm: bool, progress: Callable[[float], None]
     ) -> SolverResult:
         """Return the solution from a start.
 
@@ -79,16 +79,17 @@ class Callbacks:
     An exception in a function, Ctrl-C too, ends the run at the next iteration and is kept.
     """
 
-    def __init__(self, program: Program, progress: Callable, iterations: int):
-        self.program, self.progress, self.limit = program, progress, iterations
+    def __init__(self, program: Program, progress: Callable[[float], None], iterations: int):
+        self.program = program
+        self.progress = progress
+        self.limit: int = iterations
         entries = program.jacobian_entries
-        self.of_rows, self.of_cost = (
-            np.isin(entries.row, program.kept),
-            entries.row == program.cost_row,
-        )
-        self.columns = entries.column[self.of_cost]
+        self.of_rows: np.ndarray = np.isin(entries.row, program.kept)
+        self.of_cost: np.ndarray = entries.row == program.cost_row
+        self.columns: np.ndarray = entries.column[self.of_cost]
         self.exception: BaseException | None = None
-        self.iterations, self.functions = 0, 0.0
+        self.iterations: int = 0
+        self.functions: float = 0.0
         self._kept: dict[str, tuple[np.ndarray, np.ndarray]] = {}
 
     def _at(self, name: str, x: np.ndarray, *others: Any) -> np.ndarray:
@@ -111,37 +112,37 @@ class Callbacks:
         row_low, row_high = (x[self.program.kept] for x in of_rows)
         return low, high, row_low, row_high
 
-    def objective(self, x) -> float:
+    def objective(self, x: np.ndarray) -> float:
         return float(self._at("rows", x)[-1])
 
-    def constraints(self, x) -> np.ndarray:
+    def constraints(self, x: np.ndarray) -> np.ndarray:
         return self._at("rows", x)[self.program.kept]
 
-    def gradient(self, x) -> np.ndarray:
+    def gradient(self, x: np.ndarray) -> np.ndarray:
         values = self._at("jacobian", x)[self.of_cost]
         return np.bincount(self.columns, values, self.program.count)
 
-    def jacobianstructure(self):
+    def jacobianstructure(self) -> tuple[np.ndarray, np.ndarray]:
         entries = self.program.jacobian_entries
         rows = np.searchsorted(self.program.kept, entries.row[self.of_rows])
         return rows, entries.column[self.of_rows]
 
-    def jacobian(self, x) -> np.ndarray:
+    def jacobian(self, x: np.ndarray) -> np.ndarray:
         return self._at("jacobian", x)[self.of_rows]
 
-    def hessianstructure(self):
+    def hessianstructure(self) -> tuple[np.ndarray, np.ndarray]:
         return self.program.hessian_entries.row, self.program.hessian_entries.column
 
-    def hessian(self, x, multipliers, factor) -> np.ndarray:
+    def hessian(self, x: np.ndarray, multipliers: np.ndarray, factor: float) -> np.ndarray:
         return self._at("hessian", x, np.append(self.all_rows(multipliers), factor))
 
-    def all_rows(self, values) -> np.ndarray:
+    def all_rows(self, values: np.ndarray) -> np.ndarray:
         """Return values of the solver's rows as values of all rows, zero for the others."""
         out = np.zeros(self.program.cost_row)
         out[self.program.kept] = values
         return out
 
-    def intermediate(self, _mode, iteration, *_rest) -> bool:
+    def intermediate(self, _mode: int, iteration: int, *_rest: float | int) -> bool:
         self.iterations = int(iteration)
         try:
             self.progress(min(self.iterations / self.limit, 1.0))
@@ -216,7 +217,7 @@ class Ipopt(AbstractSolver):
         return options | dict(self.options)
 
     def solve(
-        self, program: Program, start: SolverResult, warm: bool, progress: Callable
+        self, program: Program, start: SolverResult, warm: bool, progress: Callable[[float], None]
     ) -> SolverResult:
         backend = self.backend
         if backend is None:

@@ -6,6 +6,7 @@ therefore carried to the unknowns by a few multiplications with scalars (Kroneck
 """
 
 import dataclasses
+from typing import TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,7 +14,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from svkc._jax.static_gather import static_take
+from svkc.optimize.controls import AbstractControls
 from svkc.optimize.schemes import Radau
+
+# of unknowns or of variables, with leading axes: values, places or masks
+_Entries = TypeVar("_Entries", np.ndarray, Array)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +51,7 @@ class Layout:
         """Number of variables of a stage."""
         return 2 + 3 * self.nv + self.stage_blocks * self.control + self.rows
 
-    def split_interval(self, z):
+    def split_interval(self, z: _Entries) -> tuple[_Entries, _Entries, _Entries, _Entries]:
         """Return the unknowns as times [2], motion, control blocks and multipliers."""
         ends = np.cumsum([2, (2 + self.stages) * self.nv, self.blocks * self.control])
         times, x, w, f = (z[..., a:b] for a, b in zip((0, *ends), (*ends, self.of_interval)))
@@ -58,7 +63,7 @@ class Layout:
             f.reshape(*shape, self.stages, self.rows),
         )
 
-    def split_stage(self, y):
+    def split_stage(self, y: _Entries) -> tuple[_Entries, _Entries, _Entries, _Entries]:
         """Return the variables of a stage as times [2], motion [3 nv], control blocks and f."""
         ends = np.cumsum([2, 3 * self.nv, self.stage_blocks * self.control])
         times, x, w, f = (y[..., a:b] for a, b in zip((0, *ends), (*ends, self.of_stage)))
@@ -88,7 +93,7 @@ class StagePolynomials(eqx.Module):
     D1: Float[Array | np.ndarray, "... d e"]
 
 
-def polynomials(scheme: Radau, controls, stages: list[int]) -> StagePolynomials:
+def polynomials(scheme: Radau, controls: AbstractControls, stages: list[int]) -> StagePolynomials:
     """Return the coefficients of stages; -1 is the start of the interval, which has no forces."""
     s = scheme.stages
     c = np.array([0.0 if i < 0 else scheme.c[i] for i in stages])
@@ -119,15 +124,31 @@ class Lift:
     index, count: start of the interval and the phase's duration, by the interval's length.
     """
 
-    def __init__(self, layout: Layout, poly: StagePolynomials, z, index, count):
-        self.layout, self.poly, self.count = layout, poly, count
-        self.fraction = (index + poly.c) / count
-        (self.t0, self.T), self.x, self.w, self.f = layout.split_interval(z)
-        h = self.T / count
-        self.C, self.D = poly.C0 + h * poly.C1 + h**2 * poly.C2, poly.D0 + h * poly.D1
+    def __init__(
+        self,
+        layout: Layout,
+        poly: StagePolynomials,
+        z: Float[Array, " z"],
+        index: Float[Array, ""],
+        count: Float[Array, ""],
+    ):
+        self.layout = layout
+        self.poly = poly
+        self.count = count
+        self.fraction: Float[Array, ""] = (index + poly.c) / count
+        (t0, T), x, w, f = layout.split_interval(z)
+        self.t0: Float[Array, ""] = t0
+        self.T: Float[Array, ""] = T
+        self.x: Float[Array, "m nv"] = x
+        self.w: Float[Array, "blocks control"] = w
+        self.f: Float[Array, "s rows"] = f
+        h = T / count
+        self.C: Float[Array, "3 m"] = poly.C0 + h * poly.C1 + h**2 * poly.C2
+        self.D: Float[Array, "d e"] = poly.D0 + h * poly.D1
         # derivatives by T
-        self.dC, self.dD = (poly.C1 + 2 * h * poly.C2) / count, poly.D1 / count
-        self.ddC = 2 * poly.C2 / count**2
+        self.dC: Float[Array, "3 m"] = (poly.C1 + 2 * h * poly.C2) / count
+        self.dD: Float[Array | np.ndarray, "d e"] = poly.D1 / count
+        self.ddC: Float[Array | np.ndarray, "3 m"] = 2 * poly.C2 / count**2
 
     def variables(self) -> Float[Array, " y"]:
         """Return the stage's variables."""
@@ -178,7 +199,13 @@ class Lift:
         half = jnp.sum(some[:, :, None] * H[None], 1)
         return jnp.sum(half[:, None] * some[None], 2)
 
-    def motion_hessian(self, gradient, controls, blocks, by_f) -> Float[Array, " entries"]:
+    def motion_hessian(
+        self,
+        gradient: Float[Array, "3 nv"],
+        controls: Float[Array, "stage_blocks control"],
+        blocks: Float[Array, "4 nv nv"],
+        by_f: Float[Array, "rows nv"],
+    ) -> Float[Array, " entries"]:
         """Return the Hessian by the unknowns, at `motion_places`, of a function whose second
         derivatives are those of `StageDerivatives.hessian`.
 

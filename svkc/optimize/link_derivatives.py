@@ -90,8 +90,21 @@ class RowsOfLink:
     S: motion subspaces of the path, signed. v, vdot: of the tree.
     """
 
-    def __init__(self, path: Path, S, y: Turned, axes: Float[Array, "rows 3"], *, v, vdot):
-        self.path, self.y, self.S, self.axes, self.nv = path, y, S, axes, len(v)
+    def __init__(
+        self,
+        path: Path,
+        S: Float[Array, "path 6"],
+        y: Turned,
+        axes: Float[Array, "rows 3"],
+        *,
+        v: Float[Array, " nv"],
+        vdot: Float[Array, " nv"],
+    ):
+        self.path = path
+        self.y = y
+        self.S = S
+        self.axes = axes
+        self.nv: int = len(v)
         of_path = lambda x: static_take(x, path.dofs)
         before = np.tril(np.ones((len(path.dofs),) * 2), -1)
         sum_before = lambda x: jnp.sum(before[:, :, None] * x[None], 1)
@@ -100,18 +113,18 @@ class RowsOfLink:
         V = sum_before(rates)
         products = motion_cross(V, rates)
         A = sum_before(S * of_path(vdot)[:, None] + products)
-        self.first = motion_cross(V, S)
-        self.second = motion_cross(A, S) + motion_cross(V, self.first)
+        self.first: Float[Array, "path 6"] = motion_cross(V, S)
+        self.second: Float[Array, "path 6"] = motion_cross(A, S) + motion_cross(V, self.first)
         V, A = jnp.sum(rates, 0), jnp.sum(S * of_path(vdot)[:, None] + products, 0)
         velocity = y.by(V)
         acceleration = y.by(A).plus(velocity.by(V))
         # derivatives of y, y' and y'' by the coordinates
-        self.of_y = y.by(S)
-        self.of_velocity = velocity.by(S).plus(y.by(self.first))
-        self.of_acceleration = acceleration.by(S).plus(
+        self.of_y: Turned = y.by(S)
+        self.of_velocity: Turned = velocity.by(S).plus(y.by(self.first))
+        self.of_acceleration: Turned = acceleration.by(S).plus(
             y.by(self.second), velocity.by(2 * self.first)
         )
-        self.acceleration = dot(axes, acceleration.vector[None])
+        self.acceleration: Float[Array, " rows"] = dot(axes, acceleration.vector[None])
 
     def _place(self) -> np.ndarray:
         place = np.full(self.nv, len(self.path.dofs))
@@ -126,7 +139,9 @@ class RowsOfLink:
         above = np.tri(len(self.path.dofs), dtype=bool)
         return self.over_coordinates(self.over_coordinates(sorted_pairs(x, above)).T)
 
-    def _pair(self, rows: Float[Array, "path 6"], columns: Float[Array, "path 6"]):
+    def _pair(
+        self, rows: Float[Array, "path 6"], columns: Float[Array, "path 6"]
+    ) -> Float[Array, "path path"]:
         return dot(rows[:, None], columns[None])
 
     def jacobian(self) -> Float[Array, "rows 3 nv"]:
@@ -144,7 +159,12 @@ class RowsOfLink:
         force = jnp.sum(self.axes * f[:, None], 0)
         return self._over_pairs(self._pair(self.of_y.pairing(force), self.S))
 
-    def hessian(self, multipliers, f, virtual: Float[Array, " nv"]):
+    def hessian(
+        self,
+        multipliers: Float[Array, " rows"],
+        f: Float[Array, " rows"],
+        virtual: Float[Array, " nv"],
+    ) -> tuple[Float[Array, "3 nv"], Float[Array, "4 nv nv"], Float[Array, "rows nv"]]:
         """Return the derivatives of multipliers times E y'', less the power of f on a virtual
         velocity: gradient [3 nv], the blocks [4 nv nv] of `TreeMotion.hessian`, and the second
         derivatives [rows nv] by f and q."""
@@ -171,7 +191,13 @@ class RowsOfLink:
         return self.over_coordinates(jnp.stack(gradient)), blocks, by_f
 
 
-def rows_of_links(chain: Chain, kin: Kinematics, table: LinkRows, v, vdot):
+def rows_of_links(
+    chain: Chain,
+    kin: Kinematics,
+    table: LinkRows,
+    v: Float[Array, " nv"],
+    vdot: Float[Array, " nv"],
+) -> list[tuple[np.ndarray, RowsOfLink]]:
     """Return the rows of links, each with its places in the table."""
     poses, out = link_poses(chain, kin, table), []
     for i, (link, parent, real) in enumerate(zip(table.links, table.parent, table.real)):

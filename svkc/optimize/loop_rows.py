@@ -163,7 +163,11 @@ def row_rates(
 
 
 def row_accelerations(
-    chain: Chain, kin: Kinematics, table: LinkRows, V, A: Float[Array, "tree_rows 6"]
+    chain: Chain,
+    kin: Kinematics,
+    table: LinkRows,
+    V: Float[Array, "tree_rows 6"],
+    A: Float[Array, "tree_rows 6"],
 ) -> Float[Array, " rows"]:
     """Return the second derivatives of the rows by time (rad/s^2, m/s^2).
 
@@ -244,14 +248,20 @@ def rates_at(
     return row_rates(chain, kin, table, twists(chain, kin, v))
 
 
-def link_force(chain: Chain, table: LinkRows, link: int, multipliers) -> Float[Array, "3"]:
+def link_force(
+    chain: Chain, table: LinkRows, link: int, multipliers: Float[Array, " rows"]
+) -> Float[Array, "3"]:
     """Return the force (N) on the real link, in axes of the parent body. link: of the chain."""
     six = _six_rows(table, multipliers)[np.searchsorted(table.links, link)]
     return quat_rotate(chain.structure.quat[link], six[3:])
 
 
 def link_torque(
-    chain: Chain, q: Float[Array, " nq"], table: LinkRows, link: int, multipliers
+    chain: Chain,
+    q: Float[Array, " nq"],
+    table: LinkRows,
+    link: int,
+    multipliers: Float[Array, " rows"],
 ) -> Float[Array, "3"]:
     """Return the torque (N m) on the real link, in axes of the parent body, about the joint.
 

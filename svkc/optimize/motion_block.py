@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from svkc.optimize.blocks import PlainBlock, StageBlock, lower_half
+from svkc.optimize.blocks import Multipliers, PlainBlock, StageBlock, Unknowns, lower_half
 from svkc.optimize.closed_forms import ConnectionDerivatives, StageDerivatives
 from svkc.optimize.equations import Model, connection, stage_equations
-from svkc.optimize.lift import StagePolynomials, motion_places
+from svkc.optimize.lift import Lift, StagePolynomials, motion_places
 
 
 class MotionBlock(StageBlock):
@@ -25,16 +25,16 @@ class MotionBlock(StageBlock):
         super().__init__(call, model.layout, poly, **options)
         self.model = model
 
-    def _derivatives(self, params: Any, own: Any, lift: Any) -> StageDerivatives:
+    def _derivatives(self, params: Any, own: Any, lift: Lift) -> StageDerivatives:
         return StageDerivatives(self.model, params, own, lift.variables())
 
-    def jacobian(self, params: Any, data: Any, z) -> jax.Array:
+    def jacobian(self, params: Any, data: Any, z: Unknowns) -> jax.Array:
         def at_stage(params, own, lift):
             return lift.pull_back(self._derivatives(params, own, lift).jacobian())
 
         return self._join_stages(jnp.ravel, at_stage, params, data, z)
 
-    def hessian(self, params: Any, data: Any, z, multipliers) -> jax.Array:
+    def hessian(self, params: Any, data: Any, z: Unknowns, multipliers: Multipliers) -> jax.Array:
         def at_stage(params, own, lift, m):
             return lift.motion_hessian(*self._derivatives(params, own, lift).hessian(m))
 
@@ -53,21 +53,31 @@ class NodeBlock(PlainBlock):
     function: (model, params, data, unknowns) -> rows. derivatives: class of its derivatives.
     """
 
-    def __init__(self, model: Model, function: Callable, derivatives: Any, *args: Any):
+    def __init__(
+        self,
+        model: Model,
+        function: Callable[..., jax.Array],
+        derivatives: type[ConnectionDerivatives],
+        *args: Any,
+    ):
         super().__init__(functools.partial(function, model), *args)
-        self.model, self.derivatives = model, derivatives
+        self.model = model
+        self.derivatives = derivatives
 
-    def jacobian(self, params: Any, data: Any, z) -> jax.Array:
+    def jacobian(self, params: Any, data: Any, z: Unknowns) -> jax.Array:
         def at_lane(data, z):
             return self.derivatives(self.model, params, data, z).jacobian().ravel()
 
         return jax.vmap(at_lane)(data, z)
 
-    def hessian(self, params: Any, data: Any, z, multipliers) -> jax.Array:
+    def hessian(self, params: Any, data: Any, z: Unknowns, multipliers: Multipliers) -> jax.Array:
         def at_lane(data, z, m):
             return lower_half(self.derivatives(self.model, params, data, z).hessian(m))
 
         return jax.vmap(at_lane)(data, z, multipliers)
 
 
-CLOSED_FORMS = {connection: ConnectionDerivatives}
+# of a function of nodes, the class of its derivatives
+CLOSED_FORMS: dict[Callable[..., jax.Array], type[ConnectionDerivatives]] = {
+    connection: ConnectionDerivatives
+}

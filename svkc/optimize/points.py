@@ -14,6 +14,7 @@ from svkc._jax.eager import eager_jit
 from svkc._jax.static_gather import static_take
 from svkc.model.chain import Chain, State, Structure
 from svkc.model.names import link_index
+from svkc.optimize.controls import AbstractControls
 from svkc.optimize.loop_rows import LinkRows, link_force, link_torque
 from svkc.transitions.placement import joint_coordinates
 from svkc.tree.configuration import configuration_derivative
@@ -31,7 +32,9 @@ def tree_velocity(chain: Chain, v: Float[Array, " nv"]) -> Float[Array, " dofs"]
     return jnp.concatenate([v, jnp.zeros(chain.dofs - chain.nv, v.dtype)])
 
 
-def full_state(chain: Chain, structure: Structure, q, v) -> State:
+def full_state(
+    chain: Chain, structure: Structure, q: Float[Array, " nq"], v: Float[Array, " nv"]
+) -> State:
     """Return the state of q and v of the tree, with coordinates of virtual joints that agree."""
     q, v = tree_configuration(chain, q), tree_velocity(chain, v)
     if chain.dofs == chain.nv:
@@ -42,7 +45,10 @@ def full_state(chain: Chain, structure: Structure, q, v) -> State:
 
 
 def states_of(
-    chain: Chain, structures: Sequence[Structure], motion: Sequence[tuple], function: Any = None
+    chain: Chain,
+    structures: Sequence[Structure],
+    motion: Sequence[tuple[np.ndarray, np.ndarray]],
+    function: Any = None,
 ) -> list[State]:
     """Return the states of all phases, of each with a leading axis over its nodes.
 
@@ -99,19 +105,22 @@ class Point:
         self,
         chain: Chain,
         structure: Structure,
-        controls: Any,
+        controls: AbstractControls,
         *,
         rows: tuple[LinkRows, np.ndarray],
-        times,
-        motion: tuple,
-        blocks,
-        multipliers,
+        times: tuple[Float[Array, ""], Float[Array, ""]],
+        motion: tuple[Float[Array, " nq"], Float[Array, " nv"], Float[Array, " nv"]],
+        blocks: Float[Array, "k n"],
+        multipliers: Float[Array, " rows"],
         args: Any,
         at_start: bool = False,
         fill: float | None = None,
     ):
-        self.chain, self.args, self._structure, self._controls = chain, args, structure, controls
-        self.t, self.duration = times
+        self.chain = chain
+        self.args = args
+        self._structure, self._controls = structure, controls
+        self.t: Float[Array, ""] = times[0]
+        self.duration: Float[Array, ""] = times[1]
         self._q, self._v, self._vdot = motion
         self._blocks, self._multipliers, self._at_start = blocks, multipliers, at_start
         self._rows, self._active = rows

@@ -73,33 +73,32 @@ class Problem:
         check_chain(chain)
         phases = [phases] if isinstance(phases, Phase) else list(phases)
         bounds = tuple(as_constraint("bounds", i, entry) for i, entry in enumerate(bounds))
-        self.chain, self.controls = chain, controls.for_chain(chain)
+        self.chain: Chain = chain
+        self.controls: AbstractControls = controls.for_chain(chain)
         # numbers are data, by which the optimal cost has derivatives
         as_data = lambda x: jnp.asarray(x) if isinstance(x, float) else x
-        self.args = jax.tree.map(as_data, args)
-        self.phases = [dataclasses.replace(p, bounds=(*bounds, *p.bounds)) for p in phases]
+        self.args: Any = jax.tree.map(as_data, args)
+        self.phases: list[Phase] = [
+            dataclasses.replace(p, bounds=(*bounds, *p.bounds)) for p in phases
+        ]
         names = [p.name for p in phases]
         if not phases or len(set(names)) < len(names):
             raise ValueError(f"phases: expected phases of different names, got {names}")
         for name, function in (("running", running), ("final", final)):
             if function is not None:
                 check_function(name, function, "point")
-        self.running, self.final = running, final
-        self.scheme = Radau() if scheme is None else scheme
+        self.running = running
+        self.final = final
+        self.scheme: Radau = Radau() if scheme is None else scheme
         middle = sum(sum(p.duration) / 2 for p in phases)
-        self.units = units_of(chain, middle) if units is None else units
-        self.project = boolean("project", project)
+        self.units: Units = units_of(chain, middle) if units is None else units
+        self.project: bool = boolean("project", project)
         self._programs: dict[Any, Program] = {}
         # functions that are made once, also for other meshes
         self.functions: dict[str, Any] = {}
 
     def guess(
-        self,
-        poses: Sequence[Any],
-        durations: Any = None,
-        *,
-        noise: float = 0.0,
-        key: int = 0,
+        self, poses: Sequence[Any], durations: Any = None, *, noise: float = 0.0, key: int = 0
     ) -> Guess:
         """Return a guess: straight lines between poses, and the forces of statics.
 

@@ -28,18 +28,24 @@ class Entries:
     row, column: of each entry of the matrix, without repetition.
     """
 
-    def __init__(self, parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]], shape, scale):
+    def __init__(
+        self,
+        parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]],
+        shape: tuple[int, int],
+        scale: tuple[np.ndarray, np.ndarray],
+    ):
         """parts: of each block, flat places, and the row and column of each place.
 
         shape: of the matrix. scale: (units of rows, units of columns).
         """
-        self.places = [place for place, _, _ in parts]
+        self.places: list[np.ndarray] = [place for place, _, _ in parts]
         row, column = (np.concatenate([np.zeros(0, int), *(p[k] for p in parts)]) for k in (1, 2))
         keys, self._target = np.unique(row * shape[1] + column, return_inverse=True)
-        self.row, self.column = keys // shape[1], keys % shape[1]
+        self.row: np.ndarray = keys // shape[1]
+        self.column: np.ndarray = keys % shape[1]
         self._weight = scale[1][column] / scale[0][row]
 
-    def gather(self, dense: list[np.ndarray]) -> np.ndarray:
+    def gather(self, dense: Sequence[jax.Array | np.ndarray]) -> np.ndarray:
         """Return the values of the entries, in the solver's units."""
         values = [np.asarray(x).reshape(-1)[at] for x, at in zip(dense, self.places)]
         values = np.concatenate([np.zeros(0), *values]) * self._weight
@@ -101,9 +107,12 @@ class Program:
     def __init__(
         self, transcription: Transcription, params: Params, draws: np.ndarray, cost_unit: float
     ):
-        self.transcription, self.params, self.blocks = transcription, params, transcription.blocks
-        self.unit = transcription.builder.table.unit
-        self.count, self.cost_row = transcription.builder.table.count, transcription.rows.count
+        self.transcription = transcription
+        self.params = params
+        self.blocks: list[Block] = transcription.blocks
+        self.unit: np.ndarray = transcription.builder.table.unit
+        self.count: int = transcription.builder.table.count
+        self.cost_row: int = transcription.rows.count
         self._index = [np.where(b.unknowns < 0, self.count, b.unknowns) for b in self.blocks]
         blocks = self.blocks
         self._data = [jax.tree.map(jnp.asarray, b.data) for b in blocks]
@@ -112,16 +121,20 @@ class Program:
         self._second = _over_blocks(blocks, lambda b, *x: b.hessian(*x))
         first = [self._first(self.params, self._data, self._local(x)) for x in draws]
         self._set_row_units(first)
-        self.row_unit = np.append(transcription.rows.unit, cost_unit)
+        self.row_unit: np.ndarray = np.append(transcription.rows.unit, cost_unit)
         rows = [b.rows.reshape(-1) for b in blocks]
         self._target = np.concatenate(rows) if rows else np.zeros(0, int)
         linear = transcription.linear
         self._linear = linear[0], linear[1], linear[2] / self.row_unit[linear[0]]
-        self.jacobian_entries, self.hessian_entries = self._patterns(draws, first)
+        entries, of_hessian = self._patterns(draws, first)
+        self.jacobian_entries: Entries = entries
+        self.hessian_entries: Entries = of_hessian
         # rows of fixed unknowns alone would make the solver's matrices singular
-        table, entries = transcription.builder.table, self.jacobian_entries
+        table = transcription.builder.table
         free = table.lower < table.upper
-        self.kept = np.intersect1d(entries.row[free[entries.column]], np.arange(self.cost_row))
+        self.kept: np.ndarray = np.intersect1d(
+            entries.row[free[entries.column]], np.arange(self.cost_row)
+        )
 
     def set_cost_unit(self, cost_unit: float) -> None:
         """Divide the cost by this number."""

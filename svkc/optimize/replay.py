@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from svkc.model.chain import Chain, State
 from svkc.model.tables import as_text
@@ -67,7 +68,9 @@ class ReplayReport:
         )
 
 
-def distance(chain: Chain, state: State, q, v) -> tuple[Any, Any]:
+def distance(
+    chain: Chain, state: State, q: Float[Array, " nq"], v: Float[Array, " nv"]
+) -> tuple[Float[Array, " nv"], Float[Array, " nv"]]:
     """Return the distance [nv] of a state from q and v of the tree."""
     here, there = (tree_configuration(chain, x) for x in (state.q[: chain.nq], q))
     return difference(chain, here, there)[: chain.nv], state.v[: chain.nv] - v

@@ -37,15 +37,19 @@ class Table:
     """Entries with bounds, units and names, appended segment by segment.
 
     lower, upper: bounds, in SI units and radians. unit: by which the solver divides an entry; NaN:
-        not known yet.
+        not known yet. All three are there once the table is frozen.
     """
+
+    lower: np.ndarray
+    upper: np.ndarray
+    unit: np.ndarray
 
     def __init__(self) -> None:
         self.segments: list[Segment] = []
         self._lower: list[np.ndarray] = []
         self._upper: list[np.ndarray] = []
         self._unit: list[np.ndarray] = []
-        self.count = 0
+        self.count: int = 0
 
     def add(
         self,
@@ -71,7 +75,7 @@ class Table:
         join = lambda parts: np.concatenate([np.zeros(0), *parts])
         self.lower, self.upper, self.unit = map(join, (self._lower, self._upper, self._unit))
 
-    def label(self, index: int) -> str:
+    def label(self, index: int | np.integer) -> str:
         """Return the name of an entry."""
         return next(s for s in self.segments if s.start <= index < s.stop).label(int(index))
 

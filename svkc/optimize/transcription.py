@@ -22,7 +22,7 @@ from svkc.optimize.motion_block import CLOSED_FORMS, MotionBlock, NodeBlock
 from svkc.optimize.phases import Phase
 from svkc.optimize.points import PhaseStructure
 from svkc.optimize.schemes import Radau
-from svkc.optimize.tables import Table
+from svkc.optimize.tables import PhaseIndices, Table
 from svkc.optimize.unknowns import UnknownsBuilder
 
 EQUATION = {"lower": 0.0, "upper": 0.0}
@@ -46,13 +46,18 @@ class Transcription:
         structures: Sequence[PhaseStructure],
         references: Sequence[np.ndarray],
     ):
-        self.builder, self.model, self.scheme = builder, model, scheme
-        self.specification, self.structures, self.references = phases, structures, references
-        self.rows, self.blocks = Table(), []
+        self.builder = builder
+        self.model = model
+        self.scheme = scheme
+        self.specification: Sequence[Phase] = phases
+        self.structures = structures
+        self.references: Sequence[np.ndarray] = references
+        self.rows: Table = Table()
+        self.blocks: list[Block] = []
         # functions of the blocks' lanes, which are evaluated again for other references
         self._sources: list[Callable] = []
         self._linear: list[tuple] = []
-        self.phases = [
+        self.phases: list[PhaseIndices] = [
             builder.add_phase(phase, structure, first=i == 0, impact=self.has_impact(i))
             for i, (phase, structure) in enumerate(zip(phases, structures))
         ]
@@ -130,7 +135,8 @@ class Transcription:
         """Append the rows of the stages' equations and of continuity, for all phases at once."""
         layout, s, names = self.model.layout, self.scheme.stages, self.builder.names
         units, needs_state = self.builder.units, self.model.controls.needs_state
-        equations, self.continuity = [], []
+        equations: list[np.ndarray] = []
+        self.continuity: list[np.ndarray] = []
         for i, phase in enumerate(self.specification):
             n = phase.intervals
             dynamics = self._add_rows(
@@ -159,7 +165,13 @@ class Transcription:
             end_of_interval, [s - 1], self.continuity, motion if has_quaternions else motion[:0]
         )
 
-    def add_stages(self, function: Callable, stages: list[int], rows, tangents) -> None:
+    def add_stages(
+        self,
+        function: Callable[..., jax.Array],
+        stages: list[int],
+        rows: Sequence[np.ndarray],
+        tangents: np.ndarray,
+    ) -> None:
         """Append a block of stages over the intervals of all phases. rows: of each phase."""
         model, phases = self.model, range(len(self.specification))
         index, count = zip(*(interval_places(phase) for phase in self.specification))

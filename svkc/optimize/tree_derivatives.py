@@ -100,25 +100,38 @@ class TreeMotion:
     kin: at q. v, vdot: of the tree's coordinates. gravity: whether forces include the weight.
     """
 
-    def __init__(self, chain: Chain, kin: Kinematics, v, vdot, gravity: bool = True):
-        self.chain, self.kin, self.top, S = chain, kin, chain.topology, kin.S
-        self.above = ancestors(self.top)
+    def __init__(
+        self,
+        chain: Chain,
+        kin: Kinematics,
+        v: Float[Array, " nv"],
+        vdot: Float[Array, " nv"],
+        gravity: bool = True,
+    ):
+        self.chain = chain
+        self.kin = kin
+        self.top: Topology = chain.topology
+        self.above: np.ndarray = ancestors(self.top)
+        S = kin.S
         V = twists(chain, kin, v)
         joint = sum_dofs_per_row(self.top, S * vdot[:, None]) + velocity_products(chain, kin, V, v)
         A = accumulate_from_root(self.top, joint)
         if gravity:
             A = A - jnp.concatenate([jnp.zeros_like(chain.gravity), chain.gravity])[None]
-        self.S, self.V = S, V
+        self.S: Vectors = S
+        self.V: Float[Array, "rows 6"] = V
         V_p, A_p = self._above(V), self._above(A)
-        self.first = motion_cross(V_p, S)
-        self.second = motion_cross(A_p, S) + motion_cross(V_p, self.first)
+        self.first: Vectors = motion_cross(V_p, S)
+        self.second: Vectors = motion_cross(A_p, S) + motion_cross(V_p, self.first)
         self._set_bodies(V, A)
 
     def _above(self, X: Float[Array, "rows 6"]) -> Vectors:
         """Return the values of the rows above the joints."""
         return static_take(X, np.array(self.top.parent)[self.top.dof_row])
 
-    def _momenta(self, X):
+    def _momenta(
+        self, X: Float[Array, "rows 6"]
+    ) -> tuple[Float[Array, "rows 3"], Float[Array, "rows 3"]]:
         """Return linear momentum, and angular momentum about the root's origin, of twists."""
         w, u = angular_linear(X)
         p = self.chain.mass[:, None] * (u + cross(w, self.c))
@@ -133,21 +146,23 @@ class TreeMotion:
 
     def _set_bodies(self, V, A) -> None:
         chain, R = self.chain, self.kin.R
-        self.c = c = self.kin.r + matvec(R, chain.com)
+        c = self.kin.r + matvec(R, chain.com)
+        self.c: Float[Array, "rows 3"] = c
         turned = jnp.sum(R[..., :, :, None] * chain.symmetric_inertia[..., None, :, :], -2)
-        self.J = jnp.sum(turned[..., :, None, :] * R[..., None, :, :], -1)
+        self.J: Float[Array, "rows 3 3"] = jnp.sum(turned[..., :, None, :] * R[..., None, :, :], -1)
         mass = chain.mass[:, None]
         (w, u), (alpha, acceleration) = angular_linear(V), angular_linear(A)
         acceleration = acceleration + cross(alpha, c) + cross(w, u + cross(w, c))
         force = mass * acceleration
         moment = matvec(self.J, alpha) + cross(w, matvec(self.J, w)) + cross(c, force)
         p, L = self._momenta(V)
-        self.row_turning, self.row_momentum = self._turning(V, p, L), p
+        self.row_turning: Float[Array, "rows 3 3"] = self._turning(V, p, L)
+        self.row_momentum: Float[Array, "rows 3"] = p
         square = dot(c, c)[:, None, None] * np.eye(3)[None] - _outer(c, c)
         wrench = jnp.concatenate([moment, force], -1)
         inertia = self.J + mass[..., None] * square
         parts = [mass, mass * c, inertia, wrench, self.row_turning, p]
-        self.below = Below(*_sums(self.top, parts))
+        self.below: Below = Below(*_sums(self.top, parts))
 
     def _inertia_times(self, X: Vectors) -> Vectors:
         """Return the inertia below each joint times a motion vector of the joint."""
@@ -192,7 +207,9 @@ class TreeMotion:
         above, is_above = self.above[:, None], self.above.T[:, None]
         return jnp.where(is_above, upper, jnp.where(above, lower, 0))
 
-    def hessian(self, multipliers: Float[Array, " nv"]):
+    def hessian(
+        self, multipliers: Float[Array, " nv"]
+    ) -> tuple[Float[Array, "3 nv"], Float[Array, "4 nv nv"]]:
         """Return the derivatives of the forces' sum with multipliers: gradient [3 nv], and the
         second derivatives by q and q, q and v, v and v, q and vdot [4 nv nv]."""
         S, first, second, b = self.S, self.first, self.second, self.below

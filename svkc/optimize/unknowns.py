@@ -45,11 +45,15 @@ class UnknownsBuilder:
         units: Units,
         project: bool,
     ):
-        self.chain, self.controls, self.scheme = chain, controls, scheme
-        self.units, self.project, self.table = units, project, Table()
+        self.chain = chain
+        self.controls = controls
+        self.scheme = scheme
+        self.units = units
+        self.project = project
+        self.table: Table = Table()
         of_rows = [f"{chain.link_names[row // 6]}.{LINK_ROWS[row % 6]}" for row in rows]
         dofs = list(chain.dof_names[: chain.nv])
-        self.names = Names(dofs, controls.names(chain), of_rows)
+        self.names: Names = Names(dofs, controls.names(chain), of_rows)
         self._force_unit = np.where(rows % 6 < 3, units.torque, units.force)
 
     @property

@@ -52,11 +52,15 @@ class UserRows:
     """
 
     def __init__(self, transcription: Transcription, params: Params, draws: np.ndarray):
-        self.transcription, self.params, self.draws = transcription, params, draws
+        self.transcription = transcription
+        self.params = params
+        self.draws = draws
         # rows of the cost are known when all others are
         self.cost_places: list[tuple[StageBlock, np.ndarray]] = []
 
-    def add_phase(self, i: int, running: Sequence[Callable], final: Sequence[Callable]) -> None:
+    def add_phase(
+        self, i: int, running: Sequence[Callable[..., Any]], final: Sequence[Callable[..., Any]]
+    ) -> None:
         """Append the constraints and costs of a phase."""
         phase, n, s = self.transcription.specification[i], 0, self.transcription.scheme.stages
         n = phase.intervals

@@ -4,7 +4,8 @@ After A. Farr, E. Charbonneau, M. Begon, P. Puchaud (2025), a little simpler. Co
 bounds, costs and phases are as in that work's statement.
 """
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,15 +17,19 @@ from svkc.scenes.backflip import TOE, TORQUE_LIMITS
 from svkc.tree.points import center_of_mass, point_position
 
 # of the ranges of the joints (rad), and of all rates (rad/s, m/s)
-RANGES = {
+RANGES: dict[str, tuple[float, float]] = {
     "pelvis_y": (-1, 1), "pelvis_z": (-1, 2), "shoulder": (-0.7, 3.1), "elbow": (0, 2.09),
     "hip": (-0.4, 2.6), "knee": (-2.3, 0.02), "ankle": (-0.7, 0.7),
 }  # fmt: skip
+# a function that is not negative, or one with bounds
+PathConstraint: TypeAlias = (
+    Callable[[optimize.Point], Any] | tuple[Callable[[optimize.Point], Any], float, float]
+)
 LARGEST_RATE = 31.42
 START = {"pelvis": -0.3274, "shoulder": 0.2999, "elbow": 0.4935, "hip": 1.7082, "knee": -1.9999}
 TUCK_START = [0.135, 0.455, 1.285, 0.481, 1.818, 2.6, -1.658, 0.692]
 TUCK_END = [0.107, 0.797, 2.892, 0.216, 1.954, 2.599, -2.058, 0.224]
-LANDING_START = [0.013, 0.088, 5.804, -0.305, 0, 1.014, -0.97, 0.006]
+LANDING_START: list[float] = [0.013, 0.088, 5.804, -0.305, 0, 1.014, -0.97, 0.006]
 END = [0.053, 0.091, 6.08, 2.9, -0.17, 0.092, 0.17, 0.20]
 PLACE = 0.1  # m: largest distance of the toe from the origin
 FRICTION = 0.5
@@ -65,9 +70,9 @@ def _pull(p: optimize.Point) -> Any:
     return jnp.stack([forward - along, forward + along])
 
 
-GROUND = [_friction_cone, (lambda p: p.forces("toe")[2], 0.01, np.inf)]
+GROUND: list[PathConstraint] = [_friction_cone, (lambda p: p.forces("toe")[2], 0.01, np.inf)]
 TUCK_RANGES = [optimize.between("hip", 1.96, 2.6), optimize.between("knee", -2.3, -1.5)]
-TUCKED = [_pull, (lambda p: p.forces("tuck")[1], 0.1, np.inf)]
+TUCKED: list[PathConstraint] = [_pull, (lambda p: p.forces("tuck")[1], 0.1, np.inf)]
 
 
 def _take_off(p: optimize.Point) -> Any:

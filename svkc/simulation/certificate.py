@@ -47,7 +47,11 @@ class StateCheck(eqx.Module):
 
 
 def certificate(
-    chain: Chain, records: PhaseRecords, count: Int[Array, ""], saved: tuple, stages: int
+    chain: Chain,
+    records: PhaseRecords,
+    count: Int[Array, ""],
+    saved: tuple[Float[Array, " times"], State],
+    stages: int,
 ) -> tuple[Phases, StateCheck, Int[Array, ""]]:
     """Return the phases of a run, the checks of its saved states, and where loops first lose rank.
 

@@ -47,7 +47,9 @@ class RunEnd:
     probes: tuple[float, ...]
 
 
-def trace_non_finite(traj, chain: Chain, lane: Callable | None, data, options: dict) -> str:
+def trace_non_finite(
+    traj: Any, chain: Chain, lane: Callable | None, data: Any, options: dict[str, Any]
+) -> str:
     """Return what was not finite first, one line for each lane that ended with `non_finite`.
 
     traj: a trajectory or a batch of trajectories.
@@ -67,7 +69,7 @@ def trace_non_finite(traj, chain: Chain, lane: Callable | None, data, options: d
     return "\n".join(lines)
 
 
-def run_end(traj, options: dict) -> RunEnd:
+def run_end(traj: Any, options: dict[str, Any]) -> RunEnd:
     """Return the end of one run.
 
     options: chain, and the options control, events, args and dt of the run.

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from svkc._jax.pytrees import stop_gradient_tree
+from svkc.integration.ode import Times
 from svkc.model.chain import Chain
 from svkc.model.inertial_parameters import has_invalid_inertial_parameters
 from svkc.simulation.codes import RESULTS
@@ -14,7 +15,7 @@ from svkc.simulation.options import Options
 from svkc.transitions.plan import Plan
 
 
-def initial_result(chain: Chain, times, plan: Plan, options: Options) -> RESULTS:
+def initial_result(chain: Chain, times: Times, plan: Plan, options: Options) -> RESULTS:
     """Return the result of a run before its first phase: `successful`, or why it cannot start.
 
     times: start, end and save times (s).

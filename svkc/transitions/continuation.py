@@ -231,7 +231,7 @@ def _initial_values(path: PathState, offset, gap):
 
 
 def linearize(
-    chain: Chain, structure: Structure, targets: Targets, path: PathState, q
+    chain: Chain, structure: Structure, targets: Targets, path: PathState, q: Float[Array, " q"]
 ) -> LinearSolution:
     """Return the Newton step (corrector) and the tangent of the path (predictor) at q."""
     kind, column, weight = path.kind, jacobian_scales(chain)[1], weights(chain, structure)

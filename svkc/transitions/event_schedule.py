@@ -38,12 +38,16 @@ class EventSchedule(eqx.Module):
         """Return the time of the next timed event (s), inf if there is none."""
         return jnp.min(jnp.where(self.pending, self.times, jnp.inf), initial=jnp.inf)
 
-    def due(self, t) -> Bool[Array, " timed"]:
+    def due(self, t: Float[Array, ""]) -> Bool[Array, " timed"]:
         """Return which timed events are pending and happen up to the time t (s)."""
         return self.pending & (self.times <= t)
 
     def advance(
-        self, plan: Plan, t, fired: Bool[Array, " events"], timed: Bool[Array, " timed"]
+        self,
+        plan: Plan,
+        t: Float[Array, ""],
+        fired: Bool[Array, " events"],
+        timed: Bool[Array, " timed"],
     ) -> "EventSchedule":
         """Return the schedule after the events that fired at the time t (s).
 

@@ -4,6 +4,7 @@ closed by continuation, the velocity projected, and errors that name what could 
 import functools
 import math
 import warnings
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -14,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 from svkc._jax.eager import eager_jit
 from svkc._jax.pytrees import is_concrete
 from svkc.loops.constraint import gap_tolerance, jacobian_scales, loop_gaps
+from svkc.model.annotations import Checked, Names, Numbers, Scalar
 from svkc.model.chain import Chain, State, Structure
 from svkc.model.checked_jit import check_state
 from svkc.model.names import connection_mask, q_slice, v_slice
@@ -22,6 +24,9 @@ from svkc.transitions.path_following import follow_path
 from svkc.transitions.spare_links import check_bound
 from svkc.transitions.stationarity import Targets
 from svkc.tree.configuration import difference, normalize
+
+# coordinates or velocities as users give them: an array, or numbers by joint name
+Values: TypeAlias = Checked[Numbers | dict[str, Any] | None]
 
 
 def _set_values(array, at, values):
@@ -36,7 +41,9 @@ def _set_values(array, at, values):
     return out
 
 
-def full_vector(chain: Chain, quantity: str, value, default):
+def full_vector(
+    chain: Chain, quantity: str, value: Values, default: Array | np.ndarray
+) -> tuple[Array | np.ndarray, np.ndarray]:
     """Return the full vector of a user's array or dict, and the mask of degrees of freedom whose
     values the user gives.
 
@@ -64,23 +71,23 @@ def full_vector(chain: Chain, quantity: str, value, default):
             out = _set_values(out, (..., at), number.reshape(*batch, width))
             named[v_slice(top, name)] = True
         return out, named
-    value = finite_array(quantity, value, default.dtype)
-    if top.cuttable_joints and value.shape == (*batch, len(model_entries)):
+    array = finite_array(quantity, value, default.dtype)
+    if top.cuttable_joints and array.shape == (*batch, len(model_entries)):
         # the size in the model itself, in which no joint is cut
         named[np.array(top.model_v, int)] = True
-        return _set_values(default, (..., np.array(model_entries, int)), value), named
-    if value.shape == (*batch, tree_size):
+        return _set_values(default, (..., np.array(model_entries, int)), array), named
+    if array.shape == (*batch, tree_size):
         named[: top.nv] = True
-        return _set_values(default, (..., slice(tree_size)), value), named
-    if value.shape != default.shape:
+        return _set_values(default, (..., slice(tree_size)), array), named
+    if array.shape != default.shape:
         raise ValueError(
-            f"{quantity}: got shape {value.shape}, expected {(*batch, tree_size)} for the tree or"
+            f"{quantity}: got shape {array.shape}, expected {(*batch, tree_size)} for the tree or"
             f" {default.shape} for every coordinate"
         )
-    return value, ~named
+    return array, ~named
 
 
-def check_quaternions(chain: Chain, q):
+def check_quaternions(chain: Chain, q: Array | np.ndarray) -> None:
     """Raise ValueError if a quaternion of a concrete q deviates from unit length by more than 1e-3.
 
     Smaller deviations are round-off, which normalising removes.
@@ -150,8 +157,9 @@ def _follow_and_compare(
 
 
 def assemble(
-    chain: Chain, q, v, connected, *, near: State | None, hold: bool | None, tolerance, throw: bool
-) -> State:
+    chain: Chain, q: Values, v: Values, connected: Names | Numbers | None, *, near: State | None,
+    hold: bool | None, tolerance: Scalar | None, throw: bool,
+) -> State:  # fmt: skip
     """Return a consistent state; see `Chain.state`."""
     start, structure = starting_point(chain, near, connected)
     _warn_of_precision(chain, q, v)
@@ -189,7 +197,9 @@ def _tolerance(chain: Chain, tolerance) -> Float[Array, ""]:
     return jnp.asarray(positive_scalar("tolerance", tolerance), chain.q_load.dtype)
 
 
-def starting_point(chain: Chain, near: State | None, connected) -> tuple[Array, Structure]:
+def starting_point(
+    chain: Chain, near: State | None, connected: Names | Numbers | None
+) -> tuple[Array, Structure]:
     """Return the load pose or the configuration of `near`, and the structure of the state."""
     if near is None:
         start, structure = chain.q_load, chain.structure

@@ -7,6 +7,7 @@ kinematics, loop Jacobian and pivoting are compiled once.
 
 import dataclasses
 import functools
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -193,7 +194,9 @@ def _solve_jvp(primals, tangents):
 
 
 # solve_structure(chain, structure, q, v, schedule) -> NewtonState after the schedule
-solve_structure = custom_primitive("solve_structure", _solve, _solve_jvp)
+solve_structure: Callable[[Chain, Structure, Array, Array, Schedule], NewtonState] = (
+    custom_primitive("solve_structure", _solve, _solve_jvp)
+)
 
 
 @jax.jit

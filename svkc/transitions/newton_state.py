@@ -27,7 +27,7 @@ RANK_SEARCH = (PERTURB, *(CLOSE_PERTURBED,) * 12, DECIDE_RANK)
 CONNECTION = (CLOSE, CLOSE, IMPACT)
 
 
-def is_any_of(kind, *kinds: int) -> Bool[Array, ""]:
+def is_any_of(kind: Int[Array, ""], *kinds: int) -> Bool[Array, ""]:
     """Return whether a traced kind is one of these kinds."""
     return functools.reduce(jnp.logical_or, [kind == k for k in kinds])
 

@@ -6,6 +6,7 @@ pivots are compiled once. The derivative is that of the stationary point at the 
 """
 
 import dataclasses
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -130,4 +131,6 @@ def _follow_jvp(primals, tangents):
 
 
 # follow_path(chain, structure, targets) -> PathEnd
-follow_path = custom_primitive("follow_path", _follow, _follow_jvp, like=_follow_nothing)
+follow_path: Callable[[Chain, Structure, Targets], PathEnd] = custom_primitive(
+    "follow_path", _follow, _follow_jvp, like=_follow_nothing
+)

@@ -172,7 +172,12 @@ def _gap_norms(linear: LinearSolution) -> Float[Array, " links"]:
 
 
 def next_path_state(
-    chain: Chain, structure: Structure, targets: Targets, path: PathState, q, linear: LinearSolution
+    chain: Chain,
+    structure: Structure,
+    targets: Targets,
+    path: PathState,
+    q: Float[Array, " q"],
+    linear: LinearSolution,
 ) -> PathState:
     """Return the path after an iteration that evaluated the configuration q, with its next kind."""
     kind, decision = path.kind, _decide(path, linear)

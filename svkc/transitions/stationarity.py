@@ -8,6 +8,8 @@ vector, with an entry for each velocity, divided by the `jacobian_scales` of the
 `chain.length`s).
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -74,7 +76,10 @@ def weights(chain: Chain, structure: Structure) -> Float[Array, " dofs"]:
 
 
 def independent_rows(
-    structure: Structure, J, qr: PivotedQR, rank_known: bool | Bool[Array, ""] = True
+    structure: Structure,
+    J: Float[Array, "rows dofs"],
+    qr: PivotedQR,
+    rank_known: bool | Bool[Array, ""] = True,
 ) -> PivotedQR:
     """Return the pivoted QR of J without the pivots that are too small to divide by.
 
@@ -108,7 +113,14 @@ def optimality_matrix(
     return jnp.concatenate([upper, lower]) + identity
 
 
-def gradient(chain: Chain, start, q, J, multiplier, weight) -> Float[Array, " dofs"]:
+def gradient(
+    chain: Chain,
+    start: Float[Array, " q"],
+    q: Float[Array, " q"],
+    J: Float[Array, "rows dofs"],
+    multiplier: Float[Array, " rows"],
+    weight: Float[Array, " dofs"],
+) -> Float[Array, " dofs"]:
     """Return the gradient of half the weighted squared change from the start, plus
     J^T multiplier."""
     change = difference(chain, start, q) / jacobian_scales(chain)[1]
@@ -126,11 +138,16 @@ def _multiplier(J, selection: PivotedQR, gradient_of_change, fixed):
 
 
 def stationary_tangent(
-    primals, tangents, q, held: Bool[Array, " dofs"], structure: Structure
+    primals: tuple[Chain, Structure, Float[Array, " q"], Float[Array, " q"]],
+    tangents: tuple[Any, Any, Any, Any],
+    q: Float[Array, " q"],
+    held: Bool[Array, " dofs"],
+    structure: Structure,
 ) -> Float[Array, " dofs"]:
     """Return the tangent of the stationary point q as a change y, by the implicit function theorem.
 
-    primals, tangents: chain, structure, start and requested coordinates, and their tangents.
+    primals, tangents: chain, structure, start and requested coordinates, and their tangents, with
+        None for leaves without one.
     held: coordinates that have their requested values.
     structure: the structure with the rank and the margin of the loops at q.
     """
@@ -165,7 +182,11 @@ def stationary_tangent(
 
 
 def projected_velocity(
-    chain: Chain, structure: Structure, q, v, held: Bool[Array, " dofs"]
+    chain: Chain,
+    structure: Structure,
+    q: Float[Array, " q"],
+    v: Float[Array, " dofs"],
+    held: Bool[Array, " dofs"],
 ) -> Float[Array, " dofs"]:
     """Return the velocity nearest to v that keeps the loops closed; held velocities stay.
 

@@ -1,7 +1,7 @@
 """Energy and momentum of the tree. Virtual links have no mass and take no part."""
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -12,8 +12,13 @@ from svkc.tree.configuration import difference
 from svkc.tree.kinematics import Kinematics, kinematics, twists
 from svkc.tree.spatial import cross, matvec
 
+# of each row: the results of `body_motions`
+BodyMotions: TypeAlias = tuple[
+    Float[Array, "rows 3"], Float[Array, "rows 3"], Float[Array, "rows 3"], Float[Array, "rows 3"]
+]
 
-def body_motions(chain: Chain, kin: Kinematics, v):
+
+def body_motions(chain: Chain, kin: Kinematics, v: Float[Array, " dofs"]) -> BodyMotions:
     """Return of each row its centre of mass and that point's velocity, w, and I w.
 
     Centres of mass are given from the root's origin; I w is the angular momentum about the centre
@@ -26,8 +31,10 @@ def body_motions(chain: Chain, kin: Kinematics, v):
     return c, V[:, 3:] + cross(w, c), w, spin
 
 
-def kinetic_of_bodies(chain: Chain, v, bodies) -> Float[Array, ""]:
-    """Return the kinetic energy (J), armature included. bodies: from `body_motions`."""
+def kinetic_of_bodies(
+    chain: Chain, v: Float[Array, " dofs"], bodies: BodyMotions
+) -> Float[Array, ""]:
+    """Return the kinetic energy (J), armature included."""
     _, u, w, spin = bodies
     kinetic = jnp.sum(chain.mass * jnp.sum(u * u, -1)) / 2 + jnp.sum(w * spin) / 2
     if chain.armature is None:
@@ -36,9 +43,9 @@ def kinetic_of_bodies(chain: Chain, v, bodies) -> Float[Array, ""]:
 
 
 def _energies(
-    chain: Chain, state: State, kin: Kinematics, bodies
+    chain: Chain, state: State, kin: Kinematics, bodies: BodyMotions
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return the kinetic and the potential energy. bodies: from `body_motions`."""
+    """Return the kinetic and the potential energy."""
     kinetic, c = kinetic_of_bodies(chain, state.v, bodies), bodies[0]
     potential = -jnp.sum(chain.mass * jnp.sum((kin.root_position + c) * chain.gravity[None], -1))
     if chain.stiffness is not None:
@@ -79,13 +86,11 @@ def energy(chain: Chain, state: State) -> Float[Array, ""]:
 
 
 def energy_and_momentum(
-    chain: Chain, state: State, kin: Kinematics, bodies
+    chain: Chain, state: State, kin: Kinematics, bodies: BodyMotions
 ) -> tuple[Float[Array, ""], Float[Array, "3"], Float[Array, "3"]]:
     """Return `energy` (J), linear momentum (N s) and angular momentum (N m s).
 
     Angular momentum is taken about the centre of mass of all bodies; both are in world axes.
-
-    bodies: from `body_motions`.
     """
     kinetic, potential = _energies(chain, state, kin, bodies)
     c, u, _, spin = bodies

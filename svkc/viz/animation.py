@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from svkc.mjcf.bodies import rotation_matrix
-from svkc.model.annotations import Checked, Names
+from svkc.model.annotations import Checked, MuJoCo, Names, Numbers, Scalar
 from svkc.model.chain import Chain
 from svkc.simulation.trajectory import Trajectory
 from svkc.viz.offscreen import add_line, add_sphere, offscreen
@@ -23,7 +23,7 @@ from svkc.viz.run_data import (
 
 FLASH_DURATION = 0.3  # s after an event during which connected links are drawn large
 # color of trails, of links and of the grid on the ground: red, green, blue, opacity
-RED, GREY = (0.9, 0.1, 0.1, 1), (0.6, 0.65, 0.71, 1)
+RED, GREY = (0.9, 0.1, 0.1, 1.0), (0.6, 0.65, 0.71, 1.0)
 
 
 def write_gif(path: pathlib.Path, images: Iterator[Any], fps: float) -> None:
@@ -140,7 +140,17 @@ def _box_of_run(chain: Chain, positions: np.ndarray, R: np.ndarray) -> np.ndarra
     return motion_box(ground, bodies, positions[some], R[some])
 
 
-def choose_camera(model, box, aspect: float, *, camera, lookat, distance, azimuth, elevation):
+def choose_camera(
+    model: MuJoCo,
+    box: np.ndarray,
+    aspect: float,
+    *,
+    camera: Checked[str | None],
+    lookat: Numbers | None,
+    distance: Scalar | None,
+    azimuth: Scalar,
+    elevation: Scalar,
+) -> MuJoCo:
     """Return the model's camera of a name, or a free camera that sees the whole box.
 
     Raises ValueError if the model has no camera of that name.

@@ -4,6 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from svkc.model.annotations import MuJoCo
+
 # two cells per axis leave eight vertices, hence at most 56 faces
 MIN_FACES = 100
 
@@ -19,7 +21,7 @@ class Mesh(NamedTuple):
     faces: np.ndarray
 
 
-def mesh_key(model, geom: int) -> tuple[bool, int] | None:
+def mesh_key(model: MuJoCo, geom: int) -> tuple[bool, int] | None:
     """Return whether the geom is a height field, and the number of its mesh or field.
 
     None for a primitive.
@@ -30,7 +32,7 @@ def mesh_key(model, geom: int) -> tuple[bool, int] | None:
     return None if i < 0 else (model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_HFIELD, i)
 
 
-def load_mesh(model, key: tuple[bool, int]) -> Mesh:
+def load_mesh(model: MuJoCo, key: tuple[bool, int]) -> Mesh:
     """Return the mesh or the height field of a result of `mesh_key`."""
     is_field, i = key
     return _heightfield(model, i) if is_field else _mesh(model, i)

@@ -3,10 +3,12 @@
 import contextlib
 import copy
 import importlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
+
+from svkc.model.annotations import MuJoCo
 
 GL_PACKAGES = "libegl1 libgl1"
 # red, green, blue
@@ -80,14 +82,21 @@ def offscreen(model, size: tuple[int, int]) -> Iterator[Callable]:
         gl.free()
 
 
-def add_sphere(scene, position: np.ndarray, radius: float, rgba) -> None:
+def add_sphere(scene: MuJoCo, position: np.ndarray, radius: float, rgba: Sequence[float]) -> None:
     """Add a sphere to MuJoCo's scene, unless the scene is full."""
     import mujoco
 
     _add(scene, mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, radius), position, rgba)
 
 
-def add_line(scene, start: np.ndarray, stop: np.ndarray, rgba, *, radius: float = 0.0) -> None:
+def add_line(
+    scene: MuJoCo,
+    start: np.ndarray,
+    stop: np.ndarray,
+    rgba: Sequence[float],
+    *,
+    radius: float = 0.0,
+) -> None:
     """Add a line to MuJoCo's scene, unless the scene is full.
 
     radius: of a thin cylinder with round ends (m). Zero: a line as wide as a pixel.

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from svkc.mjcf.bodies import rotation_matrix
+from svkc.model.annotations import MuJoCo
 from svkc.model.chain import Chain
 from svkc.viz.meshes import cluster, load_mesh, mesh_key
 
@@ -28,21 +29,21 @@ class Shape(NamedTuple):
     faces: np.ndarray | None
 
 
-def visible_geoms(model) -> list[int]:
+def visible_geoms(model: MuJoCo) -> list[int]:
     """Return the geoms that MuJoCo shows by default: groups 0 to 2, not transparent."""
     return [
         g for g in range(model.ngeom) if model.geom_group[g] <= 2 and geom_color(model, g)[3] > 0
     ]
 
 
-def geom_color(model, geom: int) -> np.ndarray:
+def geom_color(model: MuJoCo, geom: int) -> np.ndarray:
     """Return red, green, blue and opacity: the material's, unless the geom has a color."""
     material, own = int(model.geom_matid[geom]), model.geom_rgba[geom]
     is_default = np.array_equal(own, np.array([0.5, 0.5, 0.5, 1], np.float32))
     return model.mat_rgba[material] if material >= 0 and is_default else own
 
 
-def shapes(model, cell: float) -> list[Shape]:
+def shapes(model: MuJoCo, cell: float) -> list[Shape]:
     """Return the shapes of the visible geoms.
 
     cell: edge of the cells (m) whose mesh vertices become one, as in `cluster`.
@@ -67,7 +68,7 @@ def shapes(model, cell: float) -> list[Shape]:
     return result
 
 
-def geom_kind(model, geom: int) -> str:
+def geom_kind(model: MuJoCo, geom: int) -> str:
     """Return the name of the geom's type in MJCF."""
     import mujoco
 
@@ -181,7 +182,9 @@ def ground_and_bodies(chain: Chain, cell: float) -> tuple[list[Shape], list[Shap
     return ground, bodies
 
 
-def motion_box(ground: list[Shape], bodies: list[Shape], positions, R) -> np.ndarray:
+def motion_box(
+    ground: list[Shape], bodies: list[Shape], positions: np.ndarray, R: np.ndarray
+) -> np.ndarray:
     """Return the lowest and the highest coordinates [2 3] of what a picture of the run shows (m).
 
     The ground counts up to a quarter of the bodies' largest extent beyond the bodies: a long floor

@@ -168,7 +168,9 @@ def _plot_energies(axes, traj: Trajectory, ts, numbers, chain: Chain | None):
     axes.plot(ts, total, "k", linewidth=1.5, label=f"sum, drifts by {drift:.1e} J")
 
 
-def energy_parts(traj: Trajectory, ts, numbers, chain: Chain) -> dict[str, np.ndarray]:
+def energy_parts(
+    traj: Trajectory, ts: np.ndarray, numbers: np.ndarray, chain: Chain
+) -> dict[str, np.ndarray]:
     """Return the energies (J) at save times whose sum is constant: stored, less what was done.
 
     ts, numbers: save times (s) and their numbers, from `saved_states`.
