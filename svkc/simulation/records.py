@@ -144,8 +144,8 @@ class Phases(eqx.Module):
     kinetic_energy: largest kinetic energy at the two ends of the phase and at the save times within
         (J); None in files of older versions.
     reduced_steps: steps by articulated bodies with reduced rows of the loops, as near a singular
-        configuration and at the start of phases with redundant loops (-1: not by articulated bodies); None in files
-        of older versions.
+        configuration and at the start of phases with redundant loops (-1: not by articulated
+        bodies); None in files of older versions.
     """
 
     start: Float[Array, " phases"]

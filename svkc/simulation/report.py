@@ -42,7 +42,8 @@ class Report(Printed):
     margin: least rank margin |R_mm| / |R_11| (R of the loop Jacobian's pivoted QR, m its rank).
     swaps: how often the choice of dependent coordinates changed (-1: not recorded).
     reduced_steps: accepted steps by articulated bodies with reduced rows of the loops, as near a
-        singular configuration and at the start of phases with redundant loops (-1: not by articulated bodies).
+        singular configuration and at the start of phases with redundant loops (-1: not by
+        articulated bodies).
     accepted, rejected: numbers of steps.
     evaluations: number of evaluations of the vector field in steps.
     drift_share: sum of the phases' absolute energy drifts, divided by the largest kinetic energy at
