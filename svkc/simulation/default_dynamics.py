@@ -13,7 +13,6 @@ from svkc.loops.constrained_dynamics import (
     Dynamics,
     default_dynamics,
 )
-from svkc.loops.delassus import LAPACK_MIN_ROWS
 from svkc.model.chain import Chain
 
 # Largest ratio of two masses at which articulated bodies compute forces of loops to 1e-9 of them:
@@ -36,15 +35,13 @@ def resolve_dynamics(
     """Return the dynamics. Raises ValueError for another type.
 
     The default is articulated bodies where the stepping loop of svkc can reduce the rows of the
-    loops: steps are projected by `Projection`, and the adjoint is `Replay`. With at least
-    `LAPACK_MIN_ROWS` rows a reduction costs more than pivots that are held. Then, with other
+    loops: steps are projected by `Projection`, and the adjoint is `Replay`. With other
     stabilizations or adjoints, and where masses may differ by more than `SIMILAR_MASSES`, the
     default is that of the chain.
     """
     if dynamics is None:
         can_reduce = type(stabilization) is Projection and isinstance(adjoint, Replay)
-        has_few_rows = 6 * len(chain.link_names) < LAPACK_MIN_ROWS
-        if can_reduce and has_few_rows and _has_similar_masses(chain):
+        if can_reduce and _has_similar_masses(chain):
             return ArticulatedBodies()
         return default_dynamics(chain)
     if isinstance(dynamics, Dynamics):
