@@ -27,7 +27,9 @@ hook = install_import_hook("svkc", "beartype.beartype")
 import svkc
 import svkc.__main__
 import svkc._jax.compilation_cache
+import svkc.optimize
 import svkc.scenes
+import svkc.scenes.backflip_problem
 
 hook.uninstall()
 

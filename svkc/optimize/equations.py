@@ -6,14 +6,13 @@ No mass matrix is inverted: accelerations and forces are unknowns.
 from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from svkc._jax.static_gather import static_take
 from svkc.model.chain import Chain
-from svkc.optimize.charts import chart_from_motion, motion_from_chart, to_next_chart
+from svkc.optimize.charts import motion_from_chart, to_next_chart
 from svkc.optimize.controls import AbstractControls
 from svkc.optimize.lift import Layout
 from svkc.optimize.loop_rows import LinkRows, gaps_at, link_wrenches, rates_at, row_accelerations
@@ -195,13 +194,3 @@ def point_of_stage(
         args=params.args,
         **options,
     )
-
-
-def node_in_chart(
-    chain: Chain,
-    reference: Float[Array, "nodes nq"],
-    q: Float[Array, "nodes nq"],
-    v: Float[Array, "nodes nv"],
-) -> tuple[Float[Array, "nodes nv"], Float[Array, "nodes nv"]]:
-    """Return coordinates and rates of nodes [nodes ...] in their charts."""
-    return jax.vmap(lambda r, q, v: chart_from_motion(chain, r, q, v))(reference, q, v)

@@ -58,7 +58,7 @@ def test_derivatives_of_a_stage(joint, parent, real):
     structure = chain.state(connected=()).structure
     active = np.ones(len(table), bool)
     data = IntervalData(
-        reference=np.zeros(chain.nq), following=np.zeros(chain.nq), active=active,
+        reference=jnp.zeros(chain.nq), following=jnp.zeros(chain.nq), active=active,
         structure=structure,
     )  # fmt: skip
     y = jnp.asarray(random.normal(size=layout.of_stage))

@@ -11,7 +11,14 @@ from tolerances import REFERENCE
 import svkc
 from svkc import optimize
 from svkc.optimize.charts import chart_from_motion, motion_from_chart
-from svkc.optimize.equations import connection, equations_of_motion
+from svkc.optimize.equations import (
+    IntervalData,
+    Model,
+    Params,
+    connection,
+    equations_of_motion,
+)
+from svkc.optimize.lift import Layout
 from svkc.optimize.loop_rows import (
     LinkRows,
     gaps_at,
@@ -113,10 +120,14 @@ def test_an_impact_is_that_of_connect(joint):
     state = chain.state(v=rng.normal(size=chain.nv), connected=())
     after = svkc.connect(chain, state, link)
     table = connected_rows(chain, after)
-    model = type("Model", (), {"rows": table, "layout": type("L", (), {"nv": chain.nv})})
+    layout = Layout(
+        nv=chain.nv, stages=2, rows=len(table), control=chain.nv, blocks=2, stage_blocks=1
+    )
+    model = Model(layout, table, optimize.Torques().for_chain(chain))
     (q, before), (_, v) = tree(chain, state), tree(chain, after)
-    data = type("Data", (), {"reference": q, "active": np.ones(len(table), bool)})
-    params = type("Params", (), {"chain": chain})
+    active = np.ones(len(table), bool)
+    data = IntervalData(reference=q, following=q, active=active, structure=after.structure)
+    params = Params(chain, None)
     x, rate = chart_from_motion(chain, q, q, v)
     _, rate_before = chart_from_motion(chain, q, q, before)
 
