@@ -280,6 +280,7 @@ class Problem:
             running = [f for f in (self.running, phase.running) if f is not None]
             final = [f for f in (self.final if i == last else None, phase.final) if f is not None]
             users.add_phase(i, running, final)
+        users.add_blocks()
         transcription.rows.freeze()
         users.set_cost_row(transcription.rows.count)
         program = Program(transcription, params, draws, self.units.cost or 1.0)

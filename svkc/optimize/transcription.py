@@ -108,7 +108,7 @@ class Transcription:
         for block, source in zip(self.blocks, self._sources, strict=True):
             block.set_lanes(source())
 
-    def lanes(self, i: int, nodes: slice) -> IntervalData:
+    def lanes(self, i: int, nodes: slice | np.ndarray) -> IntervalData:
         """Return the data of some nodes of a phase."""
         return jax.tree.map(lambda x: x[nodes], self.data(i))
 

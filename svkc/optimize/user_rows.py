@@ -10,12 +10,12 @@ import numpy as np
 from svkc._jax.eager import eager_jit
 from svkc._jax.pytrees import is_concrete
 from svkc.model.validation import as_array, description, is_real
-from svkc.optimize.blocks import StageBlock, find_tangents
+from svkc.optimize.blocks import MANY_LANES, StageBlock, find_tangents
 from svkc.optimize.equations import Params, point_of_stage
 from svkc.optimize.lift import polynomials
 from svkc.optimize.phases import Constraint
 from svkc.optimize.points import Point
-from svkc.optimize.transcription import Transcription, interval_places
+from svkc.optimize.transcription import Transcription, interval_places, join_lanes
 
 
 class Values(NamedTuple):
@@ -44,6 +44,23 @@ def _cost(function: Callable, name: str, point: Point) -> Any:
     return value
 
 
+class RowGroup(NamedTuple):
+    """Rows of users' functions that one block evaluates.
+
+    place: "path", "start" or "end". entries, costs: the functions.
+    stages: at which they are evaluated (-1: the start of an interval).
+    active: mask of the rows of connected links.
+    parts: of each phase its index, the intervals, and the rows of these intervals.
+    """
+
+    place: str
+    entries: Sequence[Constraint]
+    costs: Sequence[Callable]
+    stages: list[int]
+    active: np.ndarray
+    parts: list[tuple[int, np.ndarray, np.ndarray]]
+
+
 class UserRows:
     """Appends the rows and costs of users' functions to a transcription.
 
@@ -55,6 +72,7 @@ class UserRows:
         self.transcription = transcription
         self.params = params
         self.draws = draws
+        self._groups: dict[tuple, RowGroup] = {}
         # rows of the cost are known when all others are
         self.cost_places: list[tuple[StageBlock, np.ndarray]] = []
 
@@ -70,10 +88,6 @@ class UserRows:
         self._add("start", i, at_start, (), stages=[-1], intervals=every[:1])
         end = phase.constraints("end")
         self._add("end", i, end, final, stages=[s - 1], intervals=every[-1:])
-
-    def _point(self, i: int, params: Params, data, y, **options: Any) -> Point:
-        active = np.asarray(self.transcription.structures[i].active)
-        return point_of_stage(self.transcription.model, params, data, y, active, **options)
 
     def _reads_links(self, block: StageBlock) -> bool:
         """Return whether a block's function reads coordinates of virtual joints."""
@@ -97,7 +111,10 @@ class UserRows:
         data = jax.tree.map(lambda x: jnp.asarray(x[0]), self.transcription.data(i))
 
         def evaluate(y):
-            point = self._point(i, self.params, data, y, at_start=at_start)
+            active = np.asarray(self.transcription.structures[i].active)
+            point = point_of_stage(
+                self.transcription.model, self.params, data, y, active, at_start=at_start
+            )
             values = [_evaluate(entry, point) for entry in entries]
             out.extend(values)
             return [v.numbers for v in values]
@@ -107,44 +124,79 @@ class UserRows:
         return [Values(x.shape, v.lower, v.upper) for x, v in zip(shapes, out)]
 
     def _add(self, place, i: int, entries, costs, *, stages, intervals) -> None:
-        """Append a block of constraints and costs at some stages of some intervals."""
+        """Append rows of constraints and costs at some stages of some intervals of a phase.
+
+        Lanes of all phases with these functions and connected links are evaluated by one block.
+        """
         if not entries and not costs:
             return
-        transcription, at_start, is_running = self.transcription, stages == [-1], place == "path"
-        index, count = interval_places(transcription.specification[i])
-        lanes = len(intervals)
-        rows = self._rows_of(place, i, entries, (lanes, len(stages)))
-        cost_rows = np.full((lanes, len(stages), len(costs)), -1)
+        rows = self._rows_of(place, i, entries, (len(intervals), len(stages)))
+        cost_rows = np.full((len(intervals), len(stages), len(costs)), -1)
+        rows = np.concatenate([*rows, cost_rows], -1).reshape(len(intervals), -1)
+        active = np.asarray(self.transcription.structures[i].active)
+        functions = [id(f) for f in (*(entry.function for entry in entries), *costs)]
+        key = place, len(costs), *functions, active.tobytes()
+        group = self._groups.setdefault(key, RowGroup(place, entries, costs, stages, active, []))
+        group.parts.append((i, intervals, rows))
+
+    def add_blocks(self) -> None:
+        """Append the blocks of the rows of all phases."""
+        for group in self._groups.values():
+            self._add_block(group)
+
+    def _add_block(self, group: RowGroup) -> None:
+        """Append the block of a group."""
+        transcription, stages, costs = self.transcription, group.stages, group.costs
+        at_start, is_running = group.place == "start", group.place == "path"
+        name = "running" if is_running else "final"
 
         def function(params, data, weight, y):
-            point = self._point(i, params, data, y, at_start=at_start, **block.options)
-            parts = [_evaluate(entry, point).numbers for entry in entries]
+            options = {"at_start": at_start, **block.options}
+            point = point_of_stage(transcription.model, params, data, y, group.active, **options)
+            parts = [_evaluate(entry, point).numbers for entry in group.entries]
             scale = weight * point.duration if is_running else 1.0
-            name = "running" if is_running else "final"
             return jnp.concatenate([*parts, *(scale * _cost(f, name, point)[None] for f in costs)])
 
-        forces = np.full_like(transcription.phases[i].forces, -1)
-        forces[:, 0] = transcription.phases[i].impulse
-        unknowns = transcription.phases[i].intervals(forces if at_start else None)[intervals]
-        source = lambda: jax.tree.map(lambda x: x[intervals], transcription.data(i))
+        lanes = lambda of_phase: np.concatenate([of_phase(i)[at] for i, at, _ in group.parts])
+        places = [interval_places(phase) for phase in transcription.specification]
+        source = lambda: join_lanes(transcription.lanes(i, at) for i, at, _ in group.parts)
         block = StageBlock(
             function,
             transcription.model.layout,
             polynomials(transcription.scheme, transcription.model.controls, stages),
             data=source(),
-            index=index[intervals],
-            count=count[intervals],
-            unknowns=unknowns,
-            rows=np.concatenate([*rows, cost_rows], -1).reshape(lanes, -1),
+            index=lanes(lambda i: places[i][0]),
+            count=lanes(lambda i: places[i][1]),
+            unknowns=lanes(lambda i: self._unknowns(i, at_start)),
+            rows=np.concatenate([rows for _, _, rows in group.parts]),
             tangents=np.arange(0),
         )
         block.options = {} if self._reads_links(block) else {"fill": 0.0}
-        block.tangents = block.variables = find_tangents(block, self.params, self._local(unknowns))
+        block.tangents = block.variables = self._tangents(block)
         if costs:
-            is_cost = np.zeros((lanes, len(stages), sum(r.shape[-1] for r in rows) + len(costs)))
-            is_cost[..., -len(costs) :] = 1
-            self.cost_places.append((block, is_cost.reshape(lanes, -1) > 0))
+            columns, of_stage = block.rows.shape[1], block.rows.shape[1] // len(stages)
+            is_cost = np.arange(columns) % of_stage >= of_stage - len(costs)
+            self.cost_places.append((block, is_cost))
         transcription.add_block(block, source)
+
+    def _unknowns(self, i: int, at_start: bool) -> np.ndarray:
+        """Return the unknowns [intervals n] of a phase, at its start with impulses as forces."""
+        phase = self.transcription.phases[i]
+        if not at_start:
+            return phase.intervals(None)
+        forces = np.full_like(phase.forces, -1)
+        forces[:, 0] = phase.impulse
+        return phase.intervals(forces)
+
+    def _tangents(self, block: StageBlock) -> np.ndarray:
+        """Return the stage's variables in which a block's function may not be linear.
+
+        Finding these takes the compilation of one more program. With few lanes the evaluation is
+        cheaper than that, and all variables are returned.
+        """
+        if len(block.rows) < MANY_LANES:
+            return np.arange(block.layout.of_stage)
+        return find_tangents(block, self.params, self._local(block.unknowns))
 
     def _rows_of(self, place: str, i: int, entries, lanes: tuple[int, int]) -> list[np.ndarray]:
         """Append the rows of constraints; return their indices [lanes stages values]."""

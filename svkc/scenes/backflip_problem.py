@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from svkc import optimize
+from svkc.model.annotations import Scalar
 from svkc.model.chain import Chain
 from svkc.optimize.phases import Between
 from svkc.scenes.backflip import TOE, TORQUE_LIMITS
@@ -49,7 +50,7 @@ def _toe_forward(p: optimize.Point) -> Any:
     return _toe(p)[1]
 
 
-def _above(place: tuple[float, float, float]) -> Any:
+def _above(place: tuple[Scalar, Scalar, Scalar]) -> Any:
     """Return the function of how far the centre of mass is in front of a point of the feet."""
 
     def in_front_of(p):
@@ -90,11 +91,11 @@ def _final(p: optimize.Point) -> Any:
     return 100 * (rates @ rates + velocity @ velocity + position[1] ** 2)
 
 
-def _around(pose: dict[str, float], distance: float) -> list[Between]:
+def _around(pose: dict[str, Scalar], distance: Scalar) -> list[Between]:
     return [optimize.between(j, x - distance, x + distance) for j, x in pose.items()]
 
 
-def _turn(lower: float, upper: float) -> list[Between]:
+def _turn(lower: Scalar, upper: Scalar) -> list[Between]:
     """Return bounds on the pelvis's turn, in half turns."""
     return [optimize.between("pelvis", lower * np.pi, upper * np.pi)]
 
@@ -106,7 +107,7 @@ def _phases(chain: Chain, project: bool) -> list[optimize.Phase]:
     on_ground, in_place = (_toe_on_ground, 0, 0), (_toe_forward, -PLACE, PLACE)
     start = [
         rest, *_around(START, 0.3), between("knee", -2, -0.7), between("pelvis", -np.pi, 0.5),
-        between("hip", -0.4, 2), on_ground, in_place, (_above((0, -0.03, -0.15)), 0, 0),
+        between("hip", -0.4, 2), on_ground, in_place, (_above((0.0, -0.03, -0.15)), 0, 0),
     ]  # fmt: skip
     touch = [
         between("hip", 0.014, 1.514), between("knee", -1.97, -0.87), on_ground, in_place,
