@@ -70,7 +70,9 @@ def check(program: Program, x: np.ndarray) -> Check:
     """Return the problem's numbers at a guess in the solver's units."""
     check_finite(program, x)
     random, step = np.random.default_rng(0), 1e-6
-    direction = random.normal(size=program.count)
+    lower, upper, _, _ = program.bounds()
+    # entries are found at the values of the fixed unknowns, so that others may be missing elsewhere
+    direction = random.normal(size=program.count) * (lower < upper)
     multipliers = random.normal(size=program.cost_row + 1)
     first, second = program.jacobian_entries, program.hessian_entries
 

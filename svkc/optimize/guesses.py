@@ -16,6 +16,7 @@ from svkc.optimize.equations import equations_of_motion
 from svkc.optimize.loop_rows import LinkRows, gaps_at, possible_rows, rates_at
 from svkc.optimize.phases import Phase
 from svkc.optimize.points import tree_configuration, tree_velocity
+from svkc.optimize.structures import links_here
 from svkc.transitions.initial_state import full_vector
 from svkc.tree.configuration import difference, integrate
 
@@ -78,6 +79,7 @@ class PoseLine:
             raise ValueError("guess: the first and the last pose must be known")
         self.chain = chain
         self.phases = phases
+        self.here = links_here(chain, phases)
         self.poses: list[np.ndarray | None] = [
             None if p is None else self._closed(i, p) for i, p in enumerate(poses)
         ]
@@ -90,8 +92,10 @@ class PoseLine:
         start = jnp.asarray(chain.q_load)
         pose = finite_array(f"pose {i}", pose) if not isinstance(pose, dict) else pose
         q = np.asarray(full_vector(chain, "q", pose, start)[0])[: chain.nq]
-        names = [n for p in self.phases[max(i - 1, 0) : i + 1] if not p.here for n in p.connected]
-        rows = possible_rows(chain, np.isin(chain.link_names, names))
+        closed = np.zeros(len(chain.link_names), bool)
+        for phase, here in list(zip(self.phases, self.here))[max(i - 1, 0) : i + 1]:
+            closed |= np.isin(chain.link_names, phase.connected) & ~here
+        rows = possible_rows(chain, closed)
         return close_loops(chain, q, rows) if len(rows) else q
 
     def at(self, durations: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -101,8 +101,10 @@ class Phase:
     start, end: constraints at the start and at the end, in the same forms, or from `between`.
     impact: whether links that connect at the start do so with an impact, as `svkc.connect` does.
         False: the velocity before already keeps the new loops.
-    here: whether the links connect where the bodies are, as `svkc.connect(..., here=True)` does.
-        False: at their declared placements.
+    here: names of the links that connect where the bodies are, as `svkc.connect(..., here=True)`
+        does, and stay at that place in the phases that follow. True: all links that are new in the
+        phase, but for links of the first phase that are connected when the chain is loaded. Other
+        links connect at their declared placements.
     running: running cost of this phase (1/s), a function of a `Point`; added to the problem's.
     final: cost at the end of this phase, a function of a `Point`; added to the problem's.
     continuous_torques: whether torques that are states go on from the phase before.
@@ -119,7 +121,7 @@ class Phase:
     start: Sequence[Any] = ()
     end: Sequence[Any] = ()
     impact: bool = True
-    here: bool = False
+    here: bool | Names = False
     running: Checked[Function | None] = None
     final: Checked[Function | None] = None
     continuous_torques: bool = True
@@ -140,7 +142,14 @@ class Phase:
                 f"phase {self.name!r}: got {self.intervals!r} intervals, expected 1 or more"
             )
         put("intervals", int(count))
-        for name in ("impact", "here", "continuous_torques"):
+        if not isinstance(self.here, bool):
+            put("here", tuple(names("here", self.here)))
+            for name in self.here:
+                if name not in self.connected:
+                    raise ValueError(
+                        f"phase {self.name!r}: here names {name!r}, which is not connected in it"
+                    )
+        for name in ("impact", "continuous_torques"):
             boolean(f"phase {self.name!r}: {name}", getattr(self, name))
         for name in ("running", "final"):
             if getattr(self, name) is not None:

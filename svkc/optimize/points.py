@@ -213,8 +213,10 @@ class PhaseStructure(eqx.Module):
 
     structure: of the states. active: mask of the selected rows that are constraints in the phase.
     new: those of links that connect at its start.
+    here: those of links whose joints are where the bodies were when the links connected.
     """
 
     structure: Structure
     active: np.ndarray
     new: np.ndarray
+    here: np.ndarray

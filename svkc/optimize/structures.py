@@ -53,6 +53,22 @@ def _greedy(J: np.ndarray, preferred: np.ndarray) -> list[int]:
     return rows
 
 
+def links_here(chain: Chain, phases: Sequence[Phase]) -> list[np.ndarray]:
+    """Return for each phase the mask of connected links whose joints are where the bodies were."""
+    of = lambda names: np.isin(chain.link_names, names)
+    out, old = [], np.asarray(chain.structure.connected)
+    here = np.zeros(len(old), bool)
+    for phase in phases:
+        if isinstance(phase.here, bool):
+            asked = np.full(len(old), phase.here)
+        else:
+            asked, old = of(phase.here), old & bool(out)
+        here = of(phase.connected) & np.where(old, here, asked)
+        out.append(here)
+        old = of(phase.connected)
+    return out
+
+
 def phase_structures(
     chain: Chain, phases: Sequence[Phase], poses: Sequence[Sequence[np.ndarray]]
 ) -> tuple[np.ndarray, list[PhaseStructure]]:
@@ -69,6 +85,7 @@ def phase_structures(
         own.append(before)
     rows = np.unique(np.concatenate([np.zeros(0, int), *own]))
     structures = []
+    here = links_here(chain, phases)
     for i, (phase, mask) in enumerate(zip(phases, masks)):
         active = np.isin(rows, own[i])
         old = masks[i - 1][rows // 6] if i else np.zeros(len(rows), bool)
@@ -76,7 +93,11 @@ def phase_structures(
         if len(mask):
             q = tree_configuration(chain, jnp.asarray(poses[i][0]))
             structure = decide_rank(chain, structure, q)
-        structures.append(PhaseStructure(structure, active=active, new=active & ~old))
+        structures.append(
+            PhaseStructure(
+                structure, active=active, new=active & ~old, here=active & here[i][rows // 6]
+            )
+        )
         _check_spare(chain, phase)
     return rows, structures
 

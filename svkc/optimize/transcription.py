@@ -57,10 +57,10 @@ class Transcription:
         # functions of the blocks' lanes, which are evaluated again for other references
         self._sources: list[Callable] = []
         self._linear: list[tuple] = []
-        self.phases: list[PhaseIndices] = [
-            builder.add_phase(phase, structure, first=i == 0, impact=self.has_impact(i))
-            for i, (phase, structure) in enumerate(zip(phases, structures))
-        ]
+        self.phases: list[PhaseIndices] = []
+        for i, (phase, structure) in enumerate(zip(phases, structures)):
+            before = self.phases[-1] if i else None
+            self.phases.append(builder.add_phase(phase, structure, before, self.has_impact(i)))
         self._add_times()
         self._add_motion()
         self._add_connections()
@@ -225,7 +225,8 @@ class Transcription:
             if not np.any(structure.new):
                 continue
             gaps = self._add_link_rows("gap", i, (), structure.new)
-            self._add_linear(gaps[own.offset >= 0], own.offset[own.offset >= 0], -1.0)
+            at = structure.new & structure.here
+            self._add_linear(gaps[at], own.offset[at], -1.0)
             stopped = structure.active if impact else structure.new
             rates = self._add_link_rows("gap rate", i, (), stopped, units.velocity)
             momentum = np.full(nv, -1)

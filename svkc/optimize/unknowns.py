@@ -64,15 +64,16 @@ class UnknownsBuilder:
         return np.concatenate([np.ones(nv), np.full(nv, u.velocity), np.full(states, u.torque)])
 
     def add_phase(
-        self, phase: Phase, structure: PhaseStructure, *, first: bool, impact: bool
+        self, phase: Phase, structure: PhaseStructure, before: PhaseIndices | None, impact: bool
     ) -> PhaseIndices:
         """Append the unknowns of a phase.
 
-        first: whether the motion starts with the phase. impact: whether the phase starts with one.
+        before: of the phase before (None: the motion starts with this phase).
+        impact: whether the phase starts with one.
         """
         units, n, s, nv = self.units, phase.intervals, self.scheme.stages, self.chain.nv
         add = lambda name, shape, **options: self.table.add(name, phase.name, shape, **options)
-        free_time = 0.0 if first else np.inf
+        free_time = 0.0 if before is None else np.inf
         time = add("start time", (1,), lower=-free_time, upper=free_time)
         duration = add("duration", (1,), lower=phase.duration[0], upper=phase.duration[1])
         low, high, of_u = self._bounds(phase)
@@ -94,8 +95,22 @@ class UnknownsBuilder:
             impulse=of_links("impulse", (), active & impact, self._force_unit * by_time),
             change_q=of_links("projection of q", (n,), projected, np.ones(len(active))),
             change_v=of_links("projection of v", (n,), projected, np.ones(len(active))),
-            offset=of_links("place of link", (), active & phase.here, np.ones(len(active))),
+            offset=self._places(of_links, structure, before),
         )
+
+    @staticmethod
+    def _places(
+        of_links: Callable, structure: PhaseStructure, before: PhaseIndices | None
+    ) -> np.ndarray:
+        """Return indices [rows] of the gaps that links keep.
+
+        Those of old links are those of the phase before.
+        """
+        kept = np.full(len(structure.active), -1)
+        if before is not None:
+            kept = np.where(structure.here & ~structure.new, before.offset, kept)
+        own = structure.here & (kept < 0)
+        return np.maximum(kept, of_links("place of link", (), own, np.ones(len(own))))
 
     def _add_controls(self, add: Callable, n: int, nodes: np.ndarray, bounds) -> np.ndarray:
         """Append the controls of a phase; return the indices [n blocks control]."""

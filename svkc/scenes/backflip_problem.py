@@ -4,7 +4,7 @@ After A. Farr, E. Charbonneau, M. Begon, P. Puchaud (2025), a little simpler. Co
 bounds, costs and phases are as in that work's statement.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, TypeAlias
 
 import jax.numpy as jnp
@@ -91,7 +91,7 @@ def _final(p: optimize.Point) -> Any:
     return 100 * (rates @ rates + velocity @ velocity + position[1] ** 2)
 
 
-def _around(pose: dict[str, Scalar], distance: Scalar) -> list[Between]:
+def _around(pose: Mapping[str, Scalar], distance: Scalar) -> list[Between]:
     return [optimize.between(j, x - distance, x + distance) for j, x in pose.items()]
 
 
