@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from svkc._jax.static_gather import static_take
 from svkc.model.chain import Chain
 from svkc.optimize.charts import motion_from_chart, to_next_chart
 from svkc.optimize.controls import AbstractControls
@@ -18,13 +17,14 @@ from svkc.optimize.lift import Layout
 from svkc.optimize.loop_rows import LinkRows, gaps_at, link_wrenches, rates_at, row_accelerations
 from svkc.optimize.points import Point, full_state, tree_configuration, tree_velocity
 from svkc.tree.inverse_dynamics import (
+    generalized_force,
     limit_forces,
     mass_matrix_product,
     newton_euler,
     passive_forces,
 )
-from svkc.tree.kinematics import Kinematics, kinematics, twists, velocity_products
-from svkc.tree.traversal import accumulate_from_root, accumulate_to_root, sum_dofs_per_row
+from svkc.tree.kinematics import kinematics, twists, velocity_products
+from svkc.tree.traversal import accumulate_from_root, sum_dofs_per_row
 
 # of a stage in the quadrature over the motion
 Weight: TypeAlias = Float[Array, ""] | float
@@ -61,14 +61,6 @@ class IntervalData(eqx.Module):
     following: Any
     active: Any
     structure: Any
-
-
-def generalized_force(
-    chain: Chain, kin: Kinematics, wrenches: Float[Array, "rows 6"]
-) -> Float[Array, " nv"]:
-    """Return the generalized force of wrenches on the rows, about their roots' origins."""
-    below = accumulate_to_root(chain.topology, wrenches)
-    return jnp.sum(kin.S * static_take(below, chain.topology.dof_row), -1)
 
 
 def links_force(

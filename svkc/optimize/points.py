@@ -164,7 +164,7 @@ class Point:
         Raises ValueError for a link that is not connected, and at the start of a phase.
         """
         self._refuse_at_start("forces")
-        return link_force(self.chain, self._rows, *self._multipliers_of(link))
+        return link_force(self.chain, self._rows, *self._multipliers_of(link, "forces"))
 
     def torques(self, link: str) -> Float[Array, "3"]:
         """Return the torque (N m) that a virtual link transmits, in the convention of `forces`.
@@ -173,7 +173,7 @@ class Point:
         Raises ValueError for a link that is not connected, and at the start of a phase.
         """
         self._refuse_at_start("torques")
-        return link_torque(self.chain, self._q, self._rows, *self._multipliers_of(link))
+        return link_torque(self.chain, self._q, self._rows, *self._multipliers_of(link, "torques"))
 
     def impulse(self, link: str) -> Float[Array, "3"]:
         """Return the impulse (N s) of a virtual link at the start of a phase with an impact, in the
@@ -184,7 +184,7 @@ class Point:
         """
         if not self._at_start:
             raise ValueError("impulse: a point has one at the start of a phase only")
-        return link_force(self.chain, self._rows, *self._multipliers_of(link))
+        return link_force(self.chain, self._rows, *self._multipliers_of(link, "impulse"))
 
     def torque(self, joint: str) -> Array:
         """Return the torque (N m, N) of a joint: a scalar for a hinge or slide.
@@ -201,10 +201,14 @@ class Point:
                 f"{name}: a point at the start of a phase has none; use `path`, or `end`"
             )
 
-    def _multipliers_of(self, link: str) -> tuple[int, Float[Array, " rows"]]:
+    def _multipliers_of(self, link: str, method: str) -> tuple[int, Float[Array, " rows"]]:
+        """Return the index of a link in the chain, and the multipliers of all rows.
+
+        method: name of the method that the message of the ValueError begins with.
+        """
         i = link_index(self.chain.topology, link)
         if not np.any((self._rows.rows // 6 == i) & self._active):
-            raise ValueError(f"forces: the virtual link {link!r} is not connected in this phase")
+            raise ValueError(f"{method}: the virtual link {link!r} is not connected in this phase")
         return i, jnp.where(self._active, self._multipliers, 0)
 
 
