@@ -36,7 +36,7 @@ def save_solution(solution: Any, result: str, path: Path) -> None:
         arrays[f"multipliers.{name}"] = getattr(solution.multipliers, name)
     for i, (phase, motion) in enumerate(zip(solution.problem.phases, solution.motion)):
         arrays |= {f"{i}.{name}": np.asarray(getattr(motion, name)) for name in MOTION}
-        arrays[f"{i}.mesh"] = phase.places
+        arrays[f"{i}.mesh"] = phase.node_fractions
     meta = {
         "optimize_schema": SCHEMA,
         "svkc": svkc.__version__,

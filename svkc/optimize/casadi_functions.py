@@ -58,7 +58,7 @@ def _callback_class(casadi: Any) -> Any:
 def nlp_functions(casadi: Any, callbacks: Any) -> dict[str, Any]:
     """Return the callbacks `nlp`, `grad_f`, `jac_g` and `hess_lag` for `nlpsol`."""
     program = callbacks.program
-    n, m = program.count, len(program.kept)
+    n, m = program.count, len(program.solver_rows)
     dense = casadi.Sparsity.dense
     x, p, f, g = dense(n), dense(0), dense(1), dense(m)
     jac, jac_order = _sparsity(casadi, (m, n), *callbacks.jacobianstructure())

@@ -14,7 +14,7 @@ from svkc.model.tables import Table, as_text
 from svkc.optimize.feedback import growth
 from svkc.optimize.guesses import PhaseMotion
 from svkc.optimize.plans import Plan, control_of, plan_of
-from svkc.optimize.points import full_state, padded, states_of, tree_configuration, tree_velocity
+from svkc.optimize.points import full_configuration, full_state, full_velocity, padded, states_of
 from svkc.optimize.replay import Distance, ReplayReport, distance, replay_report
 from svkc.simulation.simulate import simulate
 from svkc.transitions.placement import place_at_current_pose
@@ -113,9 +113,9 @@ def at_own_place(
     chain: Chain, structure: Structure, q: Float[Array, " nq"], v: Float[Array, " nv"]
 ) -> State:
     """Return a state whose links are where its bodies are, so that drift of the loops is none."""
-    full = tree_configuration(chain, q)
+    full = full_configuration(chain, q)
     if not chain.link_names:
-        return State(full, tree_velocity(chain, v), structure)
+        return State(full, full_velocity(chain, v), structure)
     kin = kinematics(chain, full)
     placed = place_at_current_pose(chain, structure, full, structure.connected, kin)
     return full_state(eqx.tree_at(lambda c: c.structure, chain, placed), placed, q, v)

@@ -15,7 +15,7 @@ def encode(transcription: Transcription, guess: Guess) -> np.ndarray:
     table, nv = transcription.builder.table, transcription.model.layout.nv
     x, start = np.zeros(table.count), 0.0
     rows, has_state = transcription.model.rows.rows, transcription.model.controls.has_state
-    for motion, at, reference in zip(guess.phases, transcription.phases, transcription.references):
+    for motion, at, reference in zip(guess.phases, transcription.indices, transcription.references):
         x[at.start_time], x[at.duration] = start, motion.duration
         start += float(motion.duration)
         coordinates, rates = _to_charts(transcription, reference, motion.q, motion.v)
@@ -25,9 +25,9 @@ def encode(transcription: Transcription, guess: Guess) -> np.ndarray:
         x[at.vdot] = motion.vdot
         for index, values in ((at.forces, motion.forces), (at.impulse, motion.impulse)):
             x[index[index >= 0]] = np.asarray(values)[..., rows][index >= 0]
-        keeps = at.offset >= 0
+        keeps = at.kept_gap >= 0
         if keeps.any():
-            x[at.offset[keeps]] = np.asarray(_gaps(transcription, motion.q[0]))[keeps]
+            x[at.kept_gap[keeps]] = np.asarray(_gaps(transcription, motion.q[0]))[keeps]
     return _with_noise(transcription, guess, np.clip(x, table.lower, table.upper))
 
 
@@ -64,7 +64,7 @@ def decode(transcription: Transcription, x: np.ndarray) -> tuple[PhaseMotion, ..
     )
     padded, links = np.append(x, 0.0), 6 * len(chain.link_names)
     motions = []
-    specified = zip(transcription.specification, transcription.phases, transcription.references)
+    specified = zip(transcription.phases, transcription.indices, transcription.references)
     for phase, at, reference in specified:
         coordinates = x[at.nodes[:, :nv]], x[at.nodes[:, nv : 2 * nv]]
         q, v = jax.vmap(lambda r, y, w: motion_from_chart(chain, r, y, w, w)[:2])(
@@ -81,7 +81,7 @@ def decode(transcription: Transcription, x: np.ndarray) -> tuple[PhaseMotion, ..
                 vdot=x[at.vdot],
                 forces=on_links(at.forces),
                 impulse=on_links(at.impulse),
-                mesh=phase.places,
+                mesh=phase.node_fractions,
             )
         )
     return tuple(motions)

@@ -74,9 +74,9 @@ class AbstractSolver(abc.ABC):
 
 
 class Callbacks:
-    """The functions that IPOPT calls, with f and g, and both derivatives, kept by x.
+    """The functions that IPOPT calls, with f and g, and both derivatives, cached by x.
 
-    An exception in a function, Ctrl-C too, ends the run at the next iteration and is kept.
+    An exception in a function, Ctrl-C too, ends the run at the next iteration and is cached.
     """
 
     def __init__(self, program: Program, progress: Callable[[float], None], iterations: int):
@@ -84,19 +84,19 @@ class Callbacks:
         self.progress = progress
         self.limit: int = iterations
         entries = program.jacobian_entries
-        self.of_rows: np.ndarray = np.isin(entries.row, program.kept)
+        self.of_rows: np.ndarray = np.isin(entries.row, program.solver_rows)
         self.of_cost: np.ndarray = entries.row == program.cost_row
         self.columns: np.ndarray = entries.column[self.of_cost]
         self.exception: BaseException | None = None
         self.iterations: int = 0
         self.functions: float = 0.0
-        self._kept: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+        self._cache: dict[str, tuple[np.ndarray, np.ndarray]] = {}
 
     def _at(self, name: str, x: np.ndarray, *others: Any) -> np.ndarray:
-        """Return the value of a method of the program, which is kept for the same x."""
-        kept = self._kept.get(name)
-        if kept is not None and not others and np.array_equal(kept[0], x):
-            return kept[1]
+        """Return the value of a method of the program, which is cached for the same x."""
+        cached = self._cache.get(name)
+        if cached is not None and not others and np.array_equal(cached[0], x):
+            return cached[1]
         start = time.perf_counter()
         try:
             value = getattr(self.program, name)(np.asarray(x), *others)
@@ -104,19 +104,19 @@ class Callbacks:
             self.exception = self.exception or error
             value = np.full(self.program.length(name), np.nan)
         self.functions += time.perf_counter() - start
-        self._kept[name] = np.array(x), value
+        self._cache[name] = np.array(x), value
         return value
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         low, high, *of_rows = self.program.bounds()
-        row_low, row_high = (x[self.program.kept] for x in of_rows)
+        row_low, row_high = (x[self.program.solver_rows] for x in of_rows)
         return low, high, row_low, row_high
 
     def objective(self, x: np.ndarray) -> float:
         return float(self._at("rows", x)[-1])
 
     def constraints(self, x: np.ndarray) -> np.ndarray:
-        return self._at("rows", x)[self.program.kept]
+        return self._at("rows", x)[self.program.solver_rows]
 
     def gradient(self, x: np.ndarray) -> np.ndarray:
         values = self._at("jacobian", x)[self.of_cost]
@@ -124,7 +124,7 @@ class Callbacks:
 
     def jacobianstructure(self) -> tuple[np.ndarray, np.ndarray]:
         entries = self.program.jacobian_entries
-        rows = np.searchsorted(self.program.kept, entries.row[self.of_rows])
+        rows = np.searchsorted(self.program.solver_rows, entries.row[self.of_rows])
         return rows, entries.column[self.of_rows]
 
     def jacobian(self, x: np.ndarray) -> np.ndarray:
@@ -139,7 +139,7 @@ class Callbacks:
     def all_rows(self, values: np.ndarray) -> np.ndarray:
         """Return values of the solver's rows as values of all rows, zero for the others."""
         out = np.zeros(self.program.cost_row)
-        out[self.program.kept] = values
+        out[self.program.solver_rows] = values
         return out
 
     def intermediate(self, _mode: int, iteration: int, *_rest: float | int) -> bool:
@@ -259,7 +259,7 @@ def _by_cyipopt(callbacks: Callbacks, options: dict[str, Any], start: SolverResu
     # this wheel has no METIS, and its other orderings are slower
     for name, value in ({"mumps_pivot_order": 2} | options).items():
         problem.add_option(name, value)
-    of_rows = start.multipliers[callbacks.program.kept]
+    of_rows = start.multipliers[callbacks.program.solver_rows]
     multipliers = {"lagrange": of_rows, "zl": start.lower, "zu": start.upper}
     x, info = problem.solve(start.x, **multipliers)
     status = STATUS.get(info["status"], "failed")
@@ -288,7 +288,7 @@ def _by_casadi(callbacks: Callbacks, options: dict[str, Any], start: SolverResul
     )
     result = solver(
         x0=start.x, lbx=low, ubx=high, lbg=row_low, ubg=row_high,
-        lam_x0=start.upper - start.lower, lam_g0=start.multipliers[program.kept],
+        lam_x0=start.upper - start.lower, lam_g0=start.multipliers[program.solver_rows],
     )  # fmt: skip
     x, of_rows, of_x = (np.array(result[name]).ravel() for name in ("x", "lam_g", "lam_x"))
     callbacks.iterations = int(solver.stats()["iter_count"])

@@ -14,7 +14,7 @@ from svkc.optimize.guesses import PhaseMotion
 from svkc.optimize.lift import Layout
 from svkc.optimize.loop_rows import LinkRows, rates_at
 from svkc.optimize.plans import driven_coordinates
-from svkc.optimize.points import padded, tree_configuration, tree_velocity
+from svkc.optimize.points import full_configuration, full_velocity, padded
 from svkc.optimize.structures import phase_structures
 from svkc.tree.configuration import difference, integrate
 from svkc.tree.inverse_dynamics import mass_matrix_product
@@ -101,7 +101,7 @@ def _lanes(problem: Any, motion: tuple[PhaseMotion, ...]) -> tuple[Model, _Lane]
         repeat = lambda x, m=m: np.broadcast_to(np.asarray(x), (len(m.vdot), *np.shape(x)))
         data = IntervalData(
             reference=m.q[:-1],
-            following=m.q[1:],
+            next_reference=m.q[1:],
             active=repeat(structure.active),
             structure=jax.tree.map(repeat, structure.structure),
         )
@@ -132,8 +132,8 @@ def _lanes(problem: Any, motion: tuple[PhaseMotion, ...]) -> tuple[Model, _Lane]
 
 def _moved(chain: Chain, q, dq):
     """Return a configuration of the tree moved by a tangent vector [nv]."""
-    full = tree_configuration(chain, q)
-    return integrate(chain, full, tree_velocity(chain, dq))[: chain.nq]
+    full = full_configuration(chain, q)
+    return integrate(chain, full, full_velocity(chain, dq))[: chain.nq]
 
 
 def _interval(problem: Any, model: Model, params: Params, lane: _Lane, unit: np.ndarray, z):
@@ -157,10 +157,10 @@ def _interval(problem: Any, model: Model, params: Params, lane: _Lane, unit: np.
     rows = jax.vmap(lambda y: stage_equations(model, params, lane.data, 0.0, y))(y)
     force = rows[:, :nv] - ones * (torque @ unit)[None]
     links = jnp.where(lane.data.active[None], rows[:, nv:], f)
-    following = lane.data.following
-    x, rate = to_next_chart(chain, reference, following, X[-1], R[-1])
-    q, v, _ = motion_from_chart(chain, following, x, rate, rate)
-    there, here = tree_configuration(chain, following), tree_configuration(chain, q)
+    next_reference = lane.data.next_reference
+    x, rate = to_next_chart(chain, reference, next_reference, X[-1], R[-1])
+    q, v, _ = motion_from_chart(chain, next_reference, x, rate, rate)
+    there, here = full_configuration(chain, next_reference), full_configuration(chain, q)
     end = [difference(chain, there, here)[:nv], v]
     return jnp.concatenate([force.ravel(), links.ravel(), *end])
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from svkc.model.chain import Chain, State
 from svkc.optimize.guesses import PhaseMotion
-from svkc.optimize.points import padded, tree_configuration, tree_velocity
+from svkc.optimize.points import full_configuration, full_velocity, padded
 from svkc.tree.configuration import difference, integrate
 
 
@@ -69,13 +69,13 @@ def control_table(controls: Any, scheme: Any) -> np.ndarray:
 
 def _planned(chain: Chain, q, v, step: Any, s: Any) -> tuple[Any, Any]:
     """Return q and v of the tree at a fraction s of an interval, by Hermite's cubic polynomial."""
-    start = tree_configuration(chain, q[0])
-    step_to = difference(chain, start, tree_configuration(chain, q[1]))[: chain.nv]
+    start = full_configuration(chain, q[0])
+    step_to = difference(chain, start, full_configuration(chain, q[1]))[: chain.nv]
     moved = (3 * s**2 - 2 * s**3) * step_to
     moved = moved + step * ((s - 2 * s**2 + s**3) * v[0] + (s**3 - s**2) * v[1])
     rate = (6 * s - 6 * s**2) * step_to / step
     rate = rate + (1 - 4 * s + 3 * s**2) * v[0] + (3 * s**2 - 2 * s) * v[1]
-    return integrate(chain, start, tree_velocity(chain, moved))[: chain.nq], rate
+    return integrate(chain, start, full_velocity(chain, moved))[: chain.nq], rate
 
 
 def control_of(problem: Any) -> Any:
@@ -109,7 +109,7 @@ class PlanControl(eqx.Module):
             return tau
         at_q, at_v, gains = jax.tree.map(of_interval, (plan.q, plan.v, plan.gains))
         q, v = _planned(chain, at_q, at_v, step, fraction)
-        here, there = (tree_configuration(chain, x[: chain.nq]) for x in (state.q, q))
+        here, there = (full_configuration(chain, x[: chain.nq]) for x in (state.q, q))
         error_q = difference(chain, here, there)[: chain.nv]
         error = jnp.concatenate([error_q, v - state.v[: chain.nv]])
         feedback = ((1 - fraction) * gains[0] + fraction * gains[1]) @ error

@@ -35,7 +35,7 @@ from svkc.optimize.unknowns import UnknownsBuilder
 from svkc.optimize.user_rows import UserRows
 
 # points at which patterns are found, and the size of the scaled cost at them
-_DRAWS, _COST_AT_DRAWS = 3, 50.0
+_SAMPLES, _COST_AT_SAMPLES = 3, 50.0
 
 
 class Problem:
@@ -132,7 +132,7 @@ class Problem:
             vdot=np.zeros((n, s, self.chain.nv)),
             forces=np.repeat(forces[:-1, None], s, 1),
             impulse=np.zeros(links),
-            mesh=phase.places,
+            mesh=phase.node_fractions,
         )
 
     def solve(
@@ -273,8 +273,8 @@ class Problem:
         )
         builder.table.freeze()
         params = Params(chain, self.args)
-        draws = self._draws(builder.table, transcription)
-        users = UserRows(transcription, params, draws)
+        samples = self._sample_points(builder.table, transcription)
+        users = UserRows(transcription, params, samples)
         last = len(self.phases) - 1
         for i, phase in enumerate(self.phases):
             running = [f for f in (self.running, phase.running) if f is not None]
@@ -282,18 +282,18 @@ class Problem:
             users.add_phase(i, running, final)
         transcription.rows.freeze()
         users.set_cost_row(transcription.rows.count)
-        program = Program(transcription, params, draws, self.units.cost or 1.0)
+        program = Program(transcription, params, samples, self.units.cost or 1.0)
         if self.units.cost is None:
-            costs = [abs(program.rows(x / program.unit)[-1]) for x in draws]
-            program.set_cost_unit(max(float(np.median(costs)) / _COST_AT_DRAWS, 1e-12))
+            costs = [abs(program.rows(x / program.unit)[-1]) for x in samples]
+            program.set_cost_unit(max(float(np.median(costs)) / _COST_AT_SAMPLES, 1e-12))
         return program
 
-    def _draws(self, table, transcription: Transcription) -> np.ndarray:
+    def _sample_points(self, table, transcription: Transcription) -> np.ndarray:
         """Return random points in SI units, the durations near the middle of their bounds."""
         random = np.random.default_rng(0)
-        draws = random.normal(size=(_DRAWS, table.count)) * table.unit
-        for phase, indices in zip(self.phases, transcription.phases):
+        samples = random.normal(size=(_SAMPLES, table.count)) * table.unit
+        for phase, indices in zip(self.phases, transcription.indices):
             middle = sum(phase.duration) / 2
-            draws[:, indices.duration] = middle * random.uniform(0.8, 1.2, _DRAWS)
+            samples[:, indices.duration] = middle * random.uniform(0.8, 1.2, _SAMPLES)
         fixed = table.lower == table.upper
-        return np.where(fixed, table.lower, draws)
+        return np.where(fixed, table.lower, samples)

@@ -60,7 +60,9 @@ def refined(problem: Any, solution: Any, tol: float, rounds: int, options: dict[
             for of_q, of_v in zip(report.position, report.velocity, strict=True)
         )
         phases = solution.problem.phases
-        meshes = [new_mesh(p.places, x, order) for p, x in zip(phases, defects, strict=True)]
+        meshes = [
+            new_mesh(p.node_fractions, x, order) for p, x in zip(phases, defects, strict=True)
+        ]
         finer = problem.with_mesh(meshes).solve(solution, **options)
         change = abs(float(finer.cost) - float(solution.cost))
         solution = dataclasses.replace(finer, cost_error=np.asarray(change))

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from svkc.model.chain import Chain, State
 from svkc.model.tables import as_text
 from svkc.optimize.plans import Plan, control_of, plan_of
-from svkc.optimize.points import full_state, tree_configuration
+from svkc.optimize.points import full_configuration, full_state
 from svkc.simulation.codes import RESULTS
 from svkc.simulation.report import Report
 from svkc.simulation.simulate import simulate
@@ -72,7 +72,7 @@ def distance(
     chain: Chain, state: State, q: Float[Array, " nq"], v: Float[Array, " nv"]
 ) -> tuple[Float[Array, " nv"], Float[Array, " nv"]]:
     """Return the distance [nv] of a state from q and v of the tree."""
-    here, there = (tree_configuration(chain, x) for x in (state.q[: chain.nq], q))
+    here, there = (full_configuration(chain, x) for x in (state.q[: chain.nq], q))
     return difference(chain, here, there)[: chain.nv], state.v[: chain.nv] - v
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from svkc.model.chain import Chain
 from svkc.optimize.guesses import Guess, PhaseMotion
-from svkc.optimize.points import tree_configuration, tree_velocity
+from svkc.optimize.points import full_configuration, full_velocity
 from svkc.optimize.schemes import Radau
 from svkc.optimize.solution import Solution
 from svkc.tree.configuration import integrate
@@ -31,7 +31,7 @@ def as_guess(guess: Any, problem: Any) -> Guess:
     for phase, motion in zip(problem.phases, motions, strict=True):
         same = (phase.intervals, problem.scheme.stages) == motion.vdot.shape[:2]
         same = same and np.allclose(
-            motion.times, motion.duration * phase.places, rtol=0, atol=1e-12
+            motion.times, motion.duration * phase.node_fractions, rtol=0, atol=1e-12
         )
         if not same or motion.blocks.shape[1] != blocks:
             motion = resample(problem.chain, problem.scheme, problem.controls, motion, phase)
@@ -54,7 +54,7 @@ def resample(
 ) -> PhaseMotion:
     """Return a phase of a motion on another mesh, or with another number of stages."""
     s, n = motion.vdot.shape[1], phase.intervals
-    nodes, new = motion.times / motion.duration, phase.places
+    nodes, new = motion.times / motion.duration, phase.node_fractions
     stages = (new[:-1, None] + np.diff(new)[:, None] * scheme.c).ravel()
     k, share = _within(nodes, stages, "left")
     weights = Radau(s).interpolation(share)
@@ -110,8 +110,8 @@ def _nodes(
     step = h * share[:, None] * motion.v[k] + h**2 * change(twice)
 
     def moved(q, step):
-        full = tree_configuration(chain, q)
-        return integrate(chain, full, tree_velocity(chain, step))[: chain.nq]
+        full = full_configuration(chain, q)
+        return integrate(chain, full, full_velocity(chain, step))[: chain.nq]
 
     q = np.array(jax.vmap(moved)(jnp.asarray(motion.q[k]), jnp.asarray(step)))
     q[-1], v[-1] = motion.q[-1], motion.v[-1]

@@ -1,4 +1,4 @@
-"""Rows of the user's functions: costs and constraints of points."""
+"""Rows of the user's functions: constraints, and terms of the cost."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -10,16 +10,19 @@ import numpy as np
 from svkc._jax.eager import eager_jit
 from svkc._jax.pytrees import is_concrete
 from svkc.model.validation import as_array, description, is_real
-from svkc.optimize.blocks import StageBlock, find_tangents
+from svkc.optimize.blocks import StageBlock, find_nonlinear_variables
 from svkc.optimize.equations import Params, point_of_stage
 from svkc.optimize.lift import polynomials
 from svkc.optimize.phases import Constraint
 from svkc.optimize.points import Point
-from svkc.optimize.transcription import Transcription, interval_places
+from svkc.optimize.transcription import Transcription, normalized_times
 
 
 class Values(NamedTuple):
-    """What a user's function returned: numbers, and bounds that it gave with them."""
+    """What a constraint's function returned: numbers, and their bounds.
+
+    numbers: values, or the shape of the values.
+    """
 
     numbers: Any
     lower: Any
@@ -27,7 +30,7 @@ class Values(NamedTuple):
 
 
 def _evaluate(entry: Constraint, point: Point) -> Values:
-    """Return the values of a constraint at a point. Raises ValueError if they are no numbers."""
+    """Return the values of a constraint at a point. Raises ValueError if they are not numbers."""
     result, lower, upper = entry.function(point), entry.lower, entry.upper
     if isinstance(result, tuple) and len(result) == 3:
         result, lower, upper = result
@@ -37,7 +40,7 @@ def _evaluate(entry: Constraint, point: Point) -> Values:
 
 
 def _cost(function: Callable, name: str, point: Point) -> Any:
-    """Return the value of a cost at a point. Raises ValueError if it is not one number."""
+    """Return the value of a cost at a point. Raises ValueError if it is not a single number."""
     value = function(point)
     if not is_real(as_array(value)) or jnp.shape(value) != ():
         raise ValueError(f"{name}: expected a cost of one number, got {description(value)}")
@@ -45,26 +48,26 @@ def _cost(function: Callable, name: str, point: Point) -> Any:
 
 
 class UserRows:
-    """Appends the rows and costs of users' functions to a transcription.
+    """Builder of the rows and cost terms of users' functions, which it appends to a transcription.
 
-    params: for which the functions are evaluated. draws: [draws unknowns] at which they are probed.
-    costs: lists of (place, block, local row) of the cost.
+    params: parameters for which the functions are evaluated.
+    samples: [samples unknowns] random points, at which sparsity is determined.
     """
 
-    def __init__(self, transcription: Transcription, params: Params, draws: np.ndarray):
+    def __init__(self, transcription: Transcription, params: Params, samples: np.ndarray):
         self.transcription = transcription
         self.params = params
-        self.draws = draws
-        # rows of the cost are known when all others are
-        self.cost_places: list[tuple[StageBlock, np.ndarray]] = []
+        self.samples = samples
+        # (block, mask of its local rows that are cost terms); the index of the cost's row is known
+        # only when all other rows are there
+        self._cost_terms: list[tuple[StageBlock, np.ndarray]] = []
 
     def add_phase(
         self, i: int, running: Sequence[Callable[..., Any]], final: Sequence[Callable[..., Any]]
     ) -> None:
-        """Append the constraints and costs of a phase."""
-        phase, n, s = self.transcription.specification[i], 0, self.transcription.scheme.stages
-        n = phase.intervals
-        path, every = phase.constraints("path"), np.arange(n)
+        """Append the constraints and costs of phase i. running, final: functions of the costs."""
+        phase, s = self.transcription.phases[i], self.transcription.scheme.stages
+        path, every = phase.constraints("path"), np.arange(phase.intervals)
         self._add("path", i, path, running, stages=list(range(s)), intervals=every)
         at_start = [c for c in path if self._holds_at_start(i, c)] + phase.constraints("start")
         self._add("start", i, at_start, (), stages=[-1], intervals=every[:1])
@@ -72,11 +75,15 @@ class UserRows:
         self._add("end", i, end, final, stages=[s - 1], intervals=every[-1:])
 
     def _point(self, i: int, params: Params, data, y, **options: Any) -> Point:
+        """Return the point of a stage of phase i. y: variables of the stage."""
         active = np.asarray(self.transcription.structures[i].active)
         return point_of_stage(self.transcription.model, params, data, y, active, **options)
 
     def _reads_links(self, block: StageBlock) -> bool:
-        """Return whether a block's function reads coordinates of virtual joints."""
+        """Return whether a block's function reads coordinates of virtual joints.
+
+        They are set to NaN: only functions that read them then return NaN.
+        """
         block.options = {"fill": np.nan}
         values = eager_jit(lambda *x: block.values(*x))
         lanes = lambda x: jax.tree.map(lambda x: jnp.asarray(x[:1]), x)
@@ -84,7 +91,10 @@ class UserRows:
         return bool(np.isnan(np.asarray(rows)).any())
 
     def _holds_at_start(self, i: int, entry: Constraint) -> bool:
-        """Return whether a path constraint is a function of what the start of a phase has."""
+        """Return whether a path constraint can be evaluated at the start of phase i.
+
+        Points there have no accelerations and no forces of links, and raise ValueError for them.
+        """
         try:
             self._shapes(i, [entry], at_start=True)
         except ValueError:
@@ -92,7 +102,7 @@ class UserRows:
         return True
 
     def _shapes(self, i: int, entries: Sequence[Constraint], at_start: bool) -> list[Values]:
-        """Return shapes and bounds of constraints' values, without computing them."""
+        """Return the shapes and bounds of constraints' values, by abstract evaluation."""
         out: list[Values] = []
         data = jax.tree.map(lambda x: jnp.asarray(x[0]), self.transcription.data(i))
 
@@ -102,16 +112,20 @@ class UserRows:
             out.extend(values)
             return [v.numbers for v in values]
 
-        y = jnp.zeros(self.transcription.model.layout.of_stage, self.params.chain.q_load.dtype)
+        y = jnp.zeros(self.transcription.model.layout.stage_size, self.params.chain.q_load.dtype)
         shapes = jax.eval_shape(evaluate, y)
         return [Values(x.shape, v.lower, v.upper) for x, v in zip(shapes, out)]
 
     def _add(self, place, i: int, entries, costs, *, stages, intervals) -> None:
-        """Append a block of constraints and costs at some stages of some intervals."""
+        """Append a row block of constraints and costs of phase i.
+
+        place: "path", "start" or "end". stages: indices of the stages; -1 is the interval's start.
+        intervals: indices of the intervals.
+        """
         if not entries and not costs:
             return
         transcription, at_start, is_running = self.transcription, stages == [-1], place == "path"
-        index, count = interval_places(transcription.specification[i])
+        start_ratio, duration_ratio = normalized_times(transcription.phases[i])
         lanes = len(intervals)
         rows = self._rows_of(place, i, entries, (lanes, len(stages)))
         cost_rows = np.full((lanes, len(stages), len(costs)), -1)
@@ -123,32 +137,37 @@ class UserRows:
             name = "running" if is_running else "final"
             return jnp.concatenate([*parts, *(scale * _cost(f, name, point)[None] for f in costs)])
 
-        forces = np.full_like(transcription.phases[i].forces, -1)
-        forces[:, 0] = transcription.phases[i].impulse
-        unknowns = transcription.phases[i].intervals(forces if at_start else None)[intervals]
+        forces = np.full_like(transcription.indices[i].forces, -1)
+        forces[:, 0] = transcription.indices[i].impulse
+        unknowns = transcription.indices[i].intervals(forces if at_start else None)[intervals]
         source = lambda: jax.tree.map(lambda x: x[intervals], transcription.data(i))
         block = StageBlock(
             function,
             transcription.model.layout,
             polynomials(transcription.scheme, transcription.model.controls, stages),
             data=source(),
-            index=index[intervals],
-            count=count[intervals],
+            start_ratio=start_ratio[intervals],
+            duration_ratio=duration_ratio[intervals],
             unknowns=unknowns,
             rows=np.concatenate([*rows, cost_rows], -1).reshape(lanes, -1),
-            tangents=np.arange(0),
+            nonlinear=np.arange(0),
         )
         block.options = {} if self._reads_links(block) else {"fill": 0.0}
-        block.tangents = block.variables = find_tangents(block, self.params, self._local(unknowns))
+        block.nonlinear = block.variables = find_nonlinear_variables(
+            block, self.params, self._local(unknowns)
+        )
         if costs:
             is_cost = np.zeros((lanes, len(stages), sum(r.shape[-1] for r in rows) + len(costs)))
             is_cost[..., -len(costs) :] = 1
-            self.cost_places.append((block, is_cost.reshape(lanes, -1) > 0))
+            self._cost_terms.append((block, is_cost.reshape(lanes, -1) > 0))
         transcription.add_block(block, source)
 
     def _rows_of(self, place: str, i: int, entries, lanes: tuple[int, int]) -> list[np.ndarray]:
-        """Append the rows of constraints; return their indices [lanes stages values]."""
-        rows, phase = [], self.transcription.specification[i]
+        """Append the rows of constraints; return their indices [lanes stages values] of each.
+
+        lanes: numbers of lanes and of stages.
+        """
+        rows, phase = [], self.transcription.phases[i]
         for entry, shape in zip(entries, self._shapes(i, entries, place == "start")):
             lower, upper = self._bounds(entry, shape)
             name = entry.name if entry.name.startswith(place) else f"{place} {entry.name!r}"
@@ -167,7 +186,10 @@ class UserRows:
         return rows
 
     def _bounds(self, entry: Constraint, shape: Values) -> list[np.ndarray]:
-        """Return a constraint's bounds over its values. Raises ValueError for wrong bounds."""
+        """Return a constraint's bounds, one for all values or one for each.
+
+        Raises ValueError if bounds are traced, have another shape, or contradict each other.
+        """
         bounds = []
         for bound in (shape.lower, shape.upper):
             if not is_concrete(bound):
@@ -186,11 +208,11 @@ class UserRows:
         return bounds
 
     def _local(self, unknowns: np.ndarray) -> np.ndarray:
-        """Return values of local unknowns [draws lanes n] at the draws."""
-        padded = np.concatenate([self.draws, np.zeros((len(self.draws), 1))], 1)
+        """Return the local unknowns [samples lanes n] at the samples."""
+        padded = np.concatenate([self.samples, np.zeros((len(self.samples), 1))], 1)
         return padded[:, unknowns]
 
     def set_cost_row(self, row: int) -> None:
-        """Set the row of the cost, which is the last."""
-        for block, is_cost in self.cost_places:
+        """Add all cost terms to the row with this index."""
+        for block, is_cost in self._cost_terms:
             block.rows = np.where(is_cost, row, block.rows)
