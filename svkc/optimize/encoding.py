@@ -1,4 +1,4 @@
-"""Motions as the unknowns of a transcription, and back."""
+"""Conversion of motions to the unknowns of a transcription, and back."""
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ from svkc.optimize.transcription import Transcription
 
 
 def encode(transcription: Transcription, guess: Guess) -> np.ndarray:
-    """Return a guess as unknowns in SI units."""
+    """Return a guess as the vector of unknowns, in SI units and within bounds."""
     table, nv = transcription.builder.table, transcription.model.layout.nv
     x, start = np.zeros(table.count), 0.0
     rows, has_state = transcription.model.rows.rows, transcription.model.controls.has_state
@@ -32,7 +32,7 @@ def encode(transcription: Transcription, guess: Guess) -> np.ndarray:
 
 
 def _to_charts(transcription: Transcription, reference, q, v):
-    """Return coordinates and rates of nodes in their charts."""
+    """Return the coordinates and rates [n + 1 nv] of nodes in their charts, from q and v."""
     chain = transcription.builder.chain
     return jax.vmap(lambda *x: chart_from_motion(chain, *x))(
         *(jnp.asarray(x) for x in (reference, q, v))
@@ -40,7 +40,7 @@ def _to_charts(transcription: Transcription, reference, q, v):
 
 
 def _gaps(transcription: Transcription, q):
-    """Return the gaps of the links' rows."""
+    """Return the gaps of the links' rows at q of the tree."""
     return gaps_at(transcription.builder.chain, jnp.asarray(q), transcription.model.rows)
 
 
@@ -56,7 +56,7 @@ def _with_noise(transcription: Transcription, guess: Guess, x: np.ndarray) -> np
 
 
 def decode(transcription: Transcription, x: np.ndarray) -> tuple[PhaseMotion, ...]:
-    """Return unknowns in SI units as a motion."""
+    """Return the motion of each phase from the vector of unknowns x, in SI units."""
     chain, nv, rows = (
         transcription.builder.chain,
         transcription.model.layout.nv,
@@ -88,7 +88,7 @@ def decode(transcription: Transcription, x: np.ndarray) -> tuple[PhaseMotion, ..
 
 
 def _spread(values: np.ndarray, rows: np.ndarray, count: int) -> np.ndarray:
-    """Return values of selected rows [... rows] over all rows [... count]."""
+    """Return values of selected rows [... rows] as values of all rows [... count], with zeros."""
     out = np.zeros((*values.shape[:-1], count))
     out[..., rows] = values
     return out

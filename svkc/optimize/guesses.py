@@ -12,10 +12,12 @@ import numpy as np
 from svkc._jax.eager import eager_jit
 from svkc.model.chain import Chain, State
 from svkc.model.validation import finite_array
+from svkc.optimize.controls import AbstractControls
 from svkc.optimize.equations import equations_of_motion
 from svkc.optimize.loop_rows import LinkRows, candidate_rows, gaps_at, rates_at
 from svkc.optimize.phases import Phase
 from svkc.optimize.points import full_configuration, full_velocity
+from svkc.optimize.schemes import Radau
 from svkc.transitions.initial_state import full_vector
 from svkc.tree.configuration import difference, integrate
 
@@ -179,3 +181,33 @@ def static_forces(
     for i in range(len(q)):
         out[i, rows] = np.linalg.lstsq(J[i][:, ~driven].T, weight[i][~driven], rcond=1e-6)[0]
     return out
+
+
+def motion_without_torques(
+    chain: Chain,
+    controls: AbstractControls,
+    scheme: Radau,
+    phase: Phase,
+    duration: float,
+    line: tuple[np.ndarray, np.ndarray],
+) -> PhaseMotion:
+    """Return the motion of a phase along a line, with zero torques and zero accelerations.
+
+    Multipliers of links are those of `static_forces`.
+
+    duration: s. line: (q [n + 1 nq], v [n + 1 nv]) of the tree at the nodes.
+    """
+    n, s, control = phase.intervals, scheme.stages, controls.count(chain)
+    q, v = line
+    forces = static_forces(chain, phase.connected, controls.driven(chain), q)
+    return PhaseMotion(
+        duration=float(duration),
+        q=q,
+        v=v,
+        states=np.zeros((n + 1, control * controls.has_state)),
+        blocks=np.zeros((n, controls.blocks(scheme), control)),
+        vdot=np.zeros((n, s, chain.nv)),
+        forces=np.repeat(forces[:-1, None], s, 1),
+        impulse=np.zeros(6 * len(chain.link_names)),
+        mesh=phase.node_fractions,
+    )
