@@ -1,16 +1,19 @@
-"""Optimization of a backflip with a loop that closes in flight: svkc beside CasADi.
+"""Optimization of a backflip with a loop that closes in flight: svkc compared with CasADi.
 
-Both solve the same transcription (Radau IIA, two stages, 130 intervals) of the statement in
-backflip.py with IPOPT and MUMPS, on one thread: from the straight-line guess, and from the same
-noisy starts. The cost is J / 1e6.
+Both solve one transcription (Radau IIA, two stages, 130 intervals) of the problem in backflip.py
+with IPOPT and MUMPS on one thread. They start from straight lines between poses, and from the same
+noisy guesses. Costs in the table are J / 1e6.
 
 `python benchmarks/optimize.py [--starts 20] [--by CasADi svkc]` (extras `bench`, `optimize`) prints
-the rows and writes results/optimize.csv. The last solves start CasADi's IPOPT from the best point
-of each other solver; `--confirm FILE` does so from a stored point of the layout of backflip.py.
+a table and writes it to results/optimize.csv. To confirm the optima, the last rows solve with
+CasADi from the best solution of each other solver. `--confirm FILE` does this from a stored point
+in the layout of backflip.py, and nothing else.
 
-Seconds are of the processor, from IPOPT's own statistics: functions, its primal-dual system (linear
-algebra), all of it. `ready` is what comes before: graphs, derivatives, compilation. Milliseconds of
-functions are medians of calls in turns at the straight-line guess.
+Columns in seconds are processor time by IPOPT's statistics: of the problem's functions, of linear
+algebra (the primal-dual system), and in total. `ready` is the time before the first solve: graphs,
+derivatives, compilation. Columns in milliseconds are times per iteration. The rows, Jacobian and
+Hessian are also timed alone at the straight-line guess: medians of calls that alternate between the
+solvers.
 """
 
 import argparse
@@ -22,7 +25,7 @@ import platform
 import statistics
 import time
 
-# threads of small dense blocks cost more than they save
+# several threads for small dense blocks cost more time than they save
 os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
@@ -32,7 +35,7 @@ import numpy as np
 import optimize_casadi
 
 RESULTS = pathlib.Path(__file__).parent / "results"
-# the module of a solver holds `Backflip`; a further solver is a row here
+# the module of each solver, which defines a class `Backflip`
 SOLVERS = {"CasADi": "optimize_casadi", "svkc": "optimize_svkc"}
 HEAD = [
     "start",
@@ -52,7 +55,10 @@ ROUNDS = 15
 
 
 def row(start: str, by: str, solve: optimize_casadi.Solve, ready: float) -> list:
-    """Return the row of a solve. Milliseconds are per iteration."""
+    """Return the table's row of a solve.
+
+    start: name of the guess. by: name of the solver. ready: seconds before the first solve.
+    """
     per_iteration = 1e3 / max(solve.iterations, 1)
     return [
         start,
@@ -71,7 +77,7 @@ def row(start: str, by: str, solve: optimize_casadi.Solve, ready: float) -> list
 
 
 def time_functions(problems: dict):
-    """Yield (function, by, ms) of the functions of all solvers, called in turns."""
+    """Yield (function, solver, ms): the median time of each function of each solver."""
     calls = {by: p.functions(backflip.straight_line_guess()) for by, p in problems.items()}
     for name in ("rows", "Jacobian", "Hessian"):
         times = {by: [] for by in calls}
@@ -96,7 +102,7 @@ def machine() -> dict:
 
 
 def main(starts: int, solvers: list[str]):
-    """Measure, print and write all rows."""
+    """Measure, print and write all rows. starts: number of noisy guesses."""
     problems = {by: importlib.import_module(SOLVERS[by]).Backflip() for by in solvers}
     guesses = {"straight lines": backflip.straight_line_guess()}
     guesses |= {f"noise {seed}": backflip.noisy_guess(seed) for seed in range(starts)}
@@ -124,7 +130,7 @@ def main(starts: int, solvers: list[str]):
 
 
 def confirm(path: str):
-    """Print what CasADi's IPOPT converges to from a stored point."""
+    """Print the result of CasADi from a stored point. path: of an .npz file."""
     with np.load(path) as file:
         point = {name: file[name] for name in backflip.SHAPES}
     solve = optimize_casadi.confirm(point)
@@ -136,7 +142,7 @@ def confirm(path: str):
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
-    parser.add_argument("--starts", type=int, default=20, help="noisy starts")
+    parser.add_argument("--starts", type=int, default=20, help="number of noisy guesses")
     parser.add_argument("--by", nargs="+", default=list(SOLVERS), choices=SOLVERS)
     parser.add_argument("--confirm", metavar="FILE")
     options = parser.parse_args()

@@ -1,9 +1,9 @@
-"""Where the time of examples/09_backflip.py goes, from a cold process with a cold cache.
+"""Wall time of the steps of examples/09_backflip.py, in a new process with an empty cache.
 
-`python benchmarks/optimize_cold.py` (extra `optimize`) takes the steps of the example one after
-another in this process, with an empty folder of compiled programs, and prints a row for each:
-seconds of the wall, of the processor, and those parts of the wall's that JAX reports: traces,
-lowering to XLA's language, and compilation. The rest is execution, IPOPT, and Python.
+`python benchmarks/optimize_cold.py` (extra `optimize`) runs the steps of the example one after
+another, with an empty cache of compiled programs. It prints a row for each step: wall time,
+processor time, and the parts of the wall time that JAX reports: tracing, lowering to StableHLO, and
+compilation. The rest of the wall time is execution, IPOPT, and Python.
 """
 
 import os
@@ -29,7 +29,7 @@ def count(event: str, duration: float, **_options) -> None:
 
 
 def step(name: str) -> None:
-    """Print the row of what was done since the last call."""
+    """Print the row of the step that ends now, with the times since the last call."""
     global begin
     now = time.perf_counter(), time.process_time()
     row = [now[0] - begin[0], now[1] - begin[1], *spent.values()]

@@ -1,12 +1,12 @@
-"""The backflip as svkc solves it by default: refined until it is a motion, and from many starts.
+"""The backflip by svkc alone, with its defaults: mesh refinement, and many noisy guesses.
 
-`python benchmarks/optimize_motions.py refined` solves from straight lines between poses, and
-refines the mesh until each interval, simulated from its first node, ends within 1e-3 rad (m) and
-1e-2 rad/s (m/s) of the next node. `... starts [--starts 20] [--processes 2]` solves from noisy
-starts in several processes. Both (extra `optimize`) print their rows and write them to results/.
+`python benchmarks/optimize_motions.py refined` solves from straight lines between poses. It refines
+the mesh until each interval, simulated from its first node, ends within 1e-3 rad (m) and 1e-2 rad/s
+(m/s) of the next node. `... starts [--starts 20] [--processes 2]` solves from noisy guesses in
+several processes. Both (extra `optimize`) print a table and write it to results/.
 
-Seconds are of the wall: those of the solver, and all of a round, with traces and compilation. The
-cost is J / 1e6.
+Seconds are wall time: that of the solver, and that of a whole round with tracing and compilation.
+Costs are J / 1e6.
 """
 
 import argparse
@@ -16,7 +16,7 @@ import pathlib
 import platform
 import time
 
-# threads of small dense blocks cost more than they save
+# several threads for small dense blocks cost more time than they save
 os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
@@ -55,7 +55,7 @@ def show(row: dict) -> None:
 
 
 def refined() -> None:
-    """Refine the solution from straight lines round by round."""
+    """Solve from straight lines, refine the mesh round by round, and write a row for each round."""
     problem = backflip_problem(backflip()[0])
     rows, begin = [], time.perf_counter()
     solution = problem.solve(backflip_guess(problem), solver=SOLVER)
@@ -84,7 +84,7 @@ def refined() -> None:
 
 
 def starts(count: int, processes: int) -> None:
-    """Solve from noisy starts."""
+    """Solve from `count` noisy guesses and write a row for each."""
     problem = backflip_problem(backflip()[0])
     guesses = [backflip_guess(problem, noise=0.2, key=key) for key in range(count)]
     begin = time.perf_counter()
@@ -112,7 +112,7 @@ def starts(count: int, processes: int) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
     parser.add_argument("what", choices=["refined", "starts"])
-    parser.add_argument("--starts", type=int, default=20, help="noisy starts")
+    parser.add_argument("--starts", type=int, default=20, help="number of noisy guesses")
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     options = parser.parse_args()
     refined() if options.what == "refined" else starts(options.starts, options.processes)

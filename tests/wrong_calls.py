@@ -590,4 +590,5 @@ ALSO = [
     ),
     ("scale_inertia: got 1", lambda s: s.four.replace(mass={"crank": 1.0}, scale_inertia=1)),
     ("chin", lambda s: s.load(cuttable=["rocker", "chin"])),
+    *wrong_optimizations.ALSO,
 ]

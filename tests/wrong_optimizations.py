@@ -87,6 +87,7 @@ CASES = {
     "...: got shape ..., expected one number, or": lambda s: check(
         controls=optimize.Torques(np.ones(3))
     ),
+    "...: the virtual link": on_point(lambda p: p.forces("pin")[2]),
     "Radau: got": lambda s: optimize.Radau(9),
     "at the guess ... is": lambda s: check(last=-1.0, of=fixed_problem()),
     "at the guess the derivative": lambda s: check(last=0.0, of=fixed_problem()),
@@ -97,7 +98,6 @@ CASES = {
     "constraint ...: got the bounds": on_point((lambda p: p.state.q[0], 1, 0)),
     "constraint ...: its bounds": on_point(lambda p: (p.state.q[0], p.state.v[0], 1)),
     "controls: ... is": lambda s: problem(optimize.Torques(joints=["pin"])),
-    "forces: the virtual link": on_point(lambda p: p.forces("pin")[2]),
     "guess: expected problem.guess": lambda s: problem().solve(3),
     "guess: got ... durations": lambda s: problem().guess([{}, {}], [1.0, 2.0]),
     "guess: got ... phases": lambda s: optimize.Problem(
@@ -113,6 +113,7 @@ CASES = {
     "phase ...: got ... intervals": lambda s: phase(intervals=0),
     "phase ...: got the duration": lambda s: phase(duration=(2, 1)),
     "phase ...: got the mesh": lambda s: phase(mesh=[0, 0.5]),
+    "phase ...: here names": lambda s: phase(here="pin"),
     "phase ...: path has": lambda s: phase(path=[optimize.between("x", 0, 1)]),
     "phase ...: the bounds of": lambda s: check(
         bounds=[optimize.between("x", 0, 1)], start=[optimize.between("x", 2, 3)]
@@ -122,3 +123,8 @@ CASES = {
     "solve: ...": too_few_iterations,
     "with_mesh: got": lambda s: problem().with_mesh([2, 2]),
 }
+
+ALSO = [
+    ("torques: the virtual link", on_point(lambda p: p.torques("pin")[2])),
+    ("impulse: the virtual link", on_point(lambda p: p.impulse("pin")[2], "start")),
+]

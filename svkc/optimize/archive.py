@@ -1,4 +1,4 @@
-"""Solutions on disk: one .npz file for each."""
+"""Writing of solutions to .npz files."""
 
 import json
 import os
@@ -18,7 +18,7 @@ MULTIPLIERS = ("rows", "lower", "upper")
 
 
 def description_of(problem: Any) -> dict[str, Any]:
-    """Return what a problem must have in common with that of a stored solution."""
+    """Return the properties that a problem and the problem of a stored solution must share."""
     return {
         "phases": [[p.name, *p.connected] for p in problem.phases],
         "coordinates": list(problem.chain.dof_names),
@@ -28,7 +28,7 @@ def description_of(problem: Any) -> dict[str, Any]:
 
 
 def save_solution(solution: Any, result: str, path: Path) -> None:
-    """Write one .npz file; see `Solution.save`. result: name of the solution's result."""
+    """Write a solution to one .npz file; see `Solution.save`. result: name of its result code."""
     import svkc
 
     arrays: dict[str, Any] = {name: np.asarray(getattr(solution, name)) for name in NUMBERS}
@@ -36,7 +36,7 @@ def save_solution(solution: Any, result: str, path: Path) -> None:
         arrays[f"multipliers.{name}"] = getattr(solution.multipliers, name)
     for i, (phase, motion) in enumerate(zip(solution.problem.phases, solution.motion)):
         arrays |= {f"{i}.{name}": np.asarray(getattr(motion, name)) for name in MOTION}
-        arrays[f"{i}.mesh"] = phase.places
+        arrays[f"{i}.mesh"] = phase.node_fractions
     meta = {
         "optimize_schema": SCHEMA,
         "svkc": svkc.__version__,
@@ -45,7 +45,7 @@ def save_solution(solution: Any, result: str, path: Path) -> None:
     }
     arrays["metadata"] = np.array(json.dumps(meta))
     path = pathlib.Path(path)
-    # in the same folder, so that os.replace is atomic
+    # a temporary file in the folder of the target, so that os.replace is atomic
     temporary = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:
         with open(temporary, "wb") as file:

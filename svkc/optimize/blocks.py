@@ -1,8 +1,10 @@
-"""Blocks of rows: one function over many lanes, with its derivatives and its place in the whole.
+"""Row blocks: rows of the problem that one function gives at many intervals or nodes.
 
-A block is a vmapped function of local unknowns. Tables say which unknown of the problem each local
-one is, and to which row of the problem each local row is added (-1: none). The last row of the
-problem is the cost.
+The function is vmapped. Each of its evaluations is a lane: one interval, or one node. A lane has
+local unknowns and local rows. Index tables say which unknown of the problem each local unknown is,
+and to which row of the problem each local row is added. The last row of the problem is the cost.
+
+Row blocks have nothing to do with control blocks (see `AbstractControls`).
 """
 
 from collections.abc import Callable
@@ -18,20 +20,20 @@ from svkc._jax.lanes_last import with_lanes_last
 from svkc._jax.static_gather import static_take
 from svkc.optimize.lift import Layout, Lift, StagePolynomials, dependencies
 
-# fewest lanes for which a block's execution time outweighs its compile time
+# blocks with at least this many lanes are compiled for speed; others for a short compile time
 MANY_LANES = 8
-# local unknowns, and multipliers of local rows
+# local unknowns z of all lanes, and multipliers of their local rows
 Unknowns: TypeAlias = Float[Array, "lanes n"]
 Multipliers: TypeAlias = Float[Array, "lanes m"]
 
 
 class Block:
-    """A function over lanes.
+    """Base class of row blocks.
 
-    unknowns: [lanes n] index of each local unknown in the problem; -1: the unknown is zero.
-    rows: [lanes m] index of the row to which each local row is added; -1: left out.
-    data: what distinguishes the lanes, with a leading axis. It is an argument of the methods, as it
-        changes without compiling again.
+    unknowns: [lanes n] index of each local unknown in the problem; -1: it is zero.
+    rows: [lanes m] index of the row to which each local row is added; -1: it is left out.
+    data: constants of each lane, with a leading axis over lanes. Methods take the data as an
+        argument, so that new data need no compilation.
     """
 
     unknowns: np.ndarray
@@ -39,7 +41,7 @@ class Block:
     data: Any
 
     def set_lanes(self, lanes: Any) -> None:
-        """Set the data of the lanes."""
+        """Replace the data of the lanes."""
         self.data = lanes
 
     def values(self, params: Any, data: Any, z: Unknowns) -> jax.Array:
@@ -47,38 +49,43 @@ class Block:
         raise NotImplementedError
 
     def jacobian(self, params: Any, data: Any, z: Unknowns) -> jax.Array:
-        """Return the derivatives [lanes entries] of the rows, at `jacobian_places`."""
+        """Return the entries [lanes entries] of the Jacobian in `jacobian_pattern`."""
         raise NotImplementedError
 
     def hessian(self, params: Any, data: Any, z: Unknowns, multipliers: Multipliers) -> jax.Array:
-        """Return the Hessians [lanes entries] of the rows' sum with multipliers [lanes m], at
-        `hessian_places`."""
+        """Return the entries [lanes entries] of the Hessians in `hessian_pattern`.
+
+        They are those of the functions multipliers . rows, one for each lane.
+        """
         raise NotImplementedError
 
     @property
-    def jacobian_places(self) -> tuple[np.ndarray, np.ndarray]:
-        """Local row and local unknown of each entry."""
-        return _every_place(self.rows.shape[1], self.unknowns.shape[1])
+    def jacobian_pattern(self) -> tuple[np.ndarray, np.ndarray]:
+        """Local row and local unknown of each entry of the Jacobian."""
+        return _full_pattern(self.rows.shape[1], self.unknowns.shape[1])
 
     @property
-    def hessian_places(self) -> tuple[np.ndarray, np.ndarray]:
-        """Local unknowns of each entry; of two that are symmetric there is one."""
+    def hessian_pattern(self) -> tuple[np.ndarray, np.ndarray]:
+        """The two local unknowns of each entry of the Hessian, which has one of (i, k), (k, i)."""
         return np.tril_indices(self.unknowns.shape[1])
 
 
 def lower_half(H: Float[Array, "n n"]) -> Float[Array, " entries"]:
-    """Return the entries of the lower half of a matrix."""
+    """Return the entries of the lower half of a matrix, in the order of `np.tril_indices`."""
     return static_take(H.ravel(), np.ravel_multi_index(np.tril_indices(len(H)), H.shape))
 
 
-def _every_place(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
+def _full_pattern(rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the row and column of each entry of a full matrix."""
     row, column = np.indices((rows, columns))
     return row.ravel(), column.ravel()
 
 
 class PlainBlock(Block):
-    """A block of any function (params, data of the lane, unknowns) -> rows."""
+    """A row block of any function (params, data of the lane, unknowns) -> rows.
+
+    Derivatives are those of automatic differentiation.
+    """
 
     def __init__(
         self,
@@ -93,6 +100,7 @@ class PlainBlock(Block):
         self.rows: np.ndarray = rows
 
     def _over_lanes(self, function: Callable, params: Any, data: Any, *arrays) -> jax.Array:
+        """Return function(rows of z, ...) over lanes. arrays: further arguments [lanes ...]."""
         call = lambda data, *x: function(lambda z: self.function(params, data, z), *x)
         return jax.vmap(call)(data, *arrays)
 
@@ -108,15 +116,20 @@ class PlainBlock(Block):
 
 
 class StageBlock(Block):
-    """A block of a function of stages, carried to the unknowns of intervals by their polynomials.
+    """A row block of a function of stages. Its lanes are intervals.
 
-    function: (params, data, weight, y) -> rows of a stage; weight is b / count of the quadrature.
-    poly: of each stage at which the function is evaluated.
-    index, count: [lanes] start of a lane's interval and the phase's duration, both by the
-        interval's length; of equal intervals which one the lane is, and how many there are.
-    tangents: stage's variables in which the function is not linear; others have no second
-        derivatives among themselves.
-    variables: those that have second derivatives.
+    The function is differentiated by the variables y of a stage. `Lift` gives the derivatives by
+    the unknowns of the interval.
+
+    function: (params, data of the lane, weight, y) -> rows of a stage. The weight is the stage's
+        share of the phase's duration in the quadrature of a running cost.
+    poly: coefficients of each stage at which the function is evaluated.
+    start_ratio, duration_ratio: [lanes] as of `Lift`.
+    nonlinear: indices of stage variables. The second derivative by two variables is zero where
+        neither is among these.
+    variables: indices of the stage variables that have a second derivative with any other; all of
+        them unless set.
+    options: keyword arguments for the functions of `UserRows`.
     """
 
     def __init__(
@@ -126,47 +139,51 @@ class StageBlock(Block):
         poly: StagePolynomials,
         *,
         data: Any,
-        index: np.ndarray,
-        count: np.ndarray,
+        start_ratio: np.ndarray,
+        duration_ratio: np.ndarray,
         unknowns: np.ndarray,
         rows: np.ndarray,
-        tangents: np.ndarray,
+        nonlinear: np.ndarray,
     ):
         self.function = function
         self.layout = layout
         self.poly = poly
-        self.data: Any = (data, np.asarray(index, float), np.asarray(count, float))
+        self.data: Any = (data, np.asarray(start_ratio, float), np.asarray(duration_ratio, float))
         self.unknowns: np.ndarray = unknowns
         self.rows: np.ndarray = rows
-        self.tangents = tangents
-        self.variables: np.ndarray = np.arange(layout.of_stage)
+        self.nonlinear = nonlinear
+        self.variables: np.ndarray = np.arange(layout.stage_size)
         self.options: dict[str, Any] = {}
 
     def set_lanes(self, lanes: Any) -> None:
         self.data = (lanes, *self.data[1:])
 
     def _over_stages(self, function: Callable, params: Any, data: Any, z, *arrays) -> jax.Array:
-        """Return function(rows of y, lift, ...) over lanes and stages.
+        """Return function(rows of y, lift, ...) for all lanes and stages [lanes stages ...].
 
         arrays: further arguments [lanes stages ...].
         """
         return self._join_stages(lambda x: x, self._at_stage(function), params, data, z, *arrays)
 
     def _at_stage(self, function: Callable) -> Callable:
-        """Return a function of stages from function(rows of y, lift, ...)."""
+        """Return `function` with the arguments (params, data, lift, ...) of `_join_stages`."""
 
         def at_stage(params, own, lift, *x):
-            weight = lift.poly.b / lift.count
+            weight = lift.poly.b / lift.duration_ratio
             return function(lambda y: self.function(params, own, weight, y), lift, *x)
 
         return at_stage
 
     def _join_stages(self, join: Callable, at_stage: Callable, params: Any, data: Any, z, *arrays):
-        """Return join(values of all stages) of at_stage(params, data, lift, ...) over lanes."""
+        """Return join(values of at_stage at all stages) for all lanes.
+
+        at_stage: function (params, data, lift, ...) of one stage.
+        join: function of the values [stages ...] of one lane.
+        """
 
         def at_lane(params, lane, z, *x):
-            own, index, count = lane
-            lift = lambda poly: Lift(self.layout, poly, z, index, count)
+            own, start_ratio, duration_ratio = lane
+            lift = lambda poly: Lift(self.layout, poly, z, start_ratio, duration_ratio)
             over_stages = jax.vmap(lambda poly, *x: at_stage(params, own, lift(poly), *x))
             return join(over_stages(self.poly, *x))
 
@@ -189,10 +206,10 @@ class StageBlock(Block):
         def of_stage(f, lift, m):
             y = lift.variables()
             gradient = jax.grad(lambda y: f(y) @ m)
-            if not len(self.tangents):
+            if not len(self.nonlinear):
                 return lift.curvature(gradient(y))
             g, product = jax.linearize(gradient, y)
-            directions = jnp.eye(len(y), dtype=y.dtype)[self.tangents]
+            directions = jnp.eye(len(y), dtype=y.dtype)[self.nonlinear]
             H = self._symmetric(jax.vmap(product)(directions))
             of_variables = lower_half(lift.hessian(H, self.variables))
             return jnp.concatenate([lift.curvature(g), of_variables])
@@ -202,10 +219,10 @@ class StageBlock(Block):
         return self._join_stages(total, at_stage, params, data, z, multipliers)
 
     @property
-    def hessian_places(self) -> tuple[np.ndarray, np.ndarray]:
-        row = np.arange(self.layout.of_interval)
+    def hessian_pattern(self) -> tuple[np.ndarray, np.ndarray]:
+        row = np.arange(self.layout.interval_size)
         first = row, np.ones_like(row)
-        if not len(self.tangents):
+        if not len(self.nonlinear):
             return first
         columns = dependencies(self.layout, self.variables)
         second = (columns[x] for x in np.tril_indices(len(columns)))
@@ -213,19 +230,23 @@ class StageBlock(Block):
         return row, column
 
     def _symmetric(self, rows):
-        """Return the Hessian by `variables` from its rows of `tangents`."""
-        place = np.full(self.layout.of_stage, len(self.tangents))
-        place[self.tangents] = np.arange(len(self.tangents))
+        """Return the Hessian over `variables` from the rows [nonlinear y] of the full Hessian.
+
+        Of an entry whose row is missing, the symmetric one is taken.
+        """
+        place = np.full(self.layout.stage_size, len(self.nonlinear))
+        place[self.nonlinear] = np.arange(len(self.nonlinear))
         place, some = place[self.variables], static_take(rows.T, self.variables).T
         some = static_take(some, place)
-        return jnp.where((place < len(self.tangents))[:, None], some, some.T)
+        return jnp.where((place < len(self.nonlinear))[:, None], some, some.T)
 
 
-def find_tangents(block: StageBlock, params: Any, draws: np.ndarray) -> np.ndarray:
-    """Return the stage's variables in which a block's function is not linear.
+def find_nonlinear_variables(block: StageBlock, params: Any, samples: np.ndarray) -> np.ndarray:
+    """Return the indices of the stage variables that have a second derivative that is not zero.
 
-    draws: values [draws lanes n] of local unknowns. The Hessian is evaluated there, with random
-    multipliers, and a variable is kept where a second derivative is not zero.
+    The Hessian is evaluated at random points, with random multipliers.
+
+    samples: values [samples lanes n] of local unknowns at these points.
     """
 
     @eager_jit
@@ -236,11 +257,11 @@ def find_tangents(block: StageBlock, params: Any, draws: np.ndarray) -> np.ndarr
         multipliers = multipliers.reshape(len(z), len(block.poly.c), -1)
         return block._over_stages(of_stage, params, data, z, multipliers)
 
-    # a few lanes are like the others
+    # all lanes have the same pattern: two of them are enough
     lanes = lambda x: jax.tree.map(lambda x: jnp.asarray(x[:2]), x)
     rows = block.rows[:2]
-    random, used = np.random.default_rng(0), np.zeros(block.layout.of_stage, bool)
-    for z in draws:
+    random, used = np.random.default_rng(0), np.zeros(block.layout.stage_size, bool)
+    for z in samples:
         H = second(params, lanes(block.data), lanes(z), random.normal(size=rows.shape))
         used |= (np.asarray(H) != 0).any((0, 1, 2))
     return np.flatnonzero(used)

@@ -7,7 +7,7 @@ import numpy as np
 
 
 def _sparsity(casadi: Any, shape: tuple[int, int], row: np.ndarray, column: np.ndarray):
-    """Return a CasADi pattern, and the order of its entries: by columns, then rows."""
+    """Return a sparsity pattern of CasADi, and the order of entries in it: column by column."""
     order = np.lexsort((row, column))
     pattern = casadi.Sparsity.triplet(*shape, row[order].tolist(), column[order].tolist())
     return pattern, order
@@ -17,7 +17,10 @@ def _callback_class(casadi: Any) -> Any:
     """Return the class of functions that CasADi calls."""
 
     class Values(casadi.Callback):
-        """A function of dense inputs that returns the entries of its outputs."""
+        """A function of dense inputs that returns the nonzero entries of its outputs.
+
+        inputs, outputs: sparsity patterns by name. evaluate: (arrays) -> arrays of entries.
+        """
 
         def __init__(self, name: str, inputs: dict, outputs: dict, evaluate: Callable):
             casadi.Callback.__init__(self)
@@ -56,9 +59,12 @@ def _callback_class(casadi: Any) -> Any:
 
 
 def nlp_functions(casadi: Any, callbacks: Any) -> dict[str, Any]:
-    """Return the callbacks `nlp`, `grad_f`, `jac_g` and `hess_lag` for `nlpsol`."""
+    """Return the callbacks `nlp`, `grad_f`, `jac_g` and `hess_lag` for `nlpsol`.
+
+    callbacks: `Callbacks` of a program.
+    """
     program = callbacks.program
-    n, m = program.count, len(program.kept)
+    n, m = program.count, len(program.solver_rows)
     dense = casadi.Sparsity.dense
     x, p, f, g = dense(n), dense(0), dense(1), dense(m)
     jac, jac_order = _sparsity(casadi, (m, n), *callbacks.jacobianstructure())

@@ -1,4 +1,7 @@
-"""The certificate of a solution: every interval simulated, then phases, then the whole motion."""
+"""`SolutionReport`: how far a solution is from a motion, by simulation with error control.
+
+Intervals are simulated one by one, then phases, then the whole motion.
+"""
 
 import dataclasses
 from collections.abc import Sequence
@@ -14,7 +17,7 @@ from svkc.model.tables import Table, as_text
 from svkc.optimize.feedback import growth
 from svkc.optimize.guesses import PhaseMotion
 from svkc.optimize.plans import Plan, control_of, plan_of
-from svkc.optimize.points import full_state, padded, states_of, tree_configuration, tree_velocity
+from svkc.optimize.points import full_configuration, full_state, full_velocity, padded, states_of
 from svkc.optimize.replay import Distance, ReplayReport, distance, replay_report
 from svkc.simulation.simulate import simulate
 from svkc.transitions.placement import place_at_current_pose
@@ -22,26 +25,27 @@ from svkc.tree.kinematics import kinematics
 
 # tolerances of the simulations, far below the defects that matter
 TOLERANCES: dict[str, Any] = {"rtol": 1e-8, "atol": 1e-10}
-# lanes of a batch, which waits for its slowest lane
+# lanes simulated in one batch; a batch takes as many steps as its slowest lane
 _BATCH = 16
 
 
 @dataclasses.dataclass(frozen=True)
 class SolutionReport:
-    """How far a solution is a motion.
+    """How far a solution is from a motion of the chain.
 
-    Each interval is simulated with error control from its own first node, with its own torques. A
-    defect is how far the end is from the next node of the solution.
+    Each interval is simulated with error control, from its first node and with its planned torques.
+    The defect of an interval is the distance of the simulated end from the next node.
 
-    position, velocity: of each phase, [intervals] largest defects over the coordinates (rad, m;
-        rad/s, m/s).
-    names: of the phases. worst: of each phase, the coordinate of the largest defect in velocity.
+    position, velocity: of each phase, the defect of each interval, as the largest over the
+        coordinates (rad, m; rad/s, m/s).
+    names: names of the phases.
+    worst: of each phase, the name of the coordinate with the largest defect in velocity.
     failed: number of intervals and phases whose simulation did not reach its end.
-    open_loop: of each phase, simulated from its first node with the plan's torques alone: the
-        distance of its end from the plan. None: without replay.
-    growth: of each phase, the largest factor by which it multiplies a small error without feedback,
-        in the problem's units. None: without replay.
-    replay: the whole motion simulated with feedback. None: without replay.
+    open_loop: of each phase, the distance of its end from the plan, if the phase is simulated from
+        its first node with the planned torques alone. None: without replay.
+    growth: of each phase, the largest factor by which it multiplies a small error without feedback.
+        Errors are measured in the problem's units. None: without replay.
+    replay: closed-loop replay: the whole motion simulated with feedback. None: without replay.
     """
 
     position: tuple[np.ndarray, ...]
@@ -73,7 +77,7 @@ class SolutionReport:
         return as_text([*blocks, *self._replayed()])
 
     def _replayed(self) -> list[Any]:
-        """Return the table of the replay."""
+        """Return the parts of the text on the replay, none without replay."""
         if self.replay is None or self.open_loop is None or self.growth is None:
             return []
         header = (
@@ -91,9 +95,10 @@ class SolutionReport:
 
 
 def _lanes(problem: Any, structures: Sequence[Structure], motion: tuple[PhaseMotion, ...]) -> tuple:
-    """Return lanes of all intervals, and of all phases.
+    """Return the simulations of all intervals, and those of all phases.
 
-    A lane has a first state, start, end, the end's (q, v), and the first and the last interval.
+    Each is a tuple with a leading axis over lanes: first state, start time, end time, planned (q,
+    v) at the end, and the first and the last interval of the plan.
     """
     chain, parts, wholes, k, start = problem.chain, [], [], 0, 0.0
     places = [(m.q[:-1], m.v[:-1]) for m in motion]
@@ -112,17 +117,20 @@ def _lanes(problem: Any, structures: Sequence[Structure], motion: tuple[PhaseMot
 def at_own_place(
     chain: Chain, structure: Structure, q: Float[Array, " nq"], v: Float[Array, " nv"]
 ) -> State:
-    """Return a state whose links are where its bodies are, so that drift of the loops is none."""
-    full = tree_configuration(chain, q)
+    """Return the state at q and v, with links placed at the bodies' current poses.
+
+    A simulation from a node whose loops have drifted then starts with closed loops.
+    """
+    full = full_configuration(chain, q)
     if not chain.link_names:
-        return State(full, tree_velocity(chain, v), structure)
+        return State(full, full_velocity(chain, v), structure)
     kin = kinematics(chain, full)
     placed = place_at_current_pose(chain, structure, full, structure.connected, kin)
     return full_state(eqx.tree_at(lambda c: c.structure, chain, placed), placed, q, v)
 
 
 def _distances(chain: Chain, plan: Plan, lanes: tuple, control: Any) -> tuple:
-    """Return distances [lanes nv] from the ends in q and v, and results of the runs."""
+    """Return the distances [lanes nv] in q and v from planned ends, and the runs' result codes."""
     count, lanes, parts = len(lanes[-1]), padded(lanes, _BATCH), []
     for k in range(0, count, _BATCH):
         own = jax.tree.map(lambda x, k=k: x[k : k + _BATCH], lanes)
@@ -132,7 +140,7 @@ def _distances(chain: Chain, plan: Plan, lanes: tuple, control: Any) -> tuple:
 
 @eqx.filter_jit
 def _simulate_all(chain: Chain, plan: Plan, lanes: tuple, control: Any) -> tuple:
-    """Return distances from the ends in q and v of all lanes, and which runs reached their end."""
+    """Return the result of `_distances` for one batch."""
 
     def run(state, start, stop, end, first, last):
         own = dataclasses.replace(plan, first=first, last=last)
@@ -145,7 +153,7 @@ def _simulate_all(chain: Chain, plan: Plan, lanes: tuple, control: Any) -> tuple
 
 
 def report(solution: Any, replay: bool) -> SolutionReport:
-    """Return the certificate that `Solution.report` describes."""
+    """Return the report that `Solution.report` describes."""
     problem, motion = solution.problem, solution.motion
     chain, names = problem.chain, problem.chain.dof_names
     intervals, phases = _lanes(problem, solution.structures, motion)

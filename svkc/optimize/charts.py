@@ -1,8 +1,9 @@
-"""Coordinates in which a motion is a polynomial of time.
+"""Charts: coordinates [nv] in which an interval's motion is a polynomial of time.
 
-A joint coordinate is its own chart. A quaternion is the exponential of a rotation vector times a
-reference quaternion of the node, so that collocation by polynomials keeps its order and nodes have
-no constraint of unit length.
+Scalar joint coordinates are used as they are. A quaternion is the product of a reference quaternion
+and the exponential of a rotation vector, whose three components are the coordinates. Each node has
+a chart, with a reference of its own. Collocation then keeps its order of accuracy, and nodes need
+no unit-length constraint.
 """
 
 import jax
@@ -15,7 +16,8 @@ from svkc.model.chain import Chain
 from svkc.model.topology import BALL, FREE
 from svkc.tree.spatial import quat_conjugate, quat_log, quat_multiply, quat_normalize
 
-# terms of the series of sine and cosine; below this squared half angle they are exact to round-off
+# number of terms of the series of sine and cosine, and the squared half angle (rad^2) below which
+# the series are exact to round-off
 _TERMS, _SMALL = 7, 0.1
 
 
@@ -28,7 +30,7 @@ def quaternion_starts(chain: Chain) -> tuple[np.ndarray, np.ndarray]:
 
 
 def scalar_coordinates(chain: Chain) -> tuple[np.ndarray, np.ndarray]:
-    """Return (index in q, index in v) of each coordinate of the tree that is its own chart."""
+    """Return (index in q, index in v) of each scalar coordinate of the tree."""
     top = chain.topology
     q, v = top.scalar_coordinates
     return q[q < top.nq], v[v < top.nv]
@@ -51,13 +53,16 @@ def _exponential(u: Float[Array, "n 3"]) -> Float[Array, "n 4"]:
 def _rotation_rate(
     u: Float[Array, "n 3"], rate: Float[Array, "n 3"]
 ) -> tuple[Float[Array, "n 4"], Float[Array, "n 3"]]:
-    """Return the quaternions of rotation vectors, and angular velocities in body axes."""
+    """Return quaternions and angular velocities (rad/s, body axes) from rotation vectors.
+
+    u: rotation vectors (rad). rate: their derivatives by time.
+    """
     quat, derivative = jax.jvp(_exponential, (u,), (rate,))
     return quat, 2 * quat_multiply(quat_conjugate(quat), derivative)[..., 1:]
 
 
 def _ordered(scalars, others, at_scalars: np.ndarray, at_others: np.ndarray) -> Array:
-    """Return one vector from entries at two sets of indices."""
+    """Return the vector that has `scalars` at `at_scalars`, and `others` at `at_others`."""
     order = np.argsort(np.concatenate([at_scalars, at_others.ravel()]))
     return static_take(jnp.concatenate([scalars, others.ravel()]), order)
 
@@ -69,9 +74,10 @@ def motion_from_chart(
     rate: Float[Array, " nv"],
     second: Float[Array, " nv"],
 ) -> tuple[Float[Array, " nq"], Float[Array, " nv"], Float[Array, " nv"]]:
-    """Return q, v and vdot of the tree from coordinates in a chart and their two derivatives.
+    """Return q, v and vdot of the tree from chart coordinates and their derivatives by time.
 
     reference: configuration at the chart's origin; only its quaternions are used.
+    x, rate, second: chart coordinates, their first and their second derivatives by time.
     """
     at_q, at_v = quaternion_starts(chain)
     if not len(at_q):
@@ -95,7 +101,10 @@ def chart_from_motion(
     q: Float[Array, " nq"],
     v: Float[Array, " nv"],
 ) -> tuple[Float[Array, " nv"], Float[Array, " nv"]]:
-    """Return the coordinates in a chart, and their rates, from q and v of the tree."""
+    """Return the coordinates in a chart, and their rates, from q and v of the tree.
+
+    reference: as of `motion_from_chart`.
+    """
     at_q, at_v = quaternion_starts(chain)
     if not len(at_q):
         return q, v
@@ -119,12 +128,12 @@ def chart_from_motion(
 def to_next_chart(
     chain: Chain,
     reference: Float[Array, " nq"],
-    following: Float[Array, " nq"],
+    next_reference: Float[Array, " nq"],
     x: Float[Array, " nv"],
     rate: Float[Array, " nv"],
 ) -> tuple[Float[Array, " nv"], Float[Array, " nv"]]:
-    """Return coordinates and rates of one chart in the chart about another reference."""
+    """Return chart coordinates and rates, converted to the chart about another reference."""
     if not len(quaternion_starts(chain)[0]):
         return x, rate
     q, v, _ = motion_from_chart(chain, reference, x, rate, jnp.zeros_like(x))
-    return chart_from_motion(chain, following, q, v)
+    return chart_from_motion(chain, next_reference, q, v)

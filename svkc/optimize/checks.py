@@ -1,4 +1,4 @@
-"""What is to know of a problem before it is solved."""
+"""Checks of a problem at a guess, before it is solved."""
 
 import dataclasses
 
@@ -8,20 +8,22 @@ from svkc.model.tables import Table, as_text
 from svkc.optimize.program import Program
 
 _ROWS_SHOWN = 12
-# of a row that no unknown can change, in the solver's units
+# largest violation of a row whose unknowns are all fixed, in the solver's units
 _FIXED_VIOLATION = 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
 class Check:
-    """A problem at a guess.
+    """Size, derivatives, units and violations of a problem at a guess.
 
-    unknowns, rows, jacobian, hessian: their numbers, and those of entries that are not zero.
-    derivative_error: largest difference of the Jacobian along a direction from central
-        differences, by the largest entry.
-    hessian_error: of the Hessian of the Lagrangian, in the same way.
-    cost: at the guess.
-    units: by which the solver divides.
+    unknowns, rows: numbers of unknowns and of constraint rows.
+    jacobian, hessian: numbers of entries of the sparsity patterns.
+    derivative_error: largest error of the Jacobian times a random direction, against central
+        differences of the rows, relative to the largest value.
+    hessian_error: largest error of the Hessian of the Lagrangian times a random direction, against
+        central differences of its gradient, relative to the largest value.
+    cost: cost at the guess.
+    units: units by which the solver divides.
     violated: (name, amount in SI units) of the rows that the guess violates most.
     """
 
@@ -49,7 +51,11 @@ class Check:
 
 
 def check_finite(program: Program, x: np.ndarray) -> None:
-    """Raise ValueError if a row, the cost or a derivative is not finite, by its name."""
+    """Check a problem at x, in the solver's units.
+
+    Raises ValueError, with the name of the row, if a row, the cost or a derivative is not finite,
+    or if a row of fixed unknowns alone is violated.
+    """
     values, table = program.rows(x), program.transcription.rows
     label = lambda row: "the cost" if row == program.cost_row else table.label(row)
     if not np.isfinite(values).all():
@@ -59,7 +65,7 @@ def check_finite(program: Program, x: np.ndarray) -> None:
     if not np.isfinite(entries).all():
         row = int(program.jacobian_entries.row[np.argmin(np.isfinite(entries))])
         raise ValueError(f"at the guess the derivative of {label(row)} is not finite")
-    fixed = np.setdiff1d(np.arange(program.cost_row), program.kept)
+    fixed = np.setdiff1d(np.arange(program.cost_row), program.solver_rows)
     violation = program.violation(x)[fixed]
     if np.any(violation > _FIXED_VIOLATION):
         row = int(fixed[np.argmax(violation)])
@@ -67,7 +73,7 @@ def check_finite(program: Program, x: np.ndarray) -> None:
 
 
 def check(program: Program, x: np.ndarray) -> Check:
-    """Return the problem's numbers at a guess in the solver's units."""
+    """Return the `Check` of a problem at x, in the solver's units. Raises as `check_finite`."""
     check_finite(program, x)
     random, step = np.random.default_rng(0), 1e-6
     lower, upper, _, _ = program.bounds()

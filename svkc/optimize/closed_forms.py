@@ -1,6 +1,6 @@
-"""Derivatives of a stage's rows in closed form, for trees of hinges and slides.
+"""Derivatives of a stage's rows and of a connection in closed form, for trees of hinges and slides.
 
-They have a thirtieth of the operations of automatic differentiation of the rows.
+They need a thirtieth of the operations of automatic differentiation.
 """
 
 import functools
@@ -16,16 +16,16 @@ from svkc.optimize.charts import quaternion_starts
 from svkc.optimize.controls import AbstractControls
 from svkc.optimize.equations import IntervalData, Model, Params
 from svkc.optimize.link_derivatives import RowsOfLink, rows_of_links
-from svkc.optimize.points import tree_configuration, tree_velocity
+from svkc.optimize.points import full_configuration, full_velocity
 from svkc.optimize.tree_derivatives import TreeMotion
 from svkc.tree.inverse_dynamics import limit_forces, passive_forces
 from svkc.tree.kinematics import Kinematics, kinematics
 
 
 def has_closed_forms(chain: Chain, controls: AbstractControls) -> bool:
-    """Return whether the derivatives of this module hold.
+    """Return whether the derivatives of this module apply.
 
-    The tree has no quaternions, and joint torques are linear in the controls.
+    The tree must have no quaternions, and joint torques must be linear in the controls.
     """
     return not len(quaternion_starts(chain)[0]) and not controls.needs_state
 
@@ -33,16 +33,18 @@ def has_closed_forms(chain: Chain, controls: AbstractControls) -> bool:
 def _joint_derivatives(
     chain: Chain, q: Float[Array, " nv"], v: Float[Array, " nv"]
 ) -> tuple[tuple[Array, Array], tuple[Array, Array, Array]] | None:
-    """Return derivatives of springs, dampers and limits, each joint's by its own coordinate.
+    """Return derivatives of the forces of springs, dampers and joint limits.
 
-    First by q and v; then by q and q, q and v, v and v. None if the chain has no such forces.
+    A coordinate's force depends on its own position and velocity alone, so that each derivative is
+    an array [nv]. The first pair has the derivatives by q and by v. The second tuple has the second
+    derivatives by q and q, q and v, v and v. None if the chain has no such forces.
     """
     if chain.damping is None and chain.stiffness is None and chain.limit_spring is None:
         return None
     one, nv = jnp.ones_like(q), chain.nv
 
     def force(q, v):
-        full = tree_configuration(chain, q), tree_velocity(chain, v)
+        full = full_configuration(chain, q), full_velocity(chain, v)
         return (passive_forces(chain, *full) + limit_forces(chain, *full))[:nv]
 
     by_q = lambda q, v: jax.jvp(lambda q: force(q, v), (q,), (one,))[1]
@@ -53,13 +55,16 @@ def _joint_derivatives(
 
 
 def _diagonal(x) -> jax.Array:
-    """Return diagonal matrices from their diagonals in the last axis."""
+    """Return the diagonal matrices [... n n] of the diagonals [... n]."""
     eye = np.eye(x.shape[-1], dtype=bool)
     return jnp.where(eye.reshape((1,) * (x.ndim - 1) + eye.shape), x[..., None], 0)
 
 
 class LinkDerivatives:
-    """Links' rows along a motion of the tree, with multipliers f of those that are active."""
+    """Derivatives of the links' rows at one motion (q, v, vdot) of the tree.
+
+    active: mask of the rows that are constraints. f: multipliers; those of other rows are zero.
+    """
 
     def __init__(
         self,
@@ -83,17 +88,20 @@ class LinkDerivatives:
         )
 
     def _over_rows(self, parts: list):
-        """Return arrays of the links' rows, each a list over links, in the order of the table."""
+        """Return one array in the order of the table's rows, from one array for each of `links`."""
         order = np.argsort(np.concatenate([places for places, _ in self.links]))
         return static_take(jnp.concatenate(parts), order)
 
     def _stiffness(self, f):
-        """Return the derivatives [nv nv] of the links' force by q."""
+        """Return the derivatives [nv nv] by q of the links' generalized force J^T f."""
         parts = [rows.force_stiffness(static_take(f, places)) for places, rows in self.links]
         return functools.reduce(jnp.add, parts)
 
     def _of_links(self, multipliers, f, virtual):
-        """Return the sum over links of the blocks of `RowsOfLink.hessian`, and its by_f."""
+        """Return the second derivatives of `RowsOfLink.hessian`, for all links together.
+
+        The blocks [4 nv nv] are summed over links; the derivatives by f and q are [rows nv].
+        """
         take = lambda x, places: static_take(x, places)
         parts = [r.hessian(take(multipliers, at), take(f, at), virtual) for at, r in self.links]
         blocks = functools.reduce(jnp.add, [blocks for _, blocks, _ in parts])
@@ -101,10 +109,7 @@ class LinkDerivatives:
 
 
 class StageDerivatives(LinkDerivatives):
-    """Derivatives of `stage_equations`.
-
-    y: the stage's variables.
-    """
+    """Derivatives of `stage_equations` at the stage variables y."""
 
     def __init__(self, model: Model, params: Params, data: IntervalData, y: Float[Array, " y"]):
         self.params = params
@@ -118,13 +123,13 @@ class StageDerivatives(LinkDerivatives):
         )
 
     def _torques_by_blocks(self):
-        """Return the derivatives [nv blocks control] of the joint torques, which are linear."""
+        """Return the derivatives [nv blocks control] of the joint torques by the controls."""
         controls, chain = self.model.controls, self.chain
         torques = lambda w: controls.torques(chain, self.t, None, w, self.params.args)[: chain.nv]
         return jax.jacrev(torques)(jnp.zeros_like(self.blocks))
 
     def _forces_by_motion(self):
-        """Return the derivatives [nv 3 nv] of the forces by q, v and vdot."""
+        """Return the derivatives [nv 3 nv] of the dynamics' rows by q, v and vdot."""
         J, at = self.tree.jacobian(), np.arange(3)[None, :, None]
         diagonals = []
         if self.chain.armature is not None:
@@ -138,7 +143,7 @@ class StageDerivatives(LinkDerivatives):
         return J
 
     def jacobian(self) -> Float[Array, "equations y"]:
-        """Return the derivatives."""
+        """Return the derivatives of the rows by the stage variables."""
         nv, J = self.chain.nv, self._forces_by_motion()
         controls = -self._torques_by_blocks().reshape(nv, -1)
         upper = [jnp.zeros((nv, 2)), J.reshape(nv, -1), controls]
@@ -160,10 +165,11 @@ class StageDerivatives(LinkDerivatives):
         Float[Array, "4 nv nv"],
         Float[Array, "rows nv"],
     ]:
-        """Return derivatives of the rows' sum with multipliers.
+        """Return derivatives of the function multipliers . rows.
 
-        Gradients by the motion [3 nv] and by the control blocks; second derivatives by q and q, q
-        and v, v and v, q and vdot [4 nv nv], and by the links' multipliers and q [rows nv].
+        Its gradient by q, v and vdot [3 nv] and by the control blocks. Its second derivatives by q
+        and q, q and v, v and v, q and vdot [4 nv nv], and by f and q [rows nv]. All others are
+        zero.
         """
         nv = self.chain.nv
         of_dynamics, of_rows = multipliers[:nv], multipliers[nv:]
@@ -190,7 +196,7 @@ class StageDerivatives(LinkDerivatives):
 
 
 class ConnectionDerivatives(LinkDerivatives):
-    """Derivatives of `connection`. y: as there."""
+    """Derivatives of `connection` at its unknowns y."""
 
     def __init__(self, model: Model, params: Params, data: IntervalData, y: Float[Array, " y"]):
         chain, nv = params.chain, model.layout.nv
@@ -201,7 +207,7 @@ class ConnectionDerivatives(LinkDerivatives):
         )
 
     def jacobian(self) -> Float[Array, "equations y"]:
-        """Return the derivatives."""
+        """Return the derivatives of the rows by y."""
         by_motion = self.tree.jacobian()
         mass = by_motion[:, 2]
         if self.chain.armature is not None:
@@ -219,7 +225,7 @@ class ConnectionDerivatives(LinkDerivatives):
         return jnp.concatenate([jnp.concatenate(x, 1) for x in parts])
 
     def hessian(self, multipliers: Float[Array, " equations"]) -> Float[Array, "y y"]:
-        """Return the second derivatives of the rows' sum with multipliers."""
+        """Return the second derivatives of the function multipliers . rows."""
         count = len(self.f)
         gaps, rates, momentum = jnp.split(multipliers, [count, 2 * count])
         none = jnp.zeros_like(gaps)

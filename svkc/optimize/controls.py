@@ -1,4 +1,4 @@
-"""What the solver chooses over an interval: torques, torque rates, or numbers of the user's own."""
+"""Controls: torques, torque rates, or the user's own numbers, as unknowns over an interval."""
 
 import abc
 import dataclasses
@@ -21,20 +21,26 @@ Blocks: TypeAlias = Float[Array, "k n"]
 
 
 class AbstractControls(abc.ABC):
-    """Base class of controls: blocks of numbers over an interval, and torques from them."""
+    """Base class of controls.
 
-    # whether a block is a state of the nodes, continuous within a phase
+    Controls are stored in control blocks of `count` numbers each, one number for each driven
+    coordinate or parameter. An interval has several blocks, such as one for each stage. The blocks
+    of a stage are linear in the blocks of its interval, and torques are a function of the blocks of
+    a stage.
+    """
+
+    # whether the first block is a state: an unknown of the node, continuous within a phase
     has_state: bool = False
-    # whether torques depend on more than the first block of a stage
+    # whether torques depend on time and state; if not, they are linear in the stage's first block
     needs_state: bool = False
 
     def for_chain(self, chain: Chain) -> "AbstractControls":
-        """Return the controls with everything that they leave to the chain."""
+        """Return the controls with the defaults that depend on the chain filled in."""
         return self
 
     @abc.abstractmethod
     def blocks(self, scheme: Radau) -> int:
-        """Return the number of blocks of an interval, that of the node included."""
+        """Return the number of blocks of an interval, with the block of the first node's state."""
 
     @property
     def stage_blocks(self) -> int:
@@ -43,38 +49,44 @@ class AbstractControls(abc.ABC):
 
     @abc.abstractmethod
     def coefficients(self, scheme: Radau, fractions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return D0, D1 [times stage_blocks blocks]: blocks at fractions of an interval."""
+        """Return D0, D1 [times stage_blocks blocks], which give blocks at a time of an interval.
+
+        They are (D0 + h D1) times the blocks of the interval, where h is its length (s).
+
+        fractions: times as fractions of the interval, from 0 to 1.
+        """
 
     @abc.abstractmethod
     def count(self, chain: Chain) -> int:
-        """Return the numbers in a block."""
+        """Return how many numbers a block has."""
 
     @abc.abstractmethod
     def names(self, chain: Chain) -> list[str]:
-        """Return the names of the numbers of a block."""
+        """Return the names of a block's numbers."""
 
     def driven(self, chain: Chain) -> np.ndarray:
-        """Return the mask [nv] of the coordinates that are known to have torques."""
+        """Return the mask [nv] of the driven coordinates; all False where they are not known."""
         return np.zeros(chain.nv, bool)
 
     @abc.abstractmethod
     def torques(
         self, chain: Chain, t: Time, state: State | None, blocks: Blocks, args: Any
     ) -> Float[Array, " dofs"]:
-        """Return the joint torques (N m, N) of a stage over every coordinate.
+        """Return the joint torques (N m, N) at a stage, over every coordinate.
 
+        t: time from the start of the motion (s). blocks: of the stage.
         state: None at stages of the transcription, unless `needs_state`.
         """
 
     @abc.abstractmethod
     def limits(self, chain: Chain) -> list[np.ndarray]:
-        """Return the lower and upper bounds [2 n] of each block of a stage."""
+        """Return the lower and upper bounds [2 count] of each block of a stage."""
 
 
 def _bounds(name: str, limit: Any, joints: list[str]) -> np.ndarray:
-    """Return lower and upper bounds [2 n] from a number, an array, or numbers by joint name.
+    """Return lower and upper bounds [2 n] from a limit in one of the forms of `Torques.limit`.
 
-    A pair (lower, upper) takes the place of a number.
+    name: of the limit, for messages. joints: names of the n numbers that the limit is for.
     """
     if limit is None:
         return np.full((2, len(joints)), [[-np.inf], [np.inf]])
@@ -94,7 +106,10 @@ def _bounds(name: str, limit: Any, joints: list[str]) -> np.ndarray:
 
 
 def _driven_joints(chain: Chain, joints: Names | None, *limits: Any) -> list[str]:
-    """Return the names of the driven joints: those named, those with limits, or the actuated."""
+    """Return the names of the driven joints.
+
+    They are the joints named. Without names: the keys of a limit. Without these: the actuated ones.
+    """
     if joints is not None:
         driven_joints = list(names("joints", joints))
     elif named := [limit for limit in limits if isinstance(limit, Mapping)]:
@@ -110,13 +125,13 @@ def _driven_joints(chain: Chain, joints: Names | None, *limits: Any) -> list[str
 
 
 def _columns(chain: Chain, joints: Any) -> tuple[np.ndarray, list[str]]:
-    """Return the indices in v of joints, and the names of these coordinates."""
+    """Return the indices in v of the joints' coordinates, and the names of the coordinates."""
     at = [i for joint in joints for i in range(chain.nv)[chain.v_index(joint)]]
     return np.array(at, int), [chain.dof_names[i] for i in at]
 
 
 class _JointTorques(AbstractControls):
-    """Controls whose first block is the torques of driven joints."""
+    """Controls whose first block holds the torques of the driven joints."""
 
     joints: Any = None
 
@@ -143,7 +158,9 @@ class _JointTorques(AbstractControls):
 
 @dataclasses.dataclass(frozen=True)
 class Torques(_JointTorques):
-    """Joint torques: a polynomial through one value at each stage, or constant over an interval.
+    """Joint torques as controls.
+
+    Over an interval a torque is the polynomial through one value at each stage, or constant.
 
     limit: largest torque of each joint (N m, N): a number, an array over the driven coordinates, a
         pair (lower, upper), or these by joint name. None: no limit.
@@ -173,7 +190,7 @@ class Torques(_JointTorques):
 
 @dataclasses.dataclass(frozen=True)
 class TorqueRates(_JointTorques):
-    """Torque rates, constant over an interval; torques are states.
+    """Torque rates as controls. They are constant over an interval; torques are states.
 
     limit: largest rate of each joint's torque (N m/s, N/s), in the forms of `Torques.limit`.
     torque: largest torque of each joint (N m, N), in the same forms.
@@ -205,12 +222,13 @@ class TorqueRates(_JointTorques):
 
 @dataclasses.dataclass(frozen=True)
 class Parametrized(AbstractControls):
-    """Torques as a function of the user's own numbers, which are free at each stage.
+    """Joint torques as a function of the user's own numbers u, which are unknowns at each stage.
 
-    size: number of these numbers.
+    size: how many numbers u has.
     function: (t, state, u, args) -> joint torques (N m, N), as `control` of `svkc.simulate` returns
         them.
-    limit: largest magnitude of each number, in the forms of `Torques.limit`, by the names u[0], ...
+    limit: largest magnitude of each number, in the forms of `Torques.limit`; names are u[0], u[1],
+        ...
     """
 
     size: Integer

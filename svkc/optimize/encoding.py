@@ -1,4 +1,4 @@
-"""Motions as the unknowns of a transcription, and back."""
+"""Conversion of motions to the unknowns of a transcription, and back."""
 
 import jax
 import jax.numpy as jnp
@@ -11,11 +11,11 @@ from svkc.optimize.transcription import Transcription
 
 
 def encode(transcription: Transcription, guess: Guess) -> np.ndarray:
-    """Return a guess as unknowns in SI units."""
+    """Return a guess as the vector of unknowns, in SI units and within bounds."""
     table, nv = transcription.builder.table, transcription.model.layout.nv
     x, start = np.zeros(table.count), 0.0
     rows, has_state = transcription.model.rows.rows, transcription.model.controls.has_state
-    for motion, at, reference in zip(guess.phases, transcription.phases, transcription.references):
+    for motion, at, reference in zip(guess.phases, transcription.indices, transcription.references):
         x[at.start_time], x[at.duration] = start, motion.duration
         start += float(motion.duration)
         coordinates, rates = _to_charts(transcription, reference, motion.q, motion.v)
@@ -25,14 +25,14 @@ def encode(transcription: Transcription, guess: Guess) -> np.ndarray:
         x[at.vdot] = motion.vdot
         for index, values in ((at.forces, motion.forces), (at.impulse, motion.impulse)):
             x[index[index >= 0]] = np.asarray(values)[..., rows][index >= 0]
-        keeps = at.offset >= 0
+        keeps = at.kept_gap >= 0
         if keeps.any():
-            x[at.offset[keeps]] = np.asarray(_gaps(transcription, motion.q[0]))[keeps]
+            x[at.kept_gap[keeps]] = np.asarray(_gaps(transcription, motion.q[0]))[keeps]
     return _with_noise(transcription, guess, np.clip(x, table.lower, table.upper))
 
 
 def _to_charts(transcription: Transcription, reference, q, v):
-    """Return coordinates and rates of nodes in their charts."""
+    """Return the coordinates and rates [n + 1 nv] of nodes in their charts, from q and v."""
     chain = transcription.builder.chain
     return jax.vmap(lambda *x: chart_from_motion(chain, *x))(
         *(jnp.asarray(x) for x in (reference, q, v))
@@ -40,7 +40,7 @@ def _to_charts(transcription: Transcription, reference, q, v):
 
 
 def _gaps(transcription: Transcription, q):
-    """Return the gaps of the links' rows."""
+    """Return the gaps of the links' rows at q of the tree."""
     return gaps_at(transcription.builder.chain, jnp.asarray(q), transcription.model.rows)
 
 
@@ -56,7 +56,7 @@ def _with_noise(transcription: Transcription, guess: Guess, x: np.ndarray) -> np
 
 
 def decode(transcription: Transcription, x: np.ndarray) -> tuple[PhaseMotion, ...]:
-    """Return unknowns in SI units as a motion."""
+    """Return the motion of each phase from the vector of unknowns x, in SI units."""
     chain, nv, rows = (
         transcription.builder.chain,
         transcription.model.layout.nv,
@@ -64,7 +64,7 @@ def decode(transcription: Transcription, x: np.ndarray) -> tuple[PhaseMotion, ..
     )
     padded, links = np.append(x, 0.0), 6 * len(chain.link_names)
     motions = []
-    specified = zip(transcription.specification, transcription.phases, transcription.references)
+    specified = zip(transcription.phases, transcription.indices, transcription.references)
     for phase, at, reference in specified:
         coordinates = x[at.nodes[:, :nv]], x[at.nodes[:, nv : 2 * nv]]
         q, v = jax.vmap(lambda r, y, w: motion_from_chart(chain, r, y, w, w)[:2])(
@@ -81,14 +81,14 @@ def decode(transcription: Transcription, x: np.ndarray) -> tuple[PhaseMotion, ..
                 vdot=x[at.vdot],
                 forces=on_links(at.forces),
                 impulse=on_links(at.impulse),
-                mesh=phase.places,
+                mesh=phase.node_fractions,
             )
         )
     return tuple(motions)
 
 
 def _spread(values: np.ndarray, rows: np.ndarray, count: int) -> np.ndarray:
-    """Return values of selected rows [... rows] over all rows [... count]."""
+    """Return values of selected rows [... rows] as values of all rows [... count], with zeros."""
     out = np.zeros((*values.shape[:-1], count))
     out[..., rows] = values
     return out

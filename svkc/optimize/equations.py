@@ -1,6 +1,7 @@
-"""The equations of motion as rows: inverse dynamics at stages, links at nodes.
+"""The equations of the transcription: inverse dynamics at stages, links and impacts at nodes.
 
-No mass matrix is inverted: accelerations and forces are unknowns.
+Accelerations and multipliers of links are unknowns of the solver, so that no mass matrix is
+inverted.
 """
 
 from typing import Any, NamedTuple, TypeAlias
@@ -10,28 +11,28 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from svkc._jax.static_gather import static_take
 from svkc.model.chain import Chain
 from svkc.optimize.charts import motion_from_chart, to_next_chart
 from svkc.optimize.controls import AbstractControls
 from svkc.optimize.lift import Layout
 from svkc.optimize.loop_rows import LinkRows, gaps_at, link_wrenches, rates_at, row_accelerations
-from svkc.optimize.points import Point, full_state, tree_configuration, tree_velocity
+from svkc.optimize.points import Point, full_configuration, full_state, full_velocity
 from svkc.tree.inverse_dynamics import (
+    generalized_force,
     limit_forces,
     mass_matrix_product,
     newton_euler,
     passive_forces,
 )
-from svkc.tree.kinematics import Kinematics, kinematics, twists, velocity_products
-from svkc.tree.traversal import accumulate_from_root, accumulate_to_root, sum_dofs_per_row
+from svkc.tree.kinematics import kinematics, twists, velocity_products
+from svkc.tree.traversal import accumulate_from_root, sum_dofs_per_row
 
-# of a stage in the quadrature over the motion
+# weight of a stage in the quadrature of a running cost, see `StageBlock`
 Weight: TypeAlias = Float[Array, ""] | float
 
 
 class Params(NamedTuple):
-    """What the problem is solved for: data of the compiled functions."""
+    """The parameters of the compiled functions, by which the optimal cost has derivatives."""
 
     chain: Chain
     args: Any
@@ -40,8 +41,8 @@ class Params(NamedTuple):
 class Model(NamedTuple):
     """The static part of the equations.
 
-    layout: numbers of entries. rows: of links, those that are constraints in some phase.
-    controls: of `optimize`.
+    layout: order of an interval's unknowns. rows: those of links that are constraints in some
+    phase. controls: of the problem.
     """
 
     layout: Layout
@@ -50,31 +51,24 @@ class Model(NamedTuple):
 
 
 class IntervalData(eqx.Module):
-    """What distinguishes an interval, or a node, for the equations.
+    """The constants of an interval, or of a node, in the equations.
 
-    reference, following: quaternions of the charts of the interval's first and last node.
-    active: which of the links' rows are constraints.
-    structure: of the states.
+    reference, next_reference: configurations [nq] at the origins of the charts of the interval's
+        first and last node.
+    active: mask [rows] of the links' rows that are constraints.
+    structure: structure of the phase.
     """
 
     reference: Any
-    following: Any
+    next_reference: Any
     active: Any
     structure: Any
-
-
-def generalized_force(
-    chain: Chain, kin: Kinematics, wrenches: Float[Array, "rows 6"]
-) -> Float[Array, " nv"]:
-    """Return the generalized force of wrenches on the rows, about their roots' origins."""
-    below = accumulate_to_root(chain.topology, wrenches)
-    return jnp.sum(kin.S * static_take(below, chain.topology.dof_row), -1)
 
 
 def links_force(
     chain: Chain, q: Float[Array, " nq"], table: LinkRows, multipliers: Float[Array, " rows"]
 ) -> Float[Array, " nv"]:
-    """Return J^T f, the generalized force of the links' multipliers."""
+    """Return J^T f (N m, N), the generalized force of the links' multipliers f."""
     kin = kinematics(chain, q)
     return generalized_force(chain, kin, link_wrenches(chain, kin, table, multipliers))
 
@@ -89,10 +83,12 @@ def equations_of_motion(
     tau: Float[Array, " dofs"],
     f: Float[Array, " rows"],
 ) -> tuple[Float[Array, " nv"], Float[Array, " rows"]]:
-    """Return the residual of the equations of motion, and the links' accelerations J vdot + Jdot v.
+    """Return the residual of the equations of motion, and J vdot + Jdot v of the links' rows.
 
-    The residual is ID(q, v, vdot) less joint torques, links' forces J^T f, and forces of springs,
-    dampers and joint limits.
+    The residual (N m, N) is ID(q, v, vdot) minus joint torques, minus the links' forces J^T f, and
+    minus the forces of springs, dampers and joint limits.
+
+    table: the links' rows. tau: joint torques over every coordinate. f: multipliers of the rows.
     """
     top, kin = chain.topology, kinematics(chain, q)
     V = twists(chain, kin, v)
@@ -102,7 +98,7 @@ def equations_of_motion(
     force = newton_euler(chain, kin, V, A - gravity[None])
     if chain.armature is not None:
         force = force + chain.armature * vdot
-    full_q, full_v = tree_configuration(chain, q), tree_velocity(chain, v)
+    full_q, full_v = full_configuration(chain, q), full_velocity(chain, v)
     passive = passive_forces(chain, full_q, full_v) + limit_forces(chain, full_q, full_v)
     force = force - passive[: chain.nv] - tau[: chain.nv]
     if not len(table):
@@ -114,7 +110,10 @@ def equations_of_motion(
 def stage_equations(
     model: Model, params: Params, data: IntervalData, weight: Weight, y: Float[Array, " y"]
 ) -> Float[Array, " equations"]:
-    """Return the rows of a stage: the equations of motion, and the links' accelerations."""
+    """Return the rows of a stage: the equations of motion, then the links' accelerations.
+
+    weight: not used; `StageBlock` passes it to every function. y: variables of the stage.
+    """
     (t, _), motion, blocks, f = model.layout.split_stage(y)
     chain, args = params
     q, v, vdot = motion_from_chart(chain, data.reference, *motion)
@@ -129,10 +128,13 @@ def stage_equations(
 def end_of_interval(
     model: Model, params: Params, data: IntervalData, weight: Weight, y: Float[Array, " y"]
 ) -> Float[Array, " node"]:
-    """Return the node at the end of an interval, in the next node's chart: q, v, states."""
+    """Return the collocation polynomial at the end of an interval: q, v, states of controls.
+
+    q and v are in the chart of the next node. weight: not used. y: variables of the last stage.
+    """
     _, (x, rate, _), blocks, _ = model.layout.split_stage(y)
     chain = params.chain
-    x, rate = to_next_chart(chain, data.reference, data.following, x, rate)
+    x, rate = to_next_chart(chain, data.reference, data.next_reference, x, rate)
     states = blocks[0] if model.controls.has_state else blocks[0][:0]
     return jnp.concatenate([x, rate, states])
 
@@ -140,9 +142,9 @@ def end_of_interval(
 def connection(
     model: Model, params: Params, data: IntervalData, y: Float[Array, " y"]
 ) -> Float[Array, " equations"]:
-    """Return the rows of a node at which links connect: gaps, rates, and the impact's momentum.
+    """Return the rows of a node at which links connect: gaps, gap rates, momentum balance.
 
-    y: q, v after, v before, in the node's chart, and the impulses of the rows.
+    y: q, v after the impact, v before the impact, all in the node's chart, and impulses [rows].
     """
     chain, nv = params.chain, model.layout.nv
     x, after, before, impulse = jnp.split(y, [nv, 2 * nv, 3 * nv])
@@ -159,10 +161,12 @@ def connection(
 def projection(
     model: Model, params: Params, data: IntervalData, y: Float[Array, " y"]
 ) -> Float[Array, " equations"]:
-    """Return the rows that project a node onto its loops: changes of q and v, gaps, rates.
+    """Return the rows that project a node onto its loops: changes of q, of v, gaps, gap rates.
 
-    y: q, v in the node's chart, and the multipliers of the change of q and of v. The changes are
-    J^T of the multipliers.
+    The node is the end of the interval's polynomial plus a change of q and of v. Each change is J^T
+    times multipliers of its own.
+
+    y: q, v in the node's chart, and the two sets of multipliers [rows].
     """
     chain, nv, n = params.chain, model.layout.nv, len(model.rows)
     x, rate, of_q, of_v = jnp.split(y, [nv, 2 * nv, 2 * nv + n])
@@ -180,7 +184,11 @@ def point_of_stage(
     active: np.ndarray,
     **options: Any,
 ) -> Point:
-    """Return a stage as users' functions see it. active: mask of the phase's rows, static."""
+    """Return the `Point` of a stage, for users' functions.
+
+    y: variables of the stage. active: static mask of the rows that are constraints in the phase.
+    options: further keyword arguments of `Point`.
+    """
     times, motion, blocks, f = model.layout.split_stage(y)
     return Point(
         params.chain,

@@ -1,4 +1,4 @@
-"""What is said of a solver that failed."""
+"""The exception that is raised if a solver fails."""
 
 import numpy as np
 
@@ -11,7 +11,10 @@ _ROWS_SHOWN = 6
 
 
 def raise_on_failure(program: Program, result: SolverResult) -> None:
-    """Raise RuntimeError if the solver failed. The message names the most violated rows."""
+    """Check a solver's result.
+
+    Raises RuntimeError if the solver failed, with the rows that are violated most.
+    """
     if result.status in ("successful", "acceptable"):
         return
     words = OUTCOME[OUTCOME._name_to_item[result.status]]
@@ -22,7 +25,10 @@ def raise_on_failure(program: Program, result: SolverResult) -> None:
 
 
 def violated_rows(program: Program, x: np.ndarray, tolerance: float = 1e-6) -> str:
-    """Return the names of the rows that are violated most, with the amounts in SI units."""
+    """Return the names of the rows that are violated most, with the amounts in SI units.
+
+    tolerance: in the solver's units; rows with a smaller violation are left out.
+    """
     violation = program.violation(x)
     order = np.argsort(-np.nan_to_num(violation, nan=np.inf))[:_ROWS_SHOWN]
     table = program.transcription.rows

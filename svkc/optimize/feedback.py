@@ -1,4 +1,4 @@
-"""Feedback to the plan of a solution: gains over time from Riccati's recursion."""
+"""Time-varying LQR: feedback gains along a solution, and the growth of errors without feedback."""
 
 from typing import Any
 
@@ -8,22 +8,23 @@ from svkc.optimize.guesses import PhaseMotion
 from svkc.optimize.linearization import LinearMaps
 from svkc.optimize.plans import driven_coordinates
 
-# weight of torques beside that of errors, both in the problem's units
+# weight of squared torques; that of squared errors is 1. Both are in the problem's units
 EFFORT = 0.01
 
 
 def error_units(problem: Any) -> np.ndarray:
-    """Return the units [2 nv] of errors: 1 (rad, m), and the unit of velocities."""
+    """Return the units [2 nv] of errors: 1 for positions (rad, m), then that of velocities."""
     nv = problem.chain.nv
     return np.concatenate([np.ones(nv), np.full(nv, problem.units.velocity)])
 
 
 def riccati_gains(problem: Any, motion: tuple[PhaseMotion, ...], maps: LinearMaps) -> np.ndarray:
-    """Return the gains at both ends of each interval [N 2 driven 2nv].
+    """Return the time-varying LQR gains [N 2 driven 2nv] at both ends of each interval.
 
-    They minimize, to first order, the integral of the squared errors and of `EFFORT` times the
-    squared torques, both in the problem's units, plus the squared errors at the end times 1 s. An
-    error that links do not admit is first projected as `svkc.connect` does.
+    The backward Riccati recursion minimizes, for the linearized motion, the integral of the squared
+    errors plus `EFFORT` times the squared torques, plus the squared errors at the end times 1 s.
+    Errors and torques are in the problem's units. The part of a velocity error that violates
+    connected links is projected out first, as `svkc.connect` does.
     """
     steps = np.concatenate([np.diff(m.times) for m in motion])
     Q = np.diag(error_units(problem) ** -2.0)
@@ -36,17 +37,17 @@ def riccati_gains(problem: Any, motion: tuple[PhaseMotion, ...], maps: LinearMap
         P = steps[k] * Q + A.T @ P @ (A - B @ K)
         P = maps.before[k].T @ (P + P.T) / 2 @ maps.before[k]
         gains[k] = K @ maps.after[k]
-    # linear between nodes, and held over the last interval of a phase
-    following = np.append(np.arange(1, len(steps)), len(steps) - 1)
+    # gains are linear between nodes, and constant over the last interval of a phase
+    next_interval = np.append(np.arange(1, len(steps)), len(steps) - 1)
     lasts = np.cumsum([len(m.vdot) for m in motion]) - 1
-    following[lasts] = lasts
-    return np.stack([gains, gains[following]], 1)
+    next_interval[lasts] = lasts
+    return np.stack([gains, gains[next_interval]], 1)
 
 
 def growth(problem: Any, motion: tuple[PhaseMotion, ...], maps: LinearMaps) -> np.ndarray:
-    """Return by which factor each phase multiplies an error without feedback, at most [phases].
+    """Return the largest factors [phases] by which each phase multiplies an error without feedback.
 
-    Errors are measured in the problem's units.
+    They are 2-norms of the phases' linear maps, with errors in the problem's units.
     """
     units, first, factors = error_units(problem), 0, []
     for m in motion:

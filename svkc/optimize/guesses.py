@@ -12,28 +12,33 @@ import numpy as np
 from svkc._jax.eager import eager_jit
 from svkc.model.chain import Chain, State
 from svkc.model.validation import finite_array
+from svkc.optimize.controls import AbstractControls
 from svkc.optimize.equations import equations_of_motion
-from svkc.optimize.loop_rows import LinkRows, gaps_at, possible_rows, rates_at
+from svkc.optimize.loop_rows import LinkRows, candidate_rows, gaps_at, rates_at
 from svkc.optimize.phases import Phase
-from svkc.optimize.points import tree_configuration, tree_velocity
+from svkc.optimize.points import full_configuration, full_velocity
+from svkc.optimize.schemes import Radau
 from svkc.optimize.structures import links_here
 from svkc.transitions.initial_state import full_vector
 from svkc.tree.configuration import difference, integrate
 
-# Newton steps by which boundary poses are closed, and the longest (rad, m)
+# largest number of Newton steps that close the loops of a pose, and the longest step (rad, m)
 _STEPS, _LARGEST_STEP = 30, 0.3
-# gaps (m, rad) at which the steps end, and above which the pose is left as it is
+# gaps (m, rad) at which the steps end, and above which the pose is left as the user gave it
 _CLOSED, _NEARLY_CLOSED = 1e-12, 1e-6
 
 
 class PhaseMotion(eqx.Module):
-    """A phase of a motion on a mesh.
+    """The motion of one phase on a mesh of n intervals with s stages.
 
-    duration: s. q: [n + 1 nq], v: [n + 1 nv] at the nodes, of the tree.
-    blocks: [n blocks control] of `AbstractControls`. states: [n + 1 control] at the nodes, if
-    controls have states. vdot: [n s nv].
-    forces: [n s 6 links] multipliers of the links' rows. impulse: [6 links].
-    mesh: [n + 1] places of the nodes, as fractions of the duration; None: equal intervals.
+    duration: s.
+    q: [n + 1 nq], v: [n + 1 nv] of the tree, at the nodes.
+    states: [n + 1 control] states of the controls at the nodes; empty where controls have none.
+    blocks: [n blocks control] control blocks of the intervals, see `AbstractControls`.
+    vdot: [n s nv] accelerations of the tree at the stages.
+    forces: [n s 6 links] multipliers of the links' rows at the stages (N m, N).
+    impulse: [6 links] multipliers of the links' rows in the impact at the start (N m s, N s).
+    mesh: [n + 1] positions of the nodes, as fractions of the duration; None: equal intervals.
     """
 
     duration: Any
@@ -57,8 +62,9 @@ class PhaseMotion(eqx.Module):
 class Guess:
     """A motion from which a solver starts.
 
-    phases: of the motion. noise: fraction of the range between bounds by which unknowns are moved
-        at random. key: of the random numbers.
+    phases: motion of each phase.
+    noise: unknowns are moved at random by at most this fraction of the range between their bounds.
+    key: seed of the random numbers.
     """
 
     phases: list[PhaseMotion]
@@ -67,7 +73,11 @@ class Guess:
 
 
 class PoseLine:
-    """Straight lines between poses at the boundaries of phases."""
+    """Straight lines between the known poses at the boundaries of phases.
+
+    poses: as of `Problem.guess`.
+    Raises ValueError for another number of poses, or if the first or the last one is None.
+    """
 
     def __init__(self, chain: Chain, phases: Sequence[Phase], poses: Sequence[Any]):
         if len(poses) != len(phases) + 1:
@@ -85,7 +95,7 @@ class PoseLine:
         ]
 
     def _closed(self, i: int, pose: Any) -> np.ndarray:
-        """Return a pose [nq], moved by the least change that closes the loops there."""
+        """Return the pose at boundary i as q [nq], with the loops of both phases closed."""
         chain = self.chain
         if isinstance(pose, State):
             pose = pose.q[: chain.nq]
@@ -95,11 +105,14 @@ class PoseLine:
         closed = np.zeros(len(chain.link_names), bool)
         for phase, here in list(zip(self.phases, self.here))[max(i - 1, 0) : i + 1]:
             closed |= np.isin(chain.link_names, phase.connected) & ~here
-        rows = possible_rows(chain, closed)
+        rows = candidate_rows(chain, closed)
         return close_loops(chain, q, rows) if len(rows) else q
 
     def at(self, durations: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return (q [n + 1 nq], v [n + 1 nv]) of each phase."""
+        """Return (q [n + 1 nq], v [n + 1 nv]) of each phase at its nodes.
+
+        durations: of the phases (s).
+        """
         ends = np.concatenate([[0], np.cumsum(durations)])
         known = [i for i, pose in enumerate(self.poses) if pose is not None]
         out = []
@@ -107,7 +120,7 @@ class PoseLine:
             first = max(i for i in known if i <= k)
             last = min(i for i in known if i > k)
             span = ends[last] - ends[first]
-            times = (ends[k] + durations[k] * phase.places - ends[first]) / span
+            times = (ends[k] + durations[k] * phase.node_fractions - ends[first]) / span
             out.append(self._line(self.poses[first], self.poses[last], times, span))
         return out
 
@@ -116,7 +129,7 @@ class PoseLine:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return q and v at fractions of the line between two poses, which takes `span` seconds."""
         chain = self.chain
-        start, end = (tree_configuration(chain, jnp.asarray(x)) for x in (start, end))
+        start, end = (full_configuration(chain, jnp.asarray(x)) for x in (start, end))
         step = difference(chain, start, end)
         q = jax.vmap(lambda x: integrate(chain, start, x * step))(jnp.asarray(fractions))
         v = np.broadcast_to(np.asarray(step)[: chain.nv] / span, (len(fractions), chain.nv))
@@ -124,7 +137,10 @@ class PoseLine:
 
 
 def close_loops(chain: Chain, q: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return q [nq] of the tree moved by Newton steps of least norm until the rows' gaps close."""
+    """Return q [nq] of the tree, moved by Newton steps of least norm until the gaps are closed.
+
+    The result is the given q if the gaps cannot be closed. rows: of links, as of `LinkRows`.
+    """
     table = LinkRows.of(chain, rows)
 
     @jax.jit
@@ -139,8 +155,8 @@ def close_loops(chain: Chain, q: np.ndarray, rows: np.ndarray) -> np.ndarray:
             break
         step = np.linalg.lstsq(J, -gaps, rcond=1e-6)[0]
         step = step / max(1.0, np.max(np.abs(step)) / _LARGEST_STEP)
-        full = tree_velocity(chain, jnp.asarray(step))
-        moved = integrate(chain, tree_configuration(chain, moved), full)[: chain.nq]
+        full = full_velocity(chain, jnp.asarray(step))
+        moved = integrate(chain, full_configuration(chain, moved), full)[: chain.nq]
     return np.asarray(moved) if np.max(np.abs(gaps)) < _NEARLY_CLOSED else q
 
 
@@ -149,11 +165,13 @@ def static_forces(
 ) -> np.ndarray:
     """Return multipliers [nodes 6 links] of connected links that carry the weight at rest.
 
-    They are those of least norm for the coordinates that no motor drives.
-    driven: mask [nv] of the others. q: [nodes nq].
+    They balance the equations of motion of the coordinates that no motor drives, in the sense of
+    least squares with least norm.
+
+    driven: mask [nv] of the coordinates that a motor drives. q: [nodes nq].
     """
     out = np.zeros((len(q), 6 * len(chain.link_names)))
-    rows = possible_rows(chain, np.isin(chain.link_names, connected))
+    rows = candidate_rows(chain, np.isin(chain.link_names, connected))
     if not len(rows):
         return out
     table, zero = LinkRows.of(chain, rows), jnp.zeros(chain.nv)
@@ -167,3 +185,33 @@ def static_forces(
     for i in range(len(q)):
         out[i, rows] = np.linalg.lstsq(J[i][:, ~driven].T, weight[i][~driven], rcond=1e-6)[0]
     return out
+
+
+def motion_without_torques(
+    chain: Chain,
+    controls: AbstractControls,
+    scheme: Radau,
+    phase: Phase,
+    duration: float,
+    line: tuple[np.ndarray, np.ndarray],
+) -> PhaseMotion:
+    """Return the motion of a phase along a line, with zero torques and zero accelerations.
+
+    Multipliers of links are those of `static_forces`.
+
+    duration: s. line: (q [n + 1 nq], v [n + 1 nv]) of the tree at the nodes.
+    """
+    n, s, control = phase.intervals, scheme.stages, controls.count(chain)
+    q, v = line
+    forces = static_forces(chain, phase.connected, controls.driven(chain), q)
+    return PhaseMotion(
+        duration=float(duration),
+        q=q,
+        v=v,
+        states=np.zeros((n + 1, control * controls.has_state)),
+        blocks=np.zeros((n, controls.blocks(scheme), control)),
+        vdot=np.zeros((n, s, chain.nv)),
+        forces=np.repeat(forces[:-1, None], s, 1),
+        impulse=np.zeros(6 * len(chain.link_names)),
+        mesh=phase.node_fractions,
+    )

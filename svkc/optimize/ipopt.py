@@ -16,7 +16,7 @@ from svkc.model.validation import integer, positive_scalar
 from svkc.optimize.program import Program
 
 INSTALL = "pip install 'svkc[optimize]'"
-# names of IPOPT's return codes, as results of `Solution`
+# results of `Solution` by IPOPT's return codes; other codes: "failed"
 STATUS = {
     0: "successful",
     1: "acceptable",
@@ -27,7 +27,7 @@ STATUS = {
     -5: "max_time",
     -13: "not_finite",
 }
-# the same by CasADi's names
+# results of `Solution` by CasADi's names of these codes
 CASADI_STATUS = {
     "Solve_Succeeded": "successful",
     "Solved_To_Acceptable_Level": "acceptable",
@@ -42,11 +42,11 @@ CASADI_STATUS = {
 
 @dataclasses.dataclass
 class SolverResult:
-    """What a solver returns, in its own units.
+    """Unknowns and multipliers in the solver's units: the start of a solver, or its result.
 
-    x: unknowns. multipliers: of the rows. lower, upper: multipliers of the unknowns' bounds.
-    status: name of the result. iterations: their number. seconds: wall time of the solver.
-    functions: seconds of these in rows and derivatives.
+    x: unknowns. multipliers: of the rows. lower, upper: of the unknowns' bounds.
+    status: name of the `OUTCOME`. iterations: number of iterations.
+    seconds: wall time of the solver. functions: part of this time in rows and derivatives (s).
     """
 
     x: np.ndarray
@@ -68,15 +68,16 @@ class AbstractSolver(abc.ABC):
     ) -> SolverResult:
         """Return the solution from a start.
 
-        warm: whether the start has multipliers of a nearby solution.
-        progress: called with the fraction of the iterations.
+        warm: whether the start is near a solution.
+        progress: called with the number of iterations as a fraction of the largest number.
         """
 
 
 class Callbacks:
-    """The functions that IPOPT calls, with f and g, and both derivatives, kept by x.
+    """The functions that IPOPT calls, with the names that cyipopt expects.
 
-    An exception in a function, Ctrl-C too, ends the run at the next iteration and is kept.
+    Rows and the Jacobian are cached for the last x: cost and constraints are computed together. The
+    first exception in a function, or Ctrl-C, is stored and ends the run at the next iteration.
     """
 
     def __init__(self, program: Program, progress: Callable[[float], None], iterations: int):
@@ -84,19 +85,19 @@ class Callbacks:
         self.progress = progress
         self.limit: int = iterations
         entries = program.jacobian_entries
-        self.of_rows: np.ndarray = np.isin(entries.row, program.kept)
+        self.of_rows: np.ndarray = np.isin(entries.row, program.solver_rows)
         self.of_cost: np.ndarray = entries.row == program.cost_row
         self.columns: np.ndarray = entries.column[self.of_cost]
         self.exception: BaseException | None = None
         self.iterations: int = 0
         self.functions: float = 0.0
-        self._kept: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+        self._cache: dict[str, tuple[np.ndarray, np.ndarray]] = {}
 
     def _at(self, name: str, x: np.ndarray, *others: Any) -> np.ndarray:
-        """Return the value of a method of the program, which is kept for the same x."""
-        kept = self._kept.get(name)
-        if kept is not None and not others and np.array_equal(kept[0], x):
-            return kept[1]
+        """Return the value of a method of the program at x, from the cache if possible."""
+        cached = self._cache.get(name)
+        if cached is not None and not others and np.array_equal(cached[0], x):
+            return cached[1]
         start = time.perf_counter()
         try:
             value = getattr(self.program, name)(np.asarray(x), *others)
@@ -104,19 +105,19 @@ class Callbacks:
             self.exception = self.exception or error
             value = np.full(self.program.length(name), np.nan)
         self.functions += time.perf_counter() - start
-        self._kept[name] = np.array(x), value
+        self._cache[name] = np.array(x), value
         return value
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         low, high, *of_rows = self.program.bounds()
-        row_low, row_high = (x[self.program.kept] for x in of_rows)
+        row_low, row_high = (x[self.program.solver_rows] for x in of_rows)
         return low, high, row_low, row_high
 
     def objective(self, x: np.ndarray) -> float:
         return float(self._at("rows", x)[-1])
 
     def constraints(self, x: np.ndarray) -> np.ndarray:
-        return self._at("rows", x)[self.program.kept]
+        return self._at("rows", x)[self.program.solver_rows]
 
     def gradient(self, x: np.ndarray) -> np.ndarray:
         values = self._at("jacobian", x)[self.of_cost]
@@ -124,7 +125,7 @@ class Callbacks:
 
     def jacobianstructure(self) -> tuple[np.ndarray, np.ndarray]:
         entries = self.program.jacobian_entries
-        rows = np.searchsorted(self.program.kept, entries.row[self.of_rows])
+        rows = np.searchsorted(self.program.solver_rows, entries.row[self.of_rows])
         return rows, entries.column[self.of_rows]
 
     def jacobian(self, x: np.ndarray) -> np.ndarray:
@@ -139,7 +140,7 @@ class Callbacks:
     def all_rows(self, values: np.ndarray) -> np.ndarray:
         """Return values of the solver's rows as values of all rows, zero for the others."""
         out = np.zeros(self.program.cost_row)
-        out[self.program.kept] = values
+        out[self.program.solver_rows] = values
         return out
 
     def intermediate(self, _mode: int, iteration: int, *_rest: float | int) -> bool:
@@ -152,8 +153,8 @@ class Callbacks:
 
 
 def _import(name: str) -> Any:
-    """Return a module that carries IPOPT. Raises ImportError with the command that installs it."""
-    # threads of small dense blocks cost more than they save
+    """Return the module cyipopt or casadi. Raises ImportError with the command that installs it."""
+    # several threads for small dense blocks cost more time than they save
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
     try:
@@ -164,13 +165,13 @@ def _import(name: str) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class Ipopt(AbstractSolver):
-    """IPOPT, with exact sparse derivatives.
+    """The interior-point solver IPOPT, with exact sparse Jacobian and Hessian.
 
     max_iterations: largest number of iterations.
     max_seconds: largest wall time (s).
-    tolerance: of the scaled optimality conditions; IPOPT's `tol`.
-    backend: "cyipopt" (extra `optimize`), "casadi" (CasADi's own IPOPT), or None: CasADi's where it
-        is installed, as its linear algebra is faster.
+    tolerance: tolerance of the scaled optimality conditions; `tol` of IPOPT.
+    backend: "cyipopt" (extra `optimize`), or "casadi" (the IPOPT inside CasADi). None: CasADi where
+        it is installed, because its linear algebra is faster.
     options: further options of IPOPT, by name.
 
     Raises ValueError for wrong limits or an unknown backend.
@@ -194,7 +195,7 @@ class Ipopt(AbstractSolver):
             "max_iter": int(self.max_iterations),
             "max_wall_time": float(self.max_seconds),
             "tol": float(self.tolerance),
-            # of rows as they are, before IPOPT's own scaling
+            # absolute violation of rows, before the scaling of IPOPT
             "constr_viol_tol": 1e-7,
             "print_level": 0,
             "sb": "yes",
@@ -229,7 +230,7 @@ class Ipopt(AbstractSolver):
             options = {"mu_strategy": strategy} | self._options(warm)
             x, multipliers, lower, upper, status = run(callbacks, options, start)
             iterations += callbacks.iterations
-            # where one strategy gets stuck the other often does not
+            # the second strategy often converges where the first one fails
             if status not in ("infeasible", "failed") or "mu_strategy" in self._options(warm):
                 break
         seconds = time.perf_counter() - begin
@@ -250,16 +251,16 @@ class Ipopt(AbstractSolver):
 
 
 def _by_cyipopt(callbacks: Callbacks, options: dict[str, Any], start: SolverResult) -> tuple:
-    """Run the IPOPT of cyipopt."""
+    """Return (x, multipliers, lower, upper, status) of a run of cyipopt."""
     cyipopt = _import("cyipopt")
     low, high, row_low, row_high = callbacks.bounds()
     problem = cyipopt.Problem(
         n=len(low), m=len(row_low), problem_obj=callbacks, lb=low, ub=high, cl=row_low, cu=row_high
     )
-    # this wheel has no METIS, and its other orderings are slower
+    # the wheel of cyipopt has no METIS; its other orderings are slower than number 2
     for name, value in ({"mumps_pivot_order": 2} | options).items():
         problem.add_option(name, value)
-    of_rows = start.multipliers[callbacks.program.kept]
+    of_rows = start.multipliers[callbacks.program.solver_rows]
     multipliers = {"lagrange": of_rows, "zl": start.lower, "zu": start.upper}
     x, info = problem.solve(start.x, **multipliers)
     status = STATUS.get(info["status"], "failed")
@@ -267,7 +268,7 @@ def _by_cyipopt(callbacks: Callbacks, options: dict[str, Any], start: SolverResu
 
 
 def _by_casadi(callbacks: Callbacks, options: dict[str, Any], start: SolverResult) -> tuple:
-    """Run the IPOPT of CasADi, with the functions as its callbacks."""
+    """Return (x, multipliers, lower, upper, status) of a run of the IPOPT in CasADi."""
     from svkc.optimize.casadi_functions import nlp_functions
 
     casadi, program = _import("casadi"), callbacks.program
@@ -288,7 +289,7 @@ def _by_casadi(callbacks: Callbacks, options: dict[str, Any], start: SolverResul
     )
     result = solver(
         x0=start.x, lbx=low, ubx=high, lbg=row_low, ubg=row_high,
-        lam_x0=start.upper - start.lower, lam_g0=start.multipliers[program.kept],
+        lam_x0=start.upper - start.lower, lam_g0=start.multipliers[program.solver_rows],
     )  # fmt: skip
     x, of_rows, of_x = (np.array(result[name]).ravel() for name in ("x", "lam_g", "lam_x"))
     callbacks.iterations = int(solver.stats()["iter_count"])

@@ -1,4 +1,4 @@
-"""A solution's intervals and impacts as linear maps of small errors of the state."""
+"""Linearization of a solution: intervals and impacts as linear maps of small state errors."""
 
 from typing import Any, NamedTuple
 
@@ -14,7 +14,7 @@ from svkc.optimize.guesses import PhaseMotion
 from svkc.optimize.lift import Layout
 from svkc.optimize.loop_rows import LinkRows, rates_at
 from svkc.optimize.plans import driven_coordinates
-from svkc.optimize.points import padded, tree_configuration, tree_velocity
+from svkc.optimize.points import full_configuration, full_velocity, padded
 from svkc.optimize.structures import phase_structures
 from svkc.tree.configuration import difference, integrate
 from svkc.tree.inverse_dynamics import mass_matrix_product
@@ -22,11 +22,16 @@ from svkc.tree.kinematics import kinematics
 
 
 class LinearMaps(NamedTuple):
-    """Linear maps of errors (q, v) of the tree [2 nv], for all intervals of a motion.
+    """Linear maps of small errors (q, v) [2 nv] of the tree, for all N intervals of a motion.
 
-    A: [N 2nv 2nv] from the start of an interval to its end. B: [N 2nv driven] from constant torques
-    of the driven coordinates. before: [N 2nv 2nv] from an error before the start of an interval to
-    what links leave of it, by the impact where there is one; after: the same from an error after.
+    Links let only some errors pass. An impact at the start of an interval, or the projection of
+    `svkc.connect`, removes the velocity errors that violate the links of the interval.
+
+    A: [N 2nv 2nv] from the start of an interval to its end.
+    B: [N 2nv driven] from constant torques of the driven coordinates to the end of an interval.
+    before: [N 2nv 2nv] from an error just before the start of an interval to the error after the
+        projection, linearized at the velocity before the impact.
+    after: [N 2nv 2nv] the projection, linearized at the velocity after the impact.
     """
 
     A: np.ndarray
@@ -36,7 +41,11 @@ class LinearMaps(NamedTuple):
 
 
 class _Lane(NamedTuple):
-    """An interval: its data, and its unknowns. before: velocity before its start."""
+    """An interval: its data, and its unknowns.
+
+    start: time of its start (s). step: length (s). q, v: of the tree at its start.
+    before: [nv] velocity just before its start. vdot, blocks, forces: as of `PhaseMotion`.
+    """
 
     data: IntervalData
     start: Any
@@ -52,7 +61,7 @@ class _Lane(NamedTuple):
 def linear_maps(problem: Any, motion: tuple[PhaseMotion, ...]) -> LinearMaps:
     """Return the linear maps of a motion's intervals.
 
-    An interval's map is that of its collocation equations, solved for small changes.
+    The implicit function theorem gives A and B from the derivatives of the collocation equations.
     """
     chain, model, lanes = problem.chain, *_lanes(problem, motion)
     stages = problem.scheme.stages * (chain.nv + len(model.rows))
@@ -72,9 +81,12 @@ def linear_maps(problem: Any, motion: tuple[PhaseMotion, ...]) -> LinearMaps:
 
 
 def _derivatives(problem: Any, model: Model, stages: int) -> Any:
-    """Return the compiled derivatives (params, lanes) -> of intervals, and of what links leave.
+    """Return the compiled function (params, lanes) -> derivatives for each interval.
 
-    stages: number of rows of an interval's stages.
+    They are the Jacobian of `_interval`, and those of `_projected_velocity` before and after the
+    start of the interval.
+
+    stages: number of rows of all stages of an interval.
     """
     unit = np.eye(model.layout.nv)[driven_coordinates(problem)]
 
@@ -83,7 +95,7 @@ def _derivatives(problem: Any, model: Model, stages: int) -> Any:
         def of_lane(lane):
             interval = lambda z: _interval(problem, model, params, lane, unit, z)
             first = jax.jacfwd(interval)(jnp.zeros(2 * model.layout.nv + stages + len(unit)))
-            of_links = lambda v: _kept_by_links(model, params, lane, v)
+            of_links = lambda v: _projected_velocity(model, params, lane, v)
             return first, of_links(lane.before), of_links(lane.v)
 
         return jax.vmap(of_lane)(lanes)
@@ -92,7 +104,7 @@ def _derivatives(problem: Any, model: Model, stages: int) -> Any:
 
 
 def _lanes(problem: Any, motion: tuple[PhaseMotion, ...]) -> tuple[Model, _Lane]:
-    """Return the static part of the equations, and all intervals."""
+    """Return the static part of the equations, and all intervals with a leading axis."""
     chain, controls, parts, start = problem.chain, problem.controls, [], 0.0
     poses = [[m.q[0], m.q[-1]] for m in motion]
     rows, structures = phase_structures(chain, problem.phases, poses)
@@ -101,7 +113,7 @@ def _lanes(problem: Any, motion: tuple[PhaseMotion, ...]) -> tuple[Model, _Lane]
         repeat = lambda x, m=m: np.broadcast_to(np.asarray(x), (len(m.vdot), *np.shape(x)))
         data = IntervalData(
             reference=m.q[:-1],
-            following=m.q[1:],
+            next_reference=m.q[1:],
             active=repeat(structure.active),
             structure=jax.tree.map(repeat, structure.structure),
         )
@@ -132,14 +144,16 @@ def _lanes(problem: Any, motion: tuple[PhaseMotion, ...]) -> tuple[Model, _Lane]
 
 def _moved(chain: Chain, q, dq):
     """Return a configuration of the tree moved by a tangent vector [nv]."""
-    full = tree_configuration(chain, q)
-    return integrate(chain, full, tree_velocity(chain, dq))[: chain.nq]
+    full = full_configuration(chain, q)
+    return integrate(chain, full, full_velocity(chain, dq))[: chain.nq]
 
 
 def _interval(problem: Any, model: Model, params: Params, lane: _Lane, unit: np.ndarray, z):
-    """Return the residuals of the stages, and the end's distance from the plan.
+    """Return the residuals of all stages, then the error (q, v) at the end of the interval.
 
-    z: changes of q, v, accelerations and multipliers of the stages, and torques added.
+    unit: [driven nv] rows of the identity matrix that belong to driven coordinates.
+    z: changes of q and v at the start, changes of accelerations and multipliers at the stages, and
+        constant torques that are added.
     """
     chain, scheme, s, nv = params.chain, problem.scheme, model.layout.stages, model.layout.nv
     ends = np.cumsum([nv, nv, s * nv, s * len(model.rows)])
@@ -157,16 +171,19 @@ def _interval(problem: Any, model: Model, params: Params, lane: _Lane, unit: np.
     rows = jax.vmap(lambda y: stage_equations(model, params, lane.data, 0.0, y))(y)
     force = rows[:, :nv] - ones * (torque @ unit)[None]
     links = jnp.where(lane.data.active[None], rows[:, nv:], f)
-    following = lane.data.following
-    x, rate = to_next_chart(chain, reference, following, X[-1], R[-1])
-    q, v, _ = motion_from_chart(chain, following, x, rate, rate)
-    there, here = tree_configuration(chain, following), tree_configuration(chain, q)
+    next_reference = lane.data.next_reference
+    x, rate = to_next_chart(chain, reference, next_reference, X[-1], R[-1])
+    q, v, _ = motion_from_chart(chain, next_reference, x, rate, rate)
+    there, here = full_configuration(chain, next_reference), full_configuration(chain, q)
     end = [difference(chain, there, here)[:nv], v]
     return jnp.concatenate([force.ravel(), links.ravel(), *end])
 
 
-def _kept_by_links(model: Model, params: Params, lane: _Lane, v):
-    """Return the derivatives of (q, v after links stop their gaps' rates) by (q, v) [2nv 2nv]."""
+def _projected_velocity(model: Model, params: Params, lane: _Lane, v):
+    """Return the derivatives [2nv 2nv] of (q, v projected onto the links' rows) by (q, v).
+
+    The projection is that of an impact: M (v_new - v) = J^T impulse, J v_new = 0.
+    """
     chain, nv, active = params.chain, model.layout.nv, lane.data.active
 
     def after(z):

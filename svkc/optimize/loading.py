@@ -1,4 +1,4 @@
-"""Solutions from files."""
+"""Reading of solutions from .npz files."""
 
 import json
 from typing import Any
@@ -15,13 +15,14 @@ from svkc.optimize.structures import phase_structures
 def load_solution(path: Path, problem: Any) -> Solution:
     """Return a solution that `Solution.save` wrote.
 
-    The problem of the result has the mesh of the file. Nothing is compiled.
+    `problem` of the result is the given problem with the mesh of the file. The problem is not
+    compiled.
 
-    path: of the file.
-    problem: `Problem` of which the file holds a solution, on any mesh. Functions are not stored.
+    path: path of the file.
+    problem: the `Problem` that the solution is of, on any mesh. Files hold no functions.
 
-    Raises ValueError if the file is none of a solution, has another schema, or is of another
-    problem; FileNotFoundError if there is no file.
+    Raises ValueError if the file does not hold a solution, has another schema, or belongs to
+    another problem. Raises FileNotFoundError if there is no file.
     """
     arrays, meta = _read(path)
     own = description_of(problem)

@@ -1,8 +1,10 @@
-"""The constraints of connected links without the freedoms of their joints.
+"""The loop constraints of connected links, without coordinates of their virtual joints.
 
-Each virtual link has six rows in the axes of its joint's frame: three rotations, three
-translations. A row along a freedom of the joint is not used. Multipliers of the rows are then
-components of the wrench on the real link, and coordinates of virtual joints are no unknowns.
+Each virtual link has six candidate rows along the axes of its joint's frame: three rotations, then
+three translations. Rows along freedoms of the joint are left out. The joint's frame is fixed in the
+parent. Multipliers of the rows are components of the wrench on the real link.
+
+"Rows of the tree" are the bodies in the order of `Topology`, and have nothing to do with these.
 """
 
 import dataclasses
@@ -29,10 +31,12 @@ from svkc.tree.spatial import (
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class LinkRows:
-    """Selected rows of virtual links: everything static about them.
+    """Selected constraint rows of virtual links, with the static data of these links.
 
-    rows: as indices into six rows for each virtual link. links: the virtual links with such rows.
-    parent, real: rows of their bodies in `Topology`. freedoms: rotations that are free, of each.
+    rows: of link i, the candidate rows are 6 i ... 6 i + 5.
+    links: indices of the virtual links that have selected rows.
+    parent, real: of each of `links`, the rows of the tree of its two bodies.
+    freedoms: of each of `links`, which of the three rotations are free.
     """
 
     rows: np.ndarray
@@ -43,7 +47,7 @@ class LinkRows:
 
     @classmethod
     def of(cls, chain: Chain, rows: np.ndarray) -> "LinkRows":
-        """Return the table of some rows of a chain, whose arrays have values."""
+        """Return the table of some rows of a chain, which must not be traced."""
         links, s = np.unique(rows // 6), chain.structure
         return cls(
             rows=rows,
@@ -54,8 +58,8 @@ class LinkRows:
         )
 
     @property
-    def places(self) -> np.ndarray:
-        """Places of the rows among six of each of `links`."""
+    def flat_indices(self) -> np.ndarray:
+        """Indices of the rows in an array of six rows for each of `links`."""
         return 6 * np.searchsorted(self.links, self.rows // 6) + self.rows % 6
 
     def __len__(self) -> int:
@@ -63,13 +67,13 @@ class LinkRows:
 
 
 class LinkPoses(eqx.Module):
-    """Poses of the real links in the frames of their joints.
+    """Poses of the real links' frames.
 
-    base: rotation matrix of each joint's frame, fixed in the parent.
-    quat: orientation of the real link's frame in it.
-    offset: position of the real link's frame in it (m).
-    of_parent, of_real: that position from the root of the parent and of the real link, in world
-        axes (m).
+    base: orientation of each joint's frame in the world, as a rotation matrix.
+    quat: orientation of the real link's frame in the joint's frame.
+    offset: position of the real link's frame in the joint's frame (m).
+    of_parent, of_real: position of the real link's frame in world axes (m), from the origin of the
+        parent's root, and from the origin of the real link's root.
     """
 
     base: Float[Array, "links 3 3"]
@@ -80,7 +84,7 @@ class LinkPoses(eqx.Module):
 
 
 def link_poses(chain: Chain, kin: Kinematics, table: LinkRows) -> LinkPoses:
-    """Return the poses of the real links in the frames of their joints."""
+    """Return the poses of the real links' frames. table: of the links."""
     s, p, r = chain.structure, table.parent, table.real
     quat, pos, real_quat, real_pos = (
         static_take(x, table.links) for x in (s.quat, s.pos, s.real_quat, s.real_pos)
@@ -102,9 +106,12 @@ def link_poses(chain: Chain, kin: Kinematics, table: LinkRows) -> LinkPoses:
 
 
 def _rotation_rows(quat, free: tuple[bool, ...], w=None):
-    """Return the three rotation rows of a joint; their rates if w (rad/s, joint's frame) is there.
+    """Return the three rotation rows of a joint, or their rates if w is given.
 
-    A rate is the component of w about the row's axis where the loop is closed.
+    Where the loop is closed, a rate is the component of w about the row's axis.
+
+    quat: orientation of the real link's frame in the joint's frame. free: which rotations are free.
+    w: angular velocity of the real link relative to the parent, in the joint's frame (rad/s).
     """
     if all(free):
         return jnp.zeros(3, quat.dtype)
@@ -117,9 +124,9 @@ def _rotation_rows(quat, free: tuple[bool, ...], w=None):
 
 
 def rotation_table(free: tuple[bool, ...]) -> tuple[int, np.ndarray]:
-    """Return what makes rotation rows of one or two free rotations.
+    """Return (axis, matrix) of the rotation rows of a joint with one or two free rotations.
 
-    These are an axis of the real link, and a matrix by which the axis gives the three rows.
+    The three rows are the matrix times this axis of the real link's frame, in the joint's frame.
     """
     axes, eye = np.flatnonzero(free), np.eye(3)
     if len(axes) == 1:
@@ -130,27 +137,27 @@ def rotation_table(free: tuple[bool, ...]) -> tuple[int, np.ndarray]:
 
 
 def _select(table: LinkRows, angular: list, linear) -> Float[Array, " rows"]:
-    """Return the selected rows from the rotation rows and the translations of links."""
+    """Return the selected rows from all rotation and translation rows of the links."""
     six = jnp.concatenate([jnp.stack(angular), linear], -1).ravel()
-    return static_take(six, table.places)
+    return static_take(six, table.flat_indices)
 
 
 def row_gaps(chain: Chain, kin: Kinematics, table: LinkRows) -> Float[Array, " rows"]:
-    """Return the rows (rad, m), zero where a loop is closed."""
+    """Return the gaps of the rows (rad, m), which are zero where a loop is closed."""
     poses = link_poses(chain, kin, table)
     angular = [_rotation_rows(poses.quat[i], free) for i, free in enumerate(table.freedoms)]
     return _select(table, angular, poses.offset)
 
 
 def _relative(poses: LinkPoses, of_parent, of_real, relative) -> Float[Array, "links 3"]:
-    """Return of_real - of_parent - relative, in the joints' axes."""
+    """Return of_real - of_parent - relative, turned from world axes to the joints' axes."""
     return matvec(jnp.swapaxes(poses.base, -1, -2), of_real - of_parent - relative)
 
 
 def row_rates(
     chain: Chain, kin: Kinematics, table: LinkRows, V: Float[Array, "tree_rows 6"]
 ) -> Float[Array, " rows"]:
-    """Return the derivatives of the rows by time (rad/s, m/s). V: twists of the tree."""
+    """Return the derivatives of the gaps by time (rad/s, m/s). V: twists of the tree's rows."""
     poses = link_poses(chain, kin, table)
     of_parent, of_real = static_take(V, table.parent), static_take(V, table.real)
     velocity = lambda twist, at: twist[:, 3:] + cross(twist[:, :3], at)
@@ -169,9 +176,9 @@ def row_accelerations(
     V: Float[Array, "tree_rows 6"],
     A: Float[Array, "tree_rows 6"],
 ) -> Float[Array, " rows"]:
-    """Return the second derivatives of the rows by time (rad/s^2, m/s^2).
+    """Return the second derivatives of the gaps by time (rad/s^2, m/s^2).
 
-    V: twists of the tree. A: spatial accelerations without gravity.
+    V: twists of the tree's rows. A: their spatial accelerations, without gravity.
     """
     poses = link_poses(chain, kin, table)
     of_parent, of_real = static_take(V, table.parent), static_take(V, table.real)
@@ -202,7 +209,7 @@ def row_accelerations(
 
 
 def _torque(quat, free: tuple[bool, ...], multipliers) -> Float[Array, "3"]:
-    """Return the torque of the multipliers of rotation rows, in the joint's axes (N m)."""
+    """Return the torque (N m), in the joint's axes, of the multipliers of three rotation rows."""
     if all(free):
         return jnp.zeros(3, multipliers.dtype)
     return jax.vjp(lambda w: _rotation_rows(quat, free, w), jnp.zeros_like(quat[1:]))[1](
@@ -211,18 +218,18 @@ def _torque(quat, free: tuple[bool, ...], multipliers) -> Float[Array, "3"]:
 
 
 def _six_rows(table: LinkRows, multipliers) -> Float[Array, "links 6"]:
-    """Return the multipliers of all rows of the table's links, zero where not selected."""
+    """Return the multipliers of all six rows of each link; those not selected are zero."""
     place = np.full(6 * len(table.links), len(table))
-    place[table.places] = np.arange(len(table))
+    place[table.flat_indices] = np.arange(len(table))
     return static_take(multipliers, place).reshape(-1, 6)
 
 
 def link_wrenches(
     chain: Chain, kin: Kinematics, table: LinkRows, multipliers: Float[Array, " rows"]
 ) -> Float[Array, "tree_rows 6"]:
-    """Return the wrenches of the multipliers on the rows of the tree, about their roots' origins.
+    """Return the wrenches that links with these multipliers exert on the rows of the tree.
 
-    Torque (N m), then force (N), in world axes.
+    Torque (N m), then force (N), in world axes about the origins of the rows' roots.
     """
     poses = link_poses(chain, kin, table)
     six = _six_rows(table, multipliers)
@@ -236,14 +243,14 @@ def link_wrenches(
 
 
 def gaps_at(chain: Chain, q: Float[Array, " nq"], table: LinkRows) -> Float[Array, " rows"]:
-    """Return the gaps of the rows at q of the tree."""
+    """Return the gaps of the rows (rad, m) at q of the tree."""
     return row_gaps(chain, kinematics(chain, q), table)
 
 
 def rates_at(
     chain: Chain, q: Float[Array, " nq"], v: Float[Array, " nv"], table: LinkRows
 ) -> Float[Array, " rows"]:
-    """Return the rates of the rows at q and v of the tree."""
+    """Return the derivatives of the gaps by time (rad/s, m/s) at q and v of the tree."""
     kin = kinematics(chain, q)
     return row_rates(chain, kin, table, twists(chain, kin, v))
 
@@ -251,7 +258,10 @@ def rates_at(
 def link_force(
     chain: Chain, table: LinkRows, link: int, multipliers: Float[Array, " rows"]
 ) -> Float[Array, "3"]:
-    """Return the force (N) on the real link, in axes of the parent body. link: of the chain."""
+    """Return the force (N) on the real link, in axes of the parent body.
+
+    link: index of the virtual link in the chain.
+    """
     six = _six_rows(table, multipliers)[np.searchsorted(table.links, link)]
     return quat_rotate(chain.structure.quat[link], six[3:])
 
@@ -265,17 +275,19 @@ def link_torque(
 ) -> Float[Array, "3"]:
     """Return the torque (N m) on the real link, in axes of the parent body, about the joint.
 
-    The joint is at the origin of the real link's frame. link: of the chain.
+    The joint is at the origin of the real link's frame.
+
+    link: index of the virtual link in the chain.
     """
     poses, i = link_poses(chain, kinematics(chain, q), table), np.searchsorted(table.links, link)
     torque = _torque(poses.quat[i], table.freedoms[i], _six_rows(table, multipliers)[i, :3])
     return quat_rotate(chain.structure.quat[link], torque)
 
 
-def possible_rows(chain: Chain, links: np.ndarray) -> np.ndarray:
-    """Return the rows of links in a mask that are no freedoms of their joints.
+def candidate_rows(chain: Chain, links: np.ndarray) -> np.ndarray:
+    """Return the indices of the rows of links that are not along a freedom of the joint.
 
-    Two free rotations of a joint leave one row, at the place of the third.
+    links: mask of the virtual links. A joint with two free rotations keeps its third rotation row.
     """
     free = np.array(chain.topology.link_freedoms, bool).reshape(-1, 6)
     return np.flatnonzero((~free & np.asarray(links, bool)[:, None]).ravel())

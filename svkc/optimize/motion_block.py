@@ -1,4 +1,4 @@
-"""The block of the equations of motion, with its derivatives in closed form."""
+"""Row blocks whose derivatives are in closed form: stages' equations of motion, and connections."""
 
 import functools
 from collections.abc import Callable
@@ -11,13 +11,13 @@ import numpy as np
 from svkc.optimize.blocks import Multipliers, PlainBlock, StageBlock, Unknowns, lower_half
 from svkc.optimize.closed_forms import ConnectionDerivatives, StageDerivatives
 from svkc.optimize.equations import Model, connection, stage_equations
-from svkc.optimize.lift import Lift, StagePolynomials, motion_places
+from svkc.optimize.lift import Lift, StagePolynomials, motion_hessian_pattern
 
 
 class MotionBlock(StageBlock):
-    """A block of `stage_equations` of a chain with closed forms.
+    """A row block of `stage_equations`, for chains with closed forms.
 
-    model: of the equations. options: of `StageBlock`.
+    model: static part of the equations. options: keyword arguments of `StageBlock`.
     """
 
     def __init__(self, model: Model, poly: StagePolynomials, **options: Any):
@@ -26,6 +26,7 @@ class MotionBlock(StageBlock):
         self.model = model
 
     def _derivatives(self, params: Any, own: Any, lift: Lift) -> StageDerivatives:
+        """Return the derivatives at one stage. own: data of the lane."""
         return StageDerivatives(self.model, params, own, lift.variables())
 
     def jacobian(self, params: Any, data: Any, z: Unknowns) -> jax.Array:
@@ -43,14 +44,15 @@ class MotionBlock(StageBlock):
         return self._join_stages(total, at_stage, params, data, z, multipliers)
 
     @property
-    def hessian_places(self) -> tuple[np.ndarray, np.ndarray]:
-        return motion_places(self.layout)
+    def hessian_pattern(self) -> tuple[np.ndarray, np.ndarray]:
+        return motion_hessian_pattern(self.layout)
 
 
 class NodeBlock(PlainBlock):
-    """A block of nodes of a chain with closed forms.
+    """A row block of a function of nodes, for chains with closed forms.
 
-    function: (model, params, data, unknowns) -> rows. derivatives: class of its derivatives.
+    function: (model, params, data, unknowns) -> rows.
+    derivatives: class of the function's derivatives.
     """
 
     def __init__(
@@ -77,7 +79,7 @@ class NodeBlock(PlainBlock):
         return jax.vmap(at_lane)(data, z, multipliers)
 
 
-# of a function of nodes, the class of its derivatives
+# class of the derivatives of each function of nodes that has closed forms
 CLOSED_FORMS: dict[Callable[..., jax.Array], type[ConnectionDerivatives]] = {
     connection: ConnectionDerivatives
 }

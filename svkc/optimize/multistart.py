@@ -12,17 +12,20 @@ from svkc.optimize.workers import solve_in_processes
 
 
 class Solutions(list[Solution]):
-    """Solutions in the order of their starts; `result` of each says how it ended."""
+    """A list of solutions, in the order of their guesses.
+
+    `result` of a solution says how its run ended.
+    """
 
     @property
     def solved(self) -> np.ndarray:
-        """Mask of the solutions that satisfy the solver's tolerance, or its acceptable one."""
+        """Mask of the solutions whose result is `successful` or `acceptable`."""
         ended = (OUTCOME.successful, OUTCOME.acceptable)
         return np.array([any(bool(s.result == code) for code in ended) for s in self], bool)
 
     @property
     def best(self) -> Solution | None:
-        """The solution of least cost among those that are solved; None if none is."""
+        """The solution of least cost among those in `solved`; None if there are none."""
         solved = [s for s, is_solved in zip(self, self.solved, strict=True) if is_solved]
         return min(solved, key=lambda s: float(s.cost), default=None)
 

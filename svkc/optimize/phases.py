@@ -1,4 +1,4 @@
-"""Phases of a problem, and what their users say of them: bounds, constraints, costs."""
+"""Phases of a problem, with their bounds, constraints and costs."""
 
 import dataclasses
 from collections.abc import Iterable, Sequence
@@ -11,7 +11,7 @@ from svkc.model.chain import Chain
 from svkc.model.names import unknown_name
 from svkc.model.validation import as_array, boolean, check_function, names, real_array
 
-# what a bound may be on
+# quantities that `between` can bound
 QUANTITIES = ("position", "velocity", "torque", "control")
 
 
@@ -26,15 +26,16 @@ class Between:
 
 
 def between(joint: Names, lower: Scalar, upper: Scalar, *, of: str = "position") -> Between:
-    """Return bounds on a joint's coordinate, for the lists `bounds`, `start` and `end` of phases.
+    """Return bounds on coordinates, for the lists `bounds`, `start` and `end` of phases.
 
-    joint: name of a joint, of a coordinate (`Chain.dof_names`), or of several. For `of="control"`
+    joint: one name or several, of joints or of coordinates (`Chain.dof_names`). For `of="control"`
         names of controls.
-    lower, upper: least and largest value, in SI units and radians; -inf and inf: no bound.
-    of: "position", "velocity", "torque", or "control". Torques have bounds where they are states,
-        with `TorqueRates`; otherwise torques are controls.
+    lower, upper: smallest and largest value, in SI units and radians; -inf and inf: no bound.
+    of: "position", "velocity", "torque", or "control". "torque" is for torques that are states, as
+        with `TorqueRates`. The torques of `Torques` are controls.
 
-    Raises ValueError if the bounds contradict each other, are no numbers, or `of` is unknown.
+    Raises ValueError if the lower bound is above the upper one, if a bound is not a number, or if
+    `of` is unknown.
     """
     lower, upper = (np.asarray(real_array("between", x, float)) for x in (lower, upper))
     if of not in QUANTITIES:
@@ -61,9 +62,9 @@ def constraint(
 ) -> Constraint:
     """Return a named constraint, for the lists `path`, `start` and `end` of phases.
 
-    name: shown where the constraint is violated.
+    name: name of the constraint in messages and in tables of violations.
     function: a function of a `Point` that returns a number or an array.
-    lower, upper: bounds of its values; equal bounds make an equation.
+    lower, upper: bounds of the function's values; equal bounds make an equality constraint.
     """
     return Constraint(name=name, function=function, lower=lower, upper=upper)
 
@@ -87,27 +88,30 @@ def as_constraint(where: str, index: int, entry: Any) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class Phase:
-    """A phase of a motion: one structure, for a duration that is free within bounds.
+    """A phase of a motion: a time span with one structure and a duration between bounds.
 
     name: name of the phase.
     connected: names of the virtual links that are connected in the phase.
-    duration: least and largest duration (s), or one number for a fixed one.
-    intervals: number of collocation intervals of equal length.
-    mesh: places of the nodes as fractions of the duration, from 0 to 1, in place of `intervals`;
-        None: equal intervals.
-    bounds: of coordinates at the nodes, from `between`.
-    path: constraints at every stage: functions g of a `Point` with g >= 0, (g, lower, upper), or
-        `constraint(...)`. Those that depend on the state alone hold at the start too.
-    start, end: constraints at the start and at the end, in the same forms, or from `between`.
-    impact: whether links that connect at the start do so with an impact, as `svkc.connect` does.
-        False: the velocity before already keeps the new loops.
-    here: names of the links that connect where the bodies are, as `svkc.connect(..., here=True)`
-        does, and stay at that place in the phases that follow. True: all links that are new in the
-        phase, but for links of the first phase that are connected when the chain is loaded. Other
-        links connect at their declared placements.
-    running: running cost of this phase (1/s), a function of a `Point`; added to the problem's.
-    final: cost at the end of this phase, a function of a `Point`; added to the problem's.
-    continuous_torques: whether torques that are states go on from the phase before.
+    duration: smallest and largest duration (s), or one number for a fixed duration.
+    intervals: number of mesh intervals, of equal length.
+    mesh: positions of the nodes as fractions of the duration, from 0 to 1. They take the place of
+        `intervals`. None: equal intervals.
+    bounds: bounds on coordinates at all nodes, from `between`.
+    path: constraints at every stage: functions g of a `Point` with g >= 0, tuples (g, lower,
+        upper), or `constraint(...)`. Constraints that do not read accelerations, forces or torques
+        of links also hold at the start of the phase.
+    start, end: constraints at the start and at the end of the phase, in the forms of `path`, or
+        bounds from `between`.
+    impact: whether links that connect at the start do so with an impact, as in `svkc.connect`.
+        False: velocities are continuous, and must already satisfy the new loops.
+    here: names of links that connect at the bodies' current poses, as with `svkc.connect(...,
+        here=True)`, and keep that placement in later phases. True: all links that are new in the
+        phase, except for links of the first phase that are connected when the chain is loaded.
+        Other links connect at their declared placements.
+    running: running cost of the phase (cost per second), a function of a `Point`. It is added to
+        the running cost of the problem.
+    final: cost at the end of the phase, a function of a `Point`. It is added to other costs.
+    continuous_torques: whether torques are continuous from the phase before, where they are states.
 
     Raises ValueError if a field has another form.
     """
@@ -183,8 +187,8 @@ class Phase:
         return tuple(mesh.tolist())
 
     @property
-    def places(self) -> np.ndarray:
-        """Places [intervals + 1] of the nodes, as fractions of the duration."""
+    def node_fractions(self) -> np.ndarray:
+        """Positions [intervals + 1] of the nodes, as fractions of the duration."""
         return np.linspace(0, 1, self.intervals + 1) if self.mesh is None else np.array(self.mesh)
 
     def _checked_list(self, name: str) -> tuple[Any, ...]:
@@ -207,16 +211,18 @@ class Phase:
         return entries
 
     def constraints(self, which: str) -> list[Constraint]:
-        """Return the constraints by functions of one of the lists."""
+        """Return the constraints that are functions, in the list `path`, `start` or `end`."""
         return [c for c in getattr(self, which) if isinstance(c, Constraint)]
 
     def bounds_at(self, which: str) -> list[Between]:
-        """Return the bounds on coordinates of one of the lists."""
+        """Return the bounds on coordinates in the list `bounds`, `start` or `end`."""
         return [b for b in getattr(self, which) if isinstance(b, Between)]
 
 
 def coordinates_of(chain: Chain, bound: Between, controls: list[str]) -> np.ndarray:
-    """Return the indices of a bound's coordinates in v of the tree, or in a block of controls.
+    """Return the indices of a bound's coordinates in v of the tree, or in a control block.
+
+    controls: names of a control block's numbers.
 
     Raises ValueError, with the nearest names, for unknown names.
     """

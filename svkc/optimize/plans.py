@@ -1,4 +1,4 @@
-"""The plan of a solution: torques and states over time, and the control that follows them."""
+"""The plan of a solution: controls and states over time, and the control that follows the plan."""
 
 from typing import Any
 
@@ -9,18 +9,20 @@ import numpy as np
 
 from svkc.model.chain import Chain, State
 from svkc.optimize.guesses import PhaseMotion
-from svkc.optimize.points import padded, tree_configuration, tree_velocity
+from svkc.optimize.points import full_configuration, full_velocity, padded
 from svkc.tree.configuration import difference, integrate
 
 
 class Plan(eqx.Module):
-    """The intervals of a solution, one after another.
+    """The intervals of a solution over time: the `args` of its control.
 
-    starts, steps: of each (s). blocks: of controls. q, v: at both ends [intervals 2 ...], of the
-    tree. gains: at both ends [intervals 2 driven 2 nv], from errors of q and v to torques (N m/rad,
-    N m s/rad); without driven coordinates: no feedback.
-    first, last: the intervals that are used; before and after them the plan is held. Arrays may be
-        longer than that.
+    starts, steps: start and length of each interval (s).
+    blocks: [intervals blocks control] control blocks, see `AbstractControls`.
+    q, v: [intervals 2 ...] of the tree, at both ends of each interval.
+    gains: [intervals 2 driven 2nv] at both ends of each interval, from errors of q and v to torques
+        (N m/rad, N m s/rad). An empty axis of driven coordinates: no feedback.
+    first, last: indices of the intervals in use. Before and after them the plan is constant. Arrays
+        may be longer, so that meshes share compiled programs.
     """
 
     starts: Any
@@ -51,9 +53,9 @@ def plan_of(motion: tuple[PhaseMotion, ...], gains: np.ndarray | None = None) ->
 
 
 def blocks_at(table: np.ndarray, step: Any, fraction: Any, blocks: Any) -> Any:
-    """Return the blocks of a stage at a fraction of an interval, from the interval's blocks.
+    """Return the control blocks of a stage at a fraction of an interval.
 
-    table: of `control_table`. step: length of the interval (s).
+    table: from `control_table`. step: length of the interval (s). blocks: of the interval.
     """
     powers = jnp.stack([fraction**k for k in range(table.shape[1])])
     D = jnp.tensordot(powers, table[0], 1) + step * jnp.tensordot(powers, table[1], 1)
@@ -61,41 +63,47 @@ def blocks_at(table: np.ndarray, step: Any, fraction: Any, blocks: Any) -> Any:
 
 
 def control_table(controls: Any, scheme: Any) -> np.ndarray:
-    """Return D0 and D1 of `AbstractControls.coefficients` as polynomials of the fraction."""
+    """Return D0 and D1 of `AbstractControls.coefficients` as polynomials of the fraction.
+
+    The result is [2 powers stage_blocks blocks], with the constant terms first.
+    """
     fractions = np.linspace(0, 1, scheme.stages + 1)
     inverse = np.linalg.inv(fractions[:, None] ** np.arange(len(fractions)))
     return np.stack([np.tensordot(inverse, D, 1) for D in controls.coefficients(scheme, fractions)])
 
 
 def _planned(chain: Chain, q, v, step: Any, s: Any) -> tuple[Any, Any]:
-    """Return q and v of the tree at a fraction s of an interval, by Hermite's cubic polynomial."""
-    start = tree_configuration(chain, q[0])
-    step_to = difference(chain, start, tree_configuration(chain, q[1]))[: chain.nv]
+    """Return q and v of the tree at a fraction s of an interval, by cubic Hermite interpolation.
+
+    q, v: at both ends of the interval. step: length of the interval (s).
+    """
+    start = full_configuration(chain, q[0])
+    step_to = difference(chain, start, full_configuration(chain, q[1]))[: chain.nv]
     moved = (3 * s**2 - 2 * s**3) * step_to
     moved = moved + step * ((s - 2 * s**2 + s**3) * v[0] + (s**3 - s**2) * v[1])
     rate = (6 * s - 6 * s**2) * step_to / step
     rate = rate + (1 - 4 * s + 3 * s**2) * v[0] + (3 * s**2 - 2 * s) * v[1]
-    return integrate(chain, start, tree_velocity(chain, moved))[: chain.nq], rate
+    return integrate(chain, start, full_velocity(chain, moved))[: chain.nq], rate
 
 
 def control_of(problem: Any) -> Any:
-    """Return the control (t, state, plan) -> tau that follows a `Plan`.
+    """Return the control function (t, state, plan) -> tau of a problem's plans.
 
-    It is the same object for all meshes of a problem, so that runs are compiled once.
+    Problems on other meshes share one function object, so that `simulate` compiles once.
     """
     return problem.functions.setdefault("control", PlanControl(problem))
 
 
 class PlanControl(eqx.Module):
-    """The control (t, state, plan) -> tau of a problem's plans.
+    """The control function (t, state, plan) -> tau of a problem's plans.
 
-    problem: compared by identity, as its functions are.
+    problem: static; two problems are equal if they are one object.
     """
 
     problem: Any = eqx.field(static=True)
 
     def __call__(self, t: Any, state: State, plan: Plan) -> Any:
-        """Return the joint torques over every coordinate (N m, N)."""
+        """Return the joint torques (N m, N) over every coordinate: the plan's, plus feedback."""
         problem, chain = self.problem, self.problem.chain
         k = jnp.searchsorted(plan.starts, t, side="right") - 1
         k = jnp.clip(k, *(jnp.asarray(i).astype(k.dtype) for i in (plan.first, plan.last)))
@@ -109,7 +117,7 @@ class PlanControl(eqx.Module):
             return tau
         at_q, at_v, gains = jax.tree.map(of_interval, (plan.q, plan.v, plan.gains))
         q, v = _planned(chain, at_q, at_v, step, fraction)
-        here, there = (tree_configuration(chain, x[: chain.nq]) for x in (state.q, q))
+        here, there = (full_configuration(chain, x[: chain.nq]) for x in (state.q, q))
         error_q = difference(chain, here, there)[: chain.nv]
         error = jnp.concatenate([error_q, v - state.v[: chain.nv]])
         feedback = ((1 - fraction) * gains[0] + fraction * gains[1]) @ error
@@ -117,5 +125,5 @@ class PlanControl(eqx.Module):
 
 
 def driven_coordinates(problem: Any) -> np.ndarray:
-    """Return the indices in v of the coordinates that are known to have torques."""
+    """Return the indices in v of the driven coordinates; empty where they are not known."""
     return np.flatnonzero(problem.controls.driven(problem.chain))

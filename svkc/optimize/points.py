@@ -1,4 +1,4 @@
-"""A point of a motion, as costs and constraints see it."""
+"""`Point`, the argument of costs and constraints, and states from coordinates of the tree."""
 
 import functools
 from collections.abc import Sequence
@@ -22,26 +22,29 @@ from svkc.tree.kinematics import kinematics
 from svkc.tree.spatial import quat_conjugate, quat_multiply
 
 
-def tree_configuration(chain: Chain, q: Float[Array, " nq"]) -> Float[Array, " q"]:
-    """Return q of the tree with the virtual joints' coordinates of the load pose."""
+def full_configuration(chain: Chain, q: Float[Array, " nq"]) -> Float[Array, " q"]:
+    """Return q of the chain: q of the tree, then virtual joints' coordinates of the load pose."""
     return jnp.concatenate([q, chain.q_load[chain.nq :]])
 
 
-def tree_velocity(chain: Chain, v: Float[Array, " nv"]) -> Float[Array, " dofs"]:
-    """Return v of the tree with zeros for the virtual joints' coordinates."""
+def full_velocity(chain: Chain, v: Float[Array, " nv"]) -> Float[Array, " dofs"]:
+    """Return v of the chain: v of the tree, then zeros for the virtual joints' coordinates."""
     return jnp.concatenate([v, jnp.zeros(chain.dofs - chain.nv, v.dtype)])
 
 
 def full_state(
     chain: Chain, structure: Structure, q: Float[Array, " nq"], v: Float[Array, " nv"]
 ) -> State:
-    """Return the state of q and v of the tree, with coordinates of virtual joints that agree."""
-    q, v = tree_configuration(chain, q), tree_velocity(chain, v)
+    """Return the state at q and v of the tree.
+
+    Coordinates and velocities of virtual joints follow from the motion of the bodies.
+    """
+    q, v = full_configuration(chain, q), full_velocity(chain, v)
     if chain.dofs == chain.nv:
         return State(q, v, structure)
     place = lambda q: joint_coordinates(chain, structure, kinematics(chain, q), q)
     q, rate = jax.jvp(place, (q,), (configuration_derivative(chain, q, v),))
-    return State(q, _velocity_of(chain, q, rate), structure)
+    return State(q, _velocity_from_rate(chain, q, rate), structure)
 
 
 def states_of(
@@ -50,9 +53,10 @@ def states_of(
     motion: Sequence[tuple[np.ndarray, np.ndarray]],
     function: Any = None,
 ) -> list[State]:
-    """Return the states of all phases, of each with a leading axis over its nodes.
+    """Return the states of each phase, with a leading axis over its nodes.
 
-    motion: of each phase, (q, v) [nodes ...] of the tree. function: in place of `full_state`.
+    motion: of each phase, (q [nodes nq], v [nodes nv]) of the tree.
+    function: (chain, structure, q, v) -> state; None: `full_state`.
     """
     repeat = lambda s, n: jax.tree.map(lambda x: np.broadcast_to(np.asarray(x), (n, *x.shape)), s)
     lanes = [(repeat(s, len(q)), q, v) for s, (q, v) in zip(structures, motion, strict=True)]
@@ -67,21 +71,22 @@ def states_of(
 
 @functools.partial(eager_jit, jit=eqx.filter_jit)
 def _over_lanes(function: Any, chain: Chain, lanes: tuple) -> State:
+    """Return function(chain, structure, q, v) over lanes of (structure, q, v)."""
     return jax.vmap(lambda lane: function(chain, *lane))(lanes)
 
 
 def padded(lanes: Any, multiple: int = 64) -> Any:
-    """Return lanes with the last one repeated up to a multiple of a number.
+    """Return arrays with their last entry repeated until the length is a multiple of a number.
 
-    Other numbers of intervals are then seldom compiled again.
+    Meshes of nearly as many intervals then share one compiled program.
     """
     count = len(jax.tree.leaves(lanes)[0])
     at = np.minimum(np.arange(-(-count // multiple) * multiple), count - 1)
     return jax.tree.map(lambda x: np.asarray(x)[at], lanes)
 
 
-def _velocity_of(chain: Chain, q, rate) -> Float[Array, " dofs"]:
-    """Return v from the derivative of q by time."""
+def _velocity_from_rate(chain: Chain, q, rate) -> Float[Array, " dofs"]:
+    """Return v from q and its derivative by time."""
     quat_q, quat_v = chain.topology.quaternion_starts
     scalar_q, scalar_v = chain.topology.scalar_coordinates
     at = quat_q[:, None] + np.arange(4)
@@ -91,14 +96,17 @@ def _velocity_of(chain: Chain, q, rate) -> Float[Array, " dofs"]:
 
 
 class Point:
-    """A point of a motion: what costs and constraints are functions of.
+    """One time of a motion: the argument of costs and constraints.
 
-    chain: the chain, with the parameters for which the problem is solved.
+    Points are at the stages of intervals, and at the start of a phase.
+
+    chain: the chain of the problem. Read masses and lengths from this attribute: the optimal cost
+        then has derivatives by them.
     t: time from the start of the motion (s).
     duration: duration of the phase (s).
-    u: what is chosen: torque rates, torques, or the user's own numbers.
+    u: controls: torque rates, torques, or the numbers of `Parametrized`.
     vdot: accelerations of the tree's coordinates (rad/s^2, m/s^2).
-    args: the problem's arguments.
+    args: `args` of the problem.
     """
 
     def __init__(
@@ -124,12 +132,13 @@ class Point:
         self._q, self._v, self._vdot = motion
         self._blocks, self._multipliers, self._at_start = blocks, multipliers, at_start
         self._rows, self._active = rows
-        # in place of coordinates of virtual joints, for functions that do not read them
+        # value of the virtual joints' coordinates for functions that do not read them; None:
+        # computed from the bodies
         self._fill = fill
 
     @functools.cached_property
     def state(self) -> State:
-        """The state, with the structure of the phase."""
+        """State at this time, with the structure of the phase."""
         fill = self._fill
         if fill is None:
             return full_state(self.chain, self._structure, self._q, self._v)
@@ -139,7 +148,7 @@ class Point:
 
     @property
     def u(self) -> Float[Array, " n"]:
-        """What is chosen: torque rates (N m/s, N/s), torques (N m, N), or the user's own."""
+        """Controls: torque rates (N m/s, N/s), torques (N m, N), or numbers of `Parametrized`."""
         return self._blocks[-1]
 
     @functools.cached_property
@@ -151,40 +160,43 @@ class Point:
     def vdot(self) -> Float[Array, " nv"]:
         """Accelerations of the tree's coordinates (rad/s^2, m/s^2).
 
-        Raises ValueError at the start of a phase, where there are none.
+        Raises ValueError at the start of a phase, where a point has no accelerations.
         """
         self._refuse_at_start("vdot")
         return self._vdot
 
     def forces(self, link: str) -> Float[Array, "3"]:
-        """Return the force (N) that a virtual link transmits on its real link from the parent, at
-        the joint, in axes of the parent body.
+        """Return the force (N) of a virtual link: on its real link, from its parent.
+
+        The force acts at the joint. Components are along the axes of the parent body.
 
         link: name of the virtual link.
         Raises ValueError for a link that is not connected, and at the start of a phase.
         """
         self._refuse_at_start("forces")
-        return link_force(self.chain, self._rows, *self._multipliers_of(link))
+        return link_force(self.chain, self._rows, *self._multipliers_of(link, "forces"))
 
     def torques(self, link: str) -> Float[Array, "3"]:
-        """Return the torque (N m) that a virtual link transmits, in the convention of `forces`.
+        """Return the torque (N m) of a virtual link about its joint, in the axes of `forces`.
 
         link: name of the virtual link.
         Raises ValueError for a link that is not connected, and at the start of a phase.
         """
         self._refuse_at_start("torques")
-        return link_torque(self.chain, self._q, self._rows, *self._multipliers_of(link))
+        return link_torque(self.chain, self._q, self._rows, *self._multipliers_of(link, "torques"))
 
     def impulse(self, link: str) -> Float[Array, "3"]:
-        """Return the impulse (N s) of a virtual link at the start of a phase with an impact, in the
-        convention of `forces`.
+        """Return the impulse (N s) of a virtual link in the impact at the start of a phase.
+
+        It acts at the joint, on the real link from the parent. Components are along the axes of the
+        parent body. Phases without an impact have zero impulse.
 
         link: name of the virtual link.
         Raises ValueError for a link that is not connected, and elsewhere than at a phase's start.
         """
         if not self._at_start:
             raise ValueError("impulse: a point has one at the start of a phase only")
-        return link_force(self.chain, self._rows, *self._multipliers_of(link))
+        return link_force(self.chain, self._rows, *self._multipliers_of(link, "impulse"))
 
     def torque(self, joint: str) -> Array:
         """Return the torque (N m, N) of a joint: a scalar for a hinge or slide.
@@ -196,24 +208,30 @@ class Point:
         return tau[0] if tau.shape == (1,) else tau
 
     def _refuse_at_start(self, name: str) -> None:
+        """Raise ValueError at the start of a phase. name: what the point does not have there."""
         if self._at_start:
             raise ValueError(
                 f"{name}: a point at the start of a phase has none; use `path`, or `end`"
             )
 
-    def _multipliers_of(self, link: str) -> tuple[int, Float[Array, " rows"]]:
+    def _multipliers_of(self, link: str, method: str) -> tuple[int, Float[Array, " rows"]]:
+        """Return the index of a link in the chain, and the multipliers of all rows.
+
+        method: name of the method that the message of the ValueError begins with.
+        """
         i = link_index(self.chain.topology, link)
         if not np.any((self._rows.rows // 6 == i) & self._active):
-            raise ValueError(f"forces: the virtual link {link!r} is not connected in this phase")
+            raise ValueError(f"{method}: the virtual link {link!r} is not connected in this phase")
         return i, jnp.where(self._active, self._multipliers, 0)
 
 
 class PhaseStructure(eqx.Module):
-    """What a phase's structure is to the transcription.
+    """The structure of a phase, with masks of the links' rows in it.
 
-    structure: of the states. active: mask of the selected rows that are constraints in the phase.
-    new: those of links that connect at its start.
-    here: those of links whose joints are where the bodies were when the links connected.
+    structure: structure of the phase's states.
+    active: mask [rows] of the links' rows that are constraints in the phase.
+    new: mask [rows] of those that belong to links that connect at the start of the phase.
+    here: mask [rows] of those that belong to links placed by `Phase.here`.
     """
 
     structure: Structure

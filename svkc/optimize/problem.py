@@ -1,4 +1,4 @@
-"""A problem of motion optimization: phases, controls and costs."""
+"""`Problem`: phases, controls and costs, with the calls that check and solve it."""
 
 import copy
 import dataclasses
@@ -18,7 +18,7 @@ from svkc.optimize.controls import AbstractControls
 from svkc.optimize.encoding import encode
 from svkc.optimize.equations import Model, Params
 from svkc.optimize.failures import raise_on_failure
-from svkc.optimize.guesses import Guess, PhaseMotion, PoseLine, static_forces
+from svkc.optimize.guesses import Guess, PoseLine, motion_without_torques
 from svkc.optimize.ipopt import AbstractSolver, Ipopt, SolverResult
 from svkc.optimize.lift import Layout
 from svkc.optimize.loop_rows import LinkRows
@@ -34,26 +34,26 @@ from svkc.optimize.units import Units, units_of
 from svkc.optimize.unknowns import UnknownsBuilder
 from svkc.optimize.user_rows import UserRows
 
-# points at which patterns are found, and the size of the scaled cost at them
-_DRAWS, _COST_AT_DRAWS = 3, 50.0
+# number of random points at which sparsity is determined, and the scaled cost at these points
+_SAMPLES, _COST_AT_SAMPLES = 3, 50.0
 
 
 class Problem:
-    """A motion to be optimized: phases of different structure, one after another.
+    """An optimal control problem over phases of different structure, one after another.
 
     chain: the chain.
-    phases: of the motion, in order.
+    phases: phases of the motion, in order.
     controls: `TorqueRates`, `Torques` or `Parametrized`.
-    running: running cost (1/s), a function of a `Point`.
-    final: cost at the end of the motion, a function of a `Point`.
-    bounds: of coordinates at all nodes, from `between`.
-    scheme: `Radau(2)` or with another number of stages.
-    args: passed to functions as `point.args`.
+    running: running cost (cost per second), a function of a `Point`; None: no such cost.
+    final: cost at the end of the motion, a function of a `Point`; None: no such cost.
+    bounds: bounds on coordinates at all nodes of all phases, from `between`.
+    scheme: collocation scheme; None: `Radau(2)`.
+    args: data for the functions of the problem, which read them as `point.args`.
     units: `Units` by which the solver divides; None: from mass, length and gravity.
-    project: whether nodes are projected onto their loops. Without it loops drift, as in equations
-        of motion with accelerations alone.
+    project: whether nodes are projected onto their loops. False: the equations of motion keep
+        accelerations on the loops, but positions and velocities drift off over the intervals.
 
-    Raises ValueError if an argument has another form, or a name is unknown.
+    Raises ValueError if an argument has another form, or if a name is unknown.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class Problem:
         bounds = tuple(as_constraint("bounds", i, entry) for i, entry in enumerate(bounds))
         self.chain: Chain = chain
         self.controls: AbstractControls = controls.for_chain(chain)
-        # numbers are data, by which the optimal cost has derivatives
+        # floats become arrays: `Solution.gradient` differentiates by them
         as_data = lambda x: jnp.asarray(x) if isinstance(x, float) else x
         self.args: Any = jax.tree.map(as_data, args)
         self.phases: list[Phase] = [
@@ -94,21 +94,23 @@ class Problem:
         self.units: Units = units_of(chain, middle) if units is None else units
         self.project: bool = boolean("project", project)
         self._programs: dict[Any, Program] = {}
-        # functions that are made once, also for other meshes
+        # compiled functions that problems on other meshes share
         self.functions: dict[str, Any] = {}
 
     def guess(
         self, poses: Sequence[Any], durations: Any = None, *, noise: float = 0.0, key: int = 0
     ) -> Guess:
-        """Return a guess: straight lines between poses, and the forces of statics.
+        """Return a guess with straight lines between poses.
 
-        poses: at the start of each phase and at the end: coordinates of the tree as an array, by
-            joint name, or a State. None where a pose is not known: the line goes on. The loops of
-            the phases that meet there are closed by the least change.
-        durations: of the phases (s); None: the middle of their bounds.
-        noise: fraction of the range between bounds by which unknowns are moved at random.
-        key: of the random numbers.
-        Raises ValueError if poses or durations are of another number.
+        Torques and accelerations are zero. Connected links carry the weight.
+
+        poses: pose at the start of each phase, then the pose at the end of the motion. A pose is an
+            array of the tree's coordinates, a dict by joint name, or a State. None: not known; the
+            line leads on to the next known pose. Newton steps close the loops of known poses.
+        durations: durations of the phases (s); None: the middle of their bounds.
+        noise: unknowns move at random by at most this fraction of the range between their bounds.
+        key: seed of the random numbers.
+        Raises ValueError for a wrong number of poses or of durations.
         """
         count = len(self.phases)
         middle = [sum(p.duration) / 2 for p in self.phases]
@@ -116,24 +118,11 @@ class Problem:
         if durations.shape != (count,):
             raise ValueError(f"guess: got {durations.size} durations, expected {count}")
         lines = PoseLine(self.chain, self.phases, poses).at(durations)
-        return Guess([self._at_rest(*x) for x in zip(self.phases, durations, lines)], noise, key)
-
-    def _at_rest(self, phase: Phase, duration: float, line: tuple) -> PhaseMotion:
-        """Return a phase along a line, without torques and accelerations."""
-        n, s, control = phase.intervals, self.scheme.stages, self.controls.count(self.chain)
-        links, q = 6 * len(self.chain.link_names), line[0]
-        forces = static_forces(self.chain, phase.connected, self.controls.driven(self.chain), q)
-        return PhaseMotion(
-            duration=float(duration),
-            q=line[0],
-            v=line[1],
-            states=np.zeros((n + 1, control * self.controls.has_state)),
-            blocks=np.zeros((n, self.controls.blocks(self.scheme), control)),
-            vdot=np.zeros((n, s, self.chain.nv)),
-            forces=np.repeat(forces[:-1, None], s, 1),
-            impulse=np.zeros(links),
-            mesh=phase.places,
-        )
+        motions = [
+            motion_without_torques(self.chain, self.controls, self.scheme, phase, duration, line)
+            for phase, duration, line in zip(self.phases, durations, lines)
+        ]
+        return Guess(motions, noise, key)
 
     def solve(
         self,
@@ -145,14 +134,18 @@ class Problem:
     ) -> Solution:
         """Return the optimal motion near a guess.
 
-        guess: of `guess`, or a `Solution` of a problem with these phases, on any mesh.
-        solver: None: `Ipopt()`.
-        progress_meter: of diffrax.
-        throw: raise RuntimeError if the solver fails, with the names of the rows that are violated
-            most. False returns the last iterate, whose `result` says how the run ended.
+        A `Solution` as guess starts the solver warm: from its unknowns and, on the same mesh, its
+        multipliers. Ctrl-C ends the run, and the last iterate is returned. Exceptions that users'
+        functions raise are raised again.
 
-        Ctrl-C ends the run, and the result is the last iterate. Exceptions in functions of the user
-        are raised. Raises ValueError if a row is not finite at the guess, by name.
+        guess: from `guess`, or a `Solution` of a problem with these phases, on any mesh.
+        solver: an `Ipopt`; None: `Ipopt()`.
+        progress_meter: a progress meter of diffrax; None: no display.
+        throw: whether to raise RuntimeError if the solver fails. False: the last iterate is
+            returned, and its `result` says how the run ended.
+
+        Raises ValueError, with the name of the row, if a row or a derivative is not finite at the
+        guess. Raises RuntimeError, with the rows that are violated most, if the solver fails.
         """
         program, start = self.start(guess)
         check_finite(program, start.x)
@@ -171,11 +164,11 @@ class Problem:
         return solution(self, program, result)
 
     def with_mesh(self, meshes: Sequence[Any]) -> "Problem":
-        """Return the problem with other intervals.
+        """Return the problem with another mesh for each phase.
 
-        meshes: for each phase, the number of equal intervals, or the places of the nodes as
+        meshes: for each phase, the number of equal intervals, or the positions of the nodes as
             fractions of the duration, from 0 to 1.
-        Raises ValueError for another number of meshes, and for a wrong mesh.
+        Raises ValueError for a wrong number of meshes, and for a wrong mesh.
         """
         if len(meshes) != len(self.phases):
             raise ValueError(f"with_mesh: got {len(meshes)} meshes, expected {len(self.phases)}")
@@ -198,15 +191,17 @@ class Problem:
         solver: AbstractSolver | None = None,
         progress_meter: Any = None,
     ) -> Solutions:
-        """Return the solutions from several guesses, in their order, as a list with `best`.
+        """Return the solutions from several guesses, in the order of the guesses.
 
-        Those that failed are among them: `result` says how each ended.
+        Runs that failed are in the list as well: `result` of a solution says how its run ended.
 
-        guesses: as of `solve`.
-        processes: one: starts are solved here, one after the other in one compiled program. More:
-            at once in so many new processes, which compile the problem first; needs cloudpickle.
+        guesses: each as in `solve`.
+        processes: 1: guesses are solved in this process, one after the other, with one compiled
+            program. More: they are shared among this number of new processes. Each process compiles
+            the problem for itself. Needs cloudpickle.
         solver, progress_meter: as in `solve`.
-        Raises RuntimeError, with the exception in it, if a process fails.
+        Raises ImportError without cloudpickle. Raises RuntimeError, with the text of the exception,
+        if a process fails.
         """
         count = integer("processes", processes, 1)
         return multistart(
@@ -214,11 +209,11 @@ class Problem:
         )
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what another process needs; compiled functions are made anew."""
+        """Return the attributes for pickling, without compiled functions."""
         return self.__dict__ | {"_programs": {}, "functions": {}}
 
     def start(self, guess: Guess | Solution) -> tuple[Program, SolverResult]:
-        """Return the compiled problem, and a guess in the solver's units."""
+        """Return the compiled problem, and the guess as a start of the solver, in its units."""
         motion = as_guess(guess, self)
         program = self.program(motion)
         program.set_references([m.q for m in motion.phases])
@@ -232,16 +227,16 @@ class Problem:
         return program, SolverResult(x=x, multipliers=rows, lower=lower, upper=upper)
 
     def check(self, guess: Guess | Solution) -> Check:
-        """Return what is to know before any iteration: derivatives, units, violated rows.
+        """Return size, derivative errors, units and violated rows of the problem at a guess.
 
         guess: as in `solve`.
-        Raises ValueError if a row is not finite at the guess, by name.
+        Raises ValueError, with the name of the row, if a row or a derivative is not finite.
         """
         program, start = self.start(guess)
         return check(program, start.x)
 
     def program(self, guess: Guess) -> Program:
-        """Return the compiled problem about a guess, which gives ranks and charts."""
+        """Return the compiled problem. The guess determines ranks of loops, and charts."""
         poses = [[m.q[0], m.q[-1]] for m in guess.phases]
         rows, structures = phase_structures(self.chain, self.phases, poses)
         key = (rows.tobytes(), *(s.active.tobytes() for s in structures))
@@ -250,7 +245,10 @@ class Problem:
         return self._programs[key]
 
     def _compile(self, rows: np.ndarray, structures, guess: Guess) -> Program:
-        """Return the compiled problem for these structures."""
+        """Return the compiled problem.
+
+        rows: the links' rows that are constraints in some phase. structures: of each phase.
+        """
         chain, controls = self.chain, self.controls
         layout = Layout(
             nv=chain.nv,
@@ -273,28 +271,29 @@ class Problem:
         )
         builder.table.freeze()
         params = Params(chain, self.args)
-        draws = self._draws(builder.table, transcription)
-        users = UserRows(transcription, params, draws)
+        samples = self._sample_points(builder.table, transcription)
+        users = UserRows(transcription, params, samples)
         last = len(self.phases) - 1
         for i, phase in enumerate(self.phases):
             running = [f for f in (self.running, phase.running) if f is not None]
             final = [f for f in (self.final if i == last else None, phase.final) if f is not None]
             users.add_phase(i, running, final)
         users.add_blocks()
-        transcription.rows.freeze()
-        users.set_cost_row(transcription.rows.count)
-        program = Program(transcription, params, draws, self.units.cost or 1.0)
+        program = Program(transcription, params, samples, self.units.cost or 1.0)
         if self.units.cost is None:
-            costs = [abs(program.rows(x / program.unit)[-1]) for x in draws]
-            program.set_cost_unit(max(float(np.median(costs)) / _COST_AT_DRAWS, 1e-12))
+            costs = [abs(program.rows(x / program.unit)[-1]) for x in samples]
+            program.set_cost_unit(max(float(np.median(costs)) / _COST_AT_SAMPLES, 1e-12))
         return program
 
-    def _draws(self, table, transcription: Transcription) -> np.ndarray:
-        """Return random points in SI units, the durations near the middle of their bounds."""
+    def _sample_points(self, table, transcription: Transcription) -> np.ndarray:
+        """Return random points [samples unknowns] in SI units.
+
+        Durations are near the middle of their bounds, and fixed unknowns have their values.
+        """
         random = np.random.default_rng(0)
-        draws = random.normal(size=(_DRAWS, table.count)) * table.unit
-        for phase, indices in zip(self.phases, transcription.phases):
+        samples = random.normal(size=(_SAMPLES, table.count)) * table.unit
+        for phase, indices in zip(self.phases, transcription.indices):
             middle = sum(phase.duration) / 2
-            draws[:, indices.duration] = middle * random.uniform(0.8, 1.2, _DRAWS)
+            samples[:, indices.duration] = middle * random.uniform(0.8, 1.2, _SAMPLES)
         fixed = table.lower == table.upper
-        return np.where(fixed, table.lower, draws)
+        return np.where(fixed, table.lower, samples)

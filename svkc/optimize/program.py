@@ -1,7 +1,8 @@
-"""The compiled problem: rows, Jacobian and Hessian as sparse entries for a solver.
+"""The compiled problem: rows, Jacobian and Hessian of the Lagrangian as sparse entries.
 
-Blocks return dense matrices of their lanes. Which entries are not zero is found once, at random
-points; only these are handed to the solver. Unknowns and rows are divided by their units.
+Row blocks return dense matrices of their lanes. The sparsity pattern is determined once: an entry
+belongs to it if it is not zero at one of a few random points. The solver sees unknowns and rows
+divided by their units.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,64 +17,16 @@ from svkc._jax.eager import eager_jit
 from svkc.optimize.blocks import MANY_LANES, Block
 from svkc.optimize.charts import quaternion_starts
 from svkc.optimize.equations import Params
+from svkc.optimize.sparsity import Entries, above_round_off, above_round_off_of_rows
 from svkc.optimize.transcription import Transcription
-
-# of an entry, by the largest of its row
-_ROUND_OFF = 1e-13
-
-
-class Entries:
-    """Sparse entries of a matrix: where they are in the blocks' dense results.
-
-    row, column: of each entry of the matrix, without repetition.
-    """
-
-    def __init__(
-        self,
-        parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]],
-        shape: tuple[int, int],
-        scale: tuple[np.ndarray, np.ndarray],
-    ):
-        """parts: of each block, flat places, and the row and column of each place.
-
-        shape: of the matrix. scale: (units of rows, units of columns).
-        """
-        self.places: list[np.ndarray] = [place for place, _, _ in parts]
-        row, column = (np.concatenate([np.zeros(0, int), *(p[k] for p in parts)]) for k in (1, 2))
-        keys, self._target = np.unique(row * shape[1] + column, return_inverse=True)
-        self.row: np.ndarray = keys // shape[1]
-        self.column: np.ndarray = keys % shape[1]
-        self._weight = scale[1][column] / scale[0][row]
-
-    def gather(self, dense: Sequence[jax.Array | np.ndarray]) -> np.ndarray:
-        """Return the values of the entries, in the solver's units."""
-        values = [np.asarray(x).reshape(-1)[at] for x, at in zip(dense, self.places)]
-        values = np.concatenate([np.zeros(0), *values]) * self._weight
-        return np.bincount(self._target, values, len(self.row))
-
-
-def _not_round_off(dense: np.ndarray, axes) -> np.ndarray:
-    """Return the mask of entries above round-off of the largest along some axes."""
-    # what is not finite at a random point is an entry
-    finite = np.isfinite(dense)
-    size = np.where(finite, np.abs(dense), 0)
-    return ~finite | (size > _ROUND_OFF * np.max(size, axis=axes, keepdims=True, initial=0.0))
-
-
-def _not_round_off_of_rows(values: np.ndarray, row: np.ndarray, rows: int) -> np.ndarray:
-    """Return the mask of entries [lanes entries] above round-off of the largest of their row."""
-    largest = np.zeros((len(values), rows))
-    finite = np.isfinite(values)
-    size = np.where(finite, np.abs(values), 0)
-    for i in range(rows):
-        largest[:, i] = np.max(size[:, row == i], axis=1, initial=0.0)
-    return ~finite | (size > _ROUND_OFF * largest[:, row])
 
 
 def _over_blocks(blocks: Sequence[Block], call: Callable) -> Callable:
-    """Return (params, data, *x) -> results of a function of each block, compiled.
+    """Return the compiled function (params, data, *x) -> [result of each block].
 
-    Blocks of few lanes are compiled for short compile time.
+    Blocks with few lanes are compiled for a short compile time, and others for speed.
+
+    call: (block, params, data, ...) -> result of a block.
     """
     many = [len(b.unknowns) >= MANY_LANES for b in blocks]
     programs = []
@@ -98,14 +51,17 @@ def _over_blocks(blocks: Sequence[Block], call: Callable) -> Callable:
 
 
 class Program:
-    """Rows and derivatives of a problem at unknowns in the solver's units.
+    """Rows and derivatives of a problem, in the solver's units.
 
-    whole: the transcription. params: for which it is solved. draws: points in SI units at which the
-    patterns are found. cost_unit: by which the cost is divided.
+    params: parameters of the problem. samples: random points in SI units, at which the sparsity
+        patterns are determined. cost_unit: number by which the cost is divided.
+    unit, row_unit: units of unknowns and of rows, the cost's last.
+    cost_row: index of the cost's row. solver_rows: indices of the rows that depend on an unknown
+        that is not fixed; only these are constraints of the solver.
     """
 
     def __init__(
-        self, transcription: Transcription, params: Params, draws: np.ndarray, cost_unit: float
+        self, transcription: Transcription, params: Params, samples: np.ndarray, cost_unit: float
     ):
         self.transcription = transcription
         self.params = params
@@ -119,30 +75,28 @@ class Program:
         self._values = _over_blocks(blocks, lambda b, *x: b.values(*x))
         self._first = _over_blocks(blocks, lambda b, *x: b.jacobian(*x))
         self._second = _over_blocks(blocks, lambda b, *x: b.hessian(*x))
-        first = [self._first(self.params, self._data, self._local(x)) for x in draws]
+        first = [self._first(self.params, self._data, self._local(x)) for x in samples]
         self._set_row_units(first)
         self.row_unit: np.ndarray = np.append(transcription.rows.unit, cost_unit)
         rows = [b.rows.reshape(-1) for b in blocks]
         self._target = np.concatenate(rows) if rows else np.zeros(0, int)
         linear = transcription.linear
         self._linear = linear[0], linear[1], linear[2] / self.row_unit[linear[0]]
-        entries, of_hessian = self._patterns(draws, first)
+        entries, of_hessian = self._patterns(samples, first)
         self.jacobian_entries: Entries = entries
         self.hessian_entries: Entries = of_hessian
-        # rows of fixed unknowns alone would make the solver's matrices singular
+        # rows whose unknowns are all fixed would make the solver's matrices singular
         table = transcription.builder.table
         free = table.lower < table.upper
-        self.kept: np.ndarray = np.intersect1d(
+        self.solver_rows: np.ndarray = np.intersect1d(
             entries.row[free[entries.column]], np.arange(self.cost_row)
         )
 
     def set_cost_unit(self, cost_unit: float) -> None:
-        """Divide the cost by this number."""
+        """Replace the number by which the cost is divided."""
         ratio = self.row_unit[-1] / cost_unit
         self.row_unit[-1] = cost_unit
-        entries = self.jacobian_entries
-        of_cost = entries.row[entries._target] == self.cost_row
-        entries._weight = np.where(of_cost, entries._weight * ratio, entries._weight)
+        self.jacobian_entries.scale_row(self.cost_row, ratio)
 
     def set_references(self, references: Sequence[np.ndarray]) -> None:
         """Set the origins of the charts: configurations [n + 1 nq] of each phase."""
@@ -151,17 +105,22 @@ class Program:
             self._data = [jax.tree.map(jnp.asarray, b.data) for b in self.blocks]
 
     def _local(self, x: np.ndarray) -> list[np.ndarray]:
-        """Return the local unknowns of the blocks at unknowns in SI units."""
+        """Return the local unknowns of each block. x: unknowns in SI units."""
         padded = np.append(x, 0.0)
         return [padded[index] for index in self._index]
 
     def _set_row_units(self, jacobians: list[list[jax.Array]]) -> None:
-        """Set units that are not known: each kind of row gets the size of its gradient."""
+        """Set the units of rows that have none yet.
+
+        Rows of one segment get their largest derivative by a scaled unknown.
+
+        jacobians: dense Jacobians of the blocks at each sample.
+        """
         unit = np.append(self.unit, 0.0)
         largest = np.zeros(self.cost_row + 2)
         for dense in jacobians:
             for block, index, values in zip(self.blocks, self._index, dense, strict=True):
-                row, column = block.jacobian_places
+                row, column = block.jacobian_pattern
                 size = np.abs(values) * unit[index][:, column]
                 np.maximum.at(largest, block.rows[:, row], np.where(np.isfinite(size), size, 0))
         table = self.transcription.rows
@@ -170,33 +129,41 @@ class Program:
             if np.isnan(table.unit[own]).any():
                 table.unit[own] = np.max(largest[own], initial=0.0) or 1.0
 
-    def _patterns(self, draws: np.ndarray, jacobians) -> tuple[Entries, Entries]:
-        """Return the entries of the Jacobian and of the lower half of the Hessian."""
+    def _patterns(self, samples: np.ndarray, jacobians) -> tuple[Entries, Entries]:
+        """Return the entries of the Jacobian and of the lower half of the Hessian.
+
+        jacobians: dense Jacobians of the blocks at each sample.
+        """
         random = np.random.default_rng(1)
-        places = [b.jacobian_places for b in self.blocks], [b.hessian_places for b in self.blocks]
-        first: list[Any] = [False] * len(self.blocks)
-        second: list[Any] = [False] * len(self.blocks)
+        patterns = (
+            [b.jacobian_pattern for b in self.blocks],
+            [b.hessian_pattern for b in self.blocks],
+        )
+        jacobian_used: list[Any] = [False] * len(self.blocks)
+        hessian_used: list[Any] = [False] * len(self.blocks)
         unit = np.append(self.unit, 1.0)
-        for x, jacobian in zip(draws, jacobians, strict=True):
+        for x, jacobian in zip(samples, jacobians, strict=True):
             multipliers = [
                 np.where(b.rows < 0, 0, random.normal(size=b.rows.shape)) for b in self.blocks
             ]
             hessian = self._second(self.params, self._data, self._local(x), multipliers)
             for i, (index, block) in enumerate(zip(self._index, self.blocks)):
-                (row, column), u = places[0][i], unit[index]
-                scaled = np.asarray(jacobian[i]) * u[:, column]
-                first[i] = first[i] | _not_round_off_of_rows(scaled, row, block.rows.shape[1])
-                row, column = places[1][i]
-                scaled = np.asarray(hessian[i]) * u[:, row] * u[:, column]
-                second[i] = second[i] | _not_round_off(scaled, axes=1)
+                (row, column), scale = patterns[0][i], unit[index]
+                scaled = np.asarray(jacobian[i]) * scale[:, column]
+                jacobian_used[i] = jacobian_used[i] | above_round_off_of_rows(
+                    scaled, row, block.rows.shape[1]
+                )
+                row, column = patterns[1][i]
+                scaled = np.asarray(hessian[i]) * scale[:, row] * scale[:, column]
+                hessian_used[i] = hessian_used[i] | above_round_off(scaled, axes=1)
         jacobian = [
-            self._places(u, b.rows, b.unknowns, at)
-            for u, b, at in zip(first, self.blocks, places[0])
+            self._part(used, b.rows, b.unknowns, at)
+            for used, b, at in zip(jacobian_used, self.blocks, patterns[0])
         ]
         jacobian.append((np.arange(len(self._linear[0])), *self._linear[:2]))
         hessian = [
-            self._places(u, b.unknowns, b.unknowns, at, lower=True)
-            for u, b, at in zip(second, self.blocks, places[1])
+            self._part(used, b.unknowns, b.unknowns, at, lower=True)
+            for used, b, at in zip(hessian_used, self.blocks, patterns[1])
         ]
         return (
             Entries(jacobian, (self.cost_row + 1, self.count), (self.row_unit, self.unit)),
@@ -204,24 +171,27 @@ class Program:
         )
 
     @staticmethod
-    def _places(used: np.ndarray, rows: np.ndarray, columns: np.ndarray, at, lower: bool = False):
-        """Return flat places, rows and columns of entries that are used.
+    def _part(used: np.ndarray, rows: np.ndarray, columns: np.ndarray, at, lower: bool = False):
+        """Return the part of a block in `Entries`.
 
-        used: [lanes entries]. at: local row and column of each entry.
+        used: mask [lanes entries] of nonzero entries. at: local row and local column of each entry.
+        rows, columns: [lanes ...] problem's index of each local row and column.
+        lower: whether entries above the diagonal are moved to the lower half.
         """
-        # few lanes may differ from one another, as in what is fixed at the start
+        # lanes of a large block share one pattern. Those of a small one may differ: unknowns that
+        # are fixed at the start have the value of their bounds at all samples
         used = used if len(used) < MANY_LANES else np.broadcast_to(used.any(0), used.shape)
         row, column = rows[:, at[0]], columns[:, at[1]]
         keep = used & (row >= 0) & (column >= 0)
-        place, row, column = np.flatnonzero(keep), row[keep], column[keep]
+        flat, row, column = np.flatnonzero(keep), row[keep], column[keep]
         return (
-            (place, np.maximum(row, column), np.minimum(row, column))
+            (flat, np.maximum(row, column), np.minimum(row, column))
             if lower
-            else (place, row, column)
+            else (flat, row, column)
         )
 
     def length(self, name: str) -> int:
-        """Return the number of values that a method returns."""
+        """Return how many values the method "rows", "jacobian" or "hessian" returns."""
         if name == "rows":
             return self.cost_row + 1
         return len(getattr(self, f"{name}_entries").row)
@@ -236,19 +206,25 @@ class Program:
         return total + np.bincount(row, factor * (x * self.unit)[column], self.cost_row + 1)
 
     def jacobian(self, x: np.ndarray) -> np.ndarray:
-        """Return the values of `jacobian_entries`, the cost's gradient among them."""
+        """Return the values of `jacobian_entries`, which include the gradient of the cost."""
         dense = self._first(self.params, self._data, self._local(x * self.unit))
         return self.jacobian_entries.gather([*dense, self.transcription.linear[2]])
 
     def hessian(self, x: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
-        """Return the values of `hessian_entries` for multipliers of all rows, the cost's last."""
+        """Return the values of `hessian_entries`.
+
+        multipliers: of all rows; the last one is the factor of the cost.
+        """
         scaled = np.append(multipliers / self.row_unit, 0.0)
         local = [scaled[np.where(b.rows < 0, len(scaled) - 1, b.rows)] for b in self.blocks]
         dense = self._second(self.params, self._data, self._local(x * self.unit), local)
         return self.hessian_entries.gather(dense)
 
     def parameter_gradient(self, x: np.ndarray, multipliers: np.ndarray) -> Params:
-        """Return the derivatives of the Lagrangian by the parameters, in the cost's unit."""
+        """Return the derivatives of the Lagrangian by the parameters, in the unit of the cost.
+
+        multipliers: of all rows but the cost.
+        """
         scaled = np.append(multipliers / self.row_unit[:-1], [1 / self.row_unit[-1], 0.0])
         local = [scaled[np.where(b.rows < 0, len(scaled) - 1, b.rows)] for b in self.blocks]
         z = self._local(x * self.unit)
@@ -278,6 +254,6 @@ class Program:
         )
 
     def violation(self, x: np.ndarray) -> np.ndarray:
-        """Return how far each row is outside its bounds, in the solver's units."""
+        """Return how far each row but the cost is outside its bounds, in the solver's units."""
         values, (_, _, low, high) = self.rows(x)[:-1], self.bounds()
         return np.maximum(np.maximum(low - values, values - high), 0)

@@ -1,4 +1,4 @@
-"""Meshes on which a solution is a motion: intervals with large defects are split."""
+"""Mesh refinement: intervals with large defects are split, those with small ones are joined."""
 
 import dataclasses
 from typing import Any
@@ -7,10 +7,10 @@ import numpy as np
 
 from svkc.optimize.certificate import SolutionReport
 
-# a velocity may err by this multiple of the tolerance of a position
+# tolerance of defects in velocity, as a multiple of the tolerance in position
 VELOCITY_TOLERANCE = 10.0
-# most intervals that a round puts in the place of one, by how much a new defect is to be below the
-# tolerance, and the defect that two joined intervals may be expected to have
+# largest number of intervals that one is split into, the defect that is aimed at, and the largest
+# predicted defect of two joined intervals; defects are relative to the tolerance
 _MOST, _BELOW, _JOINED = 4, 0.5, 0.05
 
 
@@ -23,11 +23,13 @@ def is_fine(report: SolutionReport, tol: float) -> bool:
 def new_mesh(places: np.ndarray, defects: np.ndarray, order: int) -> np.ndarray:
     """Return the nodes of a phase's next mesh, as fractions of the duration.
 
-    Intervals with a defect above the tolerance are split into equal parts; two neighbours with
-    defects far below it are joined.
+    Intervals with a defect above the tolerance are split into equal parts. Two neighbours with
+    defects far below the tolerance are joined. The defect of an interval is assumed proportional to
+    its length to the power of order + 1.
 
-    places: [n + 1] nodes. defects: [n] of the intervals, by the tolerance.
-    order: of the scheme; the defect of an interval falls with its length to the power of order + 1.
+    places: [n + 1] nodes of the mesh, as fractions of the duration.
+    defects: [n] defects of the intervals, divided by the tolerance.
+    order: order of the scheme.
     """
     parts = np.ceil((defects / _BELOW) ** (1 / order))
     parts = np.where(defects > 1, np.clip(parts, 2, _MOST), 1).astype(int)
@@ -48,7 +50,7 @@ def new_mesh(places: np.ndarray, defects: np.ndarray, order: int) -> np.ndarray:
 def refined(problem: Any, solution: Any, tol: float, rounds: int, options: dict[str, Any]) -> Any:
     """Return the solution that `Solution.refined` describes.
 
-    problem: of the solution. tol, rounds: as there. options: of `Problem.solve`.
+    tol, rounds: as of `Solution.refined`. options: keyword arguments of `Problem.solve`.
     """
     order = 2 * problem.scheme.stages - 1
     for _ in range(rounds):
@@ -60,7 +62,9 @@ def refined(problem: Any, solution: Any, tol: float, rounds: int, options: dict[
             for of_q, of_v in zip(report.position, report.velocity, strict=True)
         )
         phases = solution.problem.phases
-        meshes = [new_mesh(p.places, x, order) for p, x in zip(phases, defects, strict=True)]
+        meshes = [
+            new_mesh(p.node_fractions, x, order) for p, x in zip(phases, defects, strict=True)
+        ]
         finer = problem.with_mesh(meshes).solve(solution, **options)
         change = abs(float(finer.cost) - float(solution.cost))
         solution = dataclasses.replace(finer, cost_error=np.asarray(change))

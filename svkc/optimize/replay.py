@@ -1,4 +1,4 @@
-"""A solution as a run of `simulate`: with events between phases, and feedback to the plan."""
+"""Replay of a solution by `simulate`, with events between phases and feedback to the plan."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from svkc.model.chain import Chain, State
 from svkc.model.tables import as_text
 from svkc.optimize.plans import Plan, control_of, plan_of
-from svkc.optimize.points import full_state, tree_configuration
+from svkc.optimize.points import full_configuration, full_state
 from svkc.simulation.codes import RESULTS
 from svkc.simulation.report import Report
 from svkc.simulation.simulate import simulate
@@ -22,15 +22,16 @@ from svkc.transitions.events import at
 from svkc.transitions.transition import connect
 from svkc.tree.configuration import difference
 
-# how long before the end of a phase it is compared with the plan, by the duration of the motion
+# the end of a phase is compared with the plan this much earlier, as a fraction of the motion
 _JUST_BEFORE = 1e-9
 
 
 @dataclasses.dataclass(frozen=True)
 class Distance:
-    """Largest distance from the plan over the coordinates and over some times.
+    """Largest distance from the plan, over all coordinates and over some times.
 
-    position: rad, m. velocity: rad/s, m/s. worst: coordinate of the largest distance in position.
+    position: rad, m. velocity: rad/s, m/s.
+    worst: name of the coordinate with the largest distance in position.
     """
 
     position: float
@@ -39,7 +40,7 @@ class Distance:
 
     @classmethod
     def of(cls, names: Sequence[str], q: np.ndarray, v: np.ndarray) -> "Distance":
-        """Return the largest of distances [... nv] in q and v."""
+        """Return the largest of the distances [... nv] in q and v. names: of the coordinates."""
         q, v = (np.abs(x).reshape(-1, x.shape[-1]) for x in (q, v))
         worst = names[int(np.argmax(np.max(q, 0)))]
         return cls(position=float(np.max(q)), velocity=float(np.max(v)), worst=worst)
@@ -49,8 +50,8 @@ class Distance:
 class ReplayReport:
     """The whole motion simulated with feedback, with events between the phases.
 
-    phases: of each, the largest distance from the plan over its nodes.
-    report: of the run, with its loop gaps and its energy balance.
+    phases: of each phase, the largest distance from the plan over its nodes.
+    report: report of the run, with its loop gaps and its energy balance.
     """
 
     phases: tuple[Distance, ...]
@@ -71,19 +72,22 @@ class ReplayReport:
 def distance(
     chain: Chain, state: State, q: Float[Array, " nq"], v: Float[Array, " nv"]
 ) -> tuple[Float[Array, " nv"], Float[Array, " nv"]]:
-    """Return the distance [nv] of a state from q and v of the tree."""
-    here, there = (tree_configuration(chain, x) for x in (state.q[: chain.nq], q))
+    """Return the differences [nv] of a state from q and v of the tree."""
+    here, there = (full_configuration(chain, x) for x in (state.q[: chain.nq], q))
     return difference(chain, here, there)[: chain.nv], state.v[: chain.nv] - v
 
 
 def control_and_plan(solution: Any, feedback: bool) -> tuple[Any, Plan]:
-    """Return what `Solution.control` describes."""
+    """Return the control function and the plan, as `Solution.control` describes."""
     gains = solution.gains() if feedback else None
     return control_of(solution.problem), plan_of(solution.motion, gains)
 
 
 def replay(solution: Any, feedback: bool, ts: Any, options: Mapping[str, Any]) -> Trajectory:
-    """Return the run of a solution with events between its phases."""
+    """Return the run of a solution with events between its phases.
+
+    ts: save times (s); None: 101 times. options: further keyword arguments of `simulate`.
+    """
     problem, motion = solution.problem, solution.motion
     chain, (control, plan) = problem.chain, control_and_plan(solution, feedback)
     events, end = [], 0.0
@@ -109,11 +113,11 @@ def replay(solution: Any, feedback: bool, ts: Any, options: Mapping[str, Any]) -
 
 
 def replay_report(solution: Any, options: Mapping[str, Any]) -> ReplayReport:
-    """Return how far the motion with feedback leaves the plan. options: of `simulate`."""
+    """Return the report of the replay with feedback. options: keyword arguments of `simulate`."""
     motion, chain = solution.motion, solution.problem.chain
     total = sum(float(m.duration) for m in motion)
     starts = np.cumsum([0.0, *(float(m.duration) for m in motion)])
-    # an event changes velocities at the end of a phase
+    # shortly before the end of a phase, because the event there may change velocities
     times = [s + np.append(m.times[1:-1], m.duration - _JUST_BEFORE * total)
              for s, m in zip(starts, motion)]  # fmt: skip
     traj = replay(solution, True, np.concatenate(times), {"throw": False, **options})

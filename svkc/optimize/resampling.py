@@ -1,4 +1,4 @@
-"""Motions on another mesh."""
+"""Interpolation of motions to another mesh."""
 
 from typing import Any
 
@@ -8,16 +8,17 @@ import numpy as np
 
 from svkc.model.chain import Chain
 from svkc.optimize.guesses import Guess, PhaseMotion
-from svkc.optimize.points import tree_configuration, tree_velocity
+from svkc.optimize.points import full_configuration, full_velocity
 from svkc.optimize.schemes import Radau
 from svkc.optimize.solution import Solution
 from svkc.tree.configuration import integrate
 
 
 def as_guess(guess: Any, problem: Any) -> Guess:
-    """Return a guess on the mesh of a problem, from a guess or from a solution on any mesh.
+    """Return a guess on the mesh of a problem.
 
-    Raises ValueError for anything else, and for other phases.
+    guess: a `Guess` or a `Solution`, on any mesh.
+    Raises ValueError for other types, and for another number of phases.
     """
     if not isinstance(guess, Guess | Solution):
         raise ValueError(
@@ -31,7 +32,7 @@ def as_guess(guess: Any, problem: Any) -> Guess:
     for phase, motion in zip(problem.phases, motions, strict=True):
         same = (phase.intervals, problem.scheme.stages) == motion.vdot.shape[:2]
         same = same and np.allclose(
-            motion.times, motion.duration * phase.places, rtol=0, atol=1e-12
+            motion.times, motion.duration * phase.node_fractions, rtol=0, atol=1e-12
         )
         if not same or motion.blocks.shape[1] != blocks:
             motion = resample(problem.chain, problem.scheme, problem.controls, motion, phase)
@@ -42,7 +43,7 @@ def as_guess(guess: Any, problem: Any) -> Guess:
 
 
 def _linear(x: np.ndarray, y: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Return y [points ...] at x interpolated linearly, along the first axis."""
+    """Return y [points ...], given at x, interpolated linearly to the positions `at`."""
     flat = y.reshape(len(y), -1)
     columns = [np.interp(at, x, column) for column in flat.T]
     shape = (len(at), *y.shape[1:])
@@ -52,9 +53,9 @@ def _linear(x: np.ndarray, y: np.ndarray, at: np.ndarray) -> np.ndarray:
 def resample(
     chain: Chain, scheme: Radau, controls: Any, motion: PhaseMotion, phase: Any
 ) -> PhaseMotion:
-    """Return a phase of a motion on another mesh, or with another number of stages."""
+    """Return the motion of a phase on the mesh of `phase`, with the stages of `scheme`."""
     s, n = motion.vdot.shape[1], phase.intervals
-    nodes, new = motion.times / motion.duration, phase.places
+    nodes, new = motion.times / motion.duration, phase.node_fractions
     stages = (new[:-1, None] + np.diff(new)[:, None] * scheme.c).ravel()
     k, share = _within(nodes, stages, "left")
     weights = Radau(s).interpolation(share)
@@ -62,7 +63,7 @@ def resample(
         n, scheme.stages, *y.shape[2:]
     )
     q, v = _nodes(chain, motion, nodes, new)
-    # of controls: the values in the middle of the new intervals
+    # controls that are constant over an interval: the values in the middle of the new intervals
     has_state, middle = int(controls.has_state), (new[:-1] + new[1:]) / 2
     states = _linear(nodes, motion.states, new)
     free = motion.blocks[:, has_state:]
@@ -87,9 +88,10 @@ def resample(
 
 
 def _within(nodes: np.ndarray, at: np.ndarray, side: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return the interval of each place, and which fraction of this interval it is.
+    """Return the interval of each position, and the position as a fraction of this interval.
 
-    side: "left" for a place on a node to be the end of an interval, "right" for a start.
+    nodes: positions of the nodes. at: positions.
+    side: "left": a position on a node is the end of an interval; "right": the start of one.
     """
     k = np.clip(np.searchsorted(nodes, at, side=side) - 1, 0, len(nodes) - 2)
     return k, (at - nodes[k]) / (nodes[k + 1] - nodes[k])
@@ -98,7 +100,10 @@ def _within(nodes: np.ndarray, at: np.ndarray, side: Any) -> tuple[np.ndarray, n
 def _nodes(
     chain: Chain, motion: PhaseMotion, nodes: np.ndarray, new: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return q and v of the tree at new nodes, along the polynomials of the old intervals."""
+    """Return q and v of the tree at new nodes, by the collocation polynomials of old intervals.
+
+    nodes, new: positions of the old and of the new nodes, as fractions of the duration.
+    """
     k, share = _within(nodes, new, "right")
     s = motion.vdot.shape[1]
     powers, degree = np.arange(s), Radau(s).c[:, None] ** np.arange(s)
@@ -110,8 +115,8 @@ def _nodes(
     step = h * share[:, None] * motion.v[k] + h**2 * change(twice)
 
     def moved(q, step):
-        full = tree_configuration(chain, q)
-        return integrate(chain, full, tree_velocity(chain, step))[: chain.nq]
+        full = full_configuration(chain, q)
+        return integrate(chain, full, full_velocity(chain, step))[: chain.nq]
 
     q = np.array(jax.vmap(moved)(jnp.asarray(motion.q[k]), jnp.asarray(step)))
     q[-1], v[-1] = motion.q[-1], motion.v[-1]

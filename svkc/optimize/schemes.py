@@ -10,7 +10,9 @@ from svkc.model.validation import as_array
 
 @dataclasses.dataclass(frozen=True)
 class Radau:
-    """Radau IIA collocation: order 2 s - 1, and its last stage is the end of the interval.
+    """Radau IIA collocation. With s stages the order is 2 s - 1.
+
+    The last stage is at the end of the interval.
 
     stages: number s of stages of an interval, from 1 (implicit Euler) to 5.
 
@@ -46,7 +48,10 @@ class Radau:
         return self.A[-1]
 
     def interpolation(self, times: np.ndarray) -> np.ndarray:
-        """Return the weights [times s] of the stages' values at fractions of the interval."""
+        """Return the weights [times s] that interpolate the stages' values.
+
+        times: as fractions of the interval, from 0 to 1.
+        """
         powers = np.arange(self.stages)
         vandermonde = self.c[:, None] ** powers
         return (np.asarray(times, float)[:, None] ** powers) @ np.linalg.inv(vandermonde)

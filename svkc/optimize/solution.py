@@ -28,7 +28,7 @@ from svkc.optimize.replay import control_and_plan, replay
 from svkc.simulation.trajectory import Trajectory
 from svkc.tree.spatial import quat_matrix
 
-if TYPE_CHECKING:  # as equinox annotates the metaclass of its enumerations
+if TYPE_CHECKING:  # equinox annotates the metaclass of its enumerations in this way
     from enum import EnumMeta as NamedMeta
 else:
     from svkc._jax.enumerations import NamedMeta
@@ -48,9 +48,9 @@ class OUTCOME(eqx.Enumeration, metaclass=NamedMeta):  # pyright: ignore
 
 
 class Multipliers(eqx.Module):
-    """Multipliers of the solver, in its units.
+    """Lagrange multipliers at a solution, in the solver's units.
 
-    rows: of the rows. lower, upper: of the bounds of unknowns.
+    rows: of the constraint rows. lower, upper: of the bounds of the unknowns.
     """
 
     rows: Any
@@ -61,18 +61,20 @@ class Multipliers(eqx.Module):
 class Solution(Printed):
     """An optimized motion.
 
-    cost: of the motion, on its mesh.
+    cost: cost of the motion on this mesh.
     violation: largest violation of a row, in the solver's units.
-    durations: of the phases (s).
-    ts: [nodes] times (s). A time between phases occurs twice, before and after the change.
+    durations: durations of the phases (s).
+    ts: [nodes] times (s) of the nodes of all phases. The time between two phases is there twice,
+        before and after the change of structure.
     states: states at these times.
-    motion: unknowns of each phase.
-    multipliers: of rows and bounds.
-    iterations: of the solver. seconds: its wall time, and that part of it in functions.
+    motion: q, v, controls, accelerations and multipliers of each phase.
+    multipliers: Lagrange multipliers of rows and bounds.
+    iterations: number of iterations of the solver.
+    seconds: (wall time of the solver, part of this time in rows and derivatives).
     result: how the optimization ended.
-    structures: of the phases.
-    cost_error: how far the cost moved between the last two meshes of `refined`; NaN before.
-    problem: of which this is a solution.
+    structures: structures of the phases.
+    cost_error: difference of the costs on the last two meshes of `refined`; NaN if not refined.
+    problem: the problem, with the mesh of this solution.
     """
 
     cost: Any
@@ -110,11 +112,10 @@ class Solution(Printed):
         return f"<Solution: cost {float(self.cost):.8g}, {self.result}>"
 
     def forces(self, link: str, phase: str | None = None) -> Any:
-        """Return the force (N) of a virtual link at all stages of the phases that connect it.
+        """Return the force (N) [stages 3] of a virtual link at all stages of the phases that
+        connect it: on `real` from `parent`, in axes of the parent body.
 
-        [stages 3], on `real` from `parent`, in axes of the parent body.
-
-        link: name of the virtual link. phase: name of the phase; None: all that connect the link.
+        link: name of the virtual link. phase: name of a phase; None: all that connect the link.
         Raises ValueError for unknown names, and for a link that is not connected.
         """
         pairs = list(zip(self.problem.phases, self.motion, strict=True))
@@ -129,7 +130,7 @@ class Solution(Printed):
         return np.concatenate(parts)
 
     def stage_times(self, phase: str) -> np.ndarray:
-        """Return the times (s) [stages] of a phase's stages, at which `forces` are.
+        """Return the times (s) [stages] of the stages of a phase, in the order of `forces`.
 
         phase: name of the phase.
         Raises ValueError for an unknown name.
@@ -147,26 +148,26 @@ class Solution(Printed):
         return self.problem.phases[i], self.motion[i], float(np.sum(self.durations[:i]))
 
     def report(self, replay: bool = True) -> SolutionReport:
-        """Return the certificate: how far every interval is from a motion.
+        """Return the report on how far the solution is from a motion of the chain.
 
-        All intervals are simulated in one batched run, each from its own first node. So is each
-        phase, with the plan's torques alone, and then the whole motion, with feedback.
+        Each interval is simulated with error control from its first node. Then each phase is
+        simulated with the planned torques alone, and the whole motion with feedback.
 
-        replay: whether phases and the whole motion are simulated too.
+        replay: whether to simulate phases and the whole motion as well.
         """
         return report(self, replay)
 
     def refined(
         self, tol: float = 1e-3, *, rounds: int = 4, solver: Any = None, progress_meter: Any = None
     ) -> "Solution":
-        """Return the motion solved again on finer meshes, until every interval is a motion.
+        """Return the solution on finer meshes, solved until the defects are below a tolerance.
 
-        Intervals with defects above the tolerance are split, neighbours far below it are joined.
-        Each mesh starts from the solution before. `cost_error` of the result says how far
-        the cost moved between the last two meshes.
+        Intervals with defects above the tolerance are split; neighbours far below it are joined.
+        Each mesh is solved warm from the previous solution. `cost_error` of the result is the
+        difference of the costs on the last two meshes.
 
-        tol: largest defect of a position (rad, m); of a velocity it is ten times this number.
-        rounds: largest number of meshes.
+        tol: largest defect of a position (rad, m). That of a velocity is ten times this number.
+        rounds: largest number of meshes. The last one may still have defects above the tolerance.
         solver, progress_meter: as in `Problem.solve`.
         """
         options = {"solver": solver, "progress_meter": progress_meter}
@@ -176,24 +177,23 @@ class Solution(Printed):
         """Return the motion as a run of `svkc.simulate`, with events between the phases.
 
         ts: save times (s); None: 101 times over the motion.
-        feedback: whether torques towards the plan are added, as in `control`.
+        feedback: whether feedback torques are added, as in `control`.
         options: keyword arguments of `svkc.simulate`.
         """
         return replay(self, boolean("feedback", feedback), ts, options)
 
     def control(self, *, feedback: bool = True) -> tuple[Any, Any]:
-        """Return a control (t, state, args) -> tau of `svkc.simulate`, and its args.
+        """Return (function, args): a control (t, state, args) -> tau of `svkc.simulate`.
 
-        It is the same function for every solution of a problem; the args are the plan. With
-        feedback, torques of the driven coordinates are added, linear in the distance from the plan
-        in q and v. Their gains change over time, and come from Riccati's recursion along the plan:
-        they minimize, to first order, the integral of the squared distance (1 rad, 1 m, and
-        `units.velocity` count as one) plus 0.01 of the squared torques (by `units.torque`), plus
-        the squared distance at the end times 1 s. Connected links and impacts are part of the
-        linear model. The sum is not limited to bounds of torques. `Parametrized` has no feedback,
-        as its torques are known by a function alone.
+        All solutions of a problem share the function; the args are the plan. Feedback adds torques
+        of the driven coordinates that are linear in the error of q and v. Gains are those of a
+        time-varying LQR along the plan: they minimize the integral of the squared errors (in rad
+        and m, velocities divided by `units.velocity`) plus 0.01 of the squared torques (divided by
+        `units.torque`), plus the squared errors at the end times 1 s. The linear model includes
+        connected links and impacts. Bounds of torques do not limit the sum. `Parametrized` has no
+        feedback, because its torques are an arbitrary function.
 
-        feedback: False for the plan's torques alone: an unstable phase then leaves the plan.
+        feedback: False: the planned torques alone. An unstable phase then leaves the plan.
         """
         return control_and_plan(self, boolean("feedback", feedback))
 
@@ -204,8 +204,8 @@ class Solution(Printed):
     def gains(self) -> np.ndarray:
         """Return the gains of the feedback [intervals 2 driven 2nv], at both ends of intervals.
 
-        They map errors of q and v of the tree (plan minus state; N m/rad, N m s/rad) to torques of
-        the driven coordinates.
+        They map errors of q and v of the tree (plan minus state) to torques of the driven
+        coordinates (N m/rad, N m s/rad).
         """
         return riccati_gains(self.problem, self.motion, self.linear_maps())
 
@@ -223,8 +223,9 @@ class Solution(Printed):
     def gradient(self) -> Any:
         """Return the derivatives of the optimal cost by the chain's floats and by args.
 
-        A pair (chain, args) with the derivatives as leaves, None where there are none. They are
-        those of the Lagrangian (envelope theorem), valid while the active bounds do not change.
+        The result is a pair (chain, args) with derivatives as leaves, and None for other leaves. By
+        the envelope theorem they are the derivatives of the Lagrangian. They hold while the set of
+        active bounds does not change.
         """
         program, start = self.problem.start(self)
         return program.parameter_gradient(start.x, self.multipliers.rows)
@@ -232,7 +233,9 @@ class Solution(Printed):
     def impulse(self, phase: str, link: str | None = None) -> Any:
         """Return the impulse (N s) [3] of a virtual link in the impact at the start of a phase.
 
-        phase: name of the phase. link: name of the link; None: the only one that is connected.
+        It acts on `real` from `parent`. Components are along the axes of the parent body.
+
+        phase: name of the phase. link: name of the link; None: the only one of the phase.
         Raises ValueError for unknown names.
         """
         own, motion, _ = self._phase(phase)
@@ -243,7 +246,7 @@ class Solution(Printed):
         return self._force(link, motion.impulse)
 
     def _force(self, link: str, multipliers: np.ndarray) -> np.ndarray:
-        """Return the force [... 3] of multipliers of all links' rows, in the parent's axes."""
+        """Return the force [... 3] of a link, in the parent's axes, from all links' multipliers."""
         chain = self.problem.chain
         i = link_index(chain.topology, link)
         turn = np.asarray(quat_matrix(chain.structure.quat[i]))
@@ -251,7 +254,7 @@ class Solution(Printed):
 
 
 def solution(problem: Any, program: Program, result: SolverResult) -> Solution:
-    """Return the solution from what a solver returned."""
+    """Return the `Solution` of a solver's result."""
     transcription, rows = program.transcription, program.rows(result.x)
     return solution_of(
         problem,
@@ -270,7 +273,7 @@ def solution(problem: Any, program: Program, result: SolverResult) -> Solution:
 def solution_of(
     problem: Any, motion: tuple[PhaseMotion, ...], structures: list[Structure], **fields: Any
 ) -> Solution:
-    """Return the solution with this motion.
+    """Return the `Solution` with this motion.
 
     structures: of the phases. fields: of `Solution` that do not follow from the motion.
     """

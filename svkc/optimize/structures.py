@@ -1,4 +1,4 @@
-"""The structures of phases: which rows of links are constraints, by their rank."""
+"""The structure of each phase, and which rows of its links are independent constraints."""
 
 from collections.abc import Sequence
 
@@ -10,18 +10,21 @@ import numpy as np
 from svkc.loops.pivoting import rank_tolerance
 from svkc.model.chain import Chain
 from svkc.model.names import connection_mask, link_index
-from svkc.optimize.loop_rows import LinkRows, possible_rows, rates_at
+from svkc.optimize.loop_rows import LinkRows, candidate_rows, rates_at
 from svkc.optimize.phases import Phase
-from svkc.optimize.points import PhaseStructure, tree_configuration
+from svkc.optimize.points import PhaseStructure, full_configuration
 from svkc.transitions.newton import decide_rank
 
 
 def independent_rows(
-    chain: Chain, q: Sequence[np.ndarray], first: np.ndarray, candidates: np.ndarray
+    chain: Chain, q: Sequence[np.ndarray], preferred: np.ndarray, candidates: np.ndarray
 ) -> np.ndarray:
-    """Return independent rows of links, those of `first` before others, and the largest first.
+    """Return linearly independent rows among candidate rows of links.
 
-    q: configurations [nq] of the tree. The rows are those of the configuration with most of them.
+    Rows in `preferred` are chosen before others. At each step the row with the largest remainder is
+    chosen. Ranks may differ between configurations: the result is of the one with most rows.
+
+    q: configurations [nq] of the tree.
     """
     if not len(candidates):
         return candidates
@@ -33,13 +36,16 @@ def independent_rows(
     best = np.zeros(0, int)
     for pose in q:
         J = np.asarray(matrix(jnp.asarray(pose))) * scale[:, None]
-        rows = _greedy(J, np.isin(candidates, first))
+        rows = _pivoted_rows(J, np.isin(candidates, preferred))
         best = candidates[rows] if len(rows) > len(best) else best
     return np.sort(best)
 
 
-def _greedy(J: np.ndarray, preferred: np.ndarray) -> list[int]:
-    """Return rows of J by pivoted orthogonalization, the preferred ones first."""
+def _pivoted_rows(J: np.ndarray, preferred: np.ndarray) -> list[int]:
+    """Return indices of independent rows of J by Gram-Schmidt orthogonalization with pivoting.
+
+    preferred: mask of the rows that are chosen before others.
+    """
     rest, rows, largest = J.copy(), [], np.max(np.linalg.norm(J, axis=1), initial=1e-300)
     for group in (preferred, ~preferred):
         while True:
@@ -72,15 +78,16 @@ def links_here(chain: Chain, phases: Sequence[Phase]) -> list[np.ndarray]:
 def phase_structures(
     chain: Chain, phases: Sequence[Phase], poses: Sequence[Sequence[np.ndarray]]
 ) -> tuple[np.ndarray, list[PhaseStructure]]:
-    """Return the rows that are constraints in some phase, and the structure of each phase.
+    """Return the rows of links that are constraints in some phase, and each phase's structure.
 
     poses: of each phase, configurations [nq] at which its rank is decided.
+    Raises ValueError if a phase connects a spare slot.
     """
     none = np.zeros(len(chain.link_names), bool)
     masks = [np.asarray(connection_mask(chain.topology, p.connected, none)) for p in phases]
     own, before = [], np.zeros(0, int)
     for mask, q in zip(masks, poses):
-        candidates = possible_rows(chain, mask)
+        candidates = candidate_rows(chain, mask)
         before = independent_rows(chain, q, before, candidates)
         own.append(before)
     rows = np.unique(np.concatenate([np.zeros(0, int), *own]))
@@ -91,7 +98,7 @@ def phase_structures(
         old = masks[i - 1][rows // 6] if i else np.zeros(len(rows), bool)
         structure = eqx.tree_at(lambda s: s.connected, chain.structure, jnp.asarray(mask))
         if len(mask):
-            q = tree_configuration(chain, jnp.asarray(poses[i][0]))
+            q = full_configuration(chain, jnp.asarray(poses[i][0]))
             structure = decide_rank(chain, structure, q)
         structures.append(
             PhaseStructure(

@@ -1,4 +1,4 @@
-"""Tables of a problem's unknowns and rows: places, bounds, units and names."""
+"""Tables of a problem's unknowns and rows: indices, bounds, units and names."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -8,10 +8,12 @@ import numpy as np
 
 @dataclasses.dataclass
 class Segment:
-    """Consecutive entries of one kind: an array of unknowns, or of rows, of a phase.
+    """Consecutive entries of a table: one array of unknowns or of rows of one phase.
 
-    name: what they are. phase: name of the phase. entries: names along the last axis.
-    start, shape: place in the whole. First axis: intervals or nodes, if there is more than one.
+    name: name of the array. phase: name of the phase.
+    entries: names of the entries along the last axis.
+    start: index of the first entry in the table.
+    shape: shape of the array. With several axes, the first one is over intervals or nodes.
     """
 
     name: str
@@ -34,10 +36,12 @@ class Segment:
 
 
 class Table:
-    """Entries with bounds, units and names, appended segment by segment.
+    """Unknowns or rows with bounds, units and names, appended segment by segment.
 
-    lower, upper: bounds, in SI units and radians. unit: by which the solver divides an entry; NaN:
-        not known yet. All three are there once the table is frozen.
+    The attributes below exist after `freeze`.
+
+    lower, upper: bounds, in SI units and radians.
+    unit: number by which the solver divides an entry; NaN: not known yet.
     """
 
     lower: np.ndarray
@@ -62,7 +66,7 @@ class Table:
         unit: object = 1.0,
         entries: Sequence[str] = (),
     ) -> np.ndarray:
-        """Append entries and return their indices, of the given shape."""
+        """Append a segment and return the indices of its entries, as an array of this shape."""
         self.segments.append(Segment(name, phase, entries, start=self.count, shape=shape))
         at = self.count + np.arange(int(np.prod(shape))).reshape(shape)
         self.count += at.size
@@ -71,7 +75,7 @@ class Table:
         return at
 
     def freeze(self) -> None:
-        """Join the columns; nothing is added afterwards."""
+        """Set `lower`, `upper` and `unit`. Nothing may be appended afterwards."""
         join = lambda parts: np.concatenate([np.zeros(0), *parts])
         self.lower, self.upper, self.unit = map(join, (self._lower, self._upper, self._unit))
 
@@ -82,13 +86,15 @@ class Table:
 
 @dataclasses.dataclass
 class PhaseIndices:
-    """Indices of a phase's unknowns; -1 for unknowns that the phase lacks.
+    """Indices of a phase's unknowns in the table; -1 for unknowns that the phase does not have.
 
-    start_time, duration: scalars. nodes: [n + 1, q v states]. blocks: [n, blocks, control], with
-    the states of the interval's first node as its first block. vdot: [n, s, nv].
-    forces: [n, s, rows]. impulse: [rows].
-    change_q, change_v: [n, rows] multipliers of the projection at the end of each interval.
-    offset: [rows] gaps that a link that connects where it is keeps.
+    start_time, duration: scalars.
+    nodes: [n + 1, (q v states)].
+    blocks: [n, blocks, control] control blocks. Where controls have states, the first block of an
+        interval is that of its first node.
+    vdot: [n, s, nv]. forces: [n, s, rows]. impulse: [rows].
+    projection_q, projection_v: [n, rows] multipliers of the projection at the end of each interval.
+    kept_gap: [rows] gaps of links that connect with `here`, which stay constant in the phase.
     """
 
     start_time: int
@@ -98,14 +104,14 @@ class PhaseIndices:
     vdot: np.ndarray
     forces: np.ndarray
     impulse: np.ndarray
-    change_q: np.ndarray
-    change_v: np.ndarray
-    offset: np.ndarray
+    projection_q: np.ndarray
+    projection_v: np.ndarray
+    kept_gap: np.ndarray
 
     def intervals(self, forces: np.ndarray | None = None) -> np.ndarray:
-        """Return the indices [n z] of the unknowns of each interval, as `Layout` orders them.
+        """Return the indices [n z] of the unknowns of each interval, in the order of `Layout`.
 
-        forces: in place of those of the stages.
+        forces: indices [n s rows] in place of those of the stages' multipliers.
         """
         n, half = len(self.vdot), self.vdot.shape[-1]
         times = np.broadcast_to([self.start_time, self.duration], (n, 2))

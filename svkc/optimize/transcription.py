@@ -1,4 +1,4 @@
-"""The transcription: a problem's unknowns and rows, with the blocks of the equations of motion."""
+"""The transcription of a problem: its unknowns, its rows, and the functions that give the rows."""
 
 import functools
 from collections.abc import Callable, Iterable, Sequence
@@ -31,9 +31,13 @@ EQUATION = {"lower": 0.0, "upper": 0.0}
 class Transcription:
     """A problem as unknowns x and rows g(x).
 
-    builder: of the unknowns. rows: their table. phases: indices of each phase's unknowns.
-    blocks: functions whose values are added to the rows. The row after the last is the cost.
-    references: of each phase, configurations [n + 1 nq] whose quaternions are its charts' origins.
+    Rows are sums of the values of row blocks and of linear terms. The row after the last is the
+    cost.
+
+    builder: builder and table of the unknowns. rows: table of the rows.
+    phases: the phases of the problem. indices: of each phase, the indices of its unknowns.
+    structures: of each phase. blocks: the row blocks.
+    references: of each phase, configurations [n + 1 nq] at the origins of its nodes' charts.
     """
 
     def __init__(
@@ -49,18 +53,18 @@ class Transcription:
         self.builder = builder
         self.model = model
         self.scheme = scheme
-        self.specification: Sequence[Phase] = phases
+        self.phases: Sequence[Phase] = phases
         self.structures = structures
         self.references: Sequence[np.ndarray] = references
         self.rows: Table = Table()
         self.blocks: list[Block] = []
-        # functions of the blocks' lanes, which are evaluated again for other references
+        # of each block, the function that returns its lanes' data for the current references
         self._sources: list[Callable] = []
         self._linear: list[tuple] = []
-        self.phases: list[PhaseIndices] = []
+        self.indices: list[PhaseIndices] = []
         for i, (phase, structure) in enumerate(zip(phases, structures)):
-            before = self.phases[-1] if i else None
-            self.phases.append(builder.add_phase(phase, structure, before, self.has_impact(i)))
+            before = self.indices[-1] if i else None
+            self.indices.append(builder.add_phase(phase, structure, before, self.has_impact(i)))
         self._add_times()
         self._add_motion()
         self._add_connections()
@@ -68,12 +72,12 @@ class Transcription:
             self._add_projections()
 
     def has_impact(self, i: int) -> bool:
-        """Return whether a phase starts with an impact."""
-        return bool(i and self.specification[i].impact and np.any(self.structures[i].new))
+        """Return whether phase i starts with an impact."""
+        return bool(i and self.phases[i].impact and np.any(self.structures[i].new))
 
     @property
     def linear(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(row, unknown, factor) of terms that are added to the rows."""
+        """(row, unknown, factor) of the linear terms: factor times unknown is added to the row."""
         triplets = [np.broadcast_arrays(*parts) for parts in self._linear]
         empty = np.zeros(0)
         row, column, factor = (
@@ -82,42 +86,48 @@ class Transcription:
         return row.astype(int), column.astype(int), factor
 
     def _add_linear(self, rows: Any, unknowns: Any, factor: float) -> None:
-        """Add factor times unknowns to rows."""
+        """Append linear terms. rows, unknowns: indices, broadcast against each other."""
         self._linear.append((np.asarray(rows), np.asarray(unknowns), factor))
 
     def data(self, i: int) -> IntervalData:
-        """Return the data [n + 1 ...] of a phase's nodes; the first n are its intervals' own."""
-        n, structure = self.specification[i].intervals, self.structures[i]
+        """Return the data of phase i, with a leading axis over its n + 1 nodes.
+
+        Entry k < n is also the data of interval k, which starts at node k.
+        """
+        n, structure = self.phases[i].intervals, self.structures[i]
         repeat = lambda x: np.broadcast_to(np.asarray(x), (n + 1, *np.shape(x)))
         reference = np.asarray(self.references[i])
         return IntervalData(
             reference=reference,
-            following=np.concatenate([reference[1:], reference[-1:]]),
+            next_reference=np.concatenate([reference[1:], reference[-1:]]),
             active=repeat(structure.active),
             structure=jax.tree.map(repeat, structure.structure),
         )
 
     def add_block(self, block: Block, source: Callable) -> None:
-        """Append a block. source: () -> its lanes' data, as they follow from the references."""
+        """Append a row block. source: () -> data of its lanes for the current references."""
         self.blocks.append(block)
         self._sources.append(source)
 
     def set_references(self, references: Sequence[np.ndarray]) -> None:
-        """Set the origins of the charts, and the data of the blocks that follow from them."""
+        """Set the origins of the charts, and the data of the blocks that depends on them."""
         self.references = references
         for block, source in zip(self.blocks, self._sources, strict=True):
             block.set_lanes(source())
 
     def lanes(self, i: int, nodes: slice | np.ndarray) -> IntervalData:
-        """Return the data of some nodes of a phase."""
+        """Return the data of some nodes of phase i."""
         return jax.tree.map(lambda x: x[nodes], self.data(i))
 
     def _add_rows(self, name: str, i: int, shape: tuple[int, ...], **options: Any) -> np.ndarray:
-        """Append equations of a phase and return their indices."""
-        return self.rows.add(name, self.specification[i].name, shape, **EQUATION, **options)
+        """Append equality rows of phase i and return their indices."""
+        return self.rows.add(name, self.phases[i].name, shape, **EQUATION, **options)
 
     def _add_link_rows(self, name: str, i: int, shape, active, unit: float = 1.0) -> np.ndarray:
-        """Append equations for the active rows of links; return indices [... rows], -1: others."""
+        """Append equality rows of phase i for the active rows of links.
+
+        Returns the indices [*shape rows], which are -1 for rows that are not active.
+        """
         at = np.flatnonzero(active)
         out = np.full((*shape, len(self.model.rows)), -1)
         entries = [self.builder.names.rows[k] for k in at]
@@ -125,19 +135,19 @@ class Transcription:
         return out
 
     def _add_times(self) -> None:
-        """Append the rows by which each phase starts at the end of the one before."""
-        for i, (before, after) in enumerate(zip(self.phases, self.phases[1:]), 1):
+        """Append the rows by which each phase starts when the previous one ends."""
+        for i, (before, after) in enumerate(zip(self.indices, self.indices[1:]), 1):
             row = self._add_rows("start time", i, (1,))
             self._add_linear(row, after.start_time, 1.0)
             self._add_linear(row, [before.start_time, before.duration], -1.0)
 
     def _add_motion(self) -> None:
-        """Append the rows of the stages' equations and of continuity, for all phases at once."""
+        """Append the stages' equations and the continuity of nodes, in blocks over all phases."""
         layout, s, names = self.model.layout, self.scheme.stages, self.builder.names
         units, needs_state = self.builder.units, self.model.controls.needs_state
         equations: list[np.ndarray] = []
         self.continuity: list[np.ndarray] = []
-        for i, phase in enumerate(self.specification):
+        for i, phase in enumerate(self.phases):
             n = phase.intervals
             dynamics = self._add_rows(
                 "dynamics", i, (n, s, layout.nv), unit=units.torque, entries=names.dofs
@@ -145,7 +155,7 @@ class Transcription:
             active = self.structures[i].active
             links = self._add_link_rows("link", i, (n, s), active, units.acceleration)
             equations.append(np.concatenate([dynamics, links], -1).reshape(n, -1))
-            nodes = self.phases[i].nodes
+            nodes = self.indices[i].nodes
             self.continuity.append(
                 self._add_rows(
                     "continuity",
@@ -157,9 +167,9 @@ class Transcription:
             )
             self._add_linear(self.continuity[-1], nodes[1:], -1.0)
         first_control, motion = 2 + 3 * layout.nv, 2 + np.arange(2 * layout.nv)
-        control = np.arange(first_control, layout.of_stage - layout.rows)
-        tangents = np.concatenate([[0], motion, control]) if needs_state else motion
-        self.add_stages(stage_equations, list(range(s)), equations, tangents)
+        control = np.arange(first_control, layout.stage_size - layout.rows)
+        nonlinear = np.concatenate([[0], motion, control]) if needs_state else motion
+        self.add_stages(stage_equations, list(range(s)), equations, nonlinear)
         has_quaternions = len(self.builder.chain.topology.quaternion_starts[0])
         self.add_stages(
             end_of_interval, [s - 1], self.continuity, motion if has_quaternions else motion[:0]
@@ -170,20 +180,24 @@ class Transcription:
         function: Callable[..., jax.Array],
         stages: list[int],
         rows: Sequence[np.ndarray],
-        tangents: np.ndarray,
+        nonlinear: np.ndarray,
     ) -> None:
-        """Append a block of stages over the intervals of all phases. rows: of each phase."""
-        model, phases = self.model, range(len(self.specification))
-        index, count = zip(*(interval_places(phase) for phase in self.specification))
+        """Append a row block of a function of stages, over the intervals of all phases.
+
+        function: of `equations`. stages: indices of the stages. rows: of each phase [n m].
+        nonlinear: as of `StageBlock`.
+        """
+        model, phases = self.model, range(len(self.phases))
+        start_ratio, duration_ratio = zip(*(normalized_times(phase) for phase in self.phases))
         source = lambda: join_lanes(self.lanes(i, slice(-1)) for i in phases)
         poly = polynomials(self.scheme, model.controls, stages)
         options = {
             "data": source(),
-            "index": np.concatenate(index),
-            "count": np.concatenate(count),
-            "unknowns": np.concatenate([phase.intervals() for phase in self.phases]),
+            "start_ratio": np.concatenate(start_ratio),
+            "duration_ratio": np.concatenate(duration_ratio),
+            "unknowns": np.concatenate([phase.intervals() for phase in self.indices]),
             "rows": np.concatenate(rows),
-            "tangents": tangents,
+            "nonlinear": nonlinear,
         }
         if function is stage_equations and has_closed_forms(self.builder.chain, model.controls):
             block = MotionBlock(model, poly, **options)
@@ -192,8 +206,12 @@ class Transcription:
             block = StageBlock(call, model.layout, poly, **options)
         self.add_block(block, source)
 
-    def _add_plain(self, function: Callable, parts: list, nodes: slice) -> None:
-        """Append a block of nodes. parts: of each phase with such nodes, (i, unknowns, rows)."""
+    def _add_nodes(self, function: Callable, parts: list, nodes: slice) -> None:
+        """Append a row block of a function of nodes.
+
+        function: of `equations`. parts: (phase's index, unknowns, rows) of each phase that has such
+        nodes. nodes: which nodes of these phases.
+        """
         if parts:
             source = lambda: join_lanes(self.lanes(i, nodes) for i, _, _ in parts)
             unknowns, rows = (np.concatenate([part[k] for part in parts]) for k in (1, 2))
@@ -206,13 +224,16 @@ class Transcription:
             self.add_block(block, source)
 
     def _add_connections(self) -> None:
-        """Append the rows by which phases start from the ones before, and links connect."""
+        """Append the rows of the first nodes of phases.
+
+        They are continuous with the last node of the previous phase, and links connect there.
+        """
         nv, units, builder = self.model.layout.nv, self.builder.units, self.builder
         parts = []
-        for i, phase in enumerate(self.specification):
-            impact, own, structure = self.has_impact(i), self.phases[i], self.structures[i]
+        for i, phase in enumerate(self.phases):
+            impact, own, structure = self.has_impact(i), self.indices[i], self.structures[i]
             if i:
-                before, after = self.phases[i - 1].nodes[-1], own.nodes[0]
+                before, after = self.indices[i - 1].nodes[-1], own.nodes[0]
                 same = np.arange(len(after)) < (2 - impact) * nv
                 same |= (np.arange(len(after)) >= 2 * nv) & phase.continuous_torques
                 names = np.array(builder.names.node(self.model.controls.has_state))[same]
@@ -226,46 +247,46 @@ class Transcription:
                 continue
             gaps = self._add_link_rows("gap", i, (), structure.new)
             at = structure.new & structure.here
-            self._add_linear(gaps[at], own.offset[at], -1.0)
+            self._add_linear(gaps[at], own.kept_gap[at], -1.0)
             stopped = structure.active if impact else structure.new
             rates = self._add_link_rows("gap rate", i, (), stopped, units.velocity)
             momentum = np.full(nv, -1)
             if impact:
                 unit = units.torque * units.velocity / units.acceleration
                 momentum = self._add_rows("impact", i, (nv,), unit=unit, entries=builder.names.dofs)
-            v_before = self.phases[i - 1].nodes[-1, nv : 2 * nv] if impact else np.full(nv, -1)
+            v_before = self.indices[i - 1].nodes[-1, nv : 2 * nv] if impact else np.full(nv, -1)
             unknowns = [[*own.nodes[0, : 2 * nv], *v_before, *own.impulse]]
             parts.append((i, unknowns, [[*gaps, *rates, *momentum]]))
-        self._add_plain(connection, parts, slice(1))
+        self._add_nodes(connection, parts, slice(1))
 
     def _add_projections(self) -> None:
-        """Append the rows that keep the loops closed at the nodes after the first of a phase."""
+        """Append the rows that keep loops closed at all nodes of a phase but the first."""
         nv, units = self.model.layout.nv, self.builder.units
         parts = []
-        for i, phase in enumerate(self.specification):
-            active, own, n = self.structures[i].active, self.phases[i], phase.intervals
+        for i, phase in enumerate(self.phases):
+            active, own, n = self.structures[i].active, self.indices[i], phase.intervals
             if not np.any(active):
                 continue
             gaps = self._add_link_rows("gap", i, (n,), active)
-            at = np.flatnonzero(own.offset >= 0)
-            self._add_linear(gaps[:, at], own.offset[at], -1.0)
+            at = np.flatnonzero(own.kept_gap >= 0)
+            self._add_linear(gaps[:, at], own.kept_gap[at], -1.0)
             rates = self._add_link_rows("gap rate", i, (n,), active, units.velocity)
             changes = self.continuity[i][:, : 2 * nv]
-            unknowns = [own.nodes[1:, : 2 * nv], own.change_q, own.change_v]
+            unknowns = [own.nodes[1:, : 2 * nv], own.projection_q, own.projection_v]
             rows = np.concatenate([changes, gaps, rates], 1)
             parts.append((i, np.concatenate(unknowns, 1), rows))
-        self._add_plain(projection, parts, slice(1, None))
+        self._add_nodes(projection, parts, slice(1, None))
 
 
-def interval_places(phase: Phase) -> tuple[np.ndarray, np.ndarray]:
-    """Return the start of each interval, and the phase's duration, by the interval's length.
+def normalized_times(phase: Phase) -> tuple[np.ndarray, np.ndarray]:
+    """Return the start of each interval and the phase's duration, divided by the interval's length.
 
-    With n equal intervals they are 0 ... n - 1, and n.
+    With n equal intervals they are 0 ... n - 1, and n for each interval.
     """
-    lengths = np.diff(phase.places)
-    return phase.places[:-1] / lengths, 1 / lengths
+    lengths = np.diff(phase.node_fractions)
+    return phase.node_fractions[:-1] / lengths, 1 / lengths
 
 
 def join_lanes(parts: Iterable[IntervalData]) -> IntervalData:
-    """Return the lanes of several parts as one."""
+    """Return the concatenation of data along the leading axis."""
     return jax.tree.map(lambda *x: np.concatenate(x), *parts)

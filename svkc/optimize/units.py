@@ -9,10 +9,13 @@ from svkc.model.chain import Chain
 
 @dataclasses.dataclass(frozen=True)
 class Units:
-    """Sizes of what a problem has, so that the solver sees numbers near one.
+    """Typical magnitudes of a problem's quantities.
+
+    The solver divides unknowns and rows by these numbers, so that scaled values are near one.
 
     velocity: rad/s, m/s. acceleration: rad/s^2, m/s^2. force: N. torque: N m.
-    rate: of torques (N m/s). cost: in the cost's own unit; None: from the cost at random points.
+    rate: rate of torques (N m/s). cost: in the unit of the cost; None: from the cost at random
+        points.
     """
 
     velocity: float
@@ -28,7 +31,10 @@ class Units:
 
 
 def units_of(chain: Chain, duration: float) -> Units:
-    """Return units from the chain's mass, length and gravity, or from the motion's duration (s)."""
+    """Return units from the chain's mass, length and gravity.
+
+    duration: of the motion (s). Without gravity, accelerations are scaled by it.
+    """
     mass = max(float(np.sum(chain.mass)), 1e-6)
     length = max(float(chain.length), 1e-6)
     gravity = float(np.linalg.norm(chain.gravity)) or 4 * length / duration**2

@@ -17,7 +17,10 @@ LINK_ROWS = ("rx", "ry", "rz", "x", "y", "z")
 
 
 class Names(NamedTuple):
-    """Names of entries. dofs: coordinates of the tree. controls: of a block. rows: of links."""
+    """Names for labels.
+
+    dofs: of the tree's coordinates. controls: of a control block's numbers. rows: of links' rows.
+    """
 
     dofs: list[str]
     controls: list[str]
@@ -30,9 +33,10 @@ class Names(NamedTuple):
 
 
 class UnknownsBuilder:
-    """Appends the unknowns of phases to a table.
+    """Builder of the table of unknowns, phase by phase.
 
-    rows: the links' rows that are constraints in some phase, as indices into six of each link.
+    rows: the links' rows that are constraints in some phase, as in `LinkRows`.
+    project: whether nodes are projected onto their loops.
     """
 
     def __init__(
@@ -66,10 +70,10 @@ class UnknownsBuilder:
     def add_phase(
         self, phase: Phase, structure: PhaseStructure, before: PhaseIndices | None, impact: bool
     ) -> PhaseIndices:
-        """Append the unknowns of a phase.
+        """Append the unknowns of a phase and return their indices.
 
-        before: of the phase before (None: the motion starts with this phase).
-        impact: whether the phase starts with one.
+        before: indices of the phase before; None for the first phase, which starts at time 0.
+        impact: whether the phase starts with an impact.
         """
         units, n, s, nv = self.units, phase.intervals, self.scheme.stages, self.chain.nv
         add = lambda name, shape, **options: self.table.add(name, phase.name, shape, **options)
@@ -93,27 +97,31 @@ class UnknownsBuilder:
             vdot=vdot,
             forces=of_links("link force", (n, s), active, self._force_unit),
             impulse=of_links("impulse", (), active & impact, self._force_unit * by_time),
-            change_q=of_links("projection of q", (n,), projected, np.ones(len(active))),
-            change_v=of_links("projection of v", (n,), projected, np.ones(len(active))),
-            offset=self._places(of_links, structure, before),
+            projection_q=of_links("projection of q", (n,), projected, np.ones(len(active))),
+            projection_v=of_links("projection of v", (n,), projected, np.ones(len(active))),
+            kept_gap=self._kept_gaps(of_links, structure, before),
         )
 
     @staticmethod
-    def _places(
+    def _kept_gaps(
         of_links: Callable, structure: PhaseStructure, before: PhaseIndices | None
     ) -> np.ndarray:
-        """Return indices [rows] of the gaps that links keep.
+        """Return the indices [rows] of the constant gaps of links placed by `Phase.here`.
 
-        Those of old links are those of the phase before.
+        A link that was connected in the phase before keeps the unknowns of that phase.
         """
         kept = np.full(len(structure.active), -1)
         if before is not None:
-            kept = np.where(structure.here & ~structure.new, before.offset, kept)
+            kept = np.where(structure.here & ~structure.new, before.kept_gap, kept)
         own = structure.here & (kept < 0)
-        return np.maximum(kept, of_links("place of link", (), own, np.ones(len(own))))
+        return np.maximum(kept, of_links("kept gap", (), own, np.ones(len(own))))
 
     def _add_controls(self, add: Callable, n: int, nodes: np.ndarray, bounds) -> np.ndarray:
-        """Append the controls of a phase; return the indices [n blocks control]."""
+        """Append the controls of a phase; return the indices [n blocks control].
+
+        nodes: indices of the nodes' unknowns, which include the states of controls.
+        bounds: lower and upper bounds of a block.
+        """
         controls, states = self.controls, int(self.controls.has_state)
         unit = self.units.rate if states else 1.0 if controls.needs_state else self.units.torque
         shape = (n, controls.blocks(self.scheme) - states, len(self.names.controls))
@@ -130,7 +138,11 @@ class UnknownsBuilder:
         return out
 
     def _bounds(self, phase: Phase) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return lower and upper bounds [n + 1, q v states] of nodes, and [2 control] of u."""
+        """Return the bounds of a phase's unknowns.
+
+        Lower and upper bounds of the nodes [n + 1, (q v states)], and both of a control block
+        [2 control].
+        """
         nv = self.chain.nv
         *states, of_u = (np.array(x, float) for x in self.controls.limits(self.chain))
         unbounded = np.full((2, 2 * nv), [[-np.inf], [np.inf]])
@@ -150,7 +162,7 @@ class UnknownsBuilder:
         return nodes[0], nodes[1], of_u
 
     def _check_bounds(self, phase: Phase, nodes: np.ndarray, of_u: np.ndarray) -> None:
-        """Raise ValueError for an entry whose bounds contradict each other."""
+        """Raise ValueError if a lower bound is above its upper bound."""
         names = self.names.node(self.controls.has_state)
         for (low, high), entries in ((nodes, names), (of_u, self.names.controls)):
             if np.any(wrong := low > high):

@@ -1,4 +1,4 @@
-"""Rows of the user's functions: costs and constraints of points."""
+"""Rows of the user's functions: constraints, and terms of the cost."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -10,16 +10,19 @@ import numpy as np
 from svkc._jax.eager import eager_jit
 from svkc._jax.pytrees import is_concrete
 from svkc.model.validation import as_array, description, is_real
-from svkc.optimize.blocks import MANY_LANES, StageBlock, find_tangents
+from svkc.optimize.blocks import MANY_LANES, StageBlock, find_nonlinear_variables
 from svkc.optimize.equations import Params, point_of_stage
 from svkc.optimize.lift import polynomials
 from svkc.optimize.phases import Constraint
 from svkc.optimize.points import Point
-from svkc.optimize.transcription import Transcription, interval_places, join_lanes
+from svkc.optimize.transcription import Transcription, join_lanes, normalized_times
 
 
 class Values(NamedTuple):
-    """What a user's function returned: numbers, and bounds that it gave with them."""
+    """What a constraint's function returned: numbers, and their bounds.
+
+    numbers: values, or the shape of the values.
+    """
 
     numbers: Any
     lower: Any
@@ -27,7 +30,7 @@ class Values(NamedTuple):
 
 
 def _evaluate(entry: Constraint, point: Point) -> Values:
-    """Return the values of a constraint at a point. Raises ValueError if they are no numbers."""
+    """Return the values of a constraint at a point. Raises ValueError if they are not numbers."""
     result, lower, upper = entry.function(point), entry.lower, entry.upper
     if isinstance(result, tuple) and len(result) == 3:
         result, lower, upper = result
@@ -37,7 +40,7 @@ def _evaluate(entry: Constraint, point: Point) -> Values:
 
 
 def _cost(function: Callable, name: str, point: Point) -> Any:
-    """Return the value of a cost at a point. Raises ValueError if it is not one number."""
+    """Return the value of a cost at a point. Raises ValueError if it is not a single number."""
     value = function(point)
     if not is_real(as_array(value)) or jnp.shape(value) != ():
         raise ValueError(f"{name}: expected a cost of one number, got {description(value)}")
@@ -45,12 +48,12 @@ def _cost(function: Callable, name: str, point: Point) -> Any:
 
 
 class RowGroup(NamedTuple):
-    """Rows of users' functions that one block evaluates.
+    """Constraints and costs that one block evaluates, for all phases that have them.
 
-    place: "path", "start" or "end". entries, costs: the functions.
-    stages: at which they are evaluated (-1: the start of an interval).
-    active: mask of the rows of connected links.
-    parts: of each phase its index, the intervals, and the rows of these intervals.
+    place: "path", "start" or "end". entries, costs: constraints and cost functions.
+    stages: indices of the stages; -1 is the interval's start.
+    active: mask [links' rows] of the constraints in these phases.
+    parts: of each phase its index, the indices of the intervals, and their rows.
     """
 
     place: str
@@ -62,27 +65,27 @@ class RowGroup(NamedTuple):
 
 
 class UserRows:
-    """Appends the rows and costs of users' functions to a transcription.
+    """Builder of the rows and cost terms of users' functions, which it appends to a transcription.
 
-    params: for which the functions are evaluated. draws: [draws unknowns] at which they are probed.
-    costs: lists of (place, block, local row) of the cost.
+    params: parameters for which the functions are evaluated.
+    samples: [samples unknowns] random points, at which sparsity is determined.
     """
 
-    def __init__(self, transcription: Transcription, params: Params, draws: np.ndarray):
+    def __init__(self, transcription: Transcription, params: Params, samples: np.ndarray):
         self.transcription = transcription
         self.params = params
-        self.draws = draws
+        self.samples = samples
         self._groups: dict[tuple, RowGroup] = {}
-        # rows of the cost are known when all others are
-        self.cost_places: list[tuple[StageBlock, np.ndarray]] = []
+        # (block, mask of its local rows that are cost terms); the index of the cost's row is known
+        # only when all other rows are there
+        self._cost_terms: list[tuple[StageBlock, np.ndarray]] = []
 
     def add_phase(
         self, i: int, running: Sequence[Callable[..., Any]], final: Sequence[Callable[..., Any]]
     ) -> None:
-        """Append the constraints and costs of a phase."""
-        phase, n, s = self.transcription.specification[i], 0, self.transcription.scheme.stages
-        n = phase.intervals
-        path, every = phase.constraints("path"), np.arange(n)
+        """Append the constraints and costs of phase i. running, final: functions of the costs."""
+        phase, s = self.transcription.phases[i], self.transcription.scheme.stages
+        path, every = phase.constraints("path"), np.arange(phase.intervals)
         self._add("path", i, path, running, stages=list(range(s)), intervals=every)
         at_start = [c for c in path if self._holds_at_start(i, c)] + phase.constraints("start")
         self._add("start", i, at_start, (), stages=[-1], intervals=every[:1])
@@ -90,7 +93,10 @@ class UserRows:
         self._add("end", i, end, final, stages=[s - 1], intervals=every[-1:])
 
     def _reads_links(self, block: StageBlock) -> bool:
-        """Return whether a block's function reads coordinates of virtual joints."""
+        """Return whether a block's function reads coordinates of virtual joints.
+
+        They are set to NaN: only functions that read them then return NaN.
+        """
         block.options = {"fill": np.nan}
         values = eager_jit(lambda *x: block.values(*x))
         lanes = lambda x: jax.tree.map(lambda x: jnp.asarray(x[:1]), x)
@@ -98,7 +104,10 @@ class UserRows:
         return bool(np.isnan(np.asarray(rows)).any())
 
     def _holds_at_start(self, i: int, entry: Constraint) -> bool:
-        """Return whether a path constraint is a function of what the start of a phase has."""
+        """Return whether a path constraint can be evaluated at the start of phase i.
+
+        Points there have no accelerations and no forces of links, and raise ValueError for them.
+        """
         try:
             self._shapes(i, [entry], at_start=True)
         except ValueError:
@@ -106,7 +115,7 @@ class UserRows:
         return True
 
     def _shapes(self, i: int, entries: Sequence[Constraint], at_start: bool) -> list[Values]:
-        """Return shapes and bounds of constraints' values, without computing them."""
+        """Return the shapes and bounds of constraints' values, by abstract evaluation."""
         out: list[Values] = []
         data = jax.tree.map(lambda x: jnp.asarray(x[0]), self.transcription.data(i))
 
@@ -119,14 +128,17 @@ class UserRows:
             out.extend(values)
             return [v.numbers for v in values]
 
-        y = jnp.zeros(self.transcription.model.layout.of_stage, self.params.chain.q_load.dtype)
+        y = jnp.zeros(self.transcription.model.layout.stage_size, self.params.chain.q_load.dtype)
         shapes = jax.eval_shape(evaluate, y)
         return [Values(x.shape, v.lower, v.upper) for x, v in zip(shapes, out)]
 
     def _add(self, place, i: int, entries, costs, *, stages, intervals) -> None:
-        """Append rows of constraints and costs at some stages of some intervals of a phase.
+        """Append rows of constraints and costs of phase i.
 
-        Lanes of all phases with these functions and connected links are evaluated by one block.
+        One block will evaluate these rows for all phases with these functions and connected links.
+
+        place: "path", "start" or "end". stages: indices of the stages; -1 is the interval's start.
+        intervals: indices of the intervals.
         """
         if not entries and not costs:
             return
@@ -140,9 +152,13 @@ class UserRows:
         group.parts.append((i, intervals, rows))
 
     def add_blocks(self) -> None:
-        """Append the blocks of the rows of all phases."""
+        """Append the blocks of all phases, after which no rows can be added."""
         for group in self._groups.values():
             self._add_block(group)
+        rows = self.transcription.rows
+        rows.freeze()
+        for block, is_cost in self._cost_terms:
+            block.rows = np.where(is_cost, rows.count, block.rows)
 
     def _add_block(self, group: RowGroup) -> None:
         """Append the block of a group."""
@@ -158,49 +174,52 @@ class UserRows:
             return jnp.concatenate([*parts, *(scale * _cost(f, name, point)[None] for f in costs)])
 
         lanes = lambda of_phase: np.concatenate([of_phase(i)[at] for i, at, _ in group.parts])
-        places = [interval_places(phase) for phase in transcription.specification]
+        places = [normalized_times(phase) for phase in transcription.phases]
         source = lambda: join_lanes(transcription.lanes(i, at) for i, at, _ in group.parts)
         block = StageBlock(
             function,
             transcription.model.layout,
             polynomials(transcription.scheme, transcription.model.controls, stages),
             data=source(),
-            index=lanes(lambda i: places[i][0]),
-            count=lanes(lambda i: places[i][1]),
+            start_ratio=lanes(lambda i: places[i][0]),
+            duration_ratio=lanes(lambda i: places[i][1]),
             unknowns=lanes(lambda i: self._unknowns(i, at_start)),
             rows=np.concatenate([rows for _, _, rows in group.parts]),
-            tangents=np.arange(0),
+            nonlinear=np.arange(0),
         )
         block.options = {} if self._reads_links(block) else {"fill": 0.0}
-        block.tangents = block.variables = self._tangents(block)
+        block.nonlinear = block.variables = self._nonlinear_variables(block)
         if costs:
             columns, of_stage = block.rows.shape[1], block.rows.shape[1] // len(stages)
             is_cost = np.arange(columns) % of_stage >= of_stage - len(costs)
-            self.cost_places.append((block, is_cost))
+            self._cost_terms.append((block, is_cost))
         transcription.add_block(block, source)
 
     def _unknowns(self, i: int, at_start: bool) -> np.ndarray:
         """Return the unknowns [intervals n] of a phase, at its start with impulses as forces."""
-        phase = self.transcription.phases[i]
+        phase = self.transcription.indices[i]
         if not at_start:
             return phase.intervals(None)
         forces = np.full_like(phase.forces, -1)
         forces[:, 0] = phase.impulse
         return phase.intervals(forces)
 
-    def _tangents(self, block: StageBlock) -> np.ndarray:
-        """Return the stage's variables in which a block's function may not be linear.
+    def _nonlinear_variables(self, block: StageBlock) -> np.ndarray:
+        """Return the stage's variables in which a block's function may be nonlinear.
 
-        Finding these takes the compilation of one more program. With few lanes the evaluation is
-        cheaper than that, and all variables are returned.
+        To find these a program is compiled. With few lanes, second derivatives by all variables
+        cost less than that compilation.
         """
         if len(block.rows) < MANY_LANES:
-            return np.arange(block.layout.of_stage)
-        return find_tangents(block, self.params, self._local(block.unknowns))
+            return np.arange(block.layout.stage_size)
+        return find_nonlinear_variables(block, self.params, self._local(block.unknowns))
 
     def _rows_of(self, place: str, i: int, entries, lanes: tuple[int, int]) -> list[np.ndarray]:
-        """Append the rows of constraints; return their indices [lanes stages values]."""
-        rows, phase = [], self.transcription.specification[i]
+        """Append the rows of constraints; return their indices [lanes stages values] of each.
+
+        lanes: numbers of lanes and of stages.
+        """
+        rows, phase = [], self.transcription.phases[i]
         for entry, shape in zip(entries, self._shapes(i, entries, place == "start")):
             lower, upper = self._bounds(entry, shape)
             name = entry.name if entry.name.startswith(place) else f"{place} {entry.name!r}"
@@ -219,7 +238,10 @@ class UserRows:
         return rows
 
     def _bounds(self, entry: Constraint, shape: Values) -> list[np.ndarray]:
-        """Return a constraint's bounds over its values. Raises ValueError for wrong bounds."""
+        """Return a constraint's bounds, one for all values or one for each.
+
+        Raises ValueError if bounds are traced, have another shape, or contradict each other.
+        """
         bounds = []
         for bound in (shape.lower, shape.upper):
             if not is_concrete(bound):
@@ -238,11 +260,6 @@ class UserRows:
         return bounds
 
     def _local(self, unknowns: np.ndarray) -> np.ndarray:
-        """Return values of local unknowns [draws lanes n] at the draws."""
-        padded = np.concatenate([self.draws, np.zeros((len(self.draws), 1))], 1)
+        """Return the local unknowns [samples lanes n] at the samples."""
+        padded = np.concatenate([self.samples, np.zeros((len(self.samples), 1))], 1)
         return padded[:, unknowns]
-
-    def set_cost_row(self, row: int) -> None:
-        """Set the row of the cost, which is the last."""
-        for block, is_cost in self.cost_places:
-            block.rows = np.where(is_cost, row, block.rows)

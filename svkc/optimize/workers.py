@@ -1,8 +1,7 @@
-"""Starts of a solver in processes of their own, and their results by files.
+"""Worker processes that solve guesses, and return solutions as files.
 
-IPOPT's linear algebra in threads of one process would take turns: the solver's libraries are not
-safe for threads. The functions of a problem cannot be pickled in general, so that cloudpickle
-carries them.
+Threads would not run in parallel: the linear algebra of IPOPT is not thread-safe. Functions of a
+problem, such as lambdas, cannot be pickled in general; cloudpickle serializes them.
 """
 
 import importlib
@@ -23,18 +22,19 @@ from svkc.optimize.loading import load_solution
 from svkc.optimize.solution import Solution
 
 _MAIN = "import sys; from svkc.optimize.workers import work; work(sys.argv[1])"
-# settings of JAX that a process takes over
+# settings of JAX that a worker process copies from this process
 _SETTINGS = ("jax_enable_x64", "jax_compilation_cache_dir")
-# seconds between looks at what has finished
+# seconds between two counts of the files of finished solutions
 _WAIT = 0.1
 
 
 def solve_in_processes(
     problem: Any, guesses: Sequence[Any], processes: int, *, solver: Any, progress: Callable
 ) -> list[Solution]:
-    """Return the solutions from several guesses, solved in processes.
+    """Return the solutions from several guesses, solved in worker processes.
 
-    solver: as of `Problem.solve`. progress: called with the fraction of the starts that are done.
+    processes: number of worker processes. solver: as of `Problem.solve`.
+    progress: called with the fraction of the guesses that are solved.
     Raises ImportError without cloudpickle, and RuntimeError if a process fails.
     """
     try:
@@ -45,7 +45,7 @@ def solve_in_processes(
         ) from error
     with tempfile.TemporaryDirectory() as name:
         folder = pathlib.Path(name)
-        # solutions are files, as their result codes cannot be pickled
+        # guesses that are solutions are passed as files: their result codes cannot be pickled
         for k, guess in enumerate(guesses):
             if isinstance(guess, Solution):
                 guess.save(folder / f"{k}.start.npz")
@@ -53,7 +53,7 @@ def solve_in_processes(
         settings = {"path": sys.path, "jax": {x: getattr(jax.config, x) for x in _SETTINGS}}
         (folder / "settings").write_bytes(pickle.dumps(settings))
         (folder / "work").write_bytes(cloudpickle.dumps((problem, solver, starts)))
-        # without XLA's remarks on programs from a cache
+        # silences XLA's messages on programs from a cache
         environment = {"TF_CPP_MIN_LOG_LEVEL": "3"} | os.environ
         workers = []
         try:
@@ -69,9 +69,12 @@ def solve_in_processes(
 
 
 def _wait(folder: pathlib.Path, workers: list[Any], count: int, progress: Callable) -> None:
-    """Wait until all starts are done. Raises RuntimeError if one failed in its process."""
+    """Wait until all solutions are there.
+
+    Raises RuntimeError if a process raised an exception, or if all ended before.
+    """
     while True:
-        # before the files are counted, as the last file of a process precedes its end
+        # checked before counting: a process writes its last file before it ends
         running = any(worker.poll() is None for worker in workers)
         done = sum((folder / f"{k}.npz").exists() for k in range(count))
         progress(done / count)
@@ -90,7 +93,10 @@ def _wait(folder: pathlib.Path, workers: list[Any], count: int, progress: Callab
 
 
 def work(name: str) -> None:
-    """Solve starts of a folder that no other process has taken, until none is left."""
+    """Run a worker process: solve guesses of a folder that no other process has taken.
+
+    name: path of the folder.
+    """
     folder = pathlib.Path(name)
     settings = pickle.loads((folder / "settings").read_bytes())
     sys.path[:] = settings["path"]
@@ -99,7 +105,7 @@ def work(name: str) -> None:
     problem, solver, starts = pickle.loads((folder / "work").read_bytes())
     for k, guess in enumerate(starts):
         try:
-            # created by one process alone
+            # creating this file fails if another process has created it
             os.close(os.open(folder / f"{k}.taken", os.O_CREAT | os.O_EXCL))
         except FileExistsError:
             continue

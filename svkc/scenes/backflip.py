@@ -1,7 +1,8 @@
-"""The planar gymnast of a backflip whose hands pull the shanks in flight.
+"""A planar gymnast for a backflip in which the hands hold the shanks in flight.
 
-After A. Farr, E. Charbonneau, M. Begon, P. Puchaud (2025), doi 10.5281/zenodo.14546204. Both sides
-are one; y points forward, z up, joints turn about x.
+The model is that of A. Farr, E. Charbonneau, M. Begon, P. Puchaud (2025), doi
+10.5281/zenodo.14546204. Left and right limbs are merged into one body each. y points forward, z up,
+and joints turn about x.
 """
 
 from typing import Any
@@ -12,7 +13,7 @@ from svkc.mjcf.load import load
 from svkc.model.chain import Chain, State
 from svkc.model.virtual_link import VirtualLink
 
-# of both sides together (N m), 70 % of the largest
+# limits of both sides together (N m): 70 % of the largest torques
 TORQUE_LIMITS = {
     joint: 0.7 * torque
     for joint, torque in (
@@ -23,9 +24,10 @@ TORQUE_LIMITS = {
         ("ankle", 343.9806),
     )
 }
-TOE = (0.0, -0.05, -0.15)  # m, in the feet
+TOE = (0.0, -0.05, -0.15)  # m, in the frame of the feet
 JOINT = '<joint name="{0}" axis="1 0 0"/>'
-# name, joint, parent; offset y, z and fixed turn in the parent; mass, centre of mass y, z, I_x
+# name, joint ("": fixed), parent; position y, z (m) and fixed rotation (rad) in the parent; mass
+# (kg), centre of mass y, z (m), moment of inertia about x (kg m^2)
 SEGMENTS = (
     ("thorax", "", "pelvis", (-0.0515404739, 0.1813885235, 0.0), (20.46, 0.0, 0.1767, 0.5204)),
     ("head", "", "thorax", (0.0435036145, 0.3479414452, 0.0), (5.12, 0.0, 0.0853, 0.0881)),
@@ -33,7 +35,7 @@ SEGMENTS = (
      (4.72, 0.142699958, 0.000110116, 0.0377032548)),
     ("forearms", "elbow", "upper_arms", (0.33860196781, 0.0, 1.57),
      (2.52, -0.00067614, -0.12639819, 0.0130228857)),
-    # turned by -pi/2, then moved along the new y
+    # after a rotation by -pi/2, the position is along the new y axis
     ("hands", "", "forearms", (0.0, -0.26587471154, 1.57 - np.pi / 2),
      (1.12, -0.00799285, -0.05143931, 0.00276486351)),
     ("thighs", "hip", "pelvis", (0.0, 0.0, 0.0), (18.98, 0.0, -0.2017, 0.3444)),
@@ -43,11 +45,11 @@ SEGMENTS = (
 
 
 def backflip(**options: Any) -> tuple[Chain, State]:
-    """Return the chain of the gymnast, and a state that stands with the toe at the origin.
+    """Return the chain of the gymnast, and its load pose as a state without connected links.
 
-    The virtual link `toe` pins the toe to the ground, `tuck` the hands to the point below the
-    knees. Coordinates are pelvis_y, pelvis_z and pelvis (its turn), shoulder, elbow, hip, knee,
-    ankle.
+    The virtual link `toe` is a hinge between toe and ground, `tuck` a hinge between hands and
+    shanks below the knees. Coordinates are pelvis_y, pelvis_z, pelvis (rotation), shoulder, elbow,
+    hip, knee, ankle.
 
     options: keyword arguments of `svkc.load`.
     """
@@ -63,10 +65,10 @@ def backflip(**options: Any) -> tuple[Chain, State]:
 
 
 def _body(name: str, joint: str, place: tuple, inertia: tuple, inside: str) -> str:
-    """Return the MJCF of a segment with its descendants."""
+    """Return the MJCF of a segment with its descendants, `inside`. Others: as in `SEGMENTS`."""
     y, z, turn = place
     mass, com_y, com_z, moment = inertia
-    # moments about y and z have no effect in the plane; they need to be possible ones
+    # moments of inertia about y and z have no effect; MuJoCo requires physically possible values
     return (
         f'<body name="{name}" pos="0 {y} {z}" euler="{turn} 0 0">'
         f"{JOINT.format(joint) * bool(joint)}"

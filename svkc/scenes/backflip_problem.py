@@ -1,7 +1,7 @@
-"""The backflip as a problem of motion optimization: five phases, of which the third is a loop.
+"""The backflip as a problem of motion optimization. In the third of five phases a loop is closed.
 
-After A. Farr, E. Charbonneau, M. Begon, P. Puchaud (2025), a little simpler. Coordinates between
-bounds, costs and phases are as in that work's statement.
+After A. Farr, E. Charbonneau, M. Begon, P. Puchaud (2025), slightly simplified. Phases, bounds of
+coordinates and costs are those of that work.
 """
 
 from collections.abc import Callable, Mapping
@@ -17,41 +17,43 @@ from svkc.optimize.phases import Between
 from svkc.scenes.backflip import TOE, TORQUE_LIMITS
 from svkc.tree.points import center_of_mass, point_position
 
-# of the ranges of the joints (rad), and of all rates (rad/s, m/s)
+# bounds of the coordinates (rad, m)
 RANGES: dict[str, tuple[float, float]] = {
     "pelvis_y": (-1, 1), "pelvis_z": (-1, 2), "shoulder": (-0.7, 3.1), "elbow": (0, 2.09),
     "hip": (-0.4, 2.6), "knee": (-2.3, 0.02), "ankle": (-0.7, 0.7),
 }  # fmt: skip
-# a function that is not negative, or one with bounds
+# a function g of a point with g >= 0, or (g, lower, upper)
 PathConstraint: TypeAlias = (
     Callable[[optimize.Point], Any] | tuple[Callable[[optimize.Point], Any], float, float]
 )
-LARGEST_RATE = 31.42
+LARGEST_RATE = 31.42  # rad/s, m/s: bound of all velocities
 START = {"pelvis": -0.3274, "shoulder": 0.2999, "elbow": 0.4935, "hip": 1.7082, "knee": -1.9999}
 TUCK_START = [0.135, 0.455, 1.285, 0.481, 1.818, 2.6, -1.658, 0.692]
 TUCK_END = [0.107, 0.797, 2.892, 0.216, 1.954, 2.599, -2.058, 0.224]
 LANDING_START: list[float] = [0.013, 0.088, 5.804, -0.305, 0, 1.014, -0.97, 0.006]
 END = [0.053, 0.091, 6.08, 2.9, -0.17, 0.092, 0.17, 0.20]
-PLACE = 0.1  # m: largest distance of the toe from the origin
+PLACE = 0.1  # m: largest horizontal distance of the toe from the origin
 FRICTION = 0.5
 
 
 def _toe(p: optimize.Point) -> Any:
+    """Return the position of the toe (m)."""
     return point_position(p.chain, p.state, "feet", TOE)
 
 
 def _toe_on_ground(p: optimize.Point) -> Any:
-    """Return the height of the toe."""
+    """Return the height of the toe (m)."""
     return _toe(p)[2]
 
 
 def _toe_forward(p: optimize.Point) -> Any:
-    """Return the distance of the toe from the origin."""
+    """Return the horizontal coordinate of the toe (m)."""
     return _toe(p)[1]
 
 
 def _above(place: tuple[Scalar, Scalar, Scalar]) -> Any:
-    """Return the function of how far the centre of mass is in front of a point of the feet."""
+    """Return the function of a point that says how far (m) the centre of mass is in front of a
+    place in the frame of the feet."""
 
     def in_front_of(p):
         point = point_position(p.chain, p.state, "feet", place)
@@ -61,12 +63,16 @@ def _above(place: tuple[Scalar, Scalar, Scalar]) -> Any:
 
 
 def _friction_cone(p: optimize.Point) -> Any:
+    """Return two numbers that are not negative where the ground's force is in the friction cone."""
     _, tangential, normal = p.forces("toe")
     return jnp.stack([FRICTION * normal - tangential, FRICTION * normal + tangential])
 
 
 def _pull(p: optimize.Point) -> Any:
-    """Return what is not negative where the hands, on which this force acts, pull the shanks."""
+    """Return two numbers that are not negative where the hands pull the shanks.
+
+    The force acts on the hands. Its forward component must be at least the magnitude of the other.
+    """
     _, forward, along = p.forces("tuck")
     return jnp.stack([forward - along, forward + along])
 
@@ -77,26 +83,31 @@ TUCKED: list[PathConstraint] = [_pull, (lambda p: p.forces("tuck")[1], 0.1, np.i
 
 
 def _take_off(p: optimize.Point) -> Any:
+    """Return the cost at take-off, which rewards vertical velocity of the centre of mass."""
     return 1000 * p.duration - center_of_mass(p.chain, p.state).velocity[2] ** 2
 
 
 def _running(p: optimize.Point) -> Any:
+    """Return the running cost of torque rates and torques."""
+    # torques as fractions of the largest torques
     shares = [0.7 * p.torque(joint) / limit for joint, limit in TORQUE_LIMITS.items()]
     return jnp.sum(p.u**2) + 1e4 * sum(share**2 for share in shares)
 
 
 def _final(p: optimize.Point) -> Any:
+    """Return the cost at the end of the motion, which penalizes velocities and imbalance."""
     position, velocity, _ = center_of_mass(p.chain, p.state)
     rates = p.state.v[: p.chain.nv]
     return 100 * (rates @ rates + velocity @ velocity + position[1] ** 2)
 
 
 def _around(pose: Mapping[str, Scalar], distance: Scalar) -> list[Between]:
+    """Return bounds that keep coordinates within a distance (rad, m) of a pose."""
     return [optimize.between(j, x - distance, x + distance) for j, x in pose.items()]
 
 
 def _turn(lower: Scalar, upper: Scalar) -> list[Between]:
-    """Return bounds on the pelvis's turn, in half turns."""
+    """Return bounds on the rotation of the pelvis. lower, upper: in half turns."""
     return [optimize.between("pelvis", lower * np.pi, upper * np.pi)]
 
 
@@ -162,7 +173,7 @@ def backflip_problem(chain: Chain, *, project: bool = True, **options: Any) -> o
 
 
 def backflip_guess(problem: optimize.Problem, **options: Any) -> optimize.Guess:
-    """Return straight lines between the poses of the statement.
+    """Return the guess of straight lines between the poses of the original problem.
 
     options: keyword arguments of `Problem.guess`.
     """

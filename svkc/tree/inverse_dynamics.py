@@ -20,6 +20,17 @@ from svkc.tree.traversal import (
 )
 
 
+def generalized_force(
+    chain: Chain, kin: Kinematics, wrenches: Float[Array, "rows 6"]
+) -> Float[Array, " nv"]:
+    """Return the generalized force (N m, N) of wrenches on the rows of the tree.
+
+    wrenches: torque (N m), then force (N), in world axes about the origins of the rows' roots.
+    """
+    below = accumulate_to_root(chain.topology, wrenches)
+    return jnp.sum(kin.S * static_take(below, chain.topology.dof_row), -1)
+
+
 def newton_euler(
     chain: Chain, kin: Kinematics, V: Float[Array, "rows 6"] | None, A: Float[Array, "rows 6"]
 ) -> Float[Array, " nv"]:
@@ -44,8 +55,8 @@ def newton_euler(
         acceleration = acceleration + cross(w, u + cross(w, c))
         moment = moment + cross(w, angular_momentum(w))
     force = chain.mass[:, None] * acceleration
-    F = accumulate_to_root(chain.topology, jnp.concatenate([moment + cross(c, force), force], -1))
-    return jnp.sum(kin.S * static_take(F, chain.topology.dof_row), -1)
+    wrenches = jnp.concatenate([moment + cross(c, force), force], -1)
+    return generalized_force(chain, kin, wrenches)
 
 
 def rnea(

@@ -10,8 +10,8 @@ import svkc
 from svkc.optimize.closed_forms import StageDerivatives
 from svkc.optimize.controls import Torques
 from svkc.optimize.equations import IntervalData, Model, Params, stage_equations
-from svkc.optimize.lift import Layout, motion_places
-from svkc.optimize.loop_rows import LinkRows, possible_rows
+from svkc.optimize.lift import Layout, motion_hessian_pattern
+from svkc.optimize.loop_rows import LinkRows, candidate_rows
 
 # an issue of sums in another order
 ROUND_OFF = 1e-12
@@ -44,7 +44,7 @@ def linked_trees(joint: str, parent: str, real: str) -> svkc.Chain:
 def test_derivatives_of_a_stage(joint, parent, real):
     """First derivatives and those of a sum of all rows, in every variable of the stage."""
     chain, random = linked_trees(joint, parent, real), np.random.default_rng(0)
-    table = LinkRows.of(chain, possible_rows(chain, np.array([True])))
+    table = LinkRows.of(chain, candidate_rows(chain, np.array([True])))
     controls = Torques().for_chain(chain)
     layout = Layout(
         nv=chain.nv,
@@ -58,10 +58,10 @@ def test_derivatives_of_a_stage(joint, parent, real):
     structure = chain.state(connected=()).structure
     active = np.ones(len(table), bool)
     data = IntervalData(
-        reference=jnp.zeros(chain.nq), following=jnp.zeros(chain.nq), active=active,
+        reference=jnp.zeros(chain.nq), next_reference=jnp.zeros(chain.nq), active=active,
         structure=structure,
     )  # fmt: skip
-    y = jnp.asarray(random.normal(size=layout.of_stage))
+    y = jnp.asarray(random.normal(size=layout.stage_size))
     multipliers = jnp.asarray(random.normal(size=chain.nv + len(table)))
     rows = lambda y: stage_equations(model, params, data, 1.0, y)
 
@@ -87,7 +87,7 @@ def test_derivatives_of_a_stage(joint, parent, real):
         np.block([[qq, qv, qa], [qv.T, vv, zero], [qa.T, zero, zero]]),
         H[2:, 2:][: 3 * nv, : 3 * nv],
     )
-    expected = np.zeros((n, layout.of_stage))
+    expected = np.zeros((n, layout.stage_size))
     expected[:, 2 : 2 + nv] = by_f
     close(expected[:, :-n], H[-n:, :-n], scale=H)
     assert not np.any(H[-n:, -n:])
@@ -96,5 +96,5 @@ def test_derivatives_of_a_stage(joint, parent, real):
 def test_entries_of_the_hessian_are_there_once():
     """Of two symmetric entries there is one, as the solver adds what has one place."""
     layout = Layout(nv=3, stages=2, rows=2, control=2, blocks=2, stage_blocks=2)
-    pairs = np.sort(np.stack(motion_places(layout), 1), 1)
+    pairs = np.sort(np.stack(motion_hessian_pattern(layout), 1), 1)
     assert len(np.unique(pairs, axis=0)) == len(pairs)

@@ -21,10 +21,10 @@ from svkc.optimize.equations import (
 from svkc.optimize.lift import Layout
 from svkc.optimize.loop_rows import (
     LinkRows,
+    candidate_rows,
     gaps_at,
     link_force,
     link_torque,
-    possible_rows,
     rates_at,
 )
 from svkc.optimize.points import full_state
@@ -41,7 +41,7 @@ def tree(chain, state):
 
 
 def connected_rows(chain, state) -> LinkRows:
-    return LinkRows.of(chain, possible_rows(chain, np.asarray(state.structure.connected)))
+    return LinkRows.of(chain, candidate_rows(chain, np.asarray(state.structure.connected)))
 
 
 def jacobian(chain, q, table):
@@ -126,7 +126,7 @@ def test_an_impact_is_that_of_connect(joint):
     model = Model(layout, table, optimize.Torques().for_chain(chain))
     (q, before), (_, v) = tree(chain, state), tree(chain, after)
     active = np.ones(len(table), bool)
-    data = IntervalData(reference=q, following=q, active=active, structure=after.structure)
+    data = IntervalData(reference=q, next_reference=q, active=active, structure=after.structure)
     params = Params(chain, None)
     x, rate = chart_from_motion(chain, q, q, v)
     _, rate_before = chart_from_motion(chain, q, q, before)

@@ -11,7 +11,7 @@ import svkc
 from svkc import optimize
 from svkc.optimize.feedback import EFFORT, error_units, growth, riccati_gains
 from svkc.optimize.linearization import linear_maps
-from svkc.optimize.loop_rows import LinkRows, possible_rows, rates_at
+from svkc.optimize.loop_rows import LinkRows, candidate_rows, rates_at
 
 INVERTED = (
     '<mujoco><worldbody><body name="rod"><joint name="pivot" axis="0 1 0"/><geom type="capsule"'
@@ -95,7 +95,7 @@ def test_links_project_errors():
     after, nv = maps.after[0], chain.nv
     np.testing.assert_allclose(after @ after, after, atol=1e-12)
     q = jnp.asarray(motion[0].q[0])
-    table = LinkRows.of(chain, possible_rows(chain, np.asarray(state.structure.connected)))
+    table = LinkRows.of(chain, candidate_rows(chain, np.asarray(state.structure.connected)))
     left = after[nv:, nv:] @ np.random.default_rng(0).normal(size=nv)
     assert np.abs(rates_at(chain, q, jnp.asarray(left), table)).max() < 1e-12
     v = np.random.default_rng(1).normal(size=nv)

@@ -36,6 +36,7 @@ EXAMPLES = {
     "06_soft_catch": ("gradient at the start", "gradient at the end"),
     "07_identify": ("derivatives at the start", "derivatives at the end"),
     "09_backflip": ("landing", "largest defects of the intervals"),
+    "10_hopper": ("landing", "largest defects of the intervals"),
 }
 
 
