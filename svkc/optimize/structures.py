@@ -66,10 +66,10 @@ def links_here(chain: Chain, phases: Sequence[Phase]) -> list[np.ndarray]:
     here = np.zeros(len(old), bool)
     for phase in phases:
         if isinstance(phase.here, bool):
-            asked = np.full(len(old), phase.here)
+            chosen = np.full(len(old), phase.here)
         else:
-            asked, old = of(phase.here), old & bool(out)
-        here = of(phase.connected) & np.where(old, here, asked)
+            chosen, old = of(phase.here), old & bool(out)
+        here = of(phase.connected) & np.where(old, here, chosen)
         out.append(here)
         old = of(phase.connected)
     return out

@@ -148,7 +148,12 @@ class UserRows:
         active = np.asarray(self.transcription.structures[i].active)
         functions = [id(f) for f in (*(entry.function for entry in entries), *costs)]
         key = place, len(costs), *functions, active.tobytes()
-        group = self._groups.setdefault(key, RowGroup(place, entries, costs, stages, active, []))
+        group = self._groups.get(key)
+        if group is None:
+            group = RowGroup(
+                place=place, entries=entries, costs=costs, stages=stages, active=active, parts=[]
+            )
+            self._groups[key] = group
         group.parts.append((i, intervals, rows))
 
     def add_blocks(self) -> None:

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 
 from svkc.mjcf.load import load
-from svkc.model.virtual_link import VirtualLink
 from svkc.model.annotations import Scalar
 from svkc.model.chain import Chain
+from svkc.model.virtual_link import VirtualLink
 
 # m: distance of the two hinges at the trunk, and lengths of the bars and of the shank
 BASE, BAR, SHANK = 0.08, 0.3, 0.4
