@@ -44,7 +44,8 @@ def at_rest(pose, *joints):
 
 on_ground = {"connected": ("four_bar", "foot"), "here": "foot", "path": [pushes]}
 landing = [(height, 0, 0), lambda p: p.impulse("foot")[2]]
-phases = [  # in flight the foot is above the ground, up to round-off, and below 1 m
+# in flight the foot is above the ground, up to round-off, and below 1 m
+phases = [
     optimize.Phase("push", duration=(0.1, 0.6), intervals=10,
                    start=at_rest(first, "x", "z", "hip"), **on_ground),
     optimize.Phase("flight", "four_bar", duration=(0.05, 0.6), intervals=10,

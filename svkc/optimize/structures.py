@@ -21,8 +21,8 @@ def independent_rows(
 ) -> np.ndarray:
     """Return linearly independent rows among candidate rows of links.
 
-    Rows in `preferred` are of_phase before others. At each step the row with the largest remainder is
-    of_phase. Ranks may differ between configurations: the result is of the one with most rows.
+    Rows in `preferred` are chosen before others. At each step the row with the largest remainder is
+    chosen. Ranks may differ between configurations: the result is of the one with most rows.
 
     q: configurations [nq] of the tree.
     """
@@ -44,7 +44,7 @@ def independent_rows(
 def _pivoted_rows(J: np.ndarray, preferred: np.ndarray) -> list[int]:
     """Return indices of independent rows of J by Gram-Schmidt orthogonalization with pivoting.
 
-    preferred: mask of the rows that are of_phase before others.
+    preferred: mask of the rows that are chosen before others.
     """
     rest, rows, largest = J.copy(), [], np.max(np.linalg.norm(J, axis=1), initial=1e-300)
     for group in (preferred, ~preferred):
