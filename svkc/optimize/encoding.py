@@ -13,7 +13,7 @@ from svkc.optimize.transcription import Transcription
 def encode(transcription: Transcription, guess: Guess) -> np.ndarray:
     """Return a guess as the vector of unknowns, in SI units and within bounds."""
     table, nv = transcription.builder.table, transcription.model.layout.nv
-    x, start = np.zeros(table.count), 0.0
+    x, start, kept = np.zeros(table.count), 0.0, np.zeros(0, int)
     rows, has_state = transcription.model.rows.rows, transcription.model.controls.has_state
     for motion, at, reference in zip(guess.phases, transcription.indices, transcription.references):
         x[at.start_time], x[at.duration] = start, motion.duration
@@ -25,9 +25,11 @@ def encode(transcription: Transcription, guess: Guess) -> np.ndarray:
         x[at.vdot] = motion.vdot
         for index, values in ((at.forces, motion.forces), (at.impulse, motion.impulse)):
             x[index[index >= 0]] = np.asarray(values)[..., rows][index >= 0]
-        keeps = at.kept_gap >= 0
-        if keeps.any():
-            x[at.kept_gap[keeps]] = np.asarray(_gaps(transcription, motion.q[0]))[keeps]
+        # gaps of a link stay as they are where the link connects
+        starts = (at.kept_gap >= 0) & ~np.isin(at.kept_gap, kept)
+        if starts.any():
+            x[at.kept_gap[starts]] = np.asarray(_gaps(transcription, motion.q[0]))[starts]
+        kept = at.kept_gap
     return _with_noise(transcription, guess, np.clip(x, table.lower, table.upper))
 
 

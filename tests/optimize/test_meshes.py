@@ -11,6 +11,7 @@ from svkc import optimize
 from svkc.optimize.guesses import PhaseMotion
 from svkc.optimize.refinement import new_mesh
 from svkc.optimize.resampling import resample
+from svkc.scenes.hopper import hopper, stance
 
 MESH = [0, 0.2, 0.5, 0.9, 1]
 
@@ -104,3 +105,33 @@ def test_files_hold_solutions(tmp_path):
     np.testing.assert_array_equal(loaded.states.q, solution.states.q)
     np.testing.assert_array_equal(loaded.motion[0].blocks, solution.motion[0].blocks)
     np.testing.assert_array_equal(loaded.multipliers.rows, solution.multipliers.rows)
+
+
+@pytest.mark.slow
+def test_links_that_connect_at_current_poses_stay_there():
+    """A foot keeps its place while it stands, and gets another one where it lands.
+
+    The four-bar, which is connected in the loaded chain, is closed at its declared placement.
+    """
+    chain = hopper()
+    stands = {"connected": ("four_bar", "foot"), "duration": 0.2, "intervals": 2}
+    phases = [
+        optimize.Phase("push", here=True, **stands),
+        optimize.Phase("wait", **stands),
+        optimize.Phase("flight", "four_bar", duration=0.2, intervals=2),
+        optimize.Phase("landing", here="foot", **stands),
+    ]
+    problem = optimize.Problem(chain, phases, controls=optimize.Torques({"hip": 80.0}))
+    poses = [stance(0.1, -1.0), None, stance(0.1, -0.2), stance(0.4, 0.2), stance(0.4, 1.0)]
+    program, start = problem.start(problem.guess(poses))
+    push, wait, flight, landing = (indices.kept_gap for indices in program.transcription.indices)
+    np.testing.assert_array_equal(push, wait)
+    assert not np.any(flight >= 0)
+    assert not set(push[push >= 0]) & set(landing[landing >= 0])
+    # two translations of the foot are independent in the plane
+    assert np.sum(push >= 0) == np.sum(landing >= 0) == 2
+    x = start.x * program.unit
+    assert np.isclose(np.abs(x[push[push >= 0]]).max(), 0.1)
+    assert np.isclose(np.abs(x[landing[landing >= 0]]).max(), 0.4)
+    check = problem.check(problem.guess(poses))
+    assert max(check.derivative_error, check.hessian_error) < 1e-6
