@@ -218,12 +218,10 @@ class Problem:
         program = self.program(motion)
         program.set_references([m.q for m in motion.phases])
         x = encode(program.transcription, motion) / program.unit
-        rows, count = np.zeros(program.cost_row), np.zeros(program.count)
-        multipliers = guess.multipliers if isinstance(guess, Solution) else None
-        if multipliers is not None and len(multipliers.rows) == len(rows):
-            rows, lower, upper = multipliers.rows, multipliers.lower, multipliers.upper
-        else:
-            lower = upper = count
+        rows, lower, upper = np.zeros(program.cost_row), np.zeros(len(x)), np.zeros(len(x))
+        known = guess.multipliers if isinstance(guess, Solution) else None
+        if known is not None and (len(known.rows), len(known.lower)) == (len(rows), len(x)):
+            rows, lower, upper = known.rows, known.lower, known.upper
         return program, SolverResult(x=x, multipliers=rows, lower=lower, upper=upper)
 
     def check(self, guess: Guess | Solution) -> Check:
