@@ -1,8 +1,9 @@
-"""Cholesky factorisation and triangular solves in pieces that LAPACK computes in one thread.
+"""Factorisations and solves in pieces that LAPACK computes in one thread.
 
 jaxlib 0.10 splits a batch of more than 2e5 operations over its thread pool, and blocks the calling
-thread until they are done. If several CPU devices share the pool, all threads may block, which is a
-deadlock. There, `lax.map` runs the batch in chunks below that size.
+thread until they are done. If a program runs as many such calls at once as the pool has threads,
+all threads block, which is a deadlock. The calls may be independent operations of one program, or
+belong to several CPU devices. `lax.map` therefore runs large batches in chunks below that size.
 
 OpenBLAS, which jaxlib calls, distributes one large matrix over threads of its own. Where another
 thread uses the processor, these wait for one another for milliseconds. Large matrices are therefore
@@ -38,7 +39,7 @@ def _in_chunks(function: Callable, cost: Callable) -> Callable:
         count = math.prod(lanes)
         cost_per_lane = max(1, cost(*(x.shape[-2:] for x in matrices)))
         max_chunk = max(1, SINGLE_THREAD_OPERATIONS // cost_per_lane)
-        if count <= max_chunk or jax.default_backend() != "cpu" or jax.local_device_count() == 1:
+        if count <= max_chunk or jax.default_backend() != "cpu":
             return function(*matrices)
         chunk = max(n for n in range(1, max_chunk + 1) if count % n == 0)
         out = lax.map(
@@ -65,22 +66,31 @@ _cholesky = _in_chunks(
 
 
 @functools.cache
-def _triangular_solver(lower: bool, trans: bool) -> Callable:
+def _triangular_solver(lower: bool, trans: bool, unit: bool) -> Callable:
     solve = functools.partial(
-        lax.linalg.triangular_solve, left_side=True, lower=lower, transpose_a=trans
+        lax.linalg.triangular_solve,
+        left_side=True,
+        lower=lower,
+        transpose_a=trans,
+        unit_diagonal=unit,
     )
     return _in_chunks(solve, lambda A, x: x[0] * x[0] * x[1])
 
 
 def batched_solve_triangular(
-    A: Float[Array, "n n"], x: Float[Array, "n *m"], trans: bool = False, lower: bool = False
+    A: Float[Array, "n n"],
+    x: Float[Array, "n *m"],
+    trans: bool = False,
+    lower: bool = False,
+    unit: bool = False,
 ) -> Float[Array, "n *m"]:
     """Return A^-1 x, or A^-T x if `trans`, for a triangular A.
 
-    Only the triangle named by `lower` is read. There is no derivative rule: use this function as
-    the `solve` of a `custom_linear_solve`.
+    Only the triangle named by `lower` is read, without its diagonal if `unit`: that is then ones.
+    There is no derivative rule: use this function as the `solve` of a `custom_linear_solve`.
     """
-    solve, columns = functools.partial(_triangular_solver(lower, trans), A), x.reshape(len(x), -1)
+    solver, columns = _triangular_solver(lower, trans, unit), x.reshape(len(x), -1)
+    solve = functools.partial(solver, A)
     width = max(1, SOLVE_SINGLE_THREAD_ENTRIES // max(1, len(x)))
     if columns.shape[1] <= width or jax.default_backend() != "cpu":
         return solve(columns).reshape(x.shape)
@@ -135,20 +145,42 @@ def factor_general(
 
 def solve_factored(lu: Float[Array, "n n"], order: Int[Array, " n"], x: Float[Array, "n *m"]):
     """Return A^-1 x from the factors of A."""
-    x = lax.linalg.triangular_solve(
-        lu, x.reshape(len(x), -1)[order], left_side=True, lower=True, unit_diagonal=True
-    )
-    return batched_solve_triangular(lu, x)
+    return batched_solve_triangular(lu, batched_solve_triangular(lu, x[order], False, True, True))
 
 
-def solve_general(A: Float[Array, "n n"], x: Float[Array, " n"]) -> Float[Array, " n"]:
+def solve_general(A: Float[Array, "n n"], x: Float[Array, "n *m"]) -> Float[Array, "n *m"]:
     """Return A^-1 x by LU for any regular A; the derivative is one more solve, in both modes."""
 
     def by(matrix):
         lu, order, _ = factor_general(matrix)
-        return lambda _, y: solve_factored(lu, order, y)[:, 0]
+        return lambda _, y: solve_factored(lu, order, y)
 
     frozen = jax.lax.stop_gradient(A)
     return jax.lax.custom_linear_solve(
         lambda y: A @ y, x, solve=by(frozen), transpose_solve=by(frozen.T)
     )
+
+
+def solve_lower(L: Float[Array, "n n"], x: Float[Array, "n *m"]) -> Float[Array, "n *m"]:
+    """Return L^-1 x for a lower triangular L, differentiable in both arguments."""
+    frozen = jax.lax.stop_gradient(L)
+    solve = lambda trans: lambda _, y: batched_solve_triangular(frozen, y, trans, lower=True)
+    return jax.lax.custom_linear_solve(
+        lambda y: L @ y, x, solve=solve(False), transpose_solve=solve(True)
+    )
+
+
+@jax.custom_jvp
+def cholesky(A: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """Return the lower Cholesky factor L of a symmetric positive definite A.
+
+    With S = L^-1 dA L^-T, the derivative is L times the lower triangle of S, diagonal halved.
+    """
+    return _blocked_cholesky(A)
+
+
+@cholesky.defjvp
+def _(primals, tangents):
+    L = cholesky(*primals)
+    S = solve_lower(L, solve_lower(L, tangents[0]).T).T
+    return L, L @ (jnp.tril(S, -1) + jnp.diag(jnp.diagonal(S)) / 2)

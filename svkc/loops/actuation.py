@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from svkc._jax.batched_lapack import solve_general
 from svkc._jax.eager import eager_jit
 from svkc._jax.pytrees import is_concrete
 from svkc.loops.constraint import jacobian_scales, loop_kinematics
@@ -192,7 +193,7 @@ def _null_space_basis(
     P = qr.P
     Bm = qr.Q @ B
     R = Bm @ P.T + jnp.diag(jnp.where(qr.active, 0, 1).astype(B.dtype))
-    null_space = jnp.eye(B.shape[1], dtype=B.dtype) - P.T @ jnp.linalg.solve(R, Bm)
+    null_space = jnp.eye(B.shape[1], dtype=B.dtype) - P.T @ solve_general(R, Bm)
     return qr, rank, jnp.where(jnp.any(P > 0, 0)[None], 0, null_space)
 
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from svkc._jax.batched_lapack import solve_general
 from svkc.loops.constraint import jacobian_scales
 from svkc.model.chain import Chain
 
@@ -42,7 +43,7 @@ def with_inertia(
 
     def solve_with_inertia(force, bias):
         start = solve(force, bias)
-        x = jnp.linalg.solve(system, jax.tree.leaves(start)[0][dofs])
+        x = solve_general(system, jax.tree.leaves(start)[0][dofs])
         return jax.tree.map(lambda a, b: a - (inertia * x) @ b, start, responses)
 
     return solve_with_inertia

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from svkc._jax.batched_lapack import solve_general
 from svkc._jax.eager import eager_jit
 from svkc._jax.pytrees import stop_gradient_tree
 from svkc.loops.pivoting import PivotedQR, pivoted_qr_with_rank, solve_positive
@@ -25,9 +26,9 @@ def least_cost_solution(
     ZB = Z.T @ B
     ZB_over_cost = ZB.T / cost[:, None]
     G = ZB @ ZB_over_cost + jnp.diag(jnp.where(qr.active, 0, 1).astype(B.dtype))
-    y = ZB_over_cost @ jnp.linalg.solve(G, Z.T @ target_force)
+    y = ZB_over_cost @ solve_general(G, Z.T @ target_force)
     # one step of iterative refinement
-    return y + ZB_over_cost @ jnp.linalg.solve(G, Z.T @ (target_force - B @ y))
+    return y + ZB_over_cost @ solve_general(G, Z.T @ (target_force - B @ y))
 
 
 @eager_jit

@@ -11,10 +11,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
-from svkc._jax.batched_lapack import batched_solve_triangular, cholesky_solver
+from svkc._jax.batched_lapack import (
+    batched_solve_triangular,
+    cholesky,
+    cholesky_solver,
+    solve_lower,
+)
 from svkc._jax.control_flow import unvmap_any
 from svkc._jax.primitive import custom_primitive
 from svkc.model.annotations import DType
@@ -157,11 +161,10 @@ def _frozen_qr_jvp(primals, tangents):
     J, _, P, _ = primals
     Q, diag_R = frozen_qr(*primals)
     unused = jnp.diag(jnp.where(jnp.any(P > 0, 1), 0, 1).astype(J.dtype))
-    dQ = solve_triangular(
-        jax.lax.stop_gradient(Q @ J @ P.T) + unused, (tangents[0] @ P.T).T, trans=1
-    )
-    L = jnp.linalg.cholesky(Q @ Q.T + unused)
-    along = jnp.sum(solve_triangular(L, dQ, lower=True) * solve_triangular(L, Q, lower=True), 1)
+    R = jax.lax.stop_gradient(Q @ J @ P.T) + unused
+    dQ = solve_pivot_block(R, (tangents[0] @ P.T).T, trans=True)
+    L = cholesky(Q @ Q.T + unused)
+    along = jnp.sum(solve_lower(L, dQ) * solve_lower(L, Q), 1)
     return (Q, diag_R), (dQ, diag_R * along)
 
 

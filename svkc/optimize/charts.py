@@ -95,6 +95,13 @@ def motion_from_chart(
     return q, v, vdot
 
 
+def _solve_3(A: Float[Array, "n 3 3"], b: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+    """Return A^-1 b by Cramer's rule."""
+    x, y, z = (A[..., i] for i in range(3))
+    rows = jnp.stack([jnp.cross(y, z), jnp.cross(z, x), jnp.cross(x, y)], -2)
+    return jnp.sum(rows * b[:, None], -1) / jnp.sum(rows[:, 0] * x, -1, keepdims=True)
+
+
 def chart_from_motion(
     chain: Chain,
     reference: Float[Array, " nq"],
@@ -117,7 +124,7 @@ def chart_from_motion(
     )
     u = quat_log(from_reference)
     matrix = jax.vmap(jax.jacfwd(lambda du, u: _rotation_rate(u[None], du[None])[1][0]))(w, u)
-    du = jnp.linalg.solve(matrix, w[..., None])[..., 0]
+    du = _solve_3(matrix, w)
     x, rate = (
         _ordered(static_take(y, at), turns, scalar_v, turns_v)
         for y, at, turns in ((q, scalar_q, u), (v, scalar_v, du))

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from svkc._jax.batched_lapack import solve_general
 from svkc._jax.eager import eager_jit
 from svkc.model.chain import Chain
 from svkc.optimize.charts import chart_from_motion, motion_from_chart, to_next_chart
@@ -197,6 +198,6 @@ def _projected_velocity(model: Model, params: Params, lane: _Lane, v):
             return z
         J = jnp.where(active[:, None], J, 0)
         matrix = jnp.block([[M, J.T], [J, jnp.diag(jnp.where(active, 0.0, 1.0))]])
-        return jnp.concatenate([dq, jnp.linalg.solve(matrix, momentum)[:nv]])
+        return jnp.concatenate([dq, solve_general(matrix, momentum)[:nv]])
 
     return jax.jacfwd(after)(jnp.zeros(2 * nv))

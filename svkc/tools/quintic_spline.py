@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from svkc._jax.batched_lapack import solve_general
 from svkc.tree.spatial import inverse_positive
 
 # number of points at each end through which a polynomial gives the derivatives there
@@ -42,7 +43,7 @@ def _end_derivatives(
     """Return the first and the second derivative at t[0] of the polynomial through the points."""
     span = t[-1] - t[0]
     x = (t - t[0]) / span
-    coefficients = jnp.linalg.solve(jnp.stack([x**k for k in range(len(x))], 1), y)
+    coefficients = solve_general(jnp.stack([x**k for k in range(len(x))], 1), y)
     return jnp.stack([coefficients[1] / span, 2 * coefficients[2] / span**2])
 
 

@@ -1,5 +1,5 @@
-"""Batched Cholesky and triangular solves: equality with single solves, no large matrix for LAPACK,
-and no deadlock of several CPU devices in one process."""
+"""Batched factorisations and solves: equality with single solves, derivatives, no large matrix for
+LAPACK, and no deadlock of several calls of one program or of several CPU devices."""
 
 import re
 import subprocess
@@ -9,9 +9,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.test_util import check_grads
 from tolerances import REFERENCE, ROUND_OFF
 
-from svkc._jax.batched_lapack import batched_solve_triangular, cholesky_solver
+from svkc._jax.batched_lapack import (
+    batched_solve_triangular,
+    cholesky,
+    cholesky_solver,
+    solve_general,
+)
 
 
 @pytest.mark.parametrize("size", [1, 6])
@@ -40,6 +46,22 @@ def test_batches_are_their_single_solves(lanes, size):
         np.testing.assert_allclose(solve(A, x), expected, rtol=REFERENCE, atol=ROUND_OFF)
 
 
+def test_derivatives():
+    rng = np.random.default_rng(0)
+    A, x = jnp.asarray(rng.normal(size=(4, 4))), jnp.asarray(rng.normal(size=(4, 2)))
+    factor = lambda B: cholesky(jnp.asarray(B) @ B.T + jnp.eye(4))
+    check_grads(factor, (A,), 2, rtol=1e-6)
+    solve = lambda A, x: solve_general(jnp.asarray(A), jnp.asarray(x))
+    check_grads(solve, (A + 4 * jnp.eye(4), x), 2, rtol=1e-6)
+    many = jnp.asarray(np.asarray(A) + np.arange(1, 4)[:, None, None] * np.eye(4))
+    np.testing.assert_allclose(
+        jax.vmap(solve_general, (0, None))(many, x),
+        np.linalg.solve(many, np.broadcast_to(x, (3, 4, 2))),
+        rtol=REFERENCE,
+        atol=ROUND_OFF,
+    )
+
+
 @pytest.mark.parametrize("columns", [1, 9])
 def test_lapack_runs_in_one_thread(columns):
     rng = np.random.default_rng(0)
@@ -51,6 +73,28 @@ def test_lapack_runs_in_one_thread(columns):
     assert {int(n) for n, _ in shapes("dpotrf")} == {75}
     assert all(int(n) * int(m) <= 1000 for n, m in shapes("dtrsm"))
     assert shapes("dtrsm")
+
+
+INDEPENDENT_CALLS = """
+import jax, jax.numpy as jnp, numpy as np
+from svkc._jax.batched_lapack import cholesky_solver, solve_general
+
+rng = np.random.default_rng(0)
+A = rng.normal(size=(8, 192, 24, 24)) + 24 * np.eye(24)
+x = rng.normal(size=(192, 24))
+
+@jax.jit
+def run(A, x):
+    parts = [jax.vmap(solve_general)(a, x) for a in A[:4]]
+    return parts + [jax.vmap(lambda A, x: cholesky_solver(A)(x))(a @ a.mT, x) for a in A[4:]]
+
+for _ in range(100):
+    jax.block_until_ready(run(A, x))
+"""
+
+
+def test_independent_calls_do_not_wait_for_each_other():
+    subprocess.run([sys.executable, "-c", INDEPENDENT_CALLS], check=True, timeout=120)
 
 
 TWO_DEVICES = """

@@ -132,6 +132,13 @@ def test_packages_import_only_the_libraries_of_their_subject():
             assert not names, file
 
 
+def test_only_jax_package_calls_lapack():
+    """Batches of LAPACK calls can deadlock; `_jax/batched_lapack.py` has the safe forms."""
+    calls = re.compile(r"(jnp|lax|scipy)\.linalg(?!\.norm)")
+    users = [file for file in FILES if calls.search((ROOT / f"{file}.py").read_text())]
+    assert users == ["_jax/batched_lapack"]
+
+
 def test_each_package_has_several_files():
     assert {package(file) for file in FILES} == set(ORDER)
     for name in ORDER:
