@@ -1,6 +1,7 @@
 """Guesses: motions from which a solver starts."""
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -8,17 +9,18 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from svkc._jax.eager import eager_jit
 from svkc.model.chain import Chain, State
 from svkc.model.validation import finite_array
 from svkc.optimize.controls import AbstractControls
 from svkc.optimize.equations import equations_of_motion
-from svkc.optimize.loop_rows import LinkRows, candidate_rows, gaps_at, rates_at
+from svkc.optimize.loop_rows import LinkRows
 from svkc.optimize.phases import Phase
 from svkc.optimize.points import full_configuration, full_velocity
 from svkc.optimize.schemes import Radau
-from svkc.optimize.structures import links_here
+from svkc.optimize.structures import candidate_rows, gaps_and_jacobian, links_here
 from svkc.transitions.initial_state import full_vector
 from svkc.tree.configuration import difference, integrate
 
@@ -143,14 +145,9 @@ def close_loops(chain: Chain, q: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """
     table = LinkRows.of(chain, rows)
 
-    @jax.jit
-    def linearize(q):
-        rates = lambda v: rates_at(chain, q, v, table)
-        return gaps_at(chain, q, table), jax.jacfwd(rates)(jnp.zeros(chain.nv, q.dtype))
-
     moved, gaps = jnp.asarray(q), np.zeros(0)
     for _ in range(_STEPS):
-        gaps, J = (np.asarray(x) for x in linearize(moved))
+        gaps, J = (np.asarray(x) for x in gaps_and_jacobian(chain, moved, table))
         if np.max(np.abs(gaps)) < _CLOSED:
             break
         step = np.linalg.lstsq(J, -gaps, rcond=1e-6)[0]
@@ -158,6 +155,18 @@ def close_loops(chain: Chain, q: np.ndarray, rows: np.ndarray) -> np.ndarray:
         full = full_velocity(chain, jnp.asarray(step))
         moved = integrate(chain, full_configuration(chain, moved), full)[: chain.nq]
     return np.asarray(moved) if np.max(np.abs(gaps)) < _NEARLY_CLOSED else q
+
+
+@functools.partial(eager_jit, jit=eqx.filter_jit)
+def _balance(chain: Chain, table: LinkRows, q: Float[Array, "nodes nq"]) -> tuple[Array, Array]:
+    """Return, at each node, the generalized forces [nv] of the weight, and the links' Jacobian."""
+    zero, tau, f = jnp.zeros(chain.nv), jnp.zeros(chain.dofs), jnp.zeros(len(table))
+
+    def at_node(q):
+        weight = equations_of_motion(chain, table, q, zero, zero, tau=tau, f=f)[0]
+        return weight, gaps_and_jacobian(chain, q, table)[1]
+
+    return jax.vmap(at_node)(q)
 
 
 def static_forces(
@@ -174,14 +183,8 @@ def static_forces(
     rows = candidate_rows(chain, np.isin(chain.link_names, connected))
     if not len(rows):
         return out
-    table, zero = LinkRows.of(chain, rows), jnp.zeros(chain.nv)
-
-    def balance(q):
-        tau, f = jnp.zeros(chain.dofs), jnp.zeros(len(rows))
-        weight = equations_of_motion(chain, table, q, zero, zero, tau=tau, f=f)[0]
-        return weight, jax.jacfwd(lambda v: rates_at(chain, q, v, table))(zero)
-
-    weight, J = (np.asarray(x) for x in eager_jit(jax.vmap(balance))(jnp.asarray(q)))
+    balance = _balance(chain, LinkRows.of(chain, rows), jnp.asarray(q))
+    weight, J = (np.asarray(x) for x in balance)
     for i in range(len(q)):
         out[i, rows] = np.linalg.lstsq(J[i][:, ~driven].T, weight[i][~driven], rcond=1e-6)[0]
     return out

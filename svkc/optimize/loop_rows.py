@@ -33,6 +33,8 @@ from svkc.tree.spatial import (
 class LinkRows:
     """Selected constraint rows of virtual links, with the static data of these links.
 
+    Tables with equal contents are equal, so that functions compiled for one serve the others.
+
     rows: of link i, the candidate rows are 6 i ... 6 i + 5.
     links: indices of the virtual links that have selected rows.
     parent, real: of each of `links`, the rows of the tree of its two bodies.
@@ -44,6 +46,15 @@ class LinkRows:
     parent: np.ndarray
     real: np.ndarray
     freedoms: tuple[tuple[bool, ...], ...]
+
+    def _key(self) -> tuple:
+        return self.rows.tobytes(), self.parent.tobytes(), self.real.tobytes(), self.freedoms
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, LinkRows) and self._key() == other._key()
+
+    def __hash__(self) -> int:
+        return hash(self._key())
 
     @classmethod
     def of(cls, chain: Chain, rows: np.ndarray) -> "LinkRows":
@@ -282,12 +293,3 @@ def link_torque(
     poses, i = link_poses(chain, kinematics(chain, q), table), np.searchsorted(table.links, link)
     torque = _torque(poses.quat[i], table.freedoms[i], _six_rows(table, multipliers)[i, :3])
     return quat_rotate(chain.structure.quat[link], torque)
-
-
-def candidate_rows(chain: Chain, links: np.ndarray) -> np.ndarray:
-    """Return the indices of the rows of links that are not along a freedom of the joint.
-
-    links: mask of the virtual links. A joint with two free rotations keeps its third rotation row.
-    """
-    free = np.array(chain.topology.link_freedoms, bool).reshape(-1, 6)
-    return np.flatnonzero((~free & np.asarray(links, bool)[:, None]).ravel())

@@ -95,6 +95,10 @@ def _velocity_from_rate(chain: Chain, q, rate) -> Float[Array, " dofs"]:
     return static_take(jnp.concatenate([static_take(rate, scalar_q), w.ravel()]), order)
 
 
+class AbsentAtStartError(ValueError):
+    """Raised where a function reads a quantity that a point at the start of a phase lacks."""
+
+
 class Point:
     """One time of a motion: the argument of costs and constraints.
 
@@ -210,7 +214,7 @@ class Point:
     def _refuse_at_start(self, name: str) -> None:
         """Raise ValueError at the start of a phase. name: what the point does not have there."""
         if self._at_start:
-            raise ValueError(
+            raise AbsentAtStartError(
                 f"{name}: a point at the start of a phase has none; use `path`, or `end`"
             )
 

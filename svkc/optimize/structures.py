@@ -1,19 +1,40 @@
 """The structure of each phase, and which rows of its links are independent constraints."""
 
+import functools
 from collections.abc import Sequence
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
+from svkc._jax.eager import eager_jit
 from svkc.loops.pivoting import rank_tolerance
 from svkc.model.chain import Chain
 from svkc.model.names import connection_mask, link_index
-from svkc.optimize.loop_rows import LinkRows, candidate_rows, rates_at
+from svkc.optimize.loop_rows import LinkRows, gaps_at, rates_at
 from svkc.optimize.phases import Phase
 from svkc.optimize.points import PhaseStructure, full_configuration
 from svkc.transitions.newton import decide_rank
+
+
+def candidate_rows(chain: Chain, links: np.ndarray) -> np.ndarray:
+    """Return the indices of the rows of links that are not along a freedom of the joint.
+
+    links: mask of the virtual links. A joint with two free rotations keeps its third rotation row.
+    """
+    free = np.array(chain.topology.link_freedoms, bool).reshape(-1, 6)
+    return np.flatnonzero((~free & np.asarray(links, bool)[:, None]).ravel())
+
+
+@functools.partial(eager_jit, jit=eqx.filter_jit)
+def gaps_and_jacobian(
+    chain: Chain, q: Float[Array, " nq"], table: LinkRows
+) -> tuple[Float[Array, " rows"], Float[Array, "rows nv"]]:
+    """Return the gaps (m, rad) of links' rows, and the rows' derivatives by velocities."""
+    rates = lambda v: rates_at(chain, q, v, table)
+    return gaps_at(chain, q, table), jax.jacfwd(rates)(jnp.zeros(chain.nv, q.dtype))
 
 
 def independent_rows(
@@ -30,12 +51,9 @@ def independent_rows(
         return candidates
     table = LinkRows.of(chain, candidates)
     scale = np.where(candidates % 6 < 3, 1.0, 1 / float(chain.length))
-    matrix = jax.jit(
-        lambda q: jax.jacfwd(lambda v: rates_at(chain, q, v, table))(jnp.zeros(chain.nv))
-    )
     best = np.zeros(0, int)
     for pose in q:
-        J = np.asarray(matrix(jnp.asarray(pose))) * scale[:, None]
+        J = np.asarray(gaps_and_jacobian(chain, jnp.asarray(pose), table)[1]) * scale[:, None]
         rows = _pivoted_rows(J, np.isin(candidates, preferred))
         best = candidates[rows] if len(rows) > len(best) else best
     return np.sort(best)

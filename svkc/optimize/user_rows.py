@@ -14,7 +14,7 @@ from svkc.optimize.blocks import MANY_LANES, StageBlock, find_nonlinear_variable
 from svkc.optimize.equations import Params, point_of_stage
 from svkc.optimize.lift import polynomials
 from svkc.optimize.phases import Constraint
-from svkc.optimize.points import Point
+from svkc.optimize.points import AbsentAtStartError, Point
 from svkc.optimize.transcription import Transcription, join_lanes, normalized_times
 
 
@@ -106,11 +106,11 @@ class UserRows:
     def _holds_at_start(self, i: int, entry: Constraint) -> bool:
         """Return whether a path constraint can be evaluated at the start of phase i.
 
-        Points there have no accelerations and no forces of links, and raise ValueError for them.
+        Points there have no accelerations and no forces of links.
         """
         try:
             self._shapes(i, [entry], at_start=True)
-        except ValueError:
+        except AbsentAtStartError:
             return False
         return True
 

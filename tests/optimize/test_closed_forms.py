@@ -11,7 +11,8 @@ from svkc.optimize.closed_forms import StageDerivatives
 from svkc.optimize.controls import Torques
 from svkc.optimize.equations import IntervalData, Model, Params, stage_equations
 from svkc.optimize.lift import Layout, motion_hessian_pattern
-from svkc.optimize.loop_rows import LinkRows, candidate_rows
+from svkc.optimize.loop_rows import LinkRows
+from svkc.optimize.structures import candidate_rows
 
 # an issue of sums in another order
 ROUND_OFF = 1e-12

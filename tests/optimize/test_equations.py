@@ -21,13 +21,13 @@ from svkc.optimize.equations import (
 from svkc.optimize.lift import Layout
 from svkc.optimize.loop_rows import (
     LinkRows,
-    candidate_rows,
     gaps_at,
     link_force,
     link_torque,
     rates_at,
 )
 from svkc.optimize.points import full_state
+from svkc.optimize.structures import candidate_rows
 
 # MuJoCo warns so of gymnasium's half_cheetah.xml
 pytestmark = pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass' is deprecated")

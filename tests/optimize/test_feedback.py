@@ -11,7 +11,8 @@ import svkc
 from svkc import optimize
 from svkc.optimize.feedback import EFFORT, error_units, growth, riccati_gains
 from svkc.optimize.linearization import linear_maps
-from svkc.optimize.loop_rows import LinkRows, candidate_rows, rates_at
+from svkc.optimize.loop_rows import LinkRows, rates_at
+from svkc.optimize.structures import candidate_rows
 
 INVERTED = (
     '<mujoco><worldbody><body name="rod"><joint name="pivot" axis="0 1 0"/><geom type="capsule"'
