@@ -1,4 +1,4 @@
-"""Derivatives of a stage's rows and of a connection in closed form, for trees of hinges and slides.
+"""Derivatives of the rows of stages and of nodes in closed form, for trees of hinges and slides.
 
 They need a thirtieth of the operations of automatic differentiation.
 """
@@ -195,7 +195,33 @@ class StageDerivatives(LinkDerivatives):
         return gradient, controls, blocks, by_f
 
 
-class ConnectionDerivatives(LinkDerivatives):
+class NodeDerivatives(LinkDerivatives):
+    """Derivatives of a function of nodes at its unknowns y, of which q is the first."""
+
+    def _gaps_and_rates(self, gaps, rates) -> tuple[Array, Array]:
+        """Return the second derivatives by q and q, and by q and v, of rows times multipliers.
+
+        gaps, rates: multipliers of the gaps and of the gap rates.
+        """
+        none, nothing = jnp.zeros_like(gaps), jnp.zeros(self.chain.nv)
+        of_gaps, _ = self._of_links(gaps, none, nothing)
+        of_rates, _ = self._of_links(rates, none, nothing)
+        return of_gaps[3] + of_rates[1] / 2, of_rates[3]
+
+    def _force(self, f, virtual) -> tuple[Array, Array]:
+        """Return the second derivatives of virtual . J^T f by q and q, and by q and f."""
+        of_force, by_f = self._of_links(jnp.zeros_like(f), f, -virtual)
+        return of_force[0], jnp.where(self.active[:, None], by_f, 0).T
+
+
+def _symmetric(first: Float[Array, "nv y"]) -> Float[Array, "y y"]:
+    """Return a symmetric matrix from its first rows; both indices of other entries are below."""
+    nv, size = first.shape
+    below = jnp.concatenate([first[:, nv:].T, jnp.zeros((size - nv, size - nv))], 1)
+    return jnp.concatenate([first, below])
+
+
+class ConnectionDerivatives(NodeDerivatives):
     """Derivatives of `connection` at its unknowns y."""
 
     def __init__(self, model: Model, params: Params, data: IntervalData, y: Float[Array, " y"]):
@@ -228,14 +254,44 @@ class ConnectionDerivatives(LinkDerivatives):
         """Return the second derivatives of the function multipliers . rows."""
         count = len(self.f)
         gaps, rates, momentum = jnp.split(multipliers, [count, 2 * count])
-        none = jnp.zeros_like(gaps)
-        _, (qq, _, _, of_mass) = self.tree.hessian(momentum)
-        of_gaps, _ = self._of_links(gaps, none, momentum)
-        of_rates, _ = self._of_links(rates, none, momentum)
-        of_force, by_f = self._of_links(none, self.f, momentum)
-        by_f = jnp.where(self.active[:, None], by_f, 0)
-        qq = qq + of_gaps[3] + of_rates[1] / 2 + of_force[0]
-        first = jnp.concatenate([qq, of_mass + of_rates[3], -of_mass, by_f.T], 1)
-        nv, size = first.shape
-        below = jnp.concatenate([first[:, nv:].T, jnp.zeros((size - nv, size - nv))], 1)
-        return jnp.concatenate([first, below])
+        _, (of_momentum, _, _, of_mass) = self.tree.hessian(momentum)
+        of_rows, of_rates = self._gaps_and_rates(gaps, rates)
+        of_force, by_f = self._force(self.f, -momentum)
+        qq = of_momentum + of_rows + of_force
+        return _symmetric(jnp.concatenate([qq, of_mass + of_rates, -of_mass, by_f], 1))
+
+
+class ProjectionDerivatives(NodeDerivatives):
+    """Derivatives of `projection` at its unknowns y."""
+
+    def __init__(self, model: Model, params: Params, data: IntervalData, y: Float[Array, " y"]):
+        nv, n = model.layout.nv, len(model.rows)
+        q, v, of_q, of_v = jnp.split(y, [nv, 2 * nv, 2 * nv + n])
+        self.of_v: Float[Array, " rows"] = jnp.where(data.active, of_v, 0)
+        none = jnp.zeros_like(q)
+        super().__init__(model, params.chain, data.active, q=q, v=v, vdot=none, f=of_q)
+
+    def jacobian(self) -> Float[Array, "equations y"]:
+        """Return the derivatives of the rows by y."""
+        rates = self._over_rows([rows.rates() for _, rows in self.links])
+        of_rates = self._over_rows([rows.jacobian()[:, 1] / 2 for _, rows in self.links])
+        by_f = jnp.where(self.active[None], rates.T, 0)
+        none, square = jnp.zeros_like(by_f), jnp.zeros((len(rates),) * 2)
+        zero = jnp.zeros((self.chain.nv,) * 2)
+        parts = [
+            [self._stiffness(self.f), zero, by_f, none],
+            [self._stiffness(self.of_v), zero, none, by_f],
+            [rates, none.T, square, square],
+            [of_rates, rates, square, square],
+        ]
+        return jnp.concatenate([jnp.concatenate(x, 1) for x in parts])
+
+    def hessian(self, multipliers: Float[Array, " equations"]) -> Float[Array, "y y"]:
+        """Return the second derivatives of the function multipliers . rows."""
+        nv, count = self.chain.nv, len(self.f)
+        of_q, of_v, gaps, rates = jnp.split(multipliers, [nv, 2 * nv, 2 * nv + count])
+        of_rows, of_rates = self._gaps_and_rates(gaps, rates)
+        first, by_q = self._force(self.f, of_q)
+        second, by_v = self._force(self.of_v, of_v)
+        qq = of_rows + first + second
+        return _symmetric(jnp.concatenate([qq, of_rates, by_q, by_v], 1))

@@ -1,17 +1,31 @@
-"""Row blocks whose derivatives are in closed form: stages' equations of motion, and connections."""
+"""Row blocks with derivatives in closed form: equations of motion, connections, projections."""
 
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from svkc.optimize.blocks import Multipliers, PlainBlock, StageBlock, Unknowns, lower_half
-from svkc.optimize.closed_forms import ConnectionDerivatives, StageDerivatives
-from svkc.optimize.equations import Model, connection, stage_equations
+from svkc._jax.lanes_last import with_lanes_last
+from svkc.optimize.blocks import (
+    MANY_LANES,
+    Multipliers,
+    PlainBlock,
+    StageBlock,
+    Unknowns,
+    lower_half,
+)
+from svkc.optimize.closed_forms import (
+    ConnectionDerivatives,
+    ProjectionDerivatives,
+    StageDerivatives,
+)
+from svkc.optimize.equations import Model, connection, projection, stage_equations
 from svkc.optimize.lift import Lift, StagePolynomials, motion_hessian_pattern
+
+DerivativesOfNode: TypeAlias = ConnectionDerivatives | ProjectionDerivatives
 
 
 class MotionBlock(StageBlock):
@@ -59,7 +73,7 @@ class NodeBlock(PlainBlock):
         self,
         model: Model,
         function: Callable[..., jax.Array],
-        derivatives: type[ConnectionDerivatives],
+        derivatives: type[DerivativesOfNode],
         *args: Any,
     ):
         super().__init__(functools.partial(function, model), *args)
@@ -67,19 +81,27 @@ class NodeBlock(PlainBlock):
         self.derivatives = derivatives
 
     def jacobian(self, params: Any, data: Any, z: Unknowns) -> jax.Array:
-        def at_lane(data, z):
+        def at_lane(params, data, z):
             return self.derivatives(self.model, params, data, z).jacobian().ravel()
 
-        return jax.vmap(at_lane)(data, z)
+        return self._over(at_lane, params, data, z)
 
     def hessian(self, params: Any, data: Any, z: Unknowns, multipliers: Multipliers) -> jax.Array:
-        def at_lane(data, z, m):
+        def at_lane(params, data, z, m):
             return lower_half(self.derivatives(self.model, params, data, z).hessian(m))
 
-        return jax.vmap(at_lane)(data, z, multipliers)
+        return self._over(at_lane, params, data, z, multipliers)
+
+    @staticmethod
+    def _over(at_lane: Callable, params: Any, data: Any, z: Unknowns, *arrays) -> jax.Array:
+        """Return at_lane(params, data, z, ...) over lanes."""
+        if len(z) >= MANY_LANES:
+            at_lane = with_lanes_last(at_lane)
+        return jax.vmap(at_lane, (None, 0, 0, *(0 for _ in arrays)))(params, data, z, *arrays)
 
 
 # class of the derivatives of each function of nodes that has closed forms
-CLOSED_FORMS: dict[Callable[..., jax.Array], type[ConnectionDerivatives]] = {
-    connection: ConnectionDerivatives
+CLOSED_FORMS: dict[Callable[..., jax.Array], type[DerivativesOfNode]] = {
+    connection: ConnectionDerivatives,
+    projection: ProjectionDerivatives,
 }

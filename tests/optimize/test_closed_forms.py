@@ -1,5 +1,7 @@
 """Derivatives of the equations of motion in closed form against automatic differentiation."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import models
@@ -9,9 +11,16 @@ import pytest
 import svkc
 from svkc.optimize.closed_forms import StageDerivatives
 from svkc.optimize.controls import Torques
-from svkc.optimize.equations import IntervalData, Model, Params, stage_equations
+from svkc.optimize.equations import (
+    IntervalData,
+    Model,
+    Params,
+    connection,
+    stage_equations,
+)
 from svkc.optimize.lift import Layout, motion_hessian_pattern
 from svkc.optimize.loop_rows import LinkRows
+from svkc.optimize.motion_block import CLOSED_FORMS
 from svkc.optimize.structures import candidate_rows
 
 # an issue of sums in another order
@@ -32,7 +41,7 @@ def linked_trees(joint: str, parent: str, real: str) -> svkc.Chain:
     return svkc.load(text, virtual_links=[svkc.VirtualLink("grip", parent, real, joint, **PLACES)])
 
 
-@pytest.mark.parametrize(
+LINKS = pytest.mark.parametrize(
     ("joint", "parent", "real"),
     [
         ("weld", "b5", "last"),
@@ -42,9 +51,10 @@ def linked_trees(joint: str, parent: str, real: str) -> svkc.Chain:
         ("slide", "b3", "last"),
     ],
 )
-def test_derivatives_of_a_stage(joint, parent, real):
-    """First derivatives and those of a sum of all rows, in every variable of the stage."""
-    chain, random = linked_trees(joint, parent, real), np.random.default_rng(0)
+
+
+def equations_of(chain: svkc.Chain) -> tuple[Model, Params, IntervalData]:
+    """Return the static part, the parameters and the data of equations with a chain's only link."""
     table = LinkRows.of(chain, candidate_rows(chain, np.array([True])))
     controls = Torques().for_chain(chain)
     layout = Layout(
@@ -55,13 +65,26 @@ def test_derivatives_of_a_stage(joint, parent, real):
         blocks=2,
         stage_blocks=1,
     )
-    model, params = Model(layout, table, controls), Params(chain, None)
-    structure = chain.state(connected=()).structure
     active = np.ones(len(table), bool)
     data = IntervalData(
         reference=jnp.zeros(chain.nq), next_reference=jnp.zeros(chain.nq), active=active,
-        structure=structure,
+        structure=chain.state(connected=()).structure,
     )  # fmt: skip
+    return Model(layout, table, controls), Params(chain, None), data
+
+
+def close(x, y, scale=None):
+    """Check that two arrays differ by round-off of the largest entry of y, or of `scale`."""
+    scale = np.abs(y if scale is None else scale).max()
+    np.testing.assert_allclose(x, y, rtol=0, atol=ROUND_OFF * scale)
+
+
+@LINKS
+def test_derivatives_of_a_stage(joint, parent, real):
+    """First derivatives and those of a sum of all rows, in every variable of the stage."""
+    chain, random = linked_trees(joint, parent, real), np.random.default_rng(0)
+    model, params, data = equations_of(chain)
+    layout, table = model.layout, model.rows
     y = jnp.asarray(random.normal(size=layout.stage_size))
     multipliers = jnp.asarray(random.normal(size=chain.nv + len(table)))
     rows = lambda y: stage_equations(model, params, data, 1.0, y)
@@ -76,10 +99,6 @@ def test_derivatives_of_a_stage(joint, parent, real):
     J, (of_motion, of_controls, blocks, by_f), (J_ad, gradient, H) = both(y)
     nv, n = chain.nv, len(table)
 
-    def close(x, y, scale=None):
-        scale = np.abs(y if scale is None else scale).max()
-        np.testing.assert_allclose(x, y, rtol=0, atol=ROUND_OFF * scale)
-
     close(J, J_ad)
     close(np.concatenate([of_motion.ravel(), of_controls.ravel()]), gradient[2:-n])
     qq, qv, vv, qa = blocks
@@ -92,6 +111,32 @@ def test_derivatives_of_a_stage(joint, parent, real):
     expected[:, 2 : 2 + nv] = by_f
     close(expected[:, :-n], H[-n:, :-n], scale=H)
     assert not np.any(H[-n:, -n:])
+
+
+@pytest.mark.parametrize("function", CLOSED_FORMS)
+@LINKS
+def test_derivatives_of_a_node(function, joint, parent, real):
+    """First derivatives of a connection and of a projection, and those of a sum of all rows."""
+    chain, random = linked_trees(joint, parent, real), np.random.default_rng(1)
+    model, params, data = equations_of(chain)
+    # one row is not a constraint in the phase
+    data = dataclasses.replace(data, active=np.arange(len(model.rows)) > 0)
+    nv, n = chain.nv, len(model.rows)
+    y = jnp.asarray(random.normal(size=3 * nv + n if function is connection else 2 * nv + 2 * n))
+    multipliers = jnp.asarray(
+        random.normal(size=(nv if function is connection else 2 * nv) + 2 * n)
+    )
+    rows = lambda y: function(model, params, data, y)
+
+    @jax.jit
+    def both(y):
+        own = CLOSED_FORMS[function](model, params, data, y)
+        by_autodiff = jax.jacfwd(rows)(y), jax.hessian(lambda y: rows(y) @ multipliers)(y)
+        return own.jacobian(), own.hessian(multipliers), by_autodiff
+
+    J, H, (J_ad, H_ad) = both(y)
+    close(J, J_ad)
+    close(H, H_ad)
 
 
 def test_entries_of_the_hessian_are_there_once():
