@@ -32,6 +32,8 @@ RESULTS = pathlib.Path(__file__).parent / "results"
 SOLVER = optimize.Ipopt(tolerance=1e-6)
 TOLERANCE = 1e-3
 ROUNDS = 8
+# of each noisy start: one that needs more would delay the others
+MOST_ITERATIONS = 500
 
 
 def write(name: str, rows: list[dict]) -> None:
@@ -88,7 +90,8 @@ def starts(count: int, processes: int) -> None:
     problem = backflip_problem(backflip()[0])
     guesses = [backflip_guess(problem, noise=0.2, key=key) for key in range(count)]
     begin = time.perf_counter()
-    solutions = problem.multistart(guesses, processes=processes, solver=SOLVER)
+    solver = optimize.Ipopt(tolerance=1e-6, max_iterations=MOST_ITERATIONS)
+    solutions = problem.multistart(guesses, processes=processes, solver=solver)
     wall = time.perf_counter() - begin
     rows = [
         {
