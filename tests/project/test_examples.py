@@ -37,6 +37,7 @@ EXAMPLES = {
     "07_identify": ("derivatives at the start", "derivatives at the end"),
     "09_backflip": ("landing", "largest defects of the intervals"),
     "10_hopper": ("landing", "largest defects of the intervals"),
+    "11_giant_swing": ("catch", "largest defects of the intervals"),
 }
 
 
