@@ -26,6 +26,7 @@ chain = giant_swing()
 between, turn = optimize.between, 2 * np.pi
 names = {name: [f"{side}_{name}" for side in SIDES] for name in JOINTS}
 motors = {joint: JOINTS[name][2] for name, pair in names.items() for joint in pair}
+driven = np.array([chain.v_index(joint).start for joint in motors])
 bounds = [between(pair, *np.radians(JOINTS[name][:2])) for name, pair in names.items()]
 bounds += [between(["roll", "yaw"], -1, 1), between(list(motors), -15, 15, of="velocity")]
 
@@ -37,8 +38,8 @@ def distance(p):
 
 
 def running(p):
-    """Return the running cost of torques and of velocities."""
-    return jnp.sum((p.u / 100) ** 2) + 0.01 * jnp.sum(p.state.v[6 : p.chain.nv] ** 2)
+    """Return the running cost of torques and of joint velocities."""
+    return jnp.sum((p.u / 100) ** 2) + 0.01 * jnp.sum(p.state.v[driven] ** 2)
 
 
 # with both hands on the bar, these velocities determine all others
