@@ -63,7 +63,7 @@ problem = optimize.Problem(
     chain, phases, controls=optimize.Torques(motors), running=running, bounds=bounds
 )
 guess = problem.guess([hanging(angle) for angle in (2.6, 0.8, -1.2, -2.0, -2.8, -3.34)])
-motion = problem.solve(guess, solver=optimize.Ipopt(tolerance=1e-5, max_seconds=120))
+motion = problem.solve(guess, solver=optimize.Ipopt(tolerance=1e-5))
 print(motion)
 print(motion.report())
 

@@ -86,8 +86,8 @@ def batched_solve_triangular(
 ) -> Float[Array, "n *m"]:
     """Return A^-1 x, or A^-T x if `trans`, for a triangular A.
 
-    Only the triangle named by `lower` is read, without its diagonal if `unit`: that is then ones.
-    There is no derivative rule: use this function as the `solve` of a `custom_linear_solve`.
+    Only the triangle named by `lower` is read. If `unit`, its diagonal is taken as ones. There is
+    no derivative rule: use this function as the `solve` of a `custom_linear_solve`.
     """
     solver, columns = _triangular_solver(lower, trans, unit), x.reshape(len(x), -1)
     solve = functools.partial(solver, A)
@@ -145,7 +145,8 @@ def factor_general(
 
 def solve_factored(lu: Float[Array, "n n"], order: Int[Array, " n"], x: Float[Array, "n *m"]):
     """Return A^-1 x from the factors of A."""
-    return batched_solve_triangular(lu, batched_solve_triangular(lu, x[order], False, True, True))
+    below = batched_solve_triangular(lu, x[order], lower=True, unit=True)
+    return batched_solve_triangular(lu, below)
 
 
 def solve_general(A: Float[Array, "n n"], x: Float[Array, "n *m"]) -> Float[Array, "n *m"]:

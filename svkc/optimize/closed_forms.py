@@ -215,7 +215,7 @@ class NodeDerivatives(LinkDerivatives):
 
 
 def _symmetric(first: Float[Array, "nv y"]) -> Float[Array, "y y"]:
-    """Return a symmetric matrix from its first rows; both indices of other entries are below."""
+    """Return a symmetric matrix that is zero outside its first rows and columns."""
     nv, size = first.shape
     below = jnp.concatenate([first[:, nv:].T, jnp.zeros((size - nv, size - nv))], 1)
     return jnp.concatenate([first, below])

@@ -7,16 +7,8 @@ import numpy as np
 from svkc.mjcf.load import load
 from svkc.model.annotations import Scalar
 from svkc.model.chain import Chain
-from svkc.scenes.figure import (
-    ARM_LENGTH,
-    BAR_HEIGHT,
-    HALF_SHOULDER_WIDTH,
-    add_rod,
-    figure16,
-    hand_on_bar,
-    hanging_pose,
-)
-from svkc.scenes.high_bar import HALF_GRIP_WIDTH
+from svkc.scenes.figure import BAR_HEIGHT, add_rod, figure16, hand_on_bar
+from svkc.scenes.high_bar import HALF_GRIP_WIDTH, stretched_pose
 
 SIDES = ("right", "left")
 # bounds (degrees) and largest torque (N m) of the joints of each side
@@ -60,11 +52,5 @@ def hanging(angle: Scalar) -> dict[str, Any]:
 
     angle: rotation of the figure about the bar (rad): 0 hangs, pi is a handstand.
     """
-    abduction = np.arcsin((HALF_GRIP_WIDTH - HALF_SHOULDER_WIDTH) / ARM_LENGTH)
-    x, _, z, *_ = hanging_pose(ARM_LENGTH * np.cos(abduction), float(angle))
-    of_side = {
-        "shoulder_flexion": np.pi - 0.1, "shoulder_abduction": abduction, "wrist": -abduction,
-        "elbow": 0.1, "knee": 0.1, "hip_flexion": 0.1, "ankle": -0.5,
-    }  # fmt: skip
-    of_joints = {f"{side}_{name}": value for side in SIDES for name, value in of_side.items()}
-    return {"x": x, "z": z, "pitch": angle, **of_joints}
+    base, joints = stretched_pose(float(angle))
+    return {"x": base[0], "z": base[2], "pitch": angle, **joints}

@@ -47,10 +47,19 @@ def hanging_state(chain: Chain, angle: float) -> State:
     chain: the chain of `high_bar`.
     angle: rotation of the figure about the bar (rad). Positive angles move the hips backwards.
     """
+    base, joints = stretched_pose(angle)
+    return chain.state({"base": base, **joints}, hold=False)
+
+
+def stretched_pose(angle: float) -> tuple[list[float], dict[str, Any]]:
+    """Return position (m) and quaternion of the base, and the joint angles, of `hanging_state`.
+
+    angle: as of `hanging_state`.
+    """
     abduction = np.arcsin((HALF_GRIP_WIDTH - HALF_SHOULDER_WIDTH) / ARM_LENGTH)
-    q = {"base": hanging_pose(ARM_LENGTH * np.cos(abduction), angle)}
+    joints = {}
     for side in ("right", "left"):
-        q |= {
+        joints |= {
             f"{side}_shoulder_flexion": np.pi - 0.1,
             f"{side}_shoulder_abduction": abduction,
             f"{side}_wrist": -abduction,
@@ -59,4 +68,4 @@ def hanging_state(chain: Chain, angle: float) -> State:
             f"{side}_hip_flexion": 0.1,
             f"{side}_ankle": -0.5,
         }
-    return chain.state(q, hold=False)
+    return hanging_pose(ARM_LENGTH * np.cos(abduction), angle), joints
