@@ -12,13 +12,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from svkc._jax.control_flow import buffer_at_set, while_loop
+from svkc._jax.control_flow import while_loop
 from svkc._jax.pytrees import tree_where
 from svkc.integration.dense_output import ProjectedInterpolation, make_interpolation
 from svkc.integration.event_location import EventSearch, event_info
 from svkc.integration.guard_scan import locate_event
 from svkc.integration.near_singular import redone_if_near, with_rows_of_projection
 from svkc.integration.ode import ODEState, Times, is_finite, rms_norm
+from svkc.integration.runge_kutta import increments_of_stages, initial_records
 from svkc.integration.solution import (
     EVENT,
     LOOP_OPEN,
@@ -34,6 +35,7 @@ from svkc.integration.solution import (
     update_stats,
 )
 from svkc.integration.stabilization import needs_projection
+from svkc.integration.step_buffers import write_record, write_row, write_states
 from svkc.integration.step_size import (
     clip_step,
     unclipped_step_size,
@@ -63,7 +65,7 @@ def integrate_phase(
         cond_fun,
         lambda s: _body_fun(s, times, problem, options),
         _init_stepper(start, times, problem, options),
-        buffers=lambda s: (s.step_ts, s.step_near, s.checkpoints, s.ys),
+        buffers=lambda s: (s.step_ts, s.step_near, s.checkpoints, s.records, s.ys),
         kind="lax",
     )
     options.progress_meter.close(end.progress_meter_state)
@@ -85,6 +87,7 @@ def integrate_phase(
         step_ts=end.step_ts,
         step_near=end.step_near,
         checkpoints=end.checkpoints,
+        records=end.records,
         accepted=end.accepted,
         rejected=end.rejected,
         result=result.astype(jnp.int32),
@@ -132,6 +135,7 @@ def _init_stepper(
         step_ts=jnp.full(options.max_steps, jnp.inf, t0.dtype),
         step_near=None if near is None else jnp.zeros(options.max_steps, bool),
         checkpoints=rows(options.max_steps // options.checkpoint_interval),
+        records=initial_records(options.solver, field_args, start, options.record_capacity),
         ys=rows(save_ts.shape[0]),
         accepted=zero,
         rejected=zero,
@@ -192,6 +196,7 @@ def _attempt_step(
         error_norm=jnp.asarray(jnp.inf, t.dtype) if error is None else rms_norm(error),
         projection_info=info,
         interpolation=_interpolation((s.t, t1), dense_info, y, y_solver, options),
+        increments=increments_of_stages(options.solver, dense_info),
     )
 
 
@@ -215,24 +220,6 @@ def _interpolation(
     return make_interpolation(cls, t0=step[0], t1=step[1], inner=dense_info, shift=shift)
 
 
-def _write_states(
-    s: StepperState, attempt: StepAttempt, t, save_ts, accepted, interval: int
-) -> tuple[ODEState, ODEState]:
-    """Write the state after an attempt into the saved states and the checkpoints it belongs to.
-
-    t, accepted: time and number of accepted steps after the attempt.
-    interval: number of steps between checkpoints.
-    """
-    ys, checkpoints = s.ys, s.checkpoints
-    if save_ts.shape[0]:
-        i = jnp.minimum(jnp.sum(save_ts < t, dtype=jnp.int32), save_ts.shape[0] - 1)
-        ys = _write_row(ys, i, attempt.y, attempt.keep_step & (save_ts[i] == t))
-    if checkpoints.q.shape[0]:
-        is_checkpoint = attempt.keep_step & (accepted % interval == 0)
-        checkpoints = _write_row(checkpoints, accepted // interval - 1, attempt.y, is_checkpoint)
-    return ys, checkpoints
-
-
 def _body_fun(
     s: StepperState, times, problem: PhaseProblem, options: StepperOptions
 ) -> StepperState:
@@ -252,7 +239,7 @@ def _body_fun(
     if_advancing = lambda new, old: tree_where(attempt.keep_step, new, old)
     unless_held = lambda new, old: tree_where(hold, old, new)
     t, accepted = if_advancing(attempt.t, s.t), s.accepted + attempt.keep_step.astype(jnp.int32)
-    ys, checkpoints = _write_states(s, attempt, t, save_ts, accepted, options.checkpoint_interval)
+    ys, checkpoints = write_states(s, attempt, t, save_ts, accepted, options.checkpoint_interval)
     result = unless_held(attempt.result, s.result)
     progress = (t - t0) / jnp.where(stop > t0, stop - t0, 1)
     return StepperState(
@@ -272,18 +259,12 @@ def _body_fun(
         progress_meter_state=options.progress_meter.step(s.progress_meter_state, progress),
         search=search,
         near=near,
-        step_ts=_write_row(s.step_ts, s.accepted, t, attempt.keep_step),
-        step_near=_write_row(s.step_near, s.accepted, s.near, attempt.keep_step),
+        step_ts=write_row(s.step_ts, s.accepted, t, attempt.keep_step),
+        step_near=write_row(s.step_near, s.accepted, s.near, attempt.keep_step),
         checkpoints=checkpoints,
+        records=write_record(s, attempt, problem, options.record_capacity),
         ys=ys,
         accepted=accepted,
         rejected=s.rejected + rejected.astype(jnp.int32),
         stats=update_stats(s, attempt, result, problem.field_args),
     )
-
-
-def _write_row(rows, i, row, pred):
-    """Write a row at index i in place where `pred` holds."""
-    # The index of a row that is not written may be out of bounds.
-    i = jnp.where(pred, i, 0)
-    return jax.tree.map(lambda x, b: buffer_at_set(b, i, x, pred=pred), row, rows)

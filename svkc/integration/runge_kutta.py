@@ -1,5 +1,6 @@
-"""Single steps of a solver, in the form that is differentiated."""
+"""Single steps of a solver and their derivatives."""
 
+import dataclasses
 from typing import Any, ClassVar
 
 import diffrax
@@ -7,9 +8,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from svkc.integration.ode import FieldArgs, ODEState
+from svkc.integration.solution import PhaseProblem, StepRecord
 from svkc.integration.vector_field import VectorField, project_state
 
 
@@ -55,57 +57,165 @@ def without_dense_output(solver: diffrax.AbstractSolver[Any]) -> diffrax.Abstrac
     return _Dopri8WithoutDenseOutput(scan_kind=solver.scan_kind)
 
 
-def replay_step(
-    solver: diffrax.AbstractSolver[Any],
-    field: VectorField,
-    t0: Float[Array, ""],
-    t1: Float[Array, ""],
-    y: ODEState,
-    field_args: FieldArgs,
-) -> ODEState:
-    """Take one projected step that depends on no earlier step, to be differentiated.
-
-    Reverse mode stores the arguments of each evaluation of the field and of each iteration of the
-    projection, and recomputes everything else.
-    """
-    rate = eqx.filter_checkpoint(field)
+def _explicit_tableau(solver: diffrax.AbstractSolver[Any]) -> diffrax.ButcherTableau | None:
+    """Return the tableau of an explicit Runge-Kutta solver, None for any other solver."""
     if isinstance(solver, diffrax.AbstractERK) and isinstance(
         solver.tableau, diffrax.ButcherTableau
     ):
-        y1 = _explicit_step(solver.tableau, rate, t0, t1, y, field_args)
-    else:
-        solver = with_scan_kind(solver, "bounded")
-        term = diffrax.ODETerm(rate)
-        solver_state = solver.init(term, t0, t1, y, field_args)
-        y1 = solver.step(term, t0, t1, y, field_args, solver_state, made_jump=False)[0]
-    return project_state(field, field_args, y1)[0]
+        return solver.tableau
+    return None
 
 
-def _explicit_step(
-    tableau: diffrax.ButcherTableau, rate, t0, t1, y: ODEState, field_args: FieldArgs
-) -> ODEState:
-    """Take an explicit Runge-Kutta step as a scan over its stages.
+def _stage_count(tableau: diffrax.ButcherTableau) -> int:
+    """Return the number of stages without those that serve the error estimate alone."""
+    return int(np.max(np.flatnonzero(tableau.b_sol))) + 1
 
-    Stages that serve the error estimate alone are skipped.
 
-    rate: vector field.
+def increments_of_stages(solver: diffrax.AbstractSolver[Any], dense_info: Any) -> ODEState | None:
+    """Return the increments of a `StepRecord`.
+
+    dense_info: what the solver's step returned for the dense output.
     """
-    count = int(np.max(np.flatnonzero(tableau.b_sol))) + 1
+    tableau = _explicit_tableau(solver)
+    if tableau is None:
+        return None
+    return jax.tree.map(lambda k: k[: _stage_count(tableau)], dense_info["k"])
+
+
+def initial_records(
+    solver: diffrax.AbstractSolver[Any], field_args: FieldArgs, start: ODEState, capacity: int
+) -> StepRecord | None:
+    """Return records without motion, None without capacity or for a solver without increments."""
+    tableau = _explicit_tableau(solver)
+    if not capacity or tableau is None:
+        return None
+    shape = lambda x: (capacity, _stage_count(tableau), *x.shape)
+    return StepRecord(
+        increments=jax.tree.map(lambda x: jnp.zeros(shape(x), x.dtype), start),
+        row_choice=jax.tree.map(
+            lambda x: jnp.broadcast_to(x[None], (capacity, *x.shape)), field_args.row_choice
+        ),
+    )
+
+
+def increment_bytes(solver: diffrax.AbstractSolver[Any], start: ODEState) -> int:
+    """Return the size of the increments of a step, zero for a solver without increments."""
+    tableau = _explicit_tableau(solver)
+    count = 0 if tableau is None else _stage_count(tableau)
+    return count * sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(start))
+
+
+def recorded_step(
+    solver: diffrax.AbstractSolver[Any],
+    field: VectorField,
+    times,
+    y: ODEState,
+    field_args: FieldArgs,
+) -> StepRecord:
+    """Return the record of a step from y.
+
+    times: start and end.
+    """
+    tableau, increments = _explicit_tableau(solver), None
+    if tableau is not None:
+        increments = _increments(tableau, eqx.filter_checkpoint(field), times, y, field_args)
+    return StepRecord(increments, field_args.row_choice)
+
+
+def step_and_tangent(
+    solver: diffrax.AbstractSolver[Any],
+    step: tuple[Array, Array, StepRecord],
+    problem: tuple[PhaseProblem, Any],
+    start: tuple[ODEState, ODEState],
+) -> tuple[ODEState, ODEState, ODEState | None]:
+    """Return the end of a projected step, its tangent and the tangent of the increments.
+
+    Reverse mode stores the arguments of each evaluation of the field and of each iteration of the
+    projection, and recomputes everything else.
+
+    step: start, end and record.
+    problem, start: pairs of primal and tangent.
+    """
+    t0, t1, record = step
+    (y, d_y), (model, d_model) = start, problem
+    tableau = _explicit_tableau(solver)
+    with_rows = lambda p: dataclasses.replace(p.field_args, row_choice=record.row_choice)
+    project = lambda y, p: project_state(p.field, with_rows(p), y)[0]
+    if tableau is None:
+        step_and_project = lambda y, p: project(
+            _step_of_any_solver(solver, p.field, (t0, t1), y, with_rows(p)), p
+        )
+        y1, d_y1 = eqx.filter_jvp(step_and_project, (y, model), (d_y, d_model))
+        return y1, d_y1, None
+    increments = record.increments
+    assert increments is not None
+
+    @eqx.filter_checkpoint
+    def rate_tangent(t, primals, tangents):
+        return eqx.filter_jvp(lambda y, p: p.field(t, y, with_rows(p)), primals, tangents)[1]
+
+    def stage(t, weights, d_increments):
+        y_stage, d_stage = _add(y, weights, increments), _add(d_y, weights, d_increments)
+        return rate_tangent(t, (y_stage, model), (d_stage, d_model))
+
+    d_increments = _scan_stages(tableau, stage, (t0, t1), y)
+    b = tableau.b_sol[: _stage_count(tableau)]
+    ends = (_add(y, b, increments), model), (_add(d_y, b, d_increments), d_model)
+    y1, d_y1 = eqx.filter_jvp(project, *ends)
+    return y1, d_y1, d_increments
+
+
+def _step_of_any_solver(solver, field, times, y: ODEState, field_args: FieldArgs) -> ODEState:
+    """Return the end of a step without projection.
+
+    times: start and end.
+    """
+    solver, term = with_scan_kind(solver, "bounded"), diffrax.ODETerm(eqx.filter_checkpoint(field))
+    t0, t1 = times
+    solver_state = solver.init(term, t0, t1, y, field_args)
+    return solver.step(term, t0, t1, y, field_args, solver_state, made_jump=False)[0]
+
+
+def _increments(
+    tableau: diffrax.ButcherTableau, rate, times, y: ODEState, field_args: FieldArgs
+) -> ODEState:
+    """Return the increments of an explicit Runge-Kutta step.
+
+    rate: vector field. times: start and end.
+    """
+    stage = lambda t, weights, increments: rate(t, _add(y, weights, increments), field_args)
+    return _scan_stages(tableau, stage, times, y)
+
+
+def _scan_stages(tableau: diffrax.ButcherTableau, stage, times, y: ODEState) -> ODEState:
+    """Return the size of a step times `stage` at each stage, by a scan.
+
+    stage: (time, weights of earlier stages, increments of earlier stages) -> rate.
+    times: start and end. y: example of a state.
+    """
+    count, (t0, t1) = _stage_count(tableau), times
+
+    def body(increments, x):
+        weights, fraction, is_row = x
+        k = stage(t0 + fraction * (t1 - t0), weights, increments)
+        write = lambda ks, k: jnp.where(is_row.reshape(-1, *(1,) * k.ndim), (t1 - t0) * k, ks)
+        return jax.tree.map(write, increments, k), None
+
+    zeros = jax.tree.map(lambda y: jnp.zeros((count, *y.shape), y.dtype), y)
+    stages = (*_stage_weights(tableau, t1.dtype), np.eye(count, dtype=bool))
+    return jax.lax.scan(body, zeros, stages)[0]
+
+
+def _stage_weights(tableau: diffrax.ButcherTableau, dtype) -> tuple[Array, Array]:
+    """Return the weights of earlier stages, [stages, stages], and the times of the stages."""
+    count = _stage_count(tableau)
     A = np.zeros((count, count))
     for i, row in enumerate(tableau.a_lower[: count - 1]):
         A[i + 1, : i + 1] = row
-    c, dtype = np.append(0.0, tableau.c)[:count], t1.dtype
-    add = lambda weights, rates: jax.tree.map(
-        lambda y, k: y + (t1 - t0) * jnp.tensordot(weights, k, 1), y, rates
-    )
+    return jnp.asarray(A, dtype), jnp.asarray(np.append(0.0, tableau.c)[:count], dtype)
 
-    def stage(rates, x):
-        weights, fraction, is_row = x
-        k = rate(t0 + fraction * (t1 - t0), add(weights, rates), field_args)
-        write = lambda ks, k: jnp.where(is_row.reshape(-1, *(1,) * k.ndim), k[None], ks)
-        return jax.tree.map(write, rates, k), None
 
-    zeros = jax.tree.map(lambda y: jnp.zeros((count, *y.shape), y.dtype), y)
-    stages = (jnp.asarray(A, dtype), jnp.asarray(c, dtype), np.eye(count, dtype=bool))
-    rates, _ = jax.lax.scan(stage, zeros, stages)
-    return add(jnp.asarray(tableau.b_sol[:count], dtype), rates)
+def _add(y: ODEState, weights, increments: ODEState) -> ODEState:
+    """Return y plus the weighted sum of the increments of the stages."""
+    weighted = lambda y, k: y + jnp.tensordot(jnp.asarray(weights, k.dtype), k, 1)
+    return jax.tree.map(weighted, y, increments)

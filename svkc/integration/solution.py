@@ -12,6 +12,7 @@ from svkc.integration.event_location import ArmedGuards, EventInfo, EventSearch
 from svkc.integration.ode import FieldArgs, ODEState
 from svkc.integration.vector_field import VectorField
 from svkc.loops.constraint import largest_gaps
+from svkc.loops.constraint_rows import RowChoice
 from svkc.loops.projection import ProjectionInfo
 from svkc.model.annotations import DType
 from svkc.model.chain import State
@@ -43,6 +44,7 @@ class StepperOptions(eqx.Module):
     gap_tolerance: steps that leave a larger loop gap are rejected (rad, units of `chain.length`).
     max_steps: the most steps of a phase, accepted and rejected; event location is not counted.
     checkpoint_interval: one state in so many steps is stored.
+    record_capacity: records of so many first steps are stored.
     """
 
     solver: diffrax.AbstractSolver[Any]
@@ -54,6 +56,7 @@ class StepperOptions(eqx.Module):
     gap_tolerance: float = eqx.field(static=True)
     max_steps: int = eqx.field(static=True)
     checkpoint_interval: int = eqx.field(static=True)
+    record_capacity: int = eqx.field(static=True, default=0)
 
 
 class Stats(eqx.Module):
@@ -106,6 +109,18 @@ class Stats(eqx.Module):
         )
 
 
+class StepRecord(eqx.Module):
+    """What the derivative of a step needs from the step.
+
+    increments: of an explicit Runge-Kutta step, size of the step times the vector field at each of
+        its stages, without those of the error estimate alone. None: the solver has no such stages.
+    row_choice: rows of the loops that the step uses. None: all.
+    """
+
+    increments: ODEState | None
+    row_choice: RowChoice | None
+
+
 class PhaseSolution(eqx.Module):
     """The solution of one phase.
 
@@ -115,6 +130,7 @@ class PhaseSolution(eqx.Module):
     step_near: which steps were taken with reduced rows of the loops. None: see
         `StepperState.near`.
     checkpoints: states after every `checkpoint_interval` steps.
+    records: of the first `record_capacity` steps. None if that is zero.
     accepted, rejected: numbers of steps.
     result: result code, diffrax's or one of this module.
     event: the event at the end. None: there are no guards.
@@ -131,6 +147,7 @@ class PhaseSolution(eqx.Module):
     result: Int[Array, ""]
     stats: Stats
     event: EventInfo | None = None
+    records: StepRecord | None = None
 
 
 class StepperState(eqx.Module):
@@ -141,7 +158,7 @@ class StepperState(eqx.Module):
     guard_values: values of the guards at t.
     near: whether the next step is taken with reduced rows of the loops, as near a singular
         configuration. None: rows are never reduced.
-    step_ts, step_near, checkpoints, ys: as in `PhaseSolution`, as buffers of the loop.
+    step_ts, step_near, checkpoints, records, ys: as in `PhaseSolution`, as buffers of the loop.
     projection_info: that of the last projection. None: steps are not projected.
     """
 
@@ -159,6 +176,7 @@ class StepperState(eqx.Module):
     step_ts: Any
     step_near: Any
     checkpoints: Any
+    records: Any
     ys: Any
     accepted: Int[Array, ""]
     rejected: Int[Array, ""]
@@ -177,6 +195,7 @@ class StepAttempt(eqx.Module):
     step_size: size that the controller proposes for the next step.
     error_norm: root mean square of the estimated error over q and v. inf: no estimate.
     interpolation: dense output of the step. None: there are no guards.
+    increments: as in `StepRecord`.
     """
 
     t: Float[Array, ""]
@@ -191,6 +210,7 @@ class StepAttempt(eqx.Module):
     error_norm: Float[Array, ""]
     projection_info: ProjectionInfo | None
     interpolation: ProjectedInterpolation | None
+    increments: ODEState | None
 
 
 def update_stats(
