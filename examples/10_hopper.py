@@ -1,7 +1,7 @@
 """A hopper with a four-bar leg and one motor jumps 40 cm forward, from rest to rest, optimized.
 
-The four-bar stays closed. The foot stands, is then free, and lands with an impact at a place that
-is optimized. Every interval of the result is simulated from its own first node.
+The four-bar stays closed. The foot stands, is then free, and lands with an impact 40 cm further on,
+where the end pose has it. Every interval of the result is simulated from its own first node.
 
 Writes a picture to the folder named on the command line (default: the current one).
 """

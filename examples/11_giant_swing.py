@@ -1,8 +1,8 @@
-"""A giant swing, optimized: one hand lets go of the bar above it, and catches it again.
+"""A giant swing, optimized: one hand lets go of the bar and catches it again.
 
-A figure of 22 freedoms starts at rest, 30 degrees before the handstand, swings once around the bar,
-and passes the handstand. Two hands, one, two: the structure changes while it moves. Every interval
-of the result is simulated from its own first node, and the whole motion with feedback.
+A figure of 22 freedoms starts at rest, 31 degrees past the handstand. It turns once around the bar,
+through the handstand, to the same angle. One hand lets go while the figure is above the bar. Every
+interval of the result is simulated from its own first node, and the whole motion with feedback.
 
 Writes a picture to the folder named on the command line (default: the current one).
 """

@@ -1,13 +1,13 @@
 """Factorisations and solves in pieces that LAPACK computes in one thread.
 
-jaxlib 0.10 splits a batch of more than 2e5 operations over its thread pool, and blocks the calling
-thread until they are done. If a program runs as many such calls at once as the pool has threads,
-all threads block, which is a deadlock. The calls may be independent operations of one program, or
-belong to several CPU devices. `lax.map` therefore runs large batches in chunks below that size.
+jaxlib before 0.11.1 splits a batch of more than 2e5 operations over its thread pool, and blocks the
+calling thread until they are done. If as many such calls block at once as the pool has threads, the
+program deadlocks. The calls may be independent operations of one program, or belong to several CPU
+devices. `lax.map` therefore runs large batches in chunks below that size.
 
 OpenBLAS, which jaxlib calls, distributes one large matrix over threads of its own. Where another
 thread uses the processor, these wait for one another for milliseconds. Large matrices are therefore
-factored in blocks, and many right-hand sides solved in groups.
+factored by Cholesky in blocks, and many right-hand sides solved in groups. LU is not blocked.
 """
 
 import functools
@@ -21,9 +21,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 # largest number of operations that jaxlib runs in one thread
 SINGLE_THREAD_OPERATIONS = 200_000 - 1
-# Cholesky factorisations of fewer rows, and triangular solves with at most so many entries of the
-# right-hand sides, run in one thread of OpenBLAS
+# Cholesky factorisations of fewer rows run in one thread of OpenBLAS
 CHOLESKY_THREADED_ROWS = 128
+# so do triangular solves whose right-hand sides have at most so many entries
 SOLVE_SINGLE_THREAD_ENTRIES = 1000
 
 

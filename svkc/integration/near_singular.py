@@ -1,4 +1,4 @@
-"""Pivots and rows of the loops that a step uses, and steps that are taken again with others."""
+"""Choose the pivots or the rows of the loops for a step, and repeat steps with reduced rows."""
 
 import dataclasses
 
@@ -28,9 +28,9 @@ def redone_if_near(
 ) -> tuple[StepAttempt, Bool[Array, ""] | None, Bool[Array, ""]]:
     """Return the attempt, whether the next one has reduced rows, and whether this one is redone.
 
-    An attempt that ends near a singular configuration, or that does not close the loops, is not
-    kept: it is taken again with reduced rows. Rows are reduced until a step is kept that ends away
-    from singular configurations.
+    An attempt without reduced rows is repeated with reduced rows if it ends near a singular
+    configuration or does not close the loops. Later steps use reduced rows until an accepted step
+    ends away from singular configurations.
     """
     if s.near is None:
         return attempt, None, jnp.zeros((), bool)

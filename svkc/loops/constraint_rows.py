@@ -24,9 +24,10 @@ BALL_FREEDOMS = (True, True, True, False, False, False)
 
 
 class DelassusRows(NamedTuple):
-    """The rows of J that are in D: six of each of `full_links`, then the linear three of each ball.
+    """The rows of J in Delassus' matrix D: all six of `full_links`, the linear three of the others.
 
-    full_links: links with all six rows in D. The others are unlocked declared balls.
+    full_links: links with all six rows in D. The others are balls by their declaration, which
+        cannot be locked.
     rows: index in J of each row of D.
     position: index in D of each row of J; the size of D for rows that are not in D.
     """
@@ -66,7 +67,8 @@ class RowChoice(NamedTuple):
 
     near: whether the rows are reduced at every evaluation, as near a singular configuration.
     kept: the rows that are used otherwise. Of redundant loops these are as many as the phase's
-        rank, independent where they were chosen.
+        rank, less the freedoms of connected virtual joints. They are independent at the
+        configuration at which they were chosen.
     """
 
     near: Bool[Array, ""]
@@ -76,7 +78,7 @@ class RowChoice(NamedTuple):
     def of_first_step(
         cls, chain: Chain, structure: Structure, near: Bool[Array, ""]
     ) -> "RowChoice":
-        """Return the rows of a phase's first step, in which those of redundant loops are reduced.
+        """Return the rows of a phase's first step: reduced ones if a loop is redundant.
 
         near: whether the phase starts near a singular configuration.
         """
@@ -114,9 +116,10 @@ class ConstraintRows(NamedTuple):
         return jnp.concatenate([full_joints.reject(x[..., :n]), x[..., n:]], -1)
 
     def along_joints(self) -> Float[Array, "delassus delassus"]:
-        """Return the projector onto directions in which A is zero for every configuration.
+        """Return the projector onto known left null directions of A.
 
-        These are the dropped rows or, if no row is dropped, what the joints can follow: I - R.
+        These are the dropped rows or, if no row is dropped, the motions of the virtual joints:
+        I - R.
         """
         eye = jnp.eye(len(self.in_D.rows), dtype=self.A.dtype)
         projector = eye - self.reject(eye)
@@ -195,9 +198,10 @@ def reduce_rows(
 ) -> tuple[Float[Array, "n nv"], Float[Array, "n n"], Float[Array, "n nv"]]:
     """Return A = T B, T and the pivots, by Gauss-Jordan elimination with complete pivoting.
 
-    Each row of A is one in its own pivot column and zero in those of other rows. Beyond the rank,
-    and below `rank_tolerance` or `release_threshold` of the first pivot, rows are zero. The
-    condition number of A does not grow towards a singular configuration, as that of B does.
+    Each row of A is one in its own pivot column and zero in those of other rows. A pivot counts
+    only within the rank, and if it exceeds the first one times the larger of `rank_tolerance` and
+    `release_threshold` times the margin; other rows are zero. Towards a singular configuration the
+    condition number of B grows. That of A does not.
     """
     n, nv = B.shape
     weak = jnp.maximum(rank_tolerance(B.dtype), release_threshold(B.dtype) * structure.margin)
@@ -243,7 +247,8 @@ def with_consistent_velocities(
     assert rows.pivots is not None
     nv, column = chain.nv, jacobian_scales(chain)[1]
     frozen = jax.lax.stop_gradient(column)
-    # The second correction is round-off. With it, derivatives are exact although T is constant.
+    # The second correction changes v by round-off alone. It makes derivatives exact, although T
+    # is constant in them.
     for _ in range(2):
         rate = J @ (v / column)
         at_pivots = frozen[:nv] * (rows.reduce(rate) @ rows.pivots)

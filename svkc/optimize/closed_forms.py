@@ -1,6 +1,6 @@
 """Derivatives of the rows of stages and of nodes in closed form, for trees of hinges and slides.
 
-They need a thirtieth of the operations of automatic differentiation.
+Automatic differentiation of each stage takes about ten times as long (benchmarks/README.md).
 """
 
 import functools
@@ -77,9 +77,7 @@ class LinkDerivatives:
         vdot: Float[Array, " nv"],
         f: Float[Array, " rows"],
     ):
-        self.model = model
-        self.chain = chain
-        self.active = active
+        self.model, self.chain, self.active = model, chain, active
         self.kin: Kinematics = kinematics(chain, q)
         self.f: Float[Array, " rows"] = jnp.where(active, f, 0)
         has_rows = len(model.rows) > 0
@@ -98,11 +96,11 @@ class LinkDerivatives:
         return functools.reduce(jnp.add, parts)
 
     def _of_links(self, multipliers, f, virtual):
-        """Return the second derivatives of `RowsOfLink.hessian`, for all links together.
+        """Return the second derivatives that `RowsOfLink.hessian` gives, of all links together.
 
         The blocks [4 nv nv] are summed over links; the derivatives by f and q are [rows nv].
         """
-        take = lambda x, places: static_take(x, places)
+        take = static_take
         parts = [r.hessian(take(multipliers, at), take(f, at), virtual) for at, r in self.links]
         blocks = functools.reduce(jnp.add, [blocks for _, blocks, _ in parts])
         return blocks, self._over_rows([by_f for _, _, by_f in parts])
@@ -198,6 +196,10 @@ class StageDerivatives(LinkDerivatives):
 class NodeDerivatives(LinkDerivatives):
     """Derivatives of a function of nodes at its unknowns y, of which q is the first."""
 
+    def _rates_by_q(self) -> Array:
+        """Return the derivatives of gap rates by q, half of those of gap accelerations by v."""
+        return self._over_rows([rows.jacobian()[:, 1] / 2 for _, rows in self.links])
+
     def _gaps_and_rates(self, gaps, rates) -> tuple[Array, Array]:
         """Return the second derivatives by q and q, and by q and v, of rows times multipliers.
 
@@ -206,6 +208,7 @@ class NodeDerivatives(LinkDerivatives):
         none, nothing = jnp.zeros_like(gaps), jnp.zeros(self.chain.nv)
         of_gaps, _ = self._of_links(gaps, none, nothing)
         of_rates, _ = self._of_links(rates, none, nothing)
+        # from those of gap accelerations: d2 g'' / (dq dv') = d2 g / dq2, d g'' / dv = 2 d g' / dq
         return of_gaps[3] + of_rates[1] / 2, of_rates[3]
 
     def _force(self, f, virtual) -> tuple[Array, Array]:
@@ -228,9 +231,9 @@ class ConnectionDerivatives(NodeDerivatives):
         chain, nv = params.chain, model.layout.nv
         q, after, before, f = jnp.split(y, [nv, 2 * nv, 3 * nv])
         super().__init__(model, chain, data.active, q=q, v=after, vdot=jnp.zeros_like(q), f=f)
-        self.tree: TreeMotion = TreeMotion(
-            chain, self.kin, jnp.zeros_like(q), after - before, gravity=False
-        )
+        # at rest without gravity, torques are mass times acceleration: the change of momentum
+        rest, jump = jnp.zeros_like(q), after - before
+        self.tree: TreeMotion = TreeMotion(chain, self.kin, rest, jump, gravity=False)
 
     def jacobian(self) -> Float[Array, "equations y"]:
         """Return the derivatives of the rows by y."""
@@ -239,7 +242,7 @@ class ConnectionDerivatives(NodeDerivatives):
         if self.chain.armature is not None:
             mass = mass + _diagonal(self.chain.armature)
         rates = self._over_rows([rows.rates() for _, rows in self.links])
-        of_rates = self._over_rows([rows.jacobian()[:, 1] / 2 for _, rows in self.links])
+        of_rates = self._rates_by_q()
         zero, square = jnp.zeros_like(rates), jnp.zeros((len(rates),) * 2)
         by_q = by_motion[:, 0] - self._stiffness(self.f)
         by_f = jnp.where(self.active[None], -rates.T, 0)
@@ -274,7 +277,7 @@ class ProjectionDerivatives(NodeDerivatives):
     def jacobian(self) -> Float[Array, "equations y"]:
         """Return the derivatives of the rows by y."""
         rates = self._over_rows([rows.rates() for _, rows in self.links])
-        of_rates = self._over_rows([rows.jacobian()[:, 1] / 2 for _, rows in self.links])
+        of_rates = self._rates_by_q()
         by_f = jnp.where(self.active[None], rates.T, 0)
         none, square = jnp.zeros_like(by_f), jnp.zeros((len(rates),) * 2)
         zero = jnp.zeros((self.chain.nv,) * 2)

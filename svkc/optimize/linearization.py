@@ -25,8 +25,8 @@ from svkc.tree.kinematics import kinematics
 class LinearMaps(NamedTuple):
     """Linear maps of small errors (q, v) [2 nv] of the tree, for all N intervals of a motion.
 
-    Links let only some errors pass. An impact at the start of an interval, or the projection of
-    `svkc.connect`, removes the velocity errors that violate the links of the interval.
+    At the start of each interval, errors of velocity are projected onto the velocities that the
+    connected links allow, in the metric of the mass matrix. Errors of position are not projected.
 
     A: [N 2nv 2nv] from the start of an interval to its end.
     B: [N 2nv driven] from constant torques of the driven coordinates to the end of an interval.

@@ -1,10 +1,9 @@
 """The loop constraints of connected links, without coordinates of their virtual joints.
 
-Each virtual link has six candidate rows along the axes of its joint's frame: three rotations, then
-three translations. Rows along freedoms of the joint are left out. The joint's frame is fixed in the
-parent. Multipliers of the rows are components of the wrench on the real link.
-
-"Rows of the tree" are the bodies in the order of `Topology`, and have nothing to do with these.
+Each virtual link has six rows along the axes of its joint's frame: three rotations, then three
+translations. Rows along freedoms of the joint are left out. The axes are fixed in the parent.
+Multipliers of the rows are components of the wrench on the real link, about the origin of its
+link frame.
 """
 
 import dataclasses
@@ -35,9 +34,9 @@ class LinkRows:
 
     Tables with equal contents are equal, so that functions compiled for one serve the others.
 
-    rows: of link i, the candidate rows are 6 i ... 6 i + 5.
+    rows: sorted indices of the selected rows. Those of link i are 6 i ... 6 i + 5.
     links: indices of the virtual links that have selected rows.
-    parent, real: of each of `links`, the rows of the tree of its two bodies.
+    parent, real: of each of `links`, the indices of its two bodies in the tree.
     freedoms: of each of `links`, which of the three rotations are free.
     """
 

@@ -20,7 +20,7 @@ from svkc.transitions.newton import decide_rank
 
 
 def candidate_rows(chain: Chain, links: np.ndarray) -> np.ndarray:
-    """Return the indices of the rows of links that are not along a freedom of the joint.
+    """Return the indices of the rows of links that the joint constrains.
 
     links: mask of the virtual links. A joint with two free rotations keeps its third rotation row.
     """
@@ -32,7 +32,7 @@ def candidate_rows(chain: Chain, links: np.ndarray) -> np.ndarray:
 def gaps_and_jacobian(
     chain: Chain, q: Float[Array, " nq"], table: LinkRows
 ) -> tuple[Float[Array, " rows"], Float[Array, "rows nv"]]:
-    """Return the gaps (m, rad) of links' rows, and the rows' derivatives by velocities."""
+    """Return the gaps (rad, m) of links' rows, and the rows' derivatives by velocities."""
     rates = lambda v: rates_at(chain, q, v, table)
     return gaps_at(chain, q, table), jax.jacfwd(rates)(jnp.zeros(chain.nv, q.dtype))
 
@@ -78,7 +78,7 @@ def _pivoted_rows(J: np.ndarray, preferred: np.ndarray) -> list[int]:
 
 
 def links_here(chain: Chain, phases: Sequence[Phase]) -> list[np.ndarray]:
-    """Return for each phase the mask of connected links whose joints are where the bodies were."""
+    """Return for each phase the mask of links that were connected where the bodies were."""
     of = lambda names: np.isin(chain.link_names, names)
     out, old = [], np.asarray(chain.structure.connected)
     here = np.zeros(len(old), bool)
@@ -98,7 +98,8 @@ def phase_structures(
 ) -> tuple[np.ndarray, list[PhaseStructure]]:
     """Return the rows of links that are constraints in some phase, and each phase's structure.
 
-    poses: of each phase, configurations [nq] at which its rank is decided.
+    poses: of each phase, configurations [nq] at which its rows are chosen; its rank is that of the
+        first.
     Raises ValueError if a phase connects a spare slot.
     """
     none = np.zeros(len(chain.link_names), bool)

@@ -1,4 +1,4 @@
-"""The scenes that ship with svkc: functions that return a chain and its initial state."""
+"""The scenes that ship with svkc: functions that return a chain, most with an initial state."""
 
 from typing import Any as _Any
 

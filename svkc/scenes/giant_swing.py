@@ -23,9 +23,10 @@ def giant_swing() -> Chain:
     """Return the figure, with the virtual links "right_hand_grip" and "left_hand_grip".
 
     Each hand holds the bar by a hinge, as in `svkc.scenes.high_bar`. Three slides and three hinges
-    take the place of the free joint: "x", "y", "z", "pitch", "roll", "yaw". Pitch counts whole
-    turns, and chains of hinges and slides are optimized much faster. Joints have no limits: bounds
-    of the problem take their place, as torques of limits would be stiff.
+    take the place of the free joint: "x", "y", "z", "pitch", "roll", "yaw". The pitch angle is not
+    wrapped at 2 pi. Chains of hinges and slides are optimized much faster, because their
+    derivatives have closed forms. The joints have no limits, whose torques are stiff: bounds of
+    the problem replace them.
     """
     import mujoco
 

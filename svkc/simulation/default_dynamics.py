@@ -41,7 +41,8 @@ def resolve_dynamics(
     The default is articulated bodies where the stepping loop of svkc can reduce the rows of the
     loops: steps are projected by `Projection`, and the adjoint is `Replay`. With other
     stabilizations or adjoints, where masses may differ by more than `SIMILAR_MASSES`, and in
-    float32 with more than `MOST_LINKS_IN_FLOAT32`, the default is that of the chain.
+    float32 with more than `MOST_LINKS_IN_FLOAT32`, the default is composite bodies if the chain has
+    virtual links.
     """
     if dynamics is None:
         can_reduce = type(stabilization) is Projection and isinstance(adjoint, Replay)
