@@ -1,7 +1,7 @@
 """Error against computing time, for each integrator and stabilization, with MuJoCo for comparison.
 
-`python benchmarks/accuracy.py [problem ...] [--only TEXT]` prints and writes results/accuracy.csv
-and draws results/accuracy_PROBLEM.png.
+`python benchmarks/accuracy.py [problem ...] [--only TEXT] [--drawn]` prints and writes
+results/accuracy.csv and draws results/accuracy_PROBLEM.png.
 
 The error is that at the end of the run: the root mean square over coordinates (rad, m). The
 reference is a closed form, published digits, or a run of Dopri8 at rtol 1e-12, as each problem
@@ -63,6 +63,12 @@ STABILIZATIONS = {
     "Baumgarte": {"stabilization": svkc.stabilization.Baumgarte()},
     "no stabilization": {"stabilization": svkc.stabilization.NoStabilization()},
 }
+# measured on problems with loops, with fixed steps
+FAST = {
+    "stabilization": svkc.stabilization.Baumgarte(),
+    "dynamics": svkc.dynamics.ArticulatedBodies(),
+}
+FAST_LABEL = "Baumgarte, articulated bodies"
 # each is measured on problems with loops, with Dopri8
 METHODS = STABILIZATIONS | {
     "composite bodies": {"dynamics": svkc.dynamics.CompositeBodies()},
@@ -277,8 +283,9 @@ def measure_curve(problem: Problem, label: str, solver, settings, method=None):
     run = jax.jit(run)
     for setting in settings:
         traj, seconds = time_runs(run, problem.state, jnp.asarray(setting, dtype))
-        report, successful = traj.report(), bool(traj.result == svkc.RESULTS.successful)
-        error = problem.error(traj.final.q) if successful else np.nan
+        # without projection a run can reach its end with loops open by more than the tolerance
+        report, at_end = traj.report(), bool(traj.t_final >= problem.end)
+        error = problem.error(traj.final.q) if at_end else np.nan
         gap, energy = (
             float(jnp.maximum(report.gap, report.angular_gap)),
             abs(float(report.energy_drift)),
@@ -351,15 +358,32 @@ def list_curves(name: str, loops: bool):
             yield "float32", f"{label}, {other}", solver, single, method
             if label != "Dopri8":
                 yield "float64", f"{label}, {other}", solver, settings[1:3], method
+        if loops and settings is FIXED:
+            yield "float64", f"{label}, {FAST_LABEL}", solver, FIXED, FAST
     for other, method in (METHODS if loops else {}).items():
         yield "float64", f"Dopri8, {other}", INTEGRATORS["Dopri8"][0], ADAPTIVE, method
 
 
-def problem_rows(name: str, only: str):
-    """Yield the rows of one problem, limited to curves whose dtype and label contain `only`."""
+def is_drawn(dtype: str, label: str) -> bool:
+    """Return whether a curve is in the picture of its problem.
+
+    These are each integrator, each stabilization with Dopri8, fixed steps by the fastest method,
+    MuJoCo, and Tsit5 in float32.
+    """
+    labels = {
+        *INTEGRATORS,
+        *(f"Dopri8, {way}" for way in STABILIZATIONS),
+        *(f"{label}, {FAST_LABEL}" for label in INTEGRATORS),
+        *(f"MuJoCo {name}" for name in soft_loops.INTEGRATORS),
+    }
+    return label in labels and (dtype == "float64" or label == "Tsit5")
+
+
+def problem_rows(name: str, measured):
+    """Yield the rows of one problem, of the curves for which measured(dtype, label) is true."""
     problem = PROBLEMS[name]()
     for dtype, label, solver, settings, method in list_curves(name, bool(problem.chain.link_names)):
-        if only not in f"{dtype} {label}":
+        if not measured(dtype, label):
             continue
         with jax.enable_x64(dtype == "float64"):
             case = problem
@@ -371,40 +395,25 @@ def problem_rows(name: str, only: str):
             )
         jax.clear_caches()
     if name != "forty_windows" and any(
-        only in f"float64 MuJoCo {integrator}" for integrator in soft_loops.INTEGRATORS
+        measured("float64", f"MuJoCo {integrator}") for integrator in soft_loops.INTEGRATORS
     ):
         yield from (
             ["float64", *row]
             for row in measure_mujoco(problem, name)
-            if only in f"float64 {row[0]}"
+            if measured("float64", row[0])
         )
 
 
 def draw(name: str):
-    """Draw error against computing time, from results/accuracy.csv.
-
-    There is a curve for each integrator, each stabilization with Dopri8, and float32 with Tsit5.
-    """
+    """Draw error against computing time, from results/accuracy.csv."""
     import matplotlib.pyplot as plt
 
     with (RESULTS / "accuracy.csv").open() as file:
         table = [[*row[1:3], *map(float, row[3:6])] for row in csv.reader(file) if row[0] == name]
     figure, axes = plt.subplots(figsize=(8, 5), layout="constrained")
-    points_of_curve, labels = (
-        {},
-        {
-            *INTEGRATORS,
-            *(f"Dopri8, {way}" for way in STABILIZATIONS),
-            *(f"MuJoCo {name}" for name in soft_loops.INTEGRATORS),
-        },
-    )
+    points_of_curve = {}
     for dtype, label, _, seconds, error in table:
-        if (
-            np.isfinite(error)
-            and error > 0
-            and label in labels
-            and (dtype == "float64" or label == "Tsit5")
-        ):
+        if np.isfinite(error) and error > 0 and is_drawn(dtype, label):
             points_of_curve.setdefault((dtype, label), []).append((seconds, error))
     colors = plt.get_cmap("tab20")(np.arange(20))
     for color, ((dtype, label), points) in zip(colors, points_of_curve.items()):
@@ -430,7 +439,7 @@ def draw(name: str):
     plt.close(figure)
 
 
-def save(name: str, only: str, head, table):
+def save(name: str, measured, head, table):
     """Replace the rows of a problem in results/accuracy.csv.
 
     The file is read only now, because another process may have written rows of another problem.
@@ -441,7 +450,7 @@ def save(name: str, only: str, head, table):
             other_rows = [
                 row
                 for row in list(csv.reader(file))[1:]
-                if row[0] != name or only not in f"{row[1]} {row[2]}"
+                if row[0] != name or not measured(row[1], row[2])
             ]
     with path.open("w", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows([head, *other_rows, *table])
@@ -458,7 +467,13 @@ if __name__ == "__main__":
         default="",
         help="curves with this in their dtype and label alone, such as 'float32' or 'articulated'",
     )
+    parser.add_argument("--drawn", action="store_true", help="the curves of the pictures alone")
     options = parser.parse_args()
+
+    def measured(dtype, label):
+        """Return whether the command line selects a curve."""
+        return options.only in f"{dtype} {label}" and (not options.drawn or is_drawn(dtype, label))
+
     cpu = [
         line.split(":")[1].strip()
         for line in open("/proc/cpuinfo")
@@ -486,7 +501,7 @@ if __name__ == "__main__":
     print("| " + " | ".join(head) + " |")
     for name in options.problems or PROBLEMS:
         table = []
-        for row in problem_rows(name, options.only):
+        for row in problem_rows(name, measured):
             table.append(row)
             print(
                 f"| {name} | {row[0]} | {row[1]} | {row[2]:.0e} | {row[3]:.2e} | {row[4]:.1e} |"
@@ -495,7 +510,7 @@ if __name__ == "__main__":
             )
         save(
             name,
-            options.only,
+            measured,
             [*head, *machine],
             [[name, *row, *machine.values()] for row in table],
         )

@@ -58,6 +58,25 @@ def _callback_class(casadi: Any) -> Any:
     return Values
 
 
+def iteration_callback(casadi: Any, callbacks: Any) -> Any:
+    """Return the `iteration_callback` for `nlpsol`: it reports the progress, and may end the run.
+
+    callbacks: `Callbacks` of a program.
+    """
+    n, m = callbacks.program.count, len(callbacks.program.solver_rows)
+    size = {"x": n, "f": 1, "g": m, "lam_x": n, "lam_g": m, "lam_p": 0}
+    names = [casadi.nlpsol_out(i) for i in range(casadi.nlpsol_n_out())]
+    dense = casadi.Sparsity.dense
+
+    def end_or_continue(*_values: np.ndarray) -> tuple[np.ndarray]:
+        callbacks.started += 1
+        # the first call is that of the start
+        return (np.array([0.0 if callbacks.intermediate(0, callbacks.started - 1) else 1.0]),)
+
+    inputs = {name: dense(size[name]) for name in names}
+    return _callback_class(casadi)("progress", inputs, {"ret": dense(1)}, end_or_continue)
+
+
 def nlp_functions(casadi: Any, callbacks: Any) -> dict[str, Any]:
     """Return the callbacks `nlp`, `grad_f`, `jac_g` and `hess_lag` for `nlpsol`.
 

@@ -90,6 +90,7 @@ class Callbacks:
         self.columns: np.ndarray = entries.column[self.of_cost]
         self.exception: BaseException | None = None
         self.iterations: int = 0
+        self.started: int = 0
         self.functions: float = 0.0
         self._cache: dict[str, tuple[np.ndarray, np.ndarray]] = {}
 
@@ -269,11 +270,12 @@ def _by_cyipopt(callbacks: Callbacks, options: dict[str, Any], start: SolverResu
 
 def _by_casadi(callbacks: Callbacks, options: dict[str, Any], start: SolverResult) -> tuple:
     """Return (x, multipliers, lower, upper, status) of a run of the IPOPT in CasADi."""
-    from svkc.optimize.casadi_functions import nlp_functions
+    from svkc.optimize.casadi_functions import iteration_callback, nlp_functions
 
     casadi, program = _import("casadi"), callbacks.program
-    functions = nlp_functions(casadi, callbacks)
+    functions, progress = nlp_functions(casadi, callbacks), iteration_callback(casadi, callbacks)
     low, high, row_low, row_high = callbacks.bounds()
+    callbacks.started = 0
     solver = casadi.nlpsol(
         "solver",
         "ipopt",
@@ -285,6 +287,7 @@ def _by_casadi(callbacks: Callbacks, options: dict[str, Any], start: SolverResul
             "calc_lam_p": False,
             "ipopt": options,
             "error_on_fail": False,
+            "iteration_callback": progress,
         },
     )
     result = solver(

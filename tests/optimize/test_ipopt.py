@@ -1,5 +1,6 @@
 """What the adapters of IPOPT do besides solving."""
 
+import importlib.util
 from unittest import mock
 
 import diffrax
@@ -9,6 +10,9 @@ import pytest
 import wrong_optimizations
 
 from svkc import optimize
+
+# CasADi is no requirement of the tests
+BACKENDS = ["cyipopt", *(["casadi"] if importlib.util.find_spec("casadi") else [])]
 
 
 @pytest.fixture(scope="module")
@@ -41,9 +45,10 @@ def test_without_the_wheel_the_error_names_the_command(move):
         problem.solve(guess, solver=optimize.Ipopt(backend="cyipopt"))
 
 
-def test_interrupts_return_the_last_iterate_and_errors_are_raised(move):
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_interrupts_return_the_last_iterate_and_errors_are_raised(move, backend):
     problem, guess = move
-    solver = optimize.Ipopt(backend="cyipopt")
+    solver = optimize.Ipopt(backend=backend)
     step = "svkc.optimize.program.Program.hessian"
     with mock.patch(step, side_effect=KeyboardInterrupt):
         last = problem.solve(guess, solver=solver, throw=False)
@@ -56,9 +61,10 @@ def test_interrupts_return_the_last_iterate_and_errors_are_raised(move):
         problem.solve(guess, solver=solver)
 
 
-def test_a_progress_meter_is_stepped_and_closed(move, capsys):
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_progress_meter_is_stepped_and_closed(move, backend, capsys):
     problem, guess = move
-    solver = optimize.Ipopt(backend="cyipopt")
+    solver = optimize.Ipopt(backend=backend)
     motion = problem.solve(guess, solver=solver, progress_meter=diffrax.TextProgressMeter())
     assert "100.00%" in capsys.readouterr().out
     # forces of +4 N and -4 N
