@@ -1,10 +1,11 @@
 """Cost of derivatives: time and memory of a run, its gradient and its directional derivative.
 
 High bar: 1.8 s with both releases, 198 parameters (masses, centers of mass, velocity, release
-times, torques). Open chain: the same figure in free fall, alone and 64 by `vmap`, 200 steps of 2 ms
-of the classical Runge-Kutta method, 198 parameters (velocity, torques). The open chain is compared
-with MJX's gradient of the same steps, and with central differences of MuJoCo runs. Both hold the
-torque constant during a step, at its value in the middle. All three gradients are compared.
+times, torques), by default, by articulated bodies, and without the parameters of the masses. Open
+chain: the same figure in free fall, alone and 64 by `vmap`, 200 steps of 2 ms of the classical
+Runge-Kutta method, 198 parameters (velocity, torques). The open chain is compared with MJX's
+gradient of the same steps, and with central differences of MuJoCo runs. Both hold the torque
+constant during a step, at its value in the middle. All three gradients are compared.
 
 `python benchmarks/gradients.py` (extra `bench`) prints and writes results/gradients.csv. float64.
 Times are medians; programs that are compared alternate.
@@ -59,12 +60,14 @@ def high_bar_loss(**options):
     ts = jnp.linspace(0, 1.8, 73)
 
     def loss(p):
-        floats = (
-            chain.mass * p["mass"],
-            chain.inertia * p["mass"][:, None, None],
-            chain.com * p["com"],
-        )
-        c = eqx.tree_at(lambda c: (c.mass, c.inertia, c.com), chain, floats)
+        c = chain
+        if "mass" in p:
+            floats = (
+                chain.mass * p["mass"],
+                chain.inertia * p["mass"][:, None, None],
+                chain.com * p["com"],
+            )
+            c = eqx.tree_at(lambda c: (c.mass, c.inertia, c.com), chain, floats)
         start = svkc.State(state.q, state.v + p["v"], state.structure)
         events = (
             svkc.at(p["times"][0], cut="right_hand_grip"),
@@ -265,6 +268,9 @@ def main():
     rows, _ = measure_case(f"high bar, {count} parameters", loss, p)
     articulated = high_bar_loss(dynamics=svkc.dynamics.ArticulatedBodies())[0]
     rows += measure_case("high bar, articulated bodies", articulated, p)[0]
+    known = {name: x for name, x in p.items() if name not in ("mass", "com")}
+    count = sum(x.size for x in jax.tree.leaves(known))
+    rows += measure_case(f"high bar, masses known, {count} parameters", loss, known)[0]
     loss, p = falling_loss()
     count = sum(x.size for x in jax.tree.leaves(p))
     try:

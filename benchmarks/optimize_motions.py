@@ -2,8 +2,8 @@
 
 `python benchmarks/optimize_motions.py refined` solves from straight lines between poses. It refines
 the mesh until each interval, simulated from its first node, ends within 1e-3 rad (m) and 1e-2 rad/s
-(m/s) of the next node. `... starts [--starts 20] [--processes 2]` solves from noisy guesses in
-several processes. Both (extra `optimize`) print a table and write it to results/.
+(m/s) of the next node. `... starts [--starts 20] [--processes 2] [--solver Ipopt]` solves from noisy
+guesses in several processes. Both (extra `optimize`) print a table and write it to results/.
 
 Seconds are wall time: that of the solver, and that of a whole round with tracing and compilation.
 Costs are J / 1e6.
@@ -85,12 +85,12 @@ def refined() -> None:
     print(solution, solution.report(), sep="\n")
 
 
-def starts(count: int, processes: int) -> None:
-    """Solve from `count` noisy guesses and write a row for each."""
+def starts(count: int, processes: int, name: str) -> None:
+    """Solve from `count` noisy guesses and write a row for each. name: of the solver's class."""
     problem = backflip_problem(backflip()[0])
     guesses = [backflip_guess(problem, noise=0.2, key=key) for key in range(count)]
     begin = time.perf_counter()
-    solver = optimize.Ipopt(tolerance=1e-6, max_iterations=MOST_ITERATIONS)
+    solver = getattr(optimize, name)(tolerance=1e-6, max_iterations=MOST_ITERATIONS)
     solutions = problem.multistart(guesses, processes=processes, solver=solver)
     wall = time.perf_counter() - begin
     rows = [
@@ -109,7 +109,7 @@ def starts(count: int, processes: int) -> None:
     print(solutions)
     best = solutions.best
     print(f"{wall:.0f} s in {processes} processes; best cost {best and float(best.cost):.6g}")
-    write("optimize_starts.csv", rows)
+    write("optimize_starts.csv" if name == "Ipopt" else f"optimize_starts_{name}.csv", rows)
 
 
 if __name__ == "__main__":
@@ -117,5 +117,9 @@ if __name__ == "__main__":
     parser.add_argument("what", choices=["refined", "starts"])
     parser.add_argument("--starts", type=int, default=20, help="number of noisy guesses")
     parser.add_argument("--processes", type=int, default=os.cpu_count())
+    parser.add_argument("--solver", choices=["Ipopt", "InteriorPoint"], default="Ipopt")
     options = parser.parse_args()
-    refined() if options.what == "refined" else starts(options.starts, options.processes)
+    if options.what == "refined":
+        refined()
+    else:
+        starts(options.starts, options.processes, options.solver)
