@@ -241,7 +241,7 @@ class BarrierMethod:
     def least_squares(self) -> np.ndarray:
         """Return the rows' multipliers of least squared dual error, or zero if they are large.
 
-        This is equation 36.
+        The system is that of section 3.6.
         """
         at, duals, program = self.at, self.duals, self.program
         zero = np.zeros(program.row_count)

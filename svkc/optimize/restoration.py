@@ -54,7 +54,10 @@ def _violation(method: BarrierMethod, inner: BarrierMethod) -> float:
 
 
 def _method(method: BarrierMethod) -> BarrierMethod:
-    """Return the method of the restoration, at the start of equations 31 to 34."""
+    """Return the method of the restoration, at its start.
+
+    The parts of the violation minimize the barrier cost for the unknowns of the method.
+    """
     at, rows, duals, rho = method.at, method.at.rows, method.duals, VIOLATION_WEIGHT
     mu = max(method.barrier.parameter, float(np.abs(rows).max(initial=0.0)))
     program = ElasticProgram(method.program, at.w, float(np.sqrt(mu)))

@@ -1,4 +1,8 @@
-"""The watchdog: full steps on trial after many shortened ones."""
+"""The watchdog: full steps on trial after many shortened ones.
+
+Chamberlain, Powell, Lemarechal and Pedersen (1982), "The watchdog technique for forcing convergence
+in algorithms for constrained optimization".
+"""
 
 import dataclasses
 from typing import Any
@@ -7,8 +11,7 @@ import numpy as np
 
 from svkc.optimize.filter_line_search import Accepted, LineSearch, Reference, Step
 
-# shortened steps after which full steps are tried, and their number (section 3.2 of the paper names
-# the procedure; Chamberlain, Powell, Lemarechal and Pedersen 1982)
+# shortened steps after which full steps are tried, and number of full steps
 _SHORTENED, _TRIALS = 10, 3
 # part of the largest step length below which a step counts as shortened
 _FULL = 0.99
