@@ -131,7 +131,7 @@ class NewtonSystem:
     ) -> tuple | None:
         """Return (d, dy) of the system with the least shift that gives it the inertia (n, m, 0).
 
-        This is Algorithm IC of section 3.1. Shifts grow as well while residuals are large.
+        This is Algorithm IC of section 3.1, in which a matrix with a large residual is singular.
 
         parameter: the barrier parameter. Returns None if there is no such shift.
         """
@@ -144,8 +144,8 @@ class NewtonSystem:
                     self.last_shift = shift or self.last_shift
                     self.shifts = shift, row_shift
                     return solution
-            deficient = negative is None or negative < self.program.row_count
-            if deficient and row_shift == 0:
+            # also the matrix of a large residual counts as singular
+            if row_shift == 0 and (negative is None or negative <= self.program.row_count):
                 row_shift = _ROW_SHIFT * parameter**_ROW_EXPONENT
             elif shift == 0:
                 first = self.last_shift == 0
