@@ -2,7 +2,7 @@
 
 `python benchmarks/optimize_motions.py refined` solves from straight lines between poses. It refines
 the mesh until each interval, simulated from its first node, ends within 1e-3 rad (m) and 1e-2 rad/s
-(m/s) of the next node. `... starts [--starts 20] [--processes 2] [--solver Ipopt]` solves from noisy
+(m/s) of the next node. `... starts [--starts 20] [--processes 2] [--solver NAME]` solves from noisy
 guesses in several processes. Both (extra `optimize`) print a table and write it to results/.
 
 Seconds are wall time: that of the solver, and that of a whole round with tracing and compilation.

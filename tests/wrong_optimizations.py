@@ -8,6 +8,7 @@ import numpy as np
 
 import svkc
 from svkc import optimize
+from svkc.optimize.block_chain import LARGEST_DENSE, BlockChain
 
 CART = (
     '<mujoco><worldbody><body name="cart"><joint name="x" type="slide" axis="1 0 0"/><geom'
@@ -57,6 +58,12 @@ def too_few_iterations(_):
     move.solve(move.guess([{"x": 0.0}, {"x": 1.0}]), solver=solver)
 
 
+def not_a_chain(_):
+    """Couple the first interval of a large matrix with the last one."""
+    group = np.arange(LARGEST_DENSE + 1)
+    BlockChain(group, group, group[::-1])
+
+
 def load(**meta):
     """Return a call that loads a file of metadata alone."""
 
@@ -88,6 +95,7 @@ CASES = {
         controls=optimize.Torques(np.ones(3))
     ),
     "...: the virtual link": on_point(lambda p: p.forces("pin")[2]),
+    "InteriorPoint: rows couple": not_a_chain,
     "Radau: got": lambda s: optimize.Radau(9),
     "at the guess ... is": lambda s: check(last=-1.0, of=fixed_problem()),
     "at the guess the derivative": lambda s: check(last=0.0, of=fixed_problem()),

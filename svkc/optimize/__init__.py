@@ -9,6 +9,7 @@ from svkc.optimize.controls import (
     Torques as Torques,
 )
 from svkc.optimize.guesses import Guess as Guess, PhaseMotion as PhaseMotion
+from svkc.optimize.interior_point import InteriorPoint as InteriorPoint
 from svkc.optimize.ipopt import AbstractSolver as AbstractSolver, Ipopt as Ipopt
 from svkc.optimize.loading import load_solution as load_solution
 from svkc.optimize.multistart import Solutions as Solutions

@@ -139,7 +139,7 @@ class Problem:
         functions raise are raised again.
 
         guess: from `guess`, or a `Solution` of a problem with these phases, on any mesh.
-        solver: an `Ipopt`; None: `Ipopt()`.
+        solver: an `Ipopt` or an `InteriorPoint`; None: `Ipopt()`.
         progress_meter: a progress meter of diffrax; None: no display.
         throw: whether to raise RuntimeError if the solver fails. False: the last iterate is
             returned, and its `result` says how the run ended.

