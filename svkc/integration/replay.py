@@ -78,7 +78,7 @@ def _integrate(start: ODEState, times, problem: PhaseProblem, options: StepperOp
     return solution, solution.t, solution.y
 
 
-def _integrate_jvp(primals, tangents, with_records: bool):
+def _integrate_jvp(primals, tangents, *, with_records: bool):
     """Return the tangents at the fixed times of the steps, plus those of changing times.
 
     The run that is differentiated stores the records of its steps.
@@ -112,17 +112,7 @@ def _integrate_jvp(primals, tangents, with_records: bool):
         )
     if not with_records:
         solution = dataclasses.replace(solution, records=None)
-    parts, d_parts = lambda s: (s.y, s.ys, s.checkpoints), (d_y, d_ys, d_checkpoints)
-    if solution.records is not None:
-        parts, d_parts = lambda s: (s.y, s.ys, s.checkpoints, s.records.increments), (
-            *d_parts, d_increments,
-        )  # fmt: skip
-    d_solution = eqx.tree_at(
-        parts,
-        jax.tree.map(lambda x: None, solution),
-        d_parts,
-        is_leaf=lambda x: x is None or isinstance(x, ODEState),
-    )
+    d_solution = _solution_tangent(solution, (d_y, d_ys, d_checkpoints), d_increments)
     at_scheduled_end = solution.result == SUCCESSFUL
     stop_shift = jnp.where(at_scheduled_end, stop - solution.t, 0)
     d_stop_shift = None if d_stop is None else jnp.where(at_scheduled_end, d_stop, 0)
@@ -134,6 +124,23 @@ def _integrate_jvp(primals, tangents, with_records: bool):
         rate_end,
     )
     return (solution, t, y), (d_solution, *d_end)
+
+
+def _solution_tangent(solution: PhaseSolution, d_states, d_increments) -> PhaseSolution:
+    """Return the tangent of a solution, with None where there is none.
+
+    d_states: tangents of `y`, `ys` and `checkpoints`. d_increments: of the records, if any.
+    """
+    parts, d_parts = lambda s: (s.y, s.ys, s.checkpoints), d_states
+    if solution.records is not None:
+        parts = lambda s: (s.y, s.ys, s.checkpoints, s.records.increments)
+        d_parts = (*d_states, d_increments)
+    return eqx.tree_at(
+        parts,
+        jax.tree.map(lambda x: None, solution),
+        d_parts,
+        is_leaf=lambda x: x is None or isinstance(x, ODEState),
+    )
 
 
 def _at_fixed_start(
