@@ -70,8 +70,7 @@ def integrate_phase(
     )
     options.progress_meter.close(end.progress_meter_state)
     ys = end.ys
-    if save_ts.shape[0]:
-        # The loop writes the first row of equal save times only.
+    if save_ts.shape[0]:  # of equal save times, the loop writes the first row alone
         ys = jax.tree.map(lambda x: x[jnp.searchsorted(save_ts, save_ts)], ys)
     event, stopped = None, jnp.where(end.t < stop, MAX_STEPS, SUCCESSFUL)
     if options.armed_guards is not None:
