@@ -111,12 +111,10 @@ def replay_tangents(
             d_after, (d_steps, d_increments) = _block_tangent(
                 d_y, (y, steps, records), problem, options.solver
             )
-            last = jnp.minimum((i + 1) * interval, solution.accepted)
-            in_block = (save_index > i * interval) & (save_index <= last)
-            step_index = jnp.clip(save_index - i * interval - 1, 0, interval - 1)
-            save = lambda old, new: jnp.where(
-                _broadcast_mask(in_block, old) & used, new[step_index], old
-            )
+            last = jnp.minimum(first + interval, solution.accepted)
+            in_block = used & (save_index > first) & (save_index <= last)
+            step_index = jnp.clip(save_index - first - 1, 0, interval - 1)
+            save = lambda old, new: jnp.where(_broadcast_mask(in_block, old), new[step_index], old)
             d_written = None if d_recorded is None else _write(d_recorded, d_increments, first)
             return tree_where(used, d_after, d_y), jax.tree.map(save, d_ys, d_steps), d_written
 

@@ -113,8 +113,7 @@ def _init_stepper(
     )
     rows = lambda n: jax.tree.map(lambda x: jnp.broadcast_to(x[None], (n, *x.shape)), start)
     info = initial_projection_info(field, field_args, start.q)
-    choice = problem.field_args.row_choice
-    near = None if choice is None else choice.near
+    near = None if field_args.row_choice is None else field_args.row_choice.near
     guard_values, search = None, None
     if options.armed_guards is not None:
         guard_values = options.armed_guards.initial_values
