@@ -188,8 +188,7 @@ def test_a_millimetre_at_the_end_of_a_kilometre():
     """A small four-bar on a long bar: round-off of the inertia about the distant root shows.
 
     That inertia is 1e12 times the one of the four-bar. Energy drifts by 9e-3 of the kinetic energy.
-    float32 cannot resolve the four-bar: its loop stays open by a fifth of a bar, which is below the
-    tolerance of a chain of a kilometre. The report says so.
+    float32 cannot resolve the four-bar; a result code reports that.
     """
     chain = four_bar_on_a_bar(1e-3)
     state = chain.state(v={"crank": 4.0})
@@ -201,7 +200,8 @@ def test_a_millimetre_at_the_end_of_a_kilometre():
         chain = four_bar_on_a_bar(1e-3)
         state = chain.state(v={"crank": 4.0})
         traj = svkc.simulate(chain, state, 0.05, ts=0.05 * TIMES, dt=1e-4, throw=False)
-        assert "a loop is open by" in str(traj.report())
+        assert traj.result == svkc.RESULTS.non_finite
+        assert np.isfinite(traj.states.q).all()
         assert np.isfinite(traj.states.q).all()
 
 
