@@ -1,5 +1,6 @@
 """The functions of a problem as callbacks of CasADi."""
 
+import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -68,10 +69,11 @@ def iteration_callback(casadi: Any, callbacks: Any) -> Any:
     names = [casadi.nlpsol_out(i) for i in range(casadi.nlpsol_n_out())]
     dense = casadi.Sparsity.dense
 
+    # the first call is that of the start
+    iteration = itertools.count()
+
     def end_or_continue(*_values: np.ndarray) -> tuple[np.ndarray]:
-        callbacks.started += 1
-        # the first call is that of the start
-        return (np.array([0.0 if callbacks.intermediate(0, callbacks.started - 1) else 1.0]),)
+        return (np.array([0.0 if callbacks.intermediate(0, next(iteration)) else 1.0]),)
 
     inputs = {name: dense(size[name]) for name in names}
     return _callback_class(casadi)("progress", inputs, {"ret": dense(1)}, end_or_continue)

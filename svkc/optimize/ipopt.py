@@ -90,7 +90,6 @@ class Callbacks:
         self.columns: np.ndarray = entries.column[self.of_cost]
         self.exception: BaseException | None = None
         self.iterations: int = 0
-        self.started: int = 0
         self.functions: float = 0.0
         self._cache: dict[str, tuple[np.ndarray, np.ndarray]] = {}
 
@@ -275,7 +274,6 @@ def _by_casadi(callbacks: Callbacks, options: dict[str, Any], start: SolverResul
     casadi, program = _import("casadi"), callbacks.program
     functions, progress = nlp_functions(casadi, callbacks), iteration_callback(casadi, callbacks)
     low, high, row_low, row_high = callbacks.bounds()
-    callbacks.started = 0
     solver = casadi.nlpsol(
         "solver",
         "ipopt",

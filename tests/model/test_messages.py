@@ -21,7 +21,7 @@ ELSEWHERE = {
     "rollout: another process": ("tools/test_rollout.py", "another process"),
     "out: ... holds another": ("tools/test_rollout.py", "holds another rollout"),
     "expected NAME@TIME": ("project/test_commands.py", "expected NAME@TIME"),
-    "optimize needs IPOPT": ("optimize/test_ipopt.py", "optimize needs IPOPT"),
+    "optimize needs IPOPT": ("optimize/test_solvers.py", "optimize needs IPOPT"),
     "multistart in several": ("optimize/test_solution.py", "needs cloudpickle"),
     "multistart: start": ("optimize/test_solution.py", "failed in its process"),
     "multistart: all": ("optimize/test_solution.py", "all processes ended"),

@@ -1,4 +1,4 @@
-"""What the adapters of IPOPT do besides solving."""
+"""What solvers do besides solving."""
 
 import importlib.util
 from unittest import mock
@@ -13,6 +13,7 @@ from svkc import optimize
 
 # CasADi is no requirement of the tests
 BACKENDS = ["cyipopt", *(["casadi"] if importlib.util.find_spec("casadi") else [])]
+SOLVERS = [*(optimize.Ipopt(backend=name) for name in BACKENDS), optimize.InteriorPoint()]
 
 
 @pytest.fixture(scope="module")
@@ -45,10 +46,9 @@ def test_without_the_wheel_the_error_names_the_command(move):
         problem.solve(guess, solver=optimize.Ipopt(backend="cyipopt"))
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_interrupts_return_the_last_iterate_and_errors_are_raised(move, backend):
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_interrupts_return_the_last_iterate_and_errors_are_raised(move, solver):
     problem, guess = move
-    solver = optimize.Ipopt(backend=backend)
     step = "svkc.optimize.program.Program.hessian"
     with mock.patch(step, side_effect=KeyboardInterrupt):
         last = problem.solve(guess, solver=solver, throw=False)
@@ -61,10 +61,9 @@ def test_interrupts_return_the_last_iterate_and_errors_are_raised(move, backend)
         problem.solve(guess, solver=solver)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_a_progress_meter_is_stepped_and_closed(move, backend, capsys):
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_a_progress_meter_is_stepped_and_closed(move, solver, capsys):
     problem, guess = move
-    solver = optimize.Ipopt(backend=backend)
     motion = problem.solve(guess, solver=solver, progress_meter=diffrax.TextProgressMeter())
     assert "100.00%" in capsys.readouterr().out
     # forces of +4 N and -4 N
