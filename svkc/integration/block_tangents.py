@@ -1,7 +1,7 @@
 """Tangents of the steps of a phase, computed in blocks of steps.
 
 The tangents are those at fixed times of the steps. Where increments of the stages were stored in
-the run, the steps are not taken again.
+the run, the stages need not be computed again before they are differentiated.
 """
 
 import dataclasses
@@ -20,11 +20,11 @@ from svkc.integration.runge_kutta import increment_bytes, recorded_step, step_an
 from svkc.integration.solution import PhaseSolution, StepperOptions, StepRecord
 from svkc.loops.constraint_rows import choose_rows
 
-# Past the end of a run, blocks of steps are skipped in groups of at most this size, and so are
-# groups.
+# Unused blocks are skipped in groups of at most this size; unused groups are skipped in groups of
+# as many.
 GROUP_SIZE = 16
-# Of so many first steps of a phase the records are stored, in at most so much memory for each
-# element of a batch.
+# Number of steps at the start of a phase whose records are stored, and limit of the memory of their
+# increments for each element of a batch. The number is rounded up to whole groups of blocks.
 RECORDED_STEPS, RECORDS_BYTES = 512, 1 << 23
 
 
@@ -96,7 +96,8 @@ def replay_tangents(
     Each block of steps is differentiated from its checkpoint.
 
     start, problem: pairs of primal and tangent.
-    step_grid, save_index: as from `_step_grid`.
+    step_grid: times of the start and of the ends of the steps. save_index: for each save time the
+        index of its step.
     with_increments: whether the tangents of the recorded increments are returned; if not, None.
     """
     (start, d_start), interval = start, options.checkpoint_interval
@@ -143,7 +144,8 @@ def _skipped_if_unused(scan: Callable) -> Callable:
     """Return `scan` of blocks, (carry, blocks) -> (carry, tangents after each block), or no change
     and zeros if none of the blocks is used.
 
-    Reverse mode stores the arguments alone, which need no memory for each block.
+    Reverse mode stores the arguments and recomputes the rest. The outer checkpoint keeps constants
+    from being stored for each group, the inner one keeps what a branch computes from being stored.
     """
 
     @jax.checkpoint

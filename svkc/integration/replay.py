@@ -38,10 +38,10 @@ class Replay(eqx.Module):
     are fixed in derivatives; the times of events, of the start, of the end and of saved states are
     not.
 
-    The stages of the first steps of a phase are kept, in at most 8 MiB. Steps beyond are taken
-    again in derivatives. The memory for a phase is max_steps (1 + n / every) numbers, where n
-    counts the entries of q and v, plus the stages, plus the residuals of one block of `every`
-    steps.
+    Of explicit Runge-Kutta solvers the stages of the first 512 steps of a phase are kept, or of
+    fewer where they take more than 8 MiB. Steps beyond are taken again in derivatives. The memory
+    for a phase is max_steps (1 + n / every) numbers, where n counts the entries of q and v, plus
+    the stages, plus the residuals of one block of `every` steps.
 
     every: number of steps between checkpoints.
 

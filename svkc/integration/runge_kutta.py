@@ -188,7 +188,7 @@ def _increments(
 
 
 def _scan_stages(tableau: diffrax.ButcherTableau, stage, times, y: ODEState) -> ODEState:
-    """Return the size of a step times `stage` at each stage, by a scan.
+    """Return h k_i of all stages i, by a scan, with h the size of the step.
 
     stage: (time, weights of earlier stages, increments of earlier stages) -> rate.
     times: start and end. y: example of a state.

@@ -129,7 +129,7 @@ class NewtonSystem:
     def direction(
         self, terms: Terms, of_unknowns: np.ndarray, of_rows: np.ndarray, parameter: float
     ) -> tuple | None:
-        """Return (d, dy) of the system with the least shift that gives it the inertia (n, m, 0).
+        """Return (d, dy) with the first of growing shifts that gives the inertia (n, m, 0).
 
         This is Algorithm IC of section 3.1, in which a matrix with a large residual is singular.
 
