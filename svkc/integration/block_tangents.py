@@ -96,8 +96,7 @@ def replay_tangents(
     Each block of steps is differentiated from its checkpoint.
 
     start, problem: pairs of primal and tangent.
-    step_grid: times of the start and of the ends of the steps. save_index: for each save time the
-        index of its step.
+    step_grid: times of the start and of the ends of the steps. save_index: steps of the save times.
     with_increments: whether the tangents of the recorded increments are returned; if not, None.
     """
     (start, d_start), interval = start, options.checkpoint_interval
