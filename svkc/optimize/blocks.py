@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from svkc._jax.eager import eager_jit
 from svkc._jax.lanes_last import with_lanes_last
 from svkc._jax.static_gather import static_take
 from svkc.optimize.lift import Layout, Lift, StagePolynomials, dependencies
@@ -32,6 +31,8 @@ class Block:
 
     unknowns: [lanes n] index of each local unknown in the problem; -1: it is zero.
     rows: [lanes m] index of the row to which each local row is added; -1: it is left out.
+    masks: which entries of `jacobian_pattern` and of `hessian_pattern` can be nonzero; None: those
+        that are not zero at one of a few random points.
     data: constants of each lane, with a leading axis over lanes. Methods take the data as an
         argument, so that new data need no compilation.
     """
@@ -39,6 +40,7 @@ class Block:
     unknowns: np.ndarray
     rows: np.ndarray
     data: Any
+    masks: tuple[np.ndarray, np.ndarray] | None = None
 
     def set_lanes(self, lanes: Any) -> None:
         """Replace the data of the lanes."""
@@ -158,7 +160,7 @@ class StageBlock(Block):
     def set_lanes(self, lanes: Any) -> None:
         self.data = (lanes, *self.data[1:])
 
-    def _over_stages(self, function: Callable, params: Any, data: Any, z, *arrays) -> jax.Array:
+    def over_stages(self, function: Callable, params: Any, data: Any, z, *arrays) -> Any:
         """Return function(rows of y, lift, ...) for all lanes and stages [lanes stages ...].
 
         arrays: further arguments [lanes stages ...].
@@ -192,14 +194,14 @@ class StageBlock(Block):
         return jax.vmap(at_lane, (None, 0, 0, *(0 for _ in arrays)))(params, data, z, *arrays)
 
     def values(self, params: Any, data: Any, z: Unknowns) -> jax.Array:
-        rows = self._over_stages(lambda f, lift: f(lift.variables()), params, data, z)
+        rows = self.over_stages(lambda f, lift: f(lift.variables()), params, data, z)
         return rows.reshape(len(z), -1)
 
     def jacobian(self, params: Any, data: Any, z: Unknowns) -> jax.Array:
         def of_stage(f, lift):
             return lift.pull_back(jax.jacrev(f)(lift.variables()))
 
-        matrix = self._over_stages(of_stage, params, data, z)
+        matrix = self.over_stages(of_stage, params, data, z)
         return matrix.reshape(len(z), -1)
 
     def hessian(self, params: Any, data: Any, z: Unknowns, multipliers: Multipliers) -> jax.Array:
@@ -239,29 +241,3 @@ class StageBlock(Block):
         place, some = place[self.variables], static_take(rows.T, self.variables).T
         some = static_take(some, place)
         return jnp.where((place < len(self.nonlinear))[:, None], some, some.T)
-
-
-def find_nonlinear_variables(block: StageBlock, params: Any, samples: np.ndarray) -> np.ndarray:
-    """Return the indices of the stage variables that have a second derivative that is not zero.
-
-    The Hessian is evaluated at random points, with random multipliers.
-
-    samples: values [samples lanes n] of local unknowns at these points.
-    """
-
-    @eager_jit
-    def second(params, data, z, multipliers):
-        def of_stage(f, lift, m):
-            return jax.jacfwd(jax.grad(lambda y: f(y) @ m))(lift.variables())
-
-        multipliers = multipliers.reshape(len(z), len(block.poly.c), -1)
-        return block._over_stages(of_stage, params, data, z, multipliers)
-
-    # all lanes have the same pattern: two of them are enough
-    lanes = lambda x: jax.tree.map(lambda x: jnp.asarray(x[:2]), x)
-    rows = block.rows[:2]
-    random, used = np.random.default_rng(0), np.zeros(block.layout.stage_size, bool)
-    for z in samples:
-        H = second(params, lanes(block.data), lanes(z), random.normal(size=rows.shape))
-        used |= (np.asarray(H) != 0).any((0, 1, 2))
-    return np.flatnonzero(used)

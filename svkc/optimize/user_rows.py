@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from svkc._jax.eager import eager_jit
 from svkc._jax.pytrees import is_concrete
 from svkc.model.validation import as_array, description, is_real
-from svkc.optimize.blocks import MANY_LANES, StageBlock, find_nonlinear_variables
+from svkc.optimize.blocks import StageBlock
+from svkc.optimize.dependence import entry_masks, find_dependence
 from svkc.optimize.equations import Params, point_of_stage
 from svkc.optimize.lift import polynomials
 from svkc.optimize.phases import Constraint
@@ -92,16 +92,21 @@ class UserRows:
         end = phase.constraints("end")
         self._add("end", i, end, final, stages=[s - 1], intervals=every[-1:])
 
-    def _reads_links(self, block: StageBlock) -> bool:
-        """Return whether a block's function reads coordinates of virtual joints.
+    def _set_dependence(self, block: StageBlock) -> None:
+        """Find out what a block's function reads, and set the block's options and patterns.
 
-        They are set to NaN: only functions that read them then return NaN.
+        Coordinates of virtual joints are NaN at first. Functions that do not read them return
+        numbers, and need not compute them.
         """
+        samples = self._local(block.unknowns)
         block.options = {"fill": np.nan}
-        values = eager_jit(lambda *x: block.values(*x))
-        lanes = lambda x: jax.tree.map(lambda x: jnp.asarray(x[:1]), x)
-        rows = values(self.params, lanes(block.data), lanes(self._local(block.unknowns)[0]))
-        return bool(np.isnan(np.asarray(rows)).any())
+        found = find_dependence(block, self.params, samples)
+        block.options = {} if found is None else {"fill": 0.0}
+        if found is None:
+            found = find_dependence(block, self.params, samples)
+        if found is not None:
+            block.nonlinear = block.variables = np.flatnonzero(found.nonlinear.any(0))
+            block.masks = entry_masks(block, found)
 
     def _holds_at_start(self, i: int, entry: Constraint) -> bool:
         """Return whether a path constraint can be evaluated at the start of phase i.
@@ -190,10 +195,9 @@ class UserRows:
             duration_ratio=lanes(lambda i: places[i][1]),
             unknowns=lanes(lambda i: self._unknowns(i, at_start)),
             rows=np.concatenate([rows for _, _, rows in group.parts]),
-            nonlinear=np.arange(0),
+            nonlinear=np.arange(transcription.model.layout.stage_size),
         )
-        block.options = {} if self._reads_links(block) else {"fill": 0.0}
-        block.nonlinear = block.variables = self._nonlinear_variables(block)
+        self._set_dependence(block)
         if costs:
             columns, of_stage = block.rows.shape[1], block.rows.shape[1] // len(stages)
             is_cost = np.arange(columns) % of_stage >= of_stage - len(costs)
@@ -208,16 +212,6 @@ class UserRows:
         forces = np.full_like(phase.forces, -1)
         forces[:, 0] = phase.impulse
         return phase.intervals(forces)
-
-    def _nonlinear_variables(self, block: StageBlock) -> np.ndarray:
-        """Return the stage's variables in which a block's function may be nonlinear.
-
-        To find these a program is compiled. With few lanes, second derivatives by all variables
-        cost less than that compilation.
-        """
-        if len(block.rows) < MANY_LANES:
-            return np.arange(block.layout.stage_size)
-        return find_nonlinear_variables(block, self.params, self._local(block.unknowns))
 
     def _rows_of(self, place: str, i: int, entries, lanes: tuple[int, int]) -> list[np.ndarray]:
         """Append the rows of constraints; return their indices [lanes stages values] of each.

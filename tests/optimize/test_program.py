@@ -1,8 +1,12 @@
 """Derivatives of a whole problem as a solver gets them, against central differences."""
 
+import jax.numpy as jnp
+import models
 import numpy as np
 import pytest
 
+import svkc
+from svkc import optimize
 from svkc.scenes.backflip import backflip
 from svkc.scenes.backflip_problem import backflip_guess, backflip_problem
 
@@ -27,11 +31,8 @@ def _difference(function, x, direction):
     return (function(x + STEP * direction) - function(x - STEP * direction)) / (2 * STEP)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
-def test_derivatives_are_those_of_differences(problem, seed):
-    """Links, impact, projection, users' costs and constraints: every row has a random weight."""
-    program, x, free = problem
+def _check_derivatives(program, x, free, seed):
+    """Compare products of Jacobian and Hessian with differences, for random weights of the rows."""
     random = np.random.default_rng(1 + seed)
     direction = random.normal(size=len(x)) * free
     weight = random.normal(size=program.cost_row + 1)
@@ -53,3 +54,43 @@ def test_derivatives_are_those_of_differences(problem, seed):
     product += np.bincount(column[other], (values * direction[row])[other], len(x))
     by_difference = _difference(gradient, x, direction)
     np.testing.assert_allclose(product, by_difference, atol=1e-8 * np.abs(by_difference).max())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_derivatives_are_those_of_differences(problem, seed):
+    """Links, impact, projection, users' costs and constraints: every row has a random weight."""
+    _check_derivatives(*problem, seed)
+
+
+def test_derivatives_of_functions_that_are_constant_at_most_points():
+    """Penalties and constraints that begin far from the guess are in the sparsity patterns."""
+    over = lambda x, limit: jnp.maximum(x - limit, 0) ** 2
+    speed = lambda p: jnp.where(p.state.v[0] > 40, (p.state.v[0] - 40) ** 2, 0.0)
+    phase = optimize.Phase(
+        "swing",
+        duration=(0.5, 3.0),
+        intervals=2,
+        path=[optimize.constraint("speed", speed, 0, 1)],
+        end=[optimize.constraint("power", lambda p: over(p.u[0] * p.state.v[0], 200.0), 0, 1)],
+    )
+    problem = optimize.Problem(
+        svkc.load(models.ARM),
+        [phase],
+        controls=optimize.Torques(limit=5.0),
+        running=lambda p: over(-p.state.q[0], 5.0),
+        final=lambda p: over(p.vdot[0], 400.0),
+    )
+    program, start = problem.start(problem.guess([{"arm": 0.0}, {"arm": 1.0}]))
+    random, free = np.random.default_rng(0), np.ones(program.count, bool)
+    users, active = ["speed", "power"], np.zeros(program.cost_row + 1, bool)
+    for seed in range(8):
+        x = start.x + 8 * random.normal(size=program.count)
+        x[program.transcription.indices[0].duration] = 1.0
+        active |= program.rows(x) != 0
+        _check_derivatives(program, x, free, seed)
+    label = program.transcription.rows.label
+    own = [i for i in range(program.cost_row) if any(name in label(i) for name in users)]
+    assert len(own) == 6
+    assert active[own].all()
+    assert active[-1]
