@@ -100,13 +100,13 @@ class UserRows:
         """
         samples = self._local(block.unknowns)
         block.options = {"fill": np.nan}
-        found = find_dependence(block, self.params, samples)
-        block.options = {} if found is None else {"fill": 0.0}
-        if found is None:
-            found = find_dependence(block, self.params, samples)
-        if found is not None:
-            block.nonlinear = block.variables = np.flatnonzero(found.nonlinear.any(0))
-            block.masks = entry_masks(block, found)
+        dependence = find_dependence(block, self.params, samples)
+        block.options = {} if dependence is None else {"fill": 0.0}
+        if dependence is None:
+            dependence = find_dependence(block, self.params, samples)
+        if dependence is not None:
+            block.nonlinear = block.variables = np.flatnonzero(dependence.nonlinear.any(0))
+            block.masks = entry_masks(block, dependence)
 
     def _holds_at_start(self, i: int, entry: Constraint) -> bool:
         """Return whether a path constraint can be evaluated at the start of phase i.
