@@ -14,26 +14,21 @@ import jax.numpy as jnp
 import numpy as np
 
 from svkc._jax.eager import eager_jit
-from svkc.optimize.blocks import MANY_LANES, Block, StageBlock
+from svkc.optimize.blocks import MANY_LANES, Block
 from svkc.optimize.charts import quaternion_starts
 from svkc.optimize.equations import Params
 from svkc.optimize.sparsity import Entries, above_round_off, above_round_off_of_rows
 from svkc.optimize.transcription import Transcription
 
 
-def _has_many_lanes(block: Block) -> bool:
-    return len(block.unknowns) >= MANY_LANES
-
-
-def _over_blocks(
-    blocks: Sequence[Block], call: Callable, is_large: Callable = _has_many_lanes
-) -> Callable:
+def _over_blocks(blocks: Sequence[Block], call: Callable) -> Callable:
     """Return the compiled function (params, data, *x) -> [result of each block].
 
-    call: (block, params, data, ...) -> result of a block. is_large: function of a block; blocks for
-        which it is true are compiled for speed, and others for a short compile time.
+    Blocks with few lanes are compiled for a short compile time, and others for speed.
+
+    call: (block, params, data, ...) -> result of a block.
     """
-    many = [is_large(b) for b in blocks]
+    many = [len(b.unknowns) >= MANY_LANES for b in blocks]
     programs = []
     for compiled, large in ((jax.jit, True), (eager_jit, False)):
         own = [i for i, x in enumerate(many) if x == large]
@@ -79,10 +74,7 @@ class Program:
         self._data = [jax.tree.map(jnp.asarray, b.data) for b in blocks]
         self._values = _over_blocks(blocks, lambda b, *x: b.values(*x))
         self._first = _over_blocks(blocks, lambda b, *x: b.jacobian(*x))
-        # automatic second derivatives of single stages, compiled without optimization, took half of
-        # the time of the backflip's Hessian
-        is_large = lambda b: isinstance(b, StageBlock) or _has_many_lanes(b)
-        self._second = _over_blocks(blocks, lambda b, *x: b.hessian(*x), is_large)
+        self._second = _over_blocks(blocks, lambda b, *x: b.hessian(*x))
         first = [self._first(self.params, self._data, self._local(x)) for x in samples]
         self._set_row_units(first)
         self.row_unit: np.ndarray = np.append(transcription.rows.unit, cost_unit)
