@@ -72,18 +72,20 @@ class Barrier:
     """The barrier problem of a program.
 
     program: the program. parameter: the barrier parameter mu.
-    below, above: masks of unknowns with a lower, and with an upper bound.
+    has_lower, has_upper: masks of unknowns with a lower, and with an upper bound.
     """
 
     def __init__(self, program: SlackProgram, parameter: float):
         self.program = program
         self.parameter: float = parameter
-        self.below: np.ndarray = np.isfinite(program.lower)
-        self.above: np.ndarray = np.isfinite(program.upper)
-        self._lower = np.where(self.below, program.lower, 0.0)
-        self._upper = np.where(self.above, program.upper, 0.0)
-        self._one_sided = 1.0 * (self.below & ~self.above) - 1.0 * (self.above & ~self.below)
-        self._bounds = max(int(self.below.sum() + self.above.sum()), 1)
+        self.has_lower: np.ndarray = np.isfinite(program.lower)
+        self.has_upper: np.ndarray = np.isfinite(program.upper)
+        self._lower = np.where(self.has_lower, program.lower, 0.0)
+        self._upper = np.where(self.has_upper, program.upper, 0.0)
+        self._one_sided = 1.0 * (self.has_lower & ~self.has_upper) - 1.0 * (
+            self.has_upper & ~self.has_lower
+        )
+        self._bounds = max(int(self.has_lower.sum() + self.has_upper.sum()), 1)
 
     @property
     def fraction(self) -> float:
@@ -92,11 +94,14 @@ class Barrier:
 
     def gaps(self, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the distances to lower and upper bounds; 1 where there is no bound."""
-        low = np.where(self.below, w - self._lower, 1.0)
-        return low, np.where(self.above, self._upper - w, 1.0)
+        low = np.where(self.has_lower, w - self._lower, 1.0)
+        return low, np.where(self.has_upper, self._upper - w, 1.0)
 
     def cost(self, w: np.ndarray) -> float:
-        """Return the cost with the logarithms; infinite outside the bounds."""
+        """Return the cost with the logarithms and the damping (section 3.7).
+
+        It is infinite outside the bounds.
+        """
         low, high = self.gaps(w)
         if min(low.min(initial=1.0), high.min(initial=1.0)) <= 0:
             return np.inf
@@ -107,7 +112,7 @@ class Barrier:
     def gradient(self, at: Evaluation) -> np.ndarray:
         """Return the gradient of the cost with the logarithms."""
         low, high = self.gaps(at.w)
-        slope = self.below / low - self.above / high - _DAMPING * self._one_sided
+        slope = self.has_lower / low - self.has_upper / high - _DAMPING * self._one_sided
         return at.gradient - self.parameter * slope
 
     def curvature(self, w: np.ndarray, duals: Duals) -> np.ndarray:
@@ -120,12 +125,12 @@ class Barrier:
         low, high = self.gaps(w)
         of_lower = self.parameter / low - duals.lower - duals.lower / low * d
         of_upper = self.parameter / high - duals.upper + duals.upper / high * d
-        return of_lower * self.below, of_upper * self.above
+        return of_lower * self.has_lower, of_upper * self.has_upper
 
     def largest_step(self, w: np.ndarray, d: np.ndarray) -> float:
         """Return the largest step length at most 1 that keeps w + length d within the bounds."""
         low, high = self.gaps(w)
-        inward, outward = self.below & (d < 0), self.above & (d > 0)
+        inward, outward = self.has_lower & (d < 0), self.has_upper & (d > 0)
         down = (low[inward] / -d[inward]).min(initial=np.inf)
         up = (high[outward] / d[outward]).min(initial=np.inf)
         return min(1.0, self.fraction * float(min(down, up)))
@@ -146,8 +151,8 @@ class Barrier:
         )  # fmt: skip
         return Duals(
             duals.rows,
-            np.clip(duals.lower, *limits(low)) * self.below,
-            np.clip(duals.upper, *limits(high)) * self.above,
+            np.clip(duals.lower, *limits(low)) * self.has_lower,
+            np.clip(duals.upper, *limits(high)) * self.has_upper,
         )
 
     def lagrangian_gradient(self, at: Evaluation, duals: Duals) -> np.ndarray:
@@ -169,7 +174,7 @@ class Barrier:
         size = lambda x: float(np.abs(x).max(initial=0.0))
         dual = size(self.lagrangian_gradient(at, duals))
         products = max(
-            size((low * duals.lower - parameter) * self.below),
-            size((high * duals.upper - parameter) * self.above),
+            size((low * duals.lower - parameter) * self.has_lower),
+            size((high * duals.upper - parameter) * self.has_upper),
         )
         return max(dual / of_dual, size(at.rows), products / of_products), dual, products

@@ -34,7 +34,8 @@ class Run:
 
     tolerance, max_iterations, max_seconds: of `InteriorPoint`. matrix: solver of linear systems.
     progress: called with the number of iterations as a fraction of the largest number.
-    x, duals: last free unknowns, and last multipliers of the problem.
+    x, duals: free unknowns and multipliers of the problem's last iterate. If the problem is
+        infeasible, x is instead the point of least violation.
     begin: time of the start (s). iterations: number of iterations.
     """
 
@@ -83,14 +84,15 @@ class BarrierMethod:
     def solve(self) -> str:
         """Iterate to the end and return the result: the name of an `OUTCOME`, or "arrived"."""
         status = self._iterate()
-        if self.restore is not None and status == "failed" and self.is_acceptable:
-            self.run.x = self.at.w[: self.program.count]
-            return "acceptable"
+        if self.restore is not None and status == "failed":
+            self._store()
+            return "acceptable" if self.is_acceptable else status
         return status
 
     def _iterate(self) -> str:
         while True:
-            self._report()
+            self._store()
+            self.run.progress(min(self.run.iterations / self.run.max_iterations, 1.0))
             status = self._ended() or self._update_parameter()
             if status:
                 return status
@@ -102,13 +104,10 @@ class BarrierMethod:
                 return status
             self.run.iterations += 1
 
-    def _report(self) -> None:
-        """Store the iterate, and call the progress function."""
-        run = self.run
-        run.x = self.at.w[: self.program.count]
+    def _store(self) -> None:
+        """Store the iterate as the last one of the problem. Those of restorations are not."""
         if self.restore is not None:
-            run.duals = self.duals
-        run.progress(min(run.iterations / run.max_iterations, 1.0))
+            self.run.x, self.run.duals = self.at.w[: self.program.count], self.duals
 
     def _ended(self) -> str | None:
         """Return the result if the iterate is the last one."""
@@ -123,7 +122,7 @@ class BarrierMethod:
                 return "infeasible"
         else:
             scale = self.program.functions.cost_scale
-            fine = self.violation <= ROW_TOLERANCE and dual <= _DUAL_TOLERANCE * scale
+            fine = self.largest_violation <= ROW_TOLERANCE and dual <= _DUAL_TOLERANCE * scale
             if fine and error <= run.tolerance and products <= _PRODUCT_TOLERANCE * scale:
                 return "successful"
             self._acceptable = self._acceptable + 1 if self.is_acceptable else 0
@@ -134,15 +133,15 @@ class BarrierMethod:
         return "max_time" if time.perf_counter() - run.begin > run.max_seconds else None
 
     @property
-    def violation(self) -> float:
+    def largest_violation(self) -> float:
         """Largest violation of a row, not scaled."""
-        return float(np.abs(self.at.rows / self.program.functions.row_scale).max(initial=0.0))
+        return self.program.largest_violation(self.at.rows)
 
     @property
     def is_acceptable(self) -> bool:
         """Whether the iterate satisfies the conditions to the acceptable tolerance."""
         error = self.barrier.errors(self.at, self.duals, 0.0)[0]
-        return max(error, self.violation) <= _ACCEPTABLE
+        return max(error, self.largest_violation) <= _ACCEPTABLE
 
     def _update_parameter(self) -> str | None:
         """Decrease the barrier parameter if its problem is solved (section 2.1).
@@ -191,16 +190,17 @@ class BarrierMethod:
 
     def _advance(self, step: Step) -> str | None:
         """Move to the next iterate; return the result if there is none."""
-        length = step.length
         if self.restore is None:
             accepted = self.search.search(step)
         else:
             state, step, accepted = self._watchdog.take((self.at, self.duals), step)
             self.at, self.duals = state
         self._reset_filter_if_blocked()
-        is_short = length < _SHORT_LENGTH and self.at.theta > _SHORT_THETA
+        is_short = step.length < _SHORT_LENGTH and self.at.theta > _SHORT_THETA
         self._short = self._short + 1 if is_short else 0
-        if accepted is not None and (self.restore is None or self._short < _SHORT_STEPS):
+        # while full steps are on trial the filter may not have accepted the iterate
+        goes_on = self.restore is None or self._watchdog.active or self._short < _SHORT_STEPS
+        if accepted is not None and goes_on:
             self._accept(step, accepted)
             return None
         if self.restore is None:

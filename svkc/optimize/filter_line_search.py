@@ -96,7 +96,8 @@ class Accepted:
 class LineSearch:
     """Backtracking line search (section 2.3, with section 2.4 for second-order corrections).
 
-    by_filter: whether the filter alone refused the last trial point that was refused.
+    by_filter: whether the filter alone refused the last trial point of the last search that was
+        refused.
     tiny: whether the last step was as small as round-off.
     """
 
@@ -155,10 +156,11 @@ class LineSearch:
     def search(self, step: Step) -> Accepted | None:
         """Return the accepted step, or None if the step length would be too small."""
         w, origin = step.at.w, self.reference(step)
+        self.by_filter = False
         self.tiny = bool(np.max(np.abs(step.d) / (1 + np.abs(w)), initial=0.0) < _ROUND_OFF)
         if self.tiny and origin.theta < _TINY_THETA:
             return Accepted(w + step.length * step.d, step.dy, step.length)
-        least, length, self.by_filter = self._least_length(origin), step.length, False
+        least, length = self._least_length(origin), step.length
         while length >= least or length == step.length:
             origin = dataclasses.replace(origin, length=length)
             at = w + length * step.d

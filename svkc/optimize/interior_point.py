@@ -11,7 +11,7 @@ from svkc.model.validation import integer, positive_scalar
 from svkc.optimize.barrier import PUSH, Barrier, Duals, interior
 from svkc.optimize.barrier_method import BarrierMethod, Run
 from svkc.optimize.ipopt import AbstractSolver, SolverResult
-from svkc.optimize.newton_system import matrix_of
+from svkc.optimize.newton_system import newton_matrix
 from svkc.optimize.nonlinear_program import Functions, SlackProgram
 from svkc.optimize.program import Program
 from svkc.optimize.restoration import restore
@@ -20,6 +20,8 @@ from svkc.optimize.restoration import restore
 _COLD, _WARM_PRIMAL, _WARM = 0.1, 1e-4, 1e-6
 # distances to bounds of warm starts, without multipliers and with them
 _PUSH_PRIMAL, _PUSH_WARM = 1e-4, 1e-8
+# least multiplier of a bound at the start
+_LEAST_MULTIPLIER = 1e-8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,7 +66,7 @@ class InteriorPoint(AbstractSolver):
             tolerance=float(self.tolerance),
             max_iterations=int(self.max_iterations),
             max_seconds=float(self.max_seconds),
-            matrix=matrix_of(functions),
+            matrix=newton_matrix(functions),
             progress=progress,
             x=functions.start,
             duals=Duals(np.zeros(len(functions.solver_rows)), np.zeros(n), np.zeros(n)),
@@ -113,7 +115,7 @@ def _method(functions: Functions, run: Run, start: SolverResult, warm: bool) -> 
         return BarrierMethod(run, barrier, w, barrier.limited(w, duals), restore=restore)
     low, high = barrier.gaps(w) if warm else (parameter, parameter)
     zero = np.zeros(program.row_count)
-    duals = Duals(zero, parameter / low * barrier.below, parameter / high * barrier.above)
+    duals = Duals(zero, parameter / low * barrier.has_lower, parameter / high * barrier.has_upper)
     method = BarrierMethod(run, barrier, w, duals, restore=restore)
     method.duals = dataclasses.replace(duals, rows=method.least_squares())
     return method
@@ -127,7 +129,5 @@ def _scaled_duals(barrier: Barrier, start: SolverResult) -> Duals:
     of_slacks = rows[program.slack_row]
     lower = np.concatenate([start.lower[functions.free] * scale, np.maximum(-of_slacks, 0)])
     upper = np.concatenate([start.upper[functions.free] * scale, np.maximum(of_slacks, 0)])
-    least = _PUSH_WARM
-    return Duals(
-        rows, np.maximum(lower, least) * barrier.below, np.maximum(upper, least) * barrier.above
-    )
+    at_least = lambda values: np.maximum(values, _LEAST_MULTIPLIER)
+    return Duals(rows, at_least(lower) * barrier.has_lower, at_least(upper) * barrier.has_upper)

@@ -44,7 +44,7 @@ def interval_groups(functions: Functions) -> np.ndarray:
     return np.concatenate([of_unknowns, of_rows])
 
 
-def matrix_of(functions: Functions) -> BlockChain:
+def newton_matrix(functions: Functions) -> BlockChain:
     """Return the solver of systems with the Hessian, a diagonal, and the Jacobian below them."""
     n, diagonal = len(functions.free), np.arange(len(functions.free) + len(functions.solver_rows))
     row = np.concatenate([functions.hessian_row, n + functions.row, diagonal])
@@ -66,7 +66,7 @@ class NewtonSystem:
 
     Slacks are eliminated, because their part of W is a diagonal.
 
-    program: the program. matrix: of `matrix_of`.
+    program: the program. matrix: of `newton_matrix`.
     shifts: (shift, row_shift) of the last direction. last_shift: last shift above zero.
     """
 

@@ -37,7 +37,8 @@ class Functions:
         self.free: np.ndarray = np.flatnonzero(low < high)
         self.start: np.ndarray = self._all[self.free]
         self.lower, self.upper = low[self.free], high[self.free]
-        self.row_lower, self.row_upper = row_low[rows], row_high[rows]
+        self._row_bounds = row_low[rows], row_high[rows]
+        self.row_lower, self.row_upper = self._row_bounds
         self.cost_scale: float = 1.0
         self.row_scale: np.ndarray = np.ones(len(rows))
         self.seconds: float = 0.0
@@ -65,6 +66,7 @@ class Functions:
 
     def scale(self, x: np.ndarray) -> None:
         """Set the scales by the gradients at x."""
+        self.cost_scale, self.row_scale = 1.0, np.ones(len(self.solver_rows))
         largest = np.zeros(len(self.row_scale))
         np.maximum.at(largest, self.row, np.abs(self.jacobian(x)))
         of_cost = np.abs(self.gradient(x)).max(initial=0.0)
@@ -72,8 +74,7 @@ class Functions:
             _LARGEST_GRADIENT / np.maximum(size, _LEAST_SCALE), _LEAST_SCALE, 1.0
         )
         self.cost_scale, self.row_scale = float(factor(of_cost)), factor(largest)
-        self.row_lower = self.row_lower * self.row_scale
-        self.row_upper = self.row_upper * self.row_scale
+        self.row_lower, self.row_upper = (x * self.row_scale for x in self._row_bounds)
 
     def all_unknowns(self, x: np.ndarray) -> np.ndarray:
         """Return free unknowns with the fixed ones."""
@@ -120,7 +121,7 @@ class SlackProgram:
     """A program with equations as rows: min f(w) with c(w) = 0 and bounds of w = [x, slacks].
 
     c is g(x) - slack for an inequality, and g(x) - value for an equation. Bounds are relaxed by
-    1e-8 of their size (section 3.5).
+    1e-8 of their size (equation 35).
 
     count: number of free unknowns x. row_count: number of rows.
     slack_row, slack_sign: row of each slack, and its sign in the row.
@@ -151,6 +152,10 @@ class SlackProgram:
     def rows(self, w: np.ndarray) -> np.ndarray:
         of_x = self.functions.rows(w[: self.count]) - self.target
         return of_x + self.of_slacks(self.slack_sign * w[self.count :])
+
+    def largest_violation(self, rows: np.ndarray) -> float:
+        """Return the largest absolute value of rows, not scaled."""
+        return float(np.abs(rows / self.functions.row_scale).max(initial=0.0))
 
     def of_slacks(self, values: np.ndarray) -> np.ndarray:
         """Return the sums of the slacks' values over the slacks of each row."""

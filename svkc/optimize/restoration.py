@@ -33,24 +33,21 @@ def restore(method: BarrierMethod) -> str | None:
 
     inner.arrived = arrived
     status = inner.solve()
-    if status != "arrived":
-        # the nearest point is feasible, but the filter refuses it
-        feasible = _violation(method, inner) <= ROW_TOLERANCE
-        return "failed" if status == "infeasible" and feasible else status
     w = inner.at.w[:count]
+    if status == "infeasible":
+        if method.program.largest_violation(method.program.rows(w)) <= ROW_TOLERANCE:
+            # the nearest point is feasible, but the filter refuses it
+            return "failed"
+        method.run.x = w[: method.program.count]
+    if status != "arrived":
+        return status
     of_lower, of_upper = barrier.dual_steps(at.w, method.duals, w - at.w)
     length = barrier.largest_dual_step(method.duals, of_lower, of_upper)
     lower, upper = method.duals.lower + length * of_lower, method.duals.upper + length * of_upper
     if max(lower.max(initial=0.0), upper.max(initial=0.0)) > _LARGEST_MULTIPLIER:
-        lower, upper = 1.0 * barrier.below, 1.0 * barrier.above
+        lower, upper = 1.0 * barrier.has_lower, 1.0 * barrier.has_upper
     method.restart(w, lower, upper)
     return None
-
-
-def _violation(method: BarrierMethod, inner: BarrierMethod) -> float:
-    """Return the largest violation of a row, not scaled, at the end of a restoration."""
-    rows = method.program.rows(inner.at.w[: len(method.at.w)])
-    return float(np.abs(rows / method.program.functions.row_scale).max(initial=0.0))
 
 
 def _method(method: BarrierMethod) -> BarrierMethod:

@@ -57,6 +57,7 @@ class Watchdog:
         state: what the method restores if it goes back.
         """
         search = self._search
+        search.by_filter = search.tiny = False
         if self._attempt is not None and self._attempt.parameter != search.barrier.parameter:
             self.stop()
         accepted = None
@@ -109,7 +110,6 @@ class Watchdog:
         """Return a full step on trial."""
         assert self._attempt is not None
         self._attempt.left -= 1
-        self._search.tiny = False
         return Accepted(w, step.dy, step.length)
 
     def _possible(self, w: np.ndarray, theta: float) -> bool:

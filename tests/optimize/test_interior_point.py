@@ -8,8 +8,11 @@ import pytest
 import wrong_optimizations
 
 from svkc import optimize
+from svkc.optimize import interior_point
 from svkc.optimize.block_chain import BlockChain
+from svkc.optimize.nonlinear_program import Functions
 from svkc.optimize.program import Program
+from svkc.optimize.restoration import restore
 from svkc.scenes.backflip import backflip
 from svkc.scenes.backflip_problem import backflip_guess, backflip_problem
 
@@ -115,6 +118,41 @@ def test_an_infeasible_problem_names_its_rows():
     assert last.result == optimize.OUTCOME.infeasible
     with pytest.raises(RuntimeError, match=r"violates constraints.*x in move, interval"):
         problem.solve(guess, solver=SOLVER)
+
+
+def test_a_limit_in_a_restoration_returns_the_iterate_before_it():
+    """Unknowns and multipliers are of the same iterate."""
+    problem, guess = move(longest=1.0)
+    begins: list[int] = []
+
+    def record(method):
+        begins.append(method.run.iterations)
+        return restore(method)
+
+    with mock.patch.object(interior_point, "restore", record):
+        problem.solve(guess, solver=SOLVER, throw=False)
+    limits = begins[0] + np.arange(4)
+    ended = [
+        problem.solve(guess, solver=optimize.InteriorPoint(max_iterations=int(k)), throw=False)
+        for k in limits
+    ]
+    assert [int(x.iterations) for x in ended] == limits.tolist()
+    for other in ended[1:]:
+        np.testing.assert_array_equal(other.motion[0].q, ended[0].motion[0].q)
+        np.testing.assert_array_equal(other.multipliers.rows, ended[0].multipliers.rows)
+
+
+def test_scales_do_not_depend_on_earlier_scales(solved):
+    problem, guess, _ = solved
+    program, start = problem.start(guess)
+    functions = Functions(program, start.x)
+    functions.scale(100 * functions.start)
+    functions.scale(functions.start)
+    once = Functions(program, start.x)
+    once.scale(once.start)
+    np.testing.assert_array_equal(functions.row_scale, once.row_scale)
+    np.testing.assert_array_equal(functions.row_lower, once.row_lower)
+    assert functions.cost_scale == once.cost_scale
 
 
 def test_limits_have_their_results(solved):
