@@ -11,7 +11,7 @@ from svkc.model.annotations import Path
 from svkc.optimize.guesses import PhaseMotion
 
 # increase the schema whenever a stored array is added, renamed or changes its meaning
-SCHEMA = 1
+SCHEMA = 2
 MOTION = tuple(PhaseMotion.__dataclass_fields__)
 NUMBERS = ("cost", "violation", "iterations", "seconds", "cost_error")
 MULTIPLIERS = ("rows", "lower", "upper")
@@ -24,6 +24,7 @@ def description_of(problem: Any) -> dict[str, Any]:
         "coordinates": list(problem.chain.dof_names),
         "controls": [type(problem.controls).__name__, *problem.controls.names(problem.chain)],
         "stages": problem.scheme.stages,
+        "free": [[name, *shape] for name, shape in problem.args_model.shapes.items()],
     }
 
 
@@ -43,6 +44,7 @@ def save_solution(solution: Any, result: str, path: Path) -> None:
         "result": result,
         "problem": description_of(solution.problem),
     }
+    arrays["free"] = solution.problem.args_model.numbers(solution.args)
     arrays["metadata"] = np.array(json.dumps(meta))
     path = pathlib.Path(path)
     # a temporary file in the folder of the target, so that os.replace is atomic

@@ -30,6 +30,7 @@ def encode(transcription: Transcription, guess: Guess) -> np.ndarray:
         if starts.any():
             x[at.kept_gap[starts]] = np.asarray(_gaps(transcription, motion.q[0]))[starts]
         kept = at.kept_gap
+    x[transcription.builder.free] = guess.free
     return _with_noise(transcription, guess, np.clip(x, table.lower, table.upper))
 
 

@@ -39,11 +39,12 @@ def load_solution(path: Path, problem: Any) -> Solution:
         numbers = {name: arrays[name] for name in NUMBERS}
         multipliers = Multipliers(**{name: arrays[f"multipliers.{name}"] for name in MULTIPLIERS})
         result = OUTCOME._name_to_item[meta["result"]]
+        free = arrays["free"]
     except KeyError as error:
         raise ValueError(
             f"{path} is not a complete file of a solution: {error} is missing"
         ) from None
-    meshed = problem.with_mesh([m.mesh for m in motion])
+    meshed = problem.with_mesh([m.mesh for m in motion]).with_free(free)
     poses = [[m.q[0], m.q[-1]] for m in motion]
     _, structures = phase_structures(meshed.chain, meshed.phases, poses)
     return solution_of(

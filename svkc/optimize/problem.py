@@ -2,7 +2,7 @@
 
 import copy
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -14,14 +14,14 @@ from svkc.model.chain import Chain
 from svkc.model.checked_jit import check_chain
 from svkc.model.validation import boolean, check_function, integer
 from svkc.optimize.checks import Check, check, check_finite
+from svkc.optimize.compilation import compile_problem
 from svkc.optimize.controls import AbstractControls
 from svkc.optimize.encoding import encode
-from svkc.optimize.equations import Model, Params
+from svkc.optimize.equations import Params
 from svkc.optimize.failures import raise_on_failure
+from svkc.optimize.free_args import ArgsModel
 from svkc.optimize.guesses import Guess, PoseLine, motion_without_torques
 from svkc.optimize.ipopt import AbstractSolver, Ipopt, SolverResult
-from svkc.optimize.lift import Layout
-from svkc.optimize.loop_rows import LinkRows
 from svkc.optimize.multistart import Solutions, multistart
 from svkc.optimize.phases import Phase, as_constraint
 from svkc.optimize.program import Program
@@ -29,13 +29,7 @@ from svkc.optimize.resampling import as_guess
 from svkc.optimize.schemes import Radau
 from svkc.optimize.solution import Solution, solution
 from svkc.optimize.structures import phase_structures
-from svkc.optimize.transcription import Transcription
 from svkc.optimize.units import Units, units_of
-from svkc.optimize.unknowns import UnknownsBuilder
-from svkc.optimize.user_rows import UserRows
-
-# number of random points at which sparsity is determined, and the scaled cost at these points
-_SAMPLES, _COST_AT_SAMPLES = 3, 50.0
 
 
 class Problem:
@@ -49,6 +43,9 @@ class Problem:
     bounds: bounds on coordinates at all nodes of all phases, from `between`.
     scheme: collocation scheme; None: `Radau(2)`.
     args: data for the functions of the problem, which read them as `point.args`.
+    free: (lower, upper) by name of args that the solver chooses; args is then a dict with these
+        names, and its values are the guess.
+    chain_from: function (chain, args) -> chain, the chain for some args; None: the given one.
     units: `Units` by which the solver divides; None: from mass, length and gravity.
     project: whether nodes are projected onto their loops. False: the equations of motion keep
         accelerations on the loops, but positions and velocities drift off over the intervals.
@@ -67,17 +64,22 @@ class Problem:
         bounds: Sequence[Any] = (),
         scheme: Radau | None = None,
         args: Any = None,
+        free: Mapping[str, Any] | None = None,
+        chain_from: Checked[Function | None] = None,
         units: Units | None = None,
         project: bool = True,
     ):
         check_chain(chain)
         phases = [phases] if isinstance(phases, Phase) else list(phases)
         bounds = tuple(as_constraint("bounds", i, entry) for i, entry in enumerate(bounds))
-        self.chain: Chain = chain
         self.controls: AbstractControls = controls.for_chain(chain)
         # floats become arrays: `Solution.gradient` differentiates by them
         as_data = lambda x: jnp.asarray(x) if isinstance(x, float) else x
         self.args: Any = jax.tree.map(as_data, args)
+        if chain_from is not None:
+            check_function("chain_from", chain_from, "chain", "args")
+        self.args_model: ArgsModel = ArgsModel(chain, self.args, free or {}, chain_from)
+        self.chain: Chain = self.args_model.params(Params(chain, self.args)).chain
         self.phases: list[Phase] = [
             dataclasses.replace(p, bounds=(*bounds, *p.bounds)) for p in phases
         ]
@@ -98,7 +100,13 @@ class Problem:
         self.functions: dict[str, Any] = {}
 
     def guess(
-        self, poses: Sequence[Any], durations: Any = None, *, noise: float = 0.0, key: int = 0
+        self,
+        poses: Sequence[Any],
+        durations: Any = None,
+        *,
+        free: Mapping[str, Any] | None = None,
+        noise: float = 0.0,
+        key: int = 0,
     ) -> Guess:
         """Return a guess with straight lines between poses.
 
@@ -108,21 +116,24 @@ class Problem:
             array of the tree's coordinates, a dict by joint name, or a State. None: not known; the
             line leads on to the next known pose. Newton steps close the loops of known poses.
         durations: durations of the phases (s); None: the middle of their bounds.
+        free: values of free args by name; of others, the values in `args`.
         noise: unknowns move at random by at most this fraction of the range between their bounds.
         key: seed of the random numbers.
-        Raises ValueError for a wrong number of poses or of durations.
+        Raises ValueError for a wrong number of poses or of durations, and for unknown names.
         """
+        problem = self.with_free(self.args_model.numbers(self.args, free or {}))
         count = len(self.phases)
         middle = [sum(p.duration) / 2 for p in self.phases]
         durations = np.asarray(middle if durations is None else durations, float)
         if durations.shape != (count,):
             raise ValueError(f"guess: got {durations.size} durations, expected {count}")
-        lines = PoseLine(self.chain, self.phases, poses).at(durations)
+        chain = problem.chain
+        lines = PoseLine(chain, self.phases, poses).at(durations)
         motions = [
-            motion_without_torques(self.chain, self.controls, self.scheme, phase, duration, line)
+            motion_without_torques(chain, self.controls, self.scheme, phase, duration, line)
             for phase, duration, line in zip(self.phases, durations, lines)
         ]
-        return Guess(motions, noise, key)
+        return Guess(motions, noise, key, self.args_model.numbers(problem.args))
 
     def solve(
         self,
@@ -183,6 +194,19 @@ class Problem:
         problem._programs, problem.functions = {}, self.functions
         return problem
 
+    def with_free(self, numbers: np.ndarray) -> "Problem":
+        """Return the problem with other numbers of the free args, as their guess.
+
+        numbers: of all free args, in the order of `free`.
+        """
+        if not self.args_model.names:
+            return self
+        problem, given = copy.copy(self), Params(self.args_model.chain, self.args)
+        problem.chain, problem.args = self.args_model.params(given, numbers)
+        # compiled functions may hold the chain
+        problem.functions = {}
+        return problem
+
     def multistart(
         self,
         guesses: Sequence[Guess | Solution],
@@ -239,59 +263,5 @@ class Problem:
         rows, structures = phase_structures(self.chain, self.phases, poses)
         key = (rows.tobytes(), *(s.active.tobytes() for s in structures))
         if key not in self._programs:
-            self._programs[key] = self._compile(rows, structures, guess)
+            self._programs[key] = compile_problem(self, rows, structures, guess)
         return self._programs[key]
-
-    def _compile(self, rows: np.ndarray, structures, guess: Guess) -> Program:
-        """Return the compiled problem.
-
-        rows: the links' rows that are constraints in some phase. structures: of each phase.
-        """
-        chain, controls = self.chain, self.controls
-        layout = Layout(
-            nv=chain.nv,
-            stages=self.scheme.stages,
-            rows=len(rows),
-            control=controls.count(chain),
-            blocks=controls.blocks(self.scheme),
-            stage_blocks=controls.stage_blocks,
-        )
-        builder = UnknownsBuilder(
-            chain, controls, rows, scheme=self.scheme, units=self.units, project=self.project
-        )
-        transcription = Transcription(
-            builder,
-            self.phases,
-            Model(layout, LinkRows.of(chain, rows), controls),
-            scheme=self.scheme,
-            structures=structures,
-            references=[m.q for m in guess.phases],
-        )
-        builder.table.freeze()
-        params = Params(chain, self.args)
-        samples = self._sample_points(builder.table, transcription)
-        users = UserRows(transcription, params, samples)
-        last = len(self.phases) - 1
-        for i, phase in enumerate(self.phases):
-            running = [f for f in (self.running, phase.running) if f is not None]
-            final = [f for f in (self.final if i == last else None, phase.final) if f is not None]
-            users.add_phase(i, running, final)
-        users.add_blocks()
-        program = Program(transcription, params, samples, self.units.cost or 1.0)
-        if self.units.cost is None:
-            costs = [abs(program.rows(x / program.unit)[-1]) for x in samples]
-            program.set_cost_unit(max(float(np.median(costs)) / _COST_AT_SAMPLES, 1e-12))
-        return program
-
-    def _sample_points(self, table, transcription: Transcription) -> np.ndarray:
-        """Return random points [samples unknowns] in SI units.
-
-        Durations are near the middle of their bounds, and fixed unknowns have their values.
-        """
-        random = np.random.default_rng(0)
-        samples = random.normal(size=(_SAMPLES, table.count)) * table.unit
-        for phase, indices in zip(self.phases, transcription.indices):
-            middle = sum(phase.duration) / 2
-            samples[:, indices.duration] = middle * random.uniform(0.8, 1.2, _SAMPLES)
-        fixed = table.lower == table.upper
-        return np.where(fixed, table.lower, samples)

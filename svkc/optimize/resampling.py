@@ -38,8 +38,9 @@ def as_guess(guess: Any, problem: Any) -> Guess:
             motion = resample(problem.chain, problem.scheme, problem.controls, motion, phase)
         phases.append(motion)
     if isinstance(guess, Guess):
-        return Guess(phases, guess.noise, guess.key)
-    return Guess(phases)
+        free = guess.free if len(guess.free) else problem.args_model.numbers(problem.args)
+        return Guess(phases, guess.noise, guess.key, free)
+    return Guess(phases, free=problem.args_model.numbers(guess.problem.args))
 
 
 def _linear(x: np.ndarray, y: np.ndarray, at: np.ndarray) -> np.ndarray:

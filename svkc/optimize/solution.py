@@ -74,7 +74,7 @@ class Solution(Printed):
     result: how the optimization ended.
     structures: structures of the phases.
     cost_error: difference of the costs on the last two meshes of `refined`; NaN if not refined.
-    problem: the problem, with the mesh of this solution.
+    problem: the problem, with the mesh of this solution, and with the optimal free args.
     """
 
     cost: Any
@@ -103,7 +103,14 @@ class Solution(Printed):
             f" {float(self.seconds[0]):.3g} s ({float(self.seconds[1]):.3g} s in functions):"
             f" {self.result}"
         )
-        return [words, Table(("phase", "duration (s)", "intervals"), rows)]
+        names = self.problem.args_model.names
+        free = [f"{name}: {np.array2string(np.asarray(self.args[name]))}" for name in names]
+        return [words, *free, Table(("phase", "duration (s)", "intervals"), rows)]
+
+    @property
+    def args(self) -> Any:
+        """Args of the problem, with the optimal values of the free ones."""
+        return self.problem.args
 
     def __str__(self) -> str:
         return as_text(self._blocks())
@@ -256,9 +263,10 @@ class Solution(Printed):
 def solution(problem: Any, program: Program, result: SolverResult) -> Solution:
     """Return the `Solution` of a solver's result."""
     transcription, rows = program.transcription, program.rows(result.x)
+    x = result.x * program.unit
     return solution_of(
-        problem,
-        decode(transcription, result.x * program.unit),
+        problem.with_free(x[transcription.builder.free]),
+        decode(transcription, x),
         [s.structure for s in transcription.structures],
         cost=rows[-1] * program.row_unit[-1],
         violation=np.max(program.violation(result.x), initial=0.0),

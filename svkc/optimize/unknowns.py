@@ -7,6 +7,7 @@ import numpy as np
 
 from svkc.model.chain import Chain
 from svkc.optimize.controls import AbstractControls
+from svkc.optimize.free_args import ArgsModel
 from svkc.optimize.phases import Phase, coordinates_of
 from svkc.optimize.points import PhaseStructure
 from svkc.optimize.schemes import Radau
@@ -58,7 +59,21 @@ class UnknownsBuilder:
         of_rows = [f"{chain.link_names[row // 6]}.{LINK_ROWS[row % 6]}" for row in rows]
         dofs = list(chain.dof_names[: chain.nv])
         self.names: Names = Names(dofs, controls.names(chain), of_rows)
+        # indices of the free args' unknowns
+        self.free: np.ndarray = np.zeros(0, int)
         self._force_unit = np.where(rows % 6 < 3, units.torque, units.force)
+
+    def add_free_args(self, model: ArgsModel) -> np.ndarray:
+        """Append the free args; return the indices of their numbers."""
+        names = [
+            name if shape == () else f"{name}[{k}]"
+            for name, shape in model.shapes.items()
+            for k in range(int(np.prod(shape)))
+        ]
+        low, high = model.lower, model.upper
+        options = {"lower": low, "upper": high, "unit": high - low, "entries": names}
+        self.free = self.table.add("arg", "the whole motion", (len(low),), **options)
+        return self.free
 
     @property
     def node_units(self) -> np.ndarray:

@@ -31,7 +31,7 @@ def _difference(function, x, direction):
     return (function(x + STEP * direction) - function(x - STEP * direction)) / (2 * STEP)
 
 
-def _check_derivatives(program, x, free, seed):
+def check_derivatives(program, x, free, seed):
     """Compare products of Jacobian and Hessian with differences, for random weights of the rows."""
     random = np.random.default_rng(1 + seed)
     direction = random.normal(size=len(x)) * free
@@ -60,7 +60,7 @@ def _check_derivatives(program, x, free, seed):
 @pytest.mark.parametrize("seed", range(3))
 def test_derivatives_are_those_of_differences(problem, seed):
     """Links, impact, projection, users' costs and constraints: every row has a random weight."""
-    _check_derivatives(*problem, seed)
+    check_derivatives(*problem, seed)
 
 
 def test_derivatives_of_functions_that_are_constant_at_most_points():
@@ -88,7 +88,7 @@ def test_derivatives_of_functions_that_are_constant_at_most_points():
         x = start.x + 8 * random.normal(size=program.count)
         x[program.transcription.indices[0].duration] = 1.0
         active |= program.rows(x) != 0
-        _check_derivatives(program, x, free, seed)
+        check_derivatives(program, x, free, seed)
     label = program.transcription.rows.label
     own = [i for i in range(program.cost_row) if any(name in label(i) for name in users)]
     assert len(own) == 6

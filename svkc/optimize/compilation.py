@@ -1,0 +1,91 @@
+"""From a problem to its compiled program."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from svkc.optimize.equations import Model, Params
+from svkc.optimize.free_args import ArgsBlock
+from svkc.optimize.guesses import Guess
+from svkc.optimize.lift import Layout
+from svkc.optimize.loop_rows import LinkRows
+from svkc.optimize.points import PhaseStructure
+from svkc.optimize.program import Program
+from svkc.optimize.transcription import Transcription
+from svkc.optimize.unknowns import UnknownsBuilder
+from svkc.optimize.user_rows import UserRows
+
+# number of random points at which sparsity is determined, and the scaled cost at these points
+_SAMPLES, _COST_AT_SAMPLES = 3, 50.0
+
+
+def compile_problem(
+    problem: Any, rows: np.ndarray, structures: Sequence[PhaseStructure], guess: Guess
+) -> Program:
+    """Return the compiled program of a `Problem`.
+
+    rows: the links' rows that are constraints in some phase. structures: of each phase.
+    guess: its configurations are the origins of the charts.
+    """
+    chain, controls, model = problem.chain, problem.controls, problem.args_model
+    layout = Layout(
+        nv=chain.nv,
+        stages=problem.scheme.stages,
+        rows=len(rows),
+        control=controls.count(chain),
+        blocks=controls.blocks(problem.scheme),
+        stage_blocks=controls.stage_blocks,
+    )
+    builder = UnknownsBuilder(
+        chain, controls, rows, scheme=problem.scheme, units=problem.units, project=problem.project
+    )
+    transcription = Transcription(
+        builder,
+        problem.phases,
+        Model(layout, LinkRows.of(chain, rows), controls),
+        scheme=problem.scheme,
+        structures=structures,
+        references=[m.q for m in guess.phases],
+    )
+    free = builder.add_free_args(model)
+    builder.table.freeze()
+    samples = _sample_points(problem, transcription)
+    _add_user_rows(problem, transcription, samples)
+    if model:
+        transcription.blocks = [ArgsBlock(b, model, free) for b in transcription.blocks]
+    params = Params(model.chain, problem.args)
+    program = Program(transcription, params, samples, problem.units.cost or 1.0)
+    if problem.units.cost is None:
+        costs = [abs(program.rows(x / program.unit)[-1]) for x in samples]
+        program.set_cost_unit(max(float(np.median(costs)) / _COST_AT_SAMPLES, 1e-12))
+    return program
+
+
+def _add_user_rows(problem: Any, transcription: Transcription, samples: np.ndarray) -> None:
+    """Append the rows and cost terms of the user's functions."""
+    users = UserRows(transcription, Params(problem.chain, problem.args), samples)
+    last = len(problem.phases) - 1
+    for i, phase in enumerate(problem.phases):
+        running = [f for f in (problem.running, phase.running) if f is not None]
+        final = [f for f in (problem.final if i == last else None, phase.final) if f is not None]
+        users.add_phase(i, running, final)
+    users.add_blocks()
+
+
+def _sample_points(problem: Any, transcription: Transcription) -> np.ndarray:
+    """Return random points [samples unknowns] in SI units.
+
+    Durations and free args are near the middle of their bounds, and fixed unknowns have their
+    values.
+    """
+    table, random = transcription.builder.table, np.random.default_rng(0)
+    samples = random.normal(size=(_SAMPLES, table.count)) * table.unit
+    for phase, indices in zip(problem.phases, transcription.indices):
+        middle = sum(phase.duration) / 2
+        samples[:, indices.duration] = middle * random.uniform(0.8, 1.2, _SAMPLES)
+    free = transcription.builder.free
+    share = random.uniform(0.4, 0.6, (_SAMPLES, len(free)))
+    samples[:, free] = (1 - share) * table.lower[free] + share * table.upper[free]
+    fixed = table.lower == table.upper
+    return np.where(fixed, table.lower, samples)
