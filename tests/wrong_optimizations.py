@@ -8,6 +8,7 @@ import numpy as np
 
 import svkc
 from svkc import optimize
+from svkc.optimize.archive import SCHEMA
 from svkc.optimize.block_chain import LARGEST_DENSE, BlockChain
 
 CART = (
@@ -80,14 +81,20 @@ def on_point(call, where="end"):
     return lambda s: check(**{where: [call]})
 
 
+def with_args(**options):
+    """Return a problem with the arg "mass"."""
+    controls = optimize.Torques(1.0, constant=True)
+    return optimize.Problem(cart(), [phase()], controls=controls, args={"mass": 1.0}, **options)
+
+
 CASES = {
     "... depends on fixed": lambda s: check(of=fixed_problem()),
     "... has schema ... of solutions": load(optimize_schema=99),
     "... is not a complete file of a solution: ...": load(),
     "... is not a complete file of a solution: ... is missing": load(
-        optimize_schema=1, result="successful", problem={}
+        optimize_schema=SCHEMA, result="successful", problem={}
     ),
-    "... is of another problem": load(optimize_schema=1, problem={"stages": 7}),
+    "... is of another problem": load(optimize_schema=SCHEMA, problem={"stages": 7}),
     "...: a point at the start": on_point(lambda p: p.vdot[0], "start"),
     "...: expected a cost": lambda s: check(running=lambda p: p.u),
     "...: got ..., expected a function of a point": on_point(3),
@@ -102,10 +109,15 @@ CASES = {
     "backend: got": lambda s: optimize.Ipopt(backend="snopt"),
     "between: ... has": lambda s: optimize.between("x", 1, 0),
     "between: of=": lambda s: check(bounds=[optimize.between("x", 0, 1, of="torque")]),
+    "chain_from: expected": lambda s: with_args(chain_from=lambda chain, args: s.four),
     "constraint ...: expected numbers": on_point(lambda p: None),
     "constraint ...: got the bounds": on_point((lambda p: p.state.q[0], 1, 0)),
     "constraint ...: its bounds": on_point(lambda p: (p.state.q[0], p.state.v[0], 1)),
     "controls: ... is": lambda s: problem(optimize.Torques(joints=["pin"])),
+    "free[...]: expected": lambda s: with_args(free={"mass": (2, 1)}),
+    "free[...]: got shape": lambda s: with_args(free={"mass": (1, 2)}).guess(
+        [{}, {}], free={"mass": np.ones(2)}
+    ),
     "guess: expected problem.guess": lambda s: problem().solve(3),
     "guess: got ... durations": lambda s: problem().guess([{}, {}], [1.0, 2.0]),
     "guess: got ... phases": lambda s: optimize.Problem(

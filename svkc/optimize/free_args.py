@@ -84,19 +84,19 @@ class ArgsModel:
         """Return args with other numbers of the free args; None: with those that it has."""
         if not self.names or numbers is None:
             return args
-        sizes = [int(np.prod(self.shapes[name])) for name in self.names]
-        parts = jnp.split(jnp.asarray(numbers), np.cumsum(sizes)[:-1])
+        counts = [int(np.prod(self.shapes[name])) for name in self.names]
+        parts = jnp.split(jnp.asarray(numbers), np.cumsum(counts)[:-1])
         return dict(args) | {
             name: x.reshape(self.shapes[name]) for name, x in zip(self.names, parts, strict=True)
         }
 
-    def params(self, given: Params, numbers: Any = None) -> Params:
+    def params(self, params: Params, numbers: Any = None) -> Params:
         """Return the chain and the args for some numbers of the free args.
 
-        given: the chain that the user gave, and the args.
+        params: the chain that the user gave, and the args.
         """
-        args = self.with_numbers(given.args, numbers)
-        chain = given.chain if self.chain_from is None else self.chain_from(given.chain, args)
+        args = self.with_numbers(params.args, numbers)
+        chain = params.chain if self.chain_from is None else self.chain_from(params.chain, args)
         return Params(chain, args)
 
 

@@ -133,7 +133,7 @@ class Problem:
             motion_without_torques(chain, self.controls, self.scheme, phase, duration, line)
             for phase, duration, line in zip(self.phases, durations, lines)
         ]
-        return Guess(motions, noise, key, self.args_model.numbers(problem.args))
+        return Guess(motions, noise=noise, key=key, free=self.args_model.numbers(problem.args))
 
     def solve(
         self,
@@ -201,8 +201,8 @@ class Problem:
         """
         if not self.args_model.names:
             return self
-        problem, given = copy.copy(self), Params(self.args_model.chain, self.args)
-        problem.chain, problem.args = self.args_model.params(given, numbers)
+        problem, params = copy.copy(self), Params(self.args_model.chain, self.args)
+        problem.chain, problem.args = self.args_model.params(params, numbers)
         # compiled functions may hold the chain
         problem.functions = {}
         return problem

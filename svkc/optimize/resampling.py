@@ -39,7 +39,7 @@ def as_guess(guess: Any, problem: Any) -> Guess:
         phases.append(motion)
     if isinstance(guess, Guess):
         free = guess.free if len(guess.free) else problem.args_model.numbers(problem.args)
-        return Guess(phases, guess.noise, guess.key, free)
+        return Guess(phases, noise=guess.noise, key=guess.key, free=free)
     return Guess(phases, free=problem.args_model.numbers(guess.problem.args))
 
 

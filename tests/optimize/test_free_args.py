@@ -170,4 +170,3 @@ def test_wrong_guesses_of_free_args(solved):
         problem.guess(poses, free={"price": 1.0})
     with pytest.raises(ValueError, match=r"free\['mass'\]: got shape \(2,\), expected \(\)"):
         problem.guess(poses, free={"mass": jnp.ones(2)})
-
