@@ -16,7 +16,13 @@ from svkc.optimize.charts import motion_from_chart, to_next_chart
 from svkc.optimize.controls import AbstractControls
 from svkc.optimize.lift import Layout
 from svkc.optimize.loop_rows import LinkRows, gaps_at, link_wrenches, rates_at, row_accelerations
-from svkc.optimize.points import Point, full_configuration, full_state, full_velocity
+from svkc.optimize.points import (
+    Point,
+    full_configuration,
+    full_state,
+    full_velocity,
+    placed_as_in,
+)
 from svkc.tree.inverse_dynamics import (
     generalized_force,
     limit_forces,
@@ -118,7 +124,7 @@ def stage_equations(
     chain, args = params
     q, v, vdot = motion_from_chart(chain, data.reference, *motion)
     needs_state = model.controls.needs_state
-    state = full_state(chain, data.structure, q, v) if needs_state else None
+    state = full_state(chain, placed_as_in(chain, data.structure), q, v) if needs_state else None
     tau = model.controls.torques(chain, t, state, blocks, args)
     f = jnp.where(data.active, f, 0)
     force, links = equations_of_motion(chain, model.rows, q, v, vdot, tau=tau, f=f)
@@ -192,7 +198,7 @@ def point_of_stage(
     times, motion, blocks, f = model.layout.split_stage(y)
     return Point(
         params.chain,
-        data.structure,
+        placed_as_in(params.chain, data.structure),
         model.controls,
         rows=(model.rows, active),
         times=(times[0], times[1]),

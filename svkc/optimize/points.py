@@ -32,6 +32,12 @@ def full_velocity(chain: Chain, v: Float[Array, " nv"]) -> Float[Array, " dofs"]
     return jnp.concatenate([v, jnp.zeros(chain.dofs - chain.nv, v.dtype)])
 
 
+def placed_as_in(chain: Chain, structure: Structure) -> Structure:
+    """Return a structure with the links at their places in the chain, which may depend on args."""
+    places = lambda s: (s.pos, s.quat, s.real_pos, s.real_quat)
+    return eqx.tree_at(places, structure, places(chain.structure))
+
+
 def full_state(
     chain: Chain, structure: Structure, q: Float[Array, " nq"], v: Float[Array, " nv"]
 ) -> State:

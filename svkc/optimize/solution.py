@@ -21,7 +21,7 @@ from svkc.optimize.guesses import PhaseMotion
 from svkc.optimize.ipopt import SolverResult
 from svkc.optimize.linearization import LinearMaps, linear_maps
 from svkc.optimize.phases import Phase
-from svkc.optimize.points import states_of
+from svkc.optimize.points import placed_as_in, states_of
 from svkc.optimize.program import Program
 from svkc.optimize.refinement import refined
 from svkc.optimize.replay import control_and_plan, replay
@@ -264,10 +264,11 @@ def solution(problem: Any, program: Program, result: SolverResult) -> Solution:
     """Return the `Solution` of a solver's result."""
     transcription, rows = program.transcription, program.rows(result.x)
     x = result.x * program.unit
+    problem = problem.with_free(x[transcription.builder.free])
     return solution_of(
-        problem.with_free(x[transcription.builder.free]),
+        problem,
         decode(transcription, x),
-        [s.structure for s in transcription.structures],
+        [placed_as_in(problem.chain, s.structure) for s in transcription.structures],
         cost=rows[-1] * program.row_unit[-1],
         violation=np.max(program.violation(result.x), initial=0.0),
         multipliers=Multipliers(result.multipliers, lower=result.lower, upper=result.upper),

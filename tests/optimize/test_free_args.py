@@ -1,5 +1,7 @@
 """Args that the solver chooses: `free` and `chain_from` of a problem."""
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import models
 import numpy as np
@@ -97,6 +99,50 @@ def test_the_optimal_cost_by_an_arg_of_the_chain():
     problem, guess = move(free=None)
     _, by_args = problem.solve(guess).gradient()
     assert abs(float(by_args["mass"]) - (1.0 - 2.0)) < 1e-5
+
+
+def held_rods(**options):
+    """Return two rods whose end hangs on a pin of free height; the cost is least at 1.4 m."""
+    height = lambda chain, args: eqx.tree_at(
+        lambda c: c.structure.pos, chain, jnp.stack([0.5, 0.0, -args["height"]])[None]
+    )
+    pin = svkc.VirtualLink(
+        "pin", "world", "lower", "hinge", pos=(0.5, 0, -1.6), axis=(0, 1, 0), real_pos=(0, 0, -0.8)
+    )
+    chain = svkc.load(models.MJCF.format(models.TWO_RODS), virtual_links=[pin])
+    rest = [optimize.between(joint, 0, 0, of="velocity") for joint in ("upper", "lower")]
+    phase = optimize.Phase(
+        "held", connected=("pin",), duration=0.2, intervals=2, start=rest, **options
+    )
+    problem = optimize.Problem(
+        chain,
+        phase,
+        controls=optimize.Torques(),
+        args={"height": 1.6},
+        free={"height": (1.2, 1.7)},
+        chain_from=height,
+        running=lambda p: 1e-6 * jnp.sum(p.u**2),
+        final=lambda p: (p.args["height"] - 1.4) ** 2,
+    )
+    return problem, problem.guess([{"upper": -0.4, "lower": 0.2}, {"upper": -0.4, "lower": 0.2}])
+
+
+def test_a_link_with_a_free_place():
+    """Points, states and simulations have the link at its optimal place."""
+    angle = lambda p: p.state.q[-1]  # of the pin
+    problem, guess = held_rods(end=[optimize.constraint("angle", angle, -3, 3)])
+    solution = problem.solve(guess)
+    height = float(solution.args["height"])
+    assert abs(height - 1.4) < 1e-3
+    chain, last = solution.problem.chain, jax.tree.map(lambda x: x[-1], solution.states)
+    end = svkc.point_position(chain, last, "lower", jnp.array([0.0, 0.0, -0.8]))
+    np.testing.assert_allclose(end, [0.5, 0, -height], atol=1e-7)
+    np.testing.assert_allclose(last.structure.pos, chain.structure.pos)
+    turned = float(last.q[0] + last.q[1])
+    np.testing.assert_allclose(float(last.q[-1]), turned, atol=1e-7)
+    run = solution.trajectory()
+    np.testing.assert_allclose(run.final.structure.pos[0], [0.5, 0, -height])
+    assert max(x.max() for x in solution.report(replay=False).position) < 1e-3
 
 
 @pytest.mark.slow
