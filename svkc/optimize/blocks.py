@@ -31,8 +31,9 @@ class Block:
 
     unknowns: [lanes n] index of each local unknown in the problem; -1: it is zero.
     rows: [lanes m] index of the row to which each local row is added; -1: it is left out.
-    masks: which entries of `jacobian_pattern` and of `hessian_pattern` can be nonzero; None: those
-        that are not zero at one of a few random points.
+    masks: which entries of `jacobian_pattern` and of `hessian_pattern` may be nonzero although they
+        are zero at a few random points; None: not known.
+    by_args: mask [rows of a stage, free args] of derivatives that may be nonzero in this way.
     data: constants of each lane, with a leading axis over lanes. Methods take the data as an
         argument, so that new data need no compilation.
     """
@@ -41,6 +42,7 @@ class Block:
     rows: np.ndarray
     data: Any
     masks: tuple[np.ndarray, np.ndarray] | None = None
+    by_args: np.ndarray
 
     def set_lanes(self, lanes: Any) -> None:
         """Replace the data of the lanes."""

@@ -157,7 +157,9 @@ def report(solution: Any, replay: bool) -> SolutionReport:
     problem, motion = solution.problem, solution.motion
     chain, names = problem.chain, problem.chain.dof_names
     intervals, phases = _lanes(problem, solution.structures, motion)
-    distances = lambda lanes: _distances(chain, plan_of(motion), lanes, control_of(problem))
+    distances = lambda lanes: _distances(
+        chain, plan_of(problem, motion), lanes, control_of(problem)
+    )
     *errors, results = distances(intervals)
     edges = np.cumsum([len(m.vdot) for m in motion])[:-1]
     of_q, of_v = (np.split(np.abs(x), edges) for x in errors)

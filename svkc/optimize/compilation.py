@@ -18,6 +18,9 @@ from svkc.optimize.user_rows import UserRows
 
 # number of random points at which sparsity is determined, and the scaled cost at these points
 _SAMPLES, _COST_AT_SAMPLES = 3, 50.0
+# number of further points for the sparsity alone, and their distance in units: joints are beyond
+# their ranges there
+_FAR_SAMPLES, _FAR = 2, 30.0
 
 
 def compile_problem(
@@ -51,21 +54,25 @@ def compile_problem(
     free = builder.add_free_args(model)
     builder.table.freeze()
     samples = _sample_points(problem, transcription)
-    _add_user_rows(problem, transcription, samples)
+    _add_user_rows(problem, transcription)
     if model:
         transcription.blocks = [ArgsBlock(b, model, free) for b in transcription.blocks]
     params = Params(model.chain, problem.args)
-    program = Program(transcription, params, samples, problem.units.cost or 1.0)
+    program = Program(
+        transcription, params, samples, near=_SAMPLES, cost_unit=problem.units.cost or 1.0
+    )
     if problem.units.cost is None:
-        costs = [abs(program.rows(x / program.unit)[-1]) for x in samples]
-        program.set_cost_unit(max(float(np.median(costs)) / _COST_AT_SAMPLES, 1e-12))
+        costs = np.array([abs(program.rows(x / program.unit)[-1]) for x in samples[:_SAMPLES]])
+        costs = costs[np.isfinite(costs) & (costs > 0)]
+        # a cost that is zero at the samples, such as a penalty, keeps its unit
+        program.set_cost_unit(float(np.median(costs)) / _COST_AT_SAMPLES if len(costs) else 1.0)
     return program
 
 
-def _add_user_rows(problem: Any, transcription: Transcription, samples: np.ndarray) -> None:
+def _add_user_rows(problem: Any, transcription: Transcription) -> None:
     """Append the rows and cost terms of the user's functions."""
-    users = UserRows(transcription, Params(problem.chain, problem.args), samples)
-    last = len(problem.phases) - 1
+    model, last = problem.args_model, len(problem.phases) - 1
+    users = UserRows(transcription, model, Params(model.chain, problem.args))
     for i, phase in enumerate(problem.phases):
         running = [f for f in (problem.running, phase.running) if f is not None]
         final = [f for f in (problem.final if i == last else None, phase.final) if f is not None]
@@ -74,18 +81,20 @@ def _add_user_rows(problem: Any, transcription: Transcription, samples: np.ndarr
 
 
 def _sample_points(problem: Any, transcription: Transcription) -> np.ndarray:
-    """Return random points [samples unknowns] in SI units.
+    """Return random points [samples unknowns] in SI units, the far ones last.
 
     Durations and free args are near the middle of their bounds, and fixed unknowns have their
     values.
     """
     table, random = transcription.builder.table, np.random.default_rng(0)
-    samples = random.normal(size=(_SAMPLES, table.count)) * table.unit
+    count = _SAMPLES + _FAR_SAMPLES
+    samples = random.normal(size=(count, table.count)) * table.unit
+    samples[_SAMPLES:] *= _FAR
     for phase, indices in zip(problem.phases, transcription.indices):
         middle = sum(phase.duration) / 2
-        samples[:, indices.duration] = middle * random.uniform(0.8, 1.2, _SAMPLES)
+        samples[:, indices.duration] = middle * random.uniform(0.8, 1.2, count)
     free = transcription.builder.free
-    share = random.uniform(0.4, 0.6, (_SAMPLES, len(free)))
+    share = random.uniform(0.4, 0.6, (count, len(free)))
     samples[:, free] = (1 - share) * table.lower[free] + share * table.upper[free]
     fixed = table.lower == table.upper
     return np.where(fixed, table.lower, samples)

@@ -1,132 +1,201 @@
-"""On which variables of a stage the user's functions depend, and which derivatives can be nonzero.
+"""On which of its inputs each output of a function depends, found in its JAX expression.
 
-The functions are evaluated with large changes of each variable. Derivatives at random points would
-not do: those of max(0, q - 3) are zero at most points.
+The answer holds at all points. Values at sample points would not do: the derivatives of
+max(0, q - 3) are zero at most of them. The answer errs on one side only: an output may be said to
+depend on an input on which it does not.
 """
 
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import Literal
 
-from svkc._jax.eager import eager_jit
-from svkc.optimize.blocks import StageBlock
-from svkc.optimize.lift import Layout, StagePolynomials, dependencies
+# how an output depends on an input: not, with a constant derivative, or in another way
+NONE, LINEAR, NONLINEAR = np.uint8(0), np.uint8(1), np.uint8(2)
+# primitives whose outputs are linear in all inputs, element by element
+_SUMS = {"add", "sub", "add_any", "neg", "copy", "copy_p", "real", "reduce_precision"}
+# primitives that only move entries of inputs, and the number of these inputs; indices follow
+_MOVES = {"gather": 1, "dynamic_slice": 1, "static_take": 1}
+# parameters that hold the expression of a call
+_CALLS = ("jaxpr", "call_jaxpr", "fun_jaxpr")
 
-# changes of a variable, as multiples of its mean size at the samples; the first is the unit
-_CHANGES = np.array([1.0, -1.0, 1e-3, -1e-3, 100.0, -100.0])
-# differences below this fraction of the values are taken for round-off
-_ROUND_OFF = 1e-9
 
+def dependence(function: Callable, *arguments: jax.Array) -> np.ndarray:
+    """Return how each output number depends on each input number [outputs inputs].
 
-class Dependence(NamedTuple):
-    """How the rows of a stage depend on its variables.
+    The entries are NONE, LINEAR and NONLINEAR. An input is linear if the derivative by it is
+    constant, also where other inputs change.
 
-    reads: mask [rows y] of the variables on which a row depends.
-    nonlinear: mask [rows y] of the variables in which a row is not linear.
+    function: of the arguments, returns one array [outputs]. arguments: only shapes are used.
     """
-
-    reads: np.ndarray
-    nonlinear: np.ndarray
-
-
-def find_dependence(block: StageBlock, params: Any, samples: np.ndarray) -> Dependence | None:
-    """Return how the function of a block depends on its variables; None if a row is never finite.
-
-    The variables are changed one at a time at random points, by small and by large amounts. A row
-    is linear in a variable if its change is proportional to that of the variable, and independent
-    of the other variables.
-
-    samples: values [samples lanes n] of local unknowns at these points. One lane is evaluated.
-    """
-
-    @eager_jit
-    def evaluate(params, data, z, offsets):
-        def of_stage(f, lift):
-            y = lift.variables()
-            return y, jax.vmap(lambda offset: f(y + offset))(offsets)
-
-        return block.over_stages(of_stage, params, data, z)
-
-    data, n = jax.tree.map(lambda x: jnp.asarray(x[:1]), block.data), block.layout.stage_size
-    values = lambda z, offsets: evaluate(params, data, z[:1], offsets)
-    none = np.zeros((1 + len(_CHANGES) * n, n))
-    size = np.mean([np.abs(values(z, none)[0]) for z in samples], (0, 1, 2))
-    size = np.where(size > 0, size, 1.0)
-    change = none.copy()
-    change[1:] = (_CHANGES[:, None, None] * np.diag(size)).reshape(-1, n)
-    others = size * np.random.default_rng(0).normal(size=n)
-    stages = []
-    for z in samples:
-        pairs = (np.asarray(values(z, change + at)[1])[0] for at in (0 * others, others))
-        stages += zip(*pairs, strict=True)
-    if not np.any([np.isfinite(f[0]) for f, _ in stages], 0).all():
-        return None
-    masks = [_compare(f, g, n) for f, g in stages]
-    return Dependence(*(np.any(x, 0).T for x in zip(*masks)))
+    closed = jax.make_jaxpr(function)(*arguments)
+    n = sum(int(np.size(x)) for x in arguments)
+    entries, begin = [], 0
+    for x in arguments:
+        own = np.zeros((int(np.size(x)), n), np.uint8)
+        own[:, begin : begin + len(own)] = LINEAR * np.eye(len(own), dtype=np.uint8)
+        entries.append(own.reshape(*np.shape(x), n))
+        begin += len(own)
+    (result,) = _Walk(n).outputs(closed.jaxpr, closed.consts, entries)
+    return result
 
 
-def _compare(f: np.ndarray, g: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the masks [y rows] of the read and of the nonlinear variables.
-
-    Rows that are not finite without a change are left out.
-
-    f, g: rows without a change, then with each change of each variable. Of g, the other variables
-        have other values. n: number of variables.
-    """
-
-    def changes(rows):
-        base, changed = rows[0], rows[1:].reshape(len(_CHANGES), n, -1)
-        return changed - base, _ROUND_OFF * (np.abs(changed) + np.abs(base)), np.isfinite(base)
-
-    with np.errstate(invalid="ignore"):
-        (d, round_off, valid), (d_other, round_off_other, valid_other) = changes(f), changes(g)
-        factor = _CHANGES[:, None, None]
-        same = np.abs(d - d_other) <= round_off + round_off_other
-        proportional = np.abs(d - factor * d[0]) <= round_off + np.abs(factor) * round_off[0]
-        linear = proportional & (same | ~valid_other)
-    return ((d != 0) & valid).any(0), (~linear & valid).any(0)
+def _used(x: np.ndarray) -> np.ndarray:
+    """Return an array of dependence in which every dependence is nonlinear."""
+    return NONLINEAR * (x > 0).astype(np.uint8)
 
 
-def entry_masks(block: StageBlock, dependence: Dependence) -> tuple[np.ndarray, np.ndarray]:
-    """Return which entries of a block's `jacobian_pattern` and `hessian_pattern` can be nonzero.
+class _Walk:
+    """Walk through an expression. Arrays of dependence have a last axis over the n inputs."""
 
-    dependence: of the block, whose `variables` are those that are not linear.
-    """
-    layout, selected = block.layout, block.variables
-    reads, nonlinear = dependence.reads, dependence.nonlinear[:, selected]
-    stages = [
-        jax.tree.map(lambda x, k=k: np.asarray(x)[k], block.poly) for k in range(len(block.poly.c))
+    def __init__(self, n: int):
+        self.n = n
+
+    def outputs(
+        self, jaxpr: Any, consts: Sequence[Any], inputs: Sequence[np.ndarray]
+    ) -> list[np.ndarray]:
+        """Return the dependence of an expression's outputs from that of its inputs."""
+        # dependence of each variable, and values of constant indices
+        known = {var: self._none(var) for var in jaxpr.constvars}
+        known |= dict(zip(jaxpr.invars, inputs, strict=True))
+        values = dict(zip(jaxpr.constvars, consts, strict=True))
+        read = lambda x: self._none(x) if isinstance(x, Literal) else known[x]
+        value = lambda x: x.val if isinstance(x, Literal) else values.get(x)
+        for eqn in jaxpr.eqns:
+            constants = [value(x) for x in eqn.invars]
+            if _is_index(eqn) and all(x is not None for x in constants):
+                values[eqn.outvars[0]] = eqn.primitive.bind(*constants, **eqn.params)
+            result = self._equation(eqn, [read(x) for x in eqn.invars], constants)
+            known |= dict(zip(eqn.outvars, result, strict=True))
+        return [read(x) for x in jaxpr.outvars]
+
+    def _none(self, var: Any) -> np.ndarray:
+        return np.zeros((*var.aval.shape, self.n), np.uint8)
+
+    def _equation(
+        self, eqn: Any, inputs: list[np.ndarray], constants: list[Any]
+    ) -> list[np.ndarray]:
+        """Return the dependence of the outputs of one equation. constants: known inputs."""
+        shapes, name = [var.aval.shape for var in eqn.outvars], eqn.primitive.name
+        if not any(x.any() for x in inputs):
+            return [np.zeros((*shape, self.n), np.uint8) for shape in shapes]
+        inner = next((eqn.params[key] for key in _CALLS if key in eqn.params), None)
+        if inner is not None and name not in ("scan", "while", "cond"):
+            jaxpr, consts = getattr(inner, "jaxpr", inner), getattr(inner, "consts", ())
+            if len(jaxpr.invars) == len(inputs) and len(jaxpr.constvars) == len(consts):
+                return self.outputs(jaxpr, consts, inputs)
+        if len(shapes) > 1:
+            return [self._anywhere(inputs, shape, NONLINEAR) for shape in shapes]
+        if name in _MOVES and all(x is not None for x in constants[_MOVES[name] :]):
+            return [self._gathered(eqn, inputs[0], constants[1:])]
+        if name == "scatter" and constants[1] is not None:
+            return [self._scattered(eqn, inputs[0], constants[1], inputs[2])]
+        return [self._single(name, eqn.params, inputs, shapes[0])]
+
+    def _gathered(self, eqn: Any, x: np.ndarray, indices: list[Any]) -> np.ndarray:
+        """Return the dependence of entries of x at constant indices."""
+        places = jnp.arange(1, x.size // self.n + 1).reshape(x.shape[:-1])
+        places = np.asarray(eqn.primitive.bind(places, *indices, **eqn.params))
+        flat = np.concatenate([np.zeros((1, self.n), np.uint8), x.reshape(-1, self.n)])
+        # entries outside the array are filled with zeros, or with the largest or smallest integer
+        return flat[np.where((places > 0) & (places < len(flat)), places, 0)]
+
+    def _scattered(self, eqn: Any, x: np.ndarray, index: Any, updates: np.ndarray) -> np.ndarray:
+        """Return the dependence of x with some entries replaced, at constant indices."""
+        rows = np.concatenate([x.reshape(-1, self.n), updates.reshape(-1, self.n)])
+        places = jnp.arange(len(rows))
+        of_x, of_updates = jnp.split(places, [x.size // self.n])
+        of_x, of_updates = of_x.reshape(x.shape[:-1]), of_updates.reshape(updates.shape[:-1])
+        return rows[np.asarray(eqn.primitive.bind(of_x, index, of_updates, **eqn.params))]
+
+    def _single(self, name: str, params: Any, inputs: list[np.ndarray], shape) -> np.ndarray:
+        """Return the dependence of the single output, of this shape, of a primitive."""
+        x, rest = inputs[0], inputs[1:]
+        moved = _moved(name, params, x, shape)
+        if moved is not None:
+            return moved
+        if name == "concatenate":
+            return np.concatenate(inputs, params["dimension"])
+        if name in _SUMS:
+            return self._elementwise(inputs, shape)
+        if name in ("mul", "dot_general"):
+            a, b = inputs if name == "mul" else _factors(params, inputs)
+            return self._product(a, b, shape)
+        if name == "div" and not rest[0].any():
+            return self._elementwise(inputs, shape)
+        if name == "select_n" and not x.any():
+            return self._elementwise(rest, shape)
+        if all(y.shape[:-1] in ((), shape) for y in inputs):
+            return _used(self._elementwise(inputs, shape))
+        return self._anywhere(inputs, shape, NONLINEAR)
+
+    def _elementwise(self, inputs: list[np.ndarray], shape) -> np.ndarray:
+        """Return the dependence of an output whose elements depend on those of the inputs."""
+        result = np.zeros((*shape, self.n), np.uint8)
+        for x in inputs:
+            result = np.maximum(result, x)
+        return result
+
+    def _product(self, a: np.ndarray, b: np.ndarray, shape) -> np.ndarray:
+        """Return the dependence of a product: nonlinear where both factors depend on inputs."""
+        both = a.any(-1, keepdims=True) & b.any(-1, keepdims=True)
+        total = self._elementwise([a, b], shape)
+        return np.where(both, _used(total), total)
+
+    def _anywhere(self, inputs: list[np.ndarray], shape, least: np.uint8 = NONE) -> np.ndarray:
+        """Return the dependence of an output whose elements depend on all those of the inputs."""
+        union = np.zeros(self.n, np.uint8)
+        for x in inputs:
+            union = np.maximum(union, x.reshape(-1, self.n).max(0, initial=0))
+        union = np.where(union > 0, np.maximum(union, least), NONE)
+        return np.broadcast_to(union, (*shape, self.n))
+
+
+def _moved(name: str, params: Any, x: np.ndarray, shape) -> np.ndarray | None:
+    """Return the dependence of the output of a primitive that reorders or sums entries, or None."""
+    n, result = x.shape[-1], None
+    if name in ("reshape", "squeeze", "expand_dims"):
+        result = x.reshape(*shape, n)
+    elif name == "transpose":
+        result = x.transpose(*params["permutation"], x.ndim - 1)
+    elif name == "broadcast_in_dim":
+        axes = [1] * len(shape)
+        for i, axis in enumerate(params["broadcast_dimensions"]):
+            axes[axis] = x.shape[i]
+        result = np.broadcast_to(x.reshape(*axes, n), (*shape, n))
+    elif name == "slice":
+        steps = params["strides"] or (1,) * len(shape)
+        bounds = zip(params["start_indices"], params["limit_indices"], steps)
+        result = x[tuple(slice(*b) for b in bounds)]
+    elif name == "rev":
+        result = np.flip(x, params["dimensions"])
+    elif name == "reduce_sum":
+        result = x.max(tuple(params["axes"]), initial=0)
+    elif name == "convert_element_type":
+        result = x if np.issubdtype(params["new_dtype"], np.inexact) else _used(x)
+    return result
+
+
+def _factors(params: Any, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    """Return the factors of a `dot_general` such that its output is their product by elements."""
+    (contract, batch), result = params["dimension_numbers"], []
+    free = [
+        [i for i in range(x.ndim - 1) if i not in (*c, *b)]
+        for x, c, b in zip(inputs, contract, batch)
     ]
-    first = [_lift_masks(layout, poly) for poly in stages]
-    jacobian = np.stack([reads @ by_z for by_z, _ in first]).ravel()
-    by_duration = np.any([reads.any(0) @ second for _, second in first], 0)
-    if not len(selected):
-        return jacobian, by_duration
-    columns, pairs = dependencies(layout, selected), nonlinear.T @ nonlinear
-    some = [by_z[selected][:, columns] for by_z, _ in first]
-    both = np.any([x.T @ pairs @ x for x in some], 0)
-    return jacobian, np.concatenate([by_duration, both[np.tril_indices(len(columns))]])
+    for k, (x, c, b) in enumerate(zip(inputs, contract, batch)):
+        x = x.transpose(*b, *free[k], *c, x.ndim - 1)
+        x = x.max(tuple(range(len(b) + len(free[k]), x.ndim - 1)), initial=0)
+        other = [1] * len(free[1 - k])
+        own = x.shape[len(b) : -1]
+        middle = (*own, *other) if k == 0 else (*other, *own)
+        result.append(x.reshape(*x.shape[: len(b)], *middle, x.shape[-1]))
+    return result
 
 
-def _lift_masks(layout: Layout, poly: StagePolynomials) -> tuple[np.ndarray, np.ndarray]:
-    """Return the masks [y z] of the nonzero entries of dy/dz, and of its derivative by T.
-
-    poly: of one stage.
-    """
-    y, z = np.arange(layout.stage_size), np.arange(layout.interval_size)
-    (t, duration), motion, control, forces = layout.split_stage(y)
-    (_, T), x, w, f = layout.split_interval(z)
-    first, second = np.zeros((2, len(y), len(z)), bool)
-    first[t, :2] = first[duration, T] = True
-    first[forces, f] = (np.asarray(poly.slot) != 0)[:, None]
-    C0, C1, C2, D0, D1 = (np.asarray(x) != 0 for x in (poly.C0, poly.C1, poly.C2, poly.D0, poly.D1))
-    for at, unknowns, once, twice, constant in (
-        (motion, x, C1 | C2, C2, C0),
-        (control, w, D1, np.zeros_like(D1), D0),
-    ):
-        pairs = at[:, None], unknowns[None]
-        first[pairs], second[pairs] = (constant | once)[:, :, None], once[:, :, None]
-        first[at, T], second[at, T] = once.any(1)[:, None], twice.any(1)[:, None]
-    return first, second
+def _is_index(eqn: Any) -> bool:
+    """Return whether the output of an equation is an array of integers or Booleans."""
+    return len(eqn.outvars) == 1 and eqn.outvars[0].aval.dtype.kind in "iub"

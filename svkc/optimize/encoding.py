@@ -4,14 +4,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from svkc.model.chain import Chain
 from svkc.optimize.charts import chart_from_motion, motion_from_chart
 from svkc.optimize.guesses import Guess, PhaseMotion
 from svkc.optimize.loop_rows import gaps_at
 from svkc.optimize.transcription import Transcription
 
 
-def encode(transcription: Transcription, guess: Guess) -> np.ndarray:
-    """Return a guess as the vector of unknowns, in SI units and within bounds."""
+def encode(
+    transcription: Transcription, guess: Guess, chain: Chain, free: np.ndarray
+) -> np.ndarray:
+    """Return a guess as the vector of unknowns, in SI units and within bounds.
+
+    free: numbers of the free args. chain: the chain for these.
+    """
     table, nv = transcription.builder.table, transcription.model.layout.nv
     x, start, kept = np.zeros(table.count), 0.0, np.zeros(0, int)
     rows, has_state = transcription.model.rows.rows, transcription.model.controls.has_state
@@ -28,9 +34,11 @@ def encode(transcription: Transcription, guess: Guess) -> np.ndarray:
         # gaps of a link stay as they are where the link connects
         starts = (at.kept_gap >= 0) & ~np.isin(at.kept_gap, kept)
         if starts.any():
-            x[at.kept_gap[starts]] = np.asarray(_gaps(transcription, motion.q[0]))[starts]
+            x[at.kept_gap[starts]] = np.asarray(
+                gaps_at(chain, jnp.asarray(motion.q[0]), transcription.model.rows)
+            )[starts]
         kept = at.kept_gap
-    x[transcription.builder.free] = guess.free
+    x[transcription.builder.free] = free
     return _with_noise(transcription, guess, np.clip(x, table.lower, table.upper))
 
 
@@ -40,11 +48,6 @@ def _to_charts(transcription: Transcription, reference, q, v):
     return jax.vmap(lambda *x: chart_from_motion(chain, *x))(
         *(jnp.asarray(x) for x in (reference, q, v))
     )
-
-
-def _gaps(transcription: Transcription, q):
-    """Return the gaps of the links' rows at q of the tree."""
-    return gaps_at(transcription.builder.chain, jnp.asarray(q), transcription.model.rows)
 
 
 def _with_noise(transcription: Transcription, guess: Guess, x: np.ndarray) -> np.ndarray:

@@ -43,6 +43,7 @@ class ArgsModel:
         self.shapes: dict[str, tuple[int, ...]] = {name: x.shape for name, x in values.items()}
         pairs = [self._bounds(name, free[name]) for name in free]
         self.lower, self.upper = (np.concatenate([np.zeros(0), *x]) for x in zip(*pairs, ((), ())))
+        self.numbers(args)
         resolved = self.params(Params(chain, args)).chain
         check_chain(resolved)
         if resolved.topology != chain.topology:
@@ -67,7 +68,7 @@ class ArgsModel:
         """Return the numbers of the free args.
 
         others: values by name that replace those in args.
-        Raises ValueError for unknown names, and for other shapes.
+        Raises ValueError for unknown names, other shapes, and values that are not in their bounds.
         """
         values = {name: args[name] for name in self.names}
         for name, value in (others or {}).items():
@@ -78,7 +79,34 @@ class ArgsModel:
                     f"free[{name!r}]: got shape {np.shape(value)}, expected {self.shapes[name]}"
                 )
             values[name] = value
-        return np.concatenate([np.zeros(0), *(np.ravel(np.asarray(x)) for x in values.values())])
+        parts = [np.ravel(np.asarray(x, float)) for x in values.values()]
+        numbers = np.concatenate([np.zeros(0), *parts])
+        if np.any(wrong := (numbers < self.lower) | (numbers > self.upper)):
+            k = int(np.argmax(wrong))
+            raise ValueError(
+                f"free: the value {numbers[k]:g} of {self.labels[k]} is not between its bounds"
+                f" {self.lower[k]:g} and {self.upper[k]:g}"
+            )
+        return numbers
+
+    def known(self, args: Any) -> dict[str, Any]:
+        """Return those of args that are free args with these shapes, by name."""
+        if not isinstance(args, dict):
+            return {}
+        return {
+            name: args[name]
+            for name in self.names
+            if name in args and np.shape(args[name]) == self.shapes[name]
+        }
+
+    @property
+    def labels(self) -> list[str]:
+        """Name of each number of the free args."""
+        return [
+            name if shape == () else f"{name}[{k}]"
+            for name, shape in self.shapes.items()
+            for k in range(int(np.prod(shape)))
+        ]
 
     def with_numbers(self, args: Any, numbers: Any) -> Any:
         """Return args with other numbers of the free args; None: with those that it has."""
@@ -106,7 +134,7 @@ class ArgsBlock(Block):
     The numbers of the free args are the last local unknowns of every lane. Derivatives by them are
     those of automatic differentiation through the block's rows and Jacobian.
 
-    block: the block for given args. free: indices of the free args' unknowns.
+    block: the block for known args. free: indices of the free args' unknowns.
     """
 
     def __init__(self, block: Block, model: ArgsModel, free: np.ndarray):
@@ -117,10 +145,10 @@ class ArgsBlock(Block):
         of_lanes = np.broadcast_to(free, (len(block.unknowns), len(free)))
         self.unknowns = np.concatenate([block.unknowns, of_lanes], 1)
         if block.masks is not None:
-            self.masks = (
-                np.append(block.masks[0], np.ones(self._jacobian_part[0].size, bool)),
-                np.append(block.masks[1], np.ones(self._hessian_part[0].size, bool)),
-            )
+            of_rows = np.tile(block.by_args, (self.rows.shape[1] // len(block.by_args), 1))
+            of_pairs = np.full(self._hessian_part[0].size, of_rows.any())
+            parts = of_rows.ravel(), of_pairs
+            self.masks = (np.append(block.masks[0], parts[0]), np.append(block.masks[1], parts[1]))
 
     def set_lanes(self, lanes: Any) -> None:
         self.block.set_lanes(lanes)

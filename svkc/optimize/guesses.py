@@ -67,13 +67,13 @@ class Guess:
     phases: motion of each phase.
     noise: unknowns are moved at random by at most this fraction of the range between their bounds.
     key: seed of the random numbers.
-    free: numbers of the problem's free args.
+    free: values of free args by name.
     """
 
     phases: list[PhaseMotion]
     noise: float = 0.0
     key: int = 0
-    free: Any = ()
+    free: dict[str, Any] = dataclasses.field(default_factory=dict)
 
 
 class PoseLine:

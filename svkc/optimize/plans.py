@@ -23,6 +23,7 @@ class Plan(eqx.Module):
         (N m/rad, N m s/rad). An empty axis of driven coordinates: no feedback.
     first, last: indices of the intervals in use. Before and after them the plan is constant. Arrays
         may be longer, so that meshes share compiled programs.
+    chain, args: of the problem, with its free args.
     """
 
     starts: Any
@@ -33,10 +34,12 @@ class Plan(eqx.Module):
     gains: Any
     first: Any
     last: Any
+    chain: Chain
+    args: Any
 
 
-def plan_of(motion: tuple[PhaseMotion, ...], gains: np.ndarray | None = None) -> Plan:
-    """Return the plan of a motion. gains: [intervals 2 driven 2 nv]; None: open loop."""
+def plan_of(problem: Any, motion: tuple[PhaseMotion, ...], gains: np.ndarray | None = None) -> Plan:
+    """Return the plan of a problem's motion. gains: [intervals 2 driven 2 nv]; None: open loop."""
     steps = np.concatenate([np.diff(m.times) for m in motion])
     ends = lambda x: np.stack([x[:-1], x[1:]], 1)
     velocities = np.concatenate([ends(m.v) for m in motion])
@@ -49,7 +52,13 @@ def plan_of(motion: tuple[PhaseMotion, ...], gains: np.ndarray | None = None) ->
         "v": velocities,
         "gains": none if gains is None else gains,
     }
-    return Plan(**padded(intervals), first=np.array(0), last=np.array(len(steps) - 1))
+    return Plan(
+        **padded(intervals),
+        first=np.array(0),
+        last=np.array(len(steps) - 1),
+        chain=problem.chain,
+        args=problem.args,
+    )
 
 
 def blocks_at(table: np.ndarray, step: Any, fraction: Any, blocks: Any) -> Any:
@@ -89,7 +98,8 @@ def _planned(chain: Chain, q, v, step: Any, s: Any) -> tuple[Any, Any]:
 def control_of(problem: Any) -> Any:
     """Return the control function (t, state, plan) -> tau of a problem's plans.
 
-    Problems on other meshes share one function object, so that `simulate` compiles once.
+    Problems on other meshes and with other free args share one function object, so that `simulate`
+    compiles once.
     """
     return problem.functions.setdefault("control", PlanControl(problem))
 
@@ -104,7 +114,7 @@ class PlanControl(eqx.Module):
 
     def __call__(self, t: Any, state: State, plan: Plan) -> Any:
         """Return the joint torques (N m, N) over every coordinate: the plan's, plus feedback."""
-        problem, chain = self.problem, self.problem.chain
+        problem, chain = self.problem, plan.chain
         k = jnp.searchsorted(plan.starts, t, side="right") - 1
         k = jnp.clip(k, *(jnp.asarray(i).astype(k.dtype) for i in (plan.first, plan.last)))
         of_interval = lambda x: jnp.asarray(x)[k]
@@ -112,7 +122,7 @@ class PlanControl(eqx.Module):
         fraction = jnp.clip((t - start) / step, 0, 1)
         table = control_table(problem.controls, problem.scheme)
         blocks = blocks_at(table, step, fraction, blocks)
-        tau = problem.controls.torques(chain, t, state, blocks, problem.args)
+        tau = problem.controls.torques(chain, t, state, blocks, plan.args)
         if not plan.gains.shape[2]:
             return tau
         at_q, at_v, gains = jax.tree.map(of_interval, (plan.q, plan.v, plan.gains))

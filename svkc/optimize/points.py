@@ -132,7 +132,7 @@ class Point:
         multipliers: Float[Array, " rows"],
         args: Any,
         at_start: bool = False,
-        fill: float | None = None,
+        fill: Any = None,
     ):
         self.chain = chain
         self.args = args

@@ -43,9 +43,10 @@ class Problem:
     bounds: bounds on coordinates at all nodes of all phases, from `between`.
     scheme: collocation scheme; None: `Radau(2)`.
     args: data for the functions of the problem, which read them as `point.args`.
-    free: (lower, upper) by name of args that the solver chooses; args is then a dict with these
-        names, and its values are the guess.
-    chain_from: function (chain, args) -> chain, the chain for some args; None: the given one.
+    free: bounds (lower, upper) of the args that the solver chooses, by name. `args` must then be a
+        dict that has these names; its values there are the default guess.
+    chain_from: function (chain, args) -> chain that returns the chain for some args; None: the
+        chain does not depend on args.
     units: `Units` by which the solver divides; None: from mass, length and gravity.
     project: whether nodes are projected onto their loops. False: the equations of motion keep
         accelerations on the loops, but positions and velocities drift off over the intervals.
@@ -93,7 +94,7 @@ class Problem:
         self.final = final
         self.scheme: Radau = Radau() if scheme is None else scheme
         middle = sum(sum(p.duration) / 2 for p in phases)
-        self.units: Units = units_of(chain, middle) if units is None else units
+        self.units: Units = units_of(self.chain, middle) if units is None else units
         self.project: bool = boolean("project", project)
         self._programs: dict[Any, Program] = {}
         # compiled functions that problems on other meshes share
@@ -121,19 +122,18 @@ class Problem:
         key: seed of the random numbers.
         Raises ValueError for a wrong number of poses or of durations, and for unknown names.
         """
-        problem = self.with_free(self.args_model.numbers(self.args, free or {}))
+        chain = self.with_free(self.args_model.numbers(self.args, free)).chain
         count = len(self.phases)
         middle = [sum(p.duration) / 2 for p in self.phases]
         durations = np.asarray(middle if durations is None else durations, float)
         if durations.shape != (count,):
             raise ValueError(f"guess: got {durations.size} durations, expected {count}")
-        chain = problem.chain
         lines = PoseLine(chain, self.phases, poses).at(durations)
         motions = [
             motion_without_torques(chain, self.controls, self.scheme, phase, duration, line)
             for phase, duration, line in zip(self.phases, durations, lines)
         ]
-        return Guess(motions, noise=noise, key=key, free=self.args_model.numbers(problem.args))
+        return Guess(motions, noise=noise, key=key, free=dict(free or {}))
 
     def solve(
         self,
@@ -203,8 +203,6 @@ class Problem:
             return self
         problem, params = copy.copy(self), Params(self.args_model.chain, self.args)
         problem.chain, problem.args = self.args_model.params(params, numbers)
-        # compiled functions may hold the chain
-        problem.functions = {}
         return problem
 
     def multistart(
@@ -239,9 +237,11 @@ class Problem:
     def start(self, guess: Guess | Solution) -> tuple[Program, SolverResult]:
         """Return the compiled problem, and the guess as a start of the solver, in its units."""
         motion = as_guess(guess, self)
-        program = self.program(motion)
+        numbers = self.args_model.numbers(self.args, motion.free)
+        problem = self.with_free(numbers)
+        program = problem.program(motion)
         program.set_references([m.q for m in motion.phases])
-        x = encode(program.transcription, motion) / program.unit
+        x = encode(program.transcription, motion, problem.chain, numbers) / program.unit
         rows, lower, upper = np.zeros(program.cost_row), np.zeros(len(x)), np.zeros(len(x))
         known = guess.multipliers if isinstance(guess, Solution) else None
         if known is not None and (len(known.rows), len(known.lower)) == (len(rows), len(x)):

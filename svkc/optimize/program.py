@@ -54,14 +54,21 @@ class Program:
     """Rows and derivatives of a problem, in the solver's units.
 
     params: parameters of the problem. samples: random points in SI units, at which the sparsity
-        patterns are determined. cost_unit: number by which the cost is divided.
+        patterns are determined; the first `near` of them also determine the units of rows.
+    cost_unit: number by which the cost is divided.
     unit, row_unit: units of unknowns and of rows, the cost's last.
     cost_row: index of the cost's row. solver_rows: indices of the rows that depend on an unknown
         that is not fixed; only these are constraints of the solver.
     """
 
     def __init__(
-        self, transcription: Transcription, params: Params, samples: np.ndarray, cost_unit: float
+        self,
+        transcription: Transcription,
+        params: Params,
+        samples: np.ndarray,
+        *,
+        near: int,
+        cost_unit: float,
     ):
         self.transcription = transcription
         self.params = params
@@ -76,7 +83,8 @@ class Program:
         self._first = _over_blocks(blocks, lambda b, *x: b.jacobian(*x))
         self._second = _over_blocks(blocks, lambda b, *x: b.hessian(*x))
         first = [self._first(self.params, self._data, self._local(x)) for x in samples]
-        self._set_row_units(first)
+        self._set_row_units(first[:near])
+        self._near = near
         self.row_unit: np.ndarray = np.append(transcription.rows.unit, cost_unit)
         rows = [b.rows.reshape(-1) for b in blocks]
         self._target = np.concatenate(rows) if rows else np.zeros(0, int)
@@ -142,7 +150,9 @@ class Program:
         jacobian_used: list[Any] = [False] * len(self.blocks)
         hessian_used: list[Any] = [False] * len(self.blocks)
         unit = np.append(self.unit, 1.0)
-        for x, jacobian in zip(samples, jacobians, strict=True):
+        for k, (x, jacobian) in enumerate(zip(samples, jacobians, strict=True)):
+            # far from the guess a function may not be defined
+            counts = lambda values, far=k >= self._near: np.isfinite(values) | (not far)
             multipliers = [
                 np.where(b.rows < 0, 0, random.normal(size=b.rows.shape)) for b in self.blocks
             ]
@@ -150,17 +160,16 @@ class Program:
             for i, (index, block) in enumerate(zip(self._index, self.blocks)):
                 (row, column), scale = patterns[0][i], unit[index]
                 scaled = np.asarray(jacobian[i]) * scale[:, column]
-                jacobian_used[i] = jacobian_used[i] | above_round_off_of_rows(
-                    scaled, row, block.rows.shape[1]
-                )
+                own = above_round_off_of_rows(scaled, row, block.rows.shape[1])
+                jacobian_used[i] = jacobian_used[i] | own & counts(scaled)
                 row, column = patterns[1][i]
                 scaled = np.asarray(hessian[i]) * scale[:, row] * scale[:, column]
-                hessian_used[i] = hessian_used[i] | above_round_off(scaled, axes=1)
+                own = above_round_off(scaled, axes=1)
+                hessian_used[i] = hessian_used[i] | own & counts(scaled)
         for i, block in enumerate(self.blocks):
             if block.masks is not None:
-                jacobian_used[i], hessian_used[i] = (
-                    np.broadcast_to(mask, (len(block.rows), len(mask))) for mask in block.masks
-                )
+                jacobian_used[i] = jacobian_used[i] | block.masks[0]
+                hessian_used[i] = hessian_used[i] | block.masks[1]
         jacobian = [
             self._part(used, b.rows, b.unknowns, at)
             for used, b, at in zip(jacobian_used, self.blocks, patterns[0])

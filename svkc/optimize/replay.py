@@ -80,7 +80,7 @@ def distance(
 def control_and_plan(solution: Any, feedback: bool) -> tuple[Any, Plan]:
     """Return the control function and the plan, as `Solution.control` describes."""
     gains = solution.gains() if feedback else None
-    return control_of(solution.problem), plan_of(solution.motion, gains)
+    return control_of(solution.problem), plan_of(solution.problem, solution.motion, gains)
 
 
 def replay(solution: Any, feedback: bool, ts: Any, options: Mapping[str, Any]) -> Trajectory:

@@ -38,9 +38,8 @@ def as_guess(guess: Any, problem: Any) -> Guess:
             motion = resample(problem.chain, problem.scheme, problem.controls, motion, phase)
         phases.append(motion)
     if isinstance(guess, Guess):
-        free = guess.free if len(guess.free) else problem.args_model.numbers(problem.args)
-        return Guess(phases, noise=guess.noise, key=guess.key, free=free)
-    return Guess(phases, free=problem.args_model.numbers(guess.problem.args))
+        return Guess(phases, noise=guess.noise, key=guess.key, free=guess.free)
+    return Guess(phases, free=problem.args_model.known(guess.args))
 
 
 def _linear(x: np.ndarray, y: np.ndarray, at: np.ndarray) -> np.ndarray:

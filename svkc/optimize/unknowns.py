@@ -65,13 +65,8 @@ class UnknownsBuilder:
 
     def add_free_args(self, model: ArgsModel) -> np.ndarray:
         """Append the free args; return the indices of their numbers."""
-        names = [
-            name if shape == () else f"{name}[{k}]"
-            for name, shape in model.shapes.items()
-            for k in range(int(np.prod(shape)))
-        ]
         low, high = model.lower, model.upper
-        options = {"lower": low, "upper": high, "unit": high - low, "entries": names}
+        options = {"lower": low, "upper": high, "unit": high - low, "entries": model.labels}
         self.free = self.table.add("arg", "the whole motion", (len(low),), **options)
         return self.free
 

@@ -10,8 +10,10 @@ import numpy as np
 from svkc._jax.pytrees import is_concrete
 from svkc.model.validation import as_array, description, is_real
 from svkc.optimize.blocks import StageBlock
-from svkc.optimize.dependence import entry_masks, find_dependence
+from svkc.optimize.dependence import NONLINEAR, dependence
+from svkc.optimize.entry_masks import entry_masks
 from svkc.optimize.equations import Params, point_of_stage
+from svkc.optimize.free_args import ArgsModel
 from svkc.optimize.lift import polynomials
 from svkc.optimize.phases import Constraint
 from svkc.optimize.points import AbsentAtStartError, Point
@@ -67,14 +69,13 @@ class RowGroup(NamedTuple):
 class UserRows:
     """Builder of the rows and cost terms of users' functions, which it appends to a transcription.
 
-    params: parameters for which the functions are evaluated.
-    samples: [samples unknowns] random points, at which sparsity is determined.
+    args_model: how the chain depends on the args. params: the chain that the user gave, and args.
     """
 
-    def __init__(self, transcription: Transcription, params: Params, samples: np.ndarray):
+    def __init__(self, transcription: Transcription, args_model: ArgsModel, params: Params):
         self.transcription = transcription
+        self.args_model = args_model
         self.params = params
-        self.samples = samples
         self._groups: dict[tuple, RowGroup] = {}
         # (block, mask of its local rows that are cost terms); the index of the cost's row is known
         # only when all other rows are there
@@ -93,20 +94,31 @@ class UserRows:
         self._add("end", i, end, final, stages=[s - 1], intervals=every[-1:])
 
     def _set_dependence(self, block: StageBlock) -> None:
-        """Find out what a block's function reads, and set the block's options and patterns.
+        """Find out on what a block's functions depend, and set its options and patterns.
 
-        Coordinates of virtual joints are NaN at first. Functions that do not read them return
-        numbers, and need not compute them.
+        Functions that do not read coordinates of virtual joints need not compute them.
         """
-        samples = self._local(block.unknowns)
-        block.options = {"fill": np.nan}
-        dependence = find_dependence(block, self.params, samples)
-        block.options = {} if dependence is None else {"fill": 0.0}
-        if dependence is None:
-            dependence = find_dependence(block, self.params, samples)
-        if dependence is not None:
-            block.nonlinear = block.variables = np.flatnonzero(dependence.nonlinear.any(0))
-            block.masks = entry_masks(block, dependence)
+        n = block.layout.stage_size
+        lane = jax.tree.map(lambda x: jnp.asarray(x[0]), block.data[0])
+        y = jnp.zeros(n, self.params.chain.q_load.dtype)
+        numbers = jnp.asarray(self.args_model.numbers(self.params.args), y.dtype)
+
+        def rows(y, numbers, *fill):
+            block.options = {"fill": fill[0]} if fill else {}
+            params = self.args_model.params(self.params, numbers)
+            return block.function(params, lane, 1.0, y)
+
+        kinds = dependence(rows, y, numbers, y[0])
+        if kinds[:, -1].any():
+            kinds = dependence(rows, y, numbers)
+            block.options = {}
+        else:
+            kinds = kinds[:, :-1]
+            block.options = {"fill": 0.0}
+        nonlinear = kinds == NONLINEAR
+        block.nonlinear = block.variables = np.flatnonzero(nonlinear[:, :n].any(0))
+        block.masks = entry_masks(block, nonlinear[:, :n])
+        block.by_args = nonlinear[:, n:]
 
     def _holds_at_start(self, i: int, entry: Constraint) -> bool:
         """Return whether a path constraint can be evaluated at the start of phase i.
@@ -124,17 +136,18 @@ class UserRows:
         out: list[Values] = []
         data = jax.tree.map(lambda x: jnp.asarray(x[0]), self.transcription.data(i))
 
-        def evaluate(y):
+        def evaluate(y, numbers):
             active = np.asarray(self.transcription.structures[i].active)
+            params = self.args_model.params(self.params, numbers)
             point = point_of_stage(
-                self.transcription.model, self.params, data, y, active, at_start=at_start
+                self.transcription.model, params, data, y, active, at_start=at_start
             )
             values = [_evaluate(entry, point) for entry in entries]
             out.extend(values)
             return [v.numbers for v in values]
 
         y = jnp.zeros(self.transcription.model.layout.stage_size, self.params.chain.q_load.dtype)
-        shapes = jax.eval_shape(evaluate, y)
+        shapes = jax.eval_shape(evaluate, y, self.args_model.numbers(self.params.args))
         return [Values(x.shape, v.lower, v.upper) for x, v in zip(shapes, out)]
 
     def _add(self, place, i: int, entries, costs, *, stages, intervals) -> None:
@@ -245,8 +258,8 @@ class UserRows:
         for bound in (shape.lower, shape.upper):
             if not is_concrete(bound):
                 raise ValueError(
-                    f"constraint {entry.name!r}: its bounds depend on the point; put what depends"
-                    " on it into the function"
+                    f"constraint {entry.name!r}: its bounds depend on the point or on free args;"
+                    " put what depends on these into the function"
                 )
             bounds.append(np.ravel(np.asarray(as_array(bound), float)))
         if not all(b.shape in ((1,), shape.numbers) for b in bounds) or not np.all(
@@ -257,8 +270,3 @@ class UserRows:
                 f" {shape.numbers[0]} values"
             )
         return bounds
-
-    def _local(self, unknowns: np.ndarray) -> np.ndarray:
-        """Return the local unknowns [samples lanes n] at the samples."""
-        padded = np.concatenate([self.samples, np.zeros((len(self.samples), 1))], 1)
-        return padded[:, unknowns]

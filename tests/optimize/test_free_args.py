@@ -67,7 +67,7 @@ def test_simulations_and_refinement_use_the_optimal_args(solved):
 def test_guesses_of_free_args(solved):
     problem, _, solution = solved
     guess = problem.guess([{"x": 0.0}, {"x": 1.0}], free={"mass": 4.0})
-    assert guess.free == 4.0
+    assert guess.free == {"mass": 4.0}
     assert abs(float(problem.solve(guess).cost) - float(solution.cost)) < 1e-6
     many = problem.multistart([guess, solution])
     assert many.solved.all()
