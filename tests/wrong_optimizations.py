@@ -114,6 +114,7 @@ CASES = {
     "constraint ...: got the bounds": on_point((lambda p: p.state.q[0], 1, 0)),
     "constraint ...: its bounds": on_point(lambda p: (p.state.q[0], p.state.v[0], 1)),
     "controls: ... is": lambda s: problem(optimize.Torques(joints=["pin"])),
+    "free: the value": lambda s: with_args(free={"mass": (2, 3)}),
     "free[...]: expected": lambda s: with_args(free={"mass": (2, 1)}),
     "free[...]: got shape": lambda s: with_args(free={"mass": (1, 2)}).guess(
         [{}, {}], free={"mass": np.ones(2)}

@@ -58,7 +58,10 @@ class ArgsModel:
         except (TypeError, ValueError):
             low = high = np.array([np.nan])
         if not np.all(np.isfinite(low) & np.isfinite(high) & (low < high)):
-            raise ValueError(f"free[{name!r}]: expected (lower, upper), finite, got {bounds!r}")
+            raise ValueError(
+                f"free[{name!r}]: expected (lower, upper), finite, with lower < upper, got"
+                f" {bounds!r}"
+            )
         return [low, high]
 
     def __bool__(self) -> bool:

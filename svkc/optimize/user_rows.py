@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from svkc._jax.dependence import NONLINEAR, dependence
 from svkc._jax.pytrees import is_concrete
 from svkc.model.validation import as_array, description, is_real
 from svkc.optimize.blocks import StageBlock
-from svkc.optimize.dependence import NONLINEAR, dependence
 from svkc.optimize.entry_masks import entry_masks
 from svkc.optimize.equations import Params, point_of_stage
 from svkc.optimize.free_args import ArgsModel

@@ -31,9 +31,13 @@ def move(price=2.0, **options):
         wrong_optimizations.cart(),
         optimize.Phase("move", duration=(0.5, 8.0), intervals=4, start=ends[0], end=ends[1]),
         controls=optimize.Torques(1.0, constant=True),
-        args={"mass": 1.0, "price": price},
         final=lambda p: p.t + p.args["price"] / p.args["mass"],
-        **{"free": {"mass": (0.5, 5.0)}, "chain_from": heavier} | options,
+        **{
+            "args": {"mass": 1.0, "price": price},
+            "free": {"mass": (0.5, 5.0)},
+            "chain_from": heavier,
+        }
+        | options,
     )
     return problem, problem.guess([{"x": 0.0}, {"x": 1.0}])
 
@@ -145,9 +149,37 @@ def test_a_link_with_a_free_place():
     assert max(x.max() for x in solution.report(replay=False).position) < 1e-3
 
 
+def test_a_solution_with_fixed_args_is_a_guess(solved):
+    problem, _, solution = solved
+    fixed, guess = move(free=None)
+    warm = problem.solve(fixed.solve(guess))
+    assert abs(float(warm.cost) - float(solution.cost)) < 1e-6
+    plain = optimize.Problem(
+        wrong_optimizations.cart(), fixed.phases, controls=optimize.Torques(1.0, constant=True)
+    )
+    assert problem.solve(plain.solve(plain.guess([{"x": 0.0}, {"x": 1.0}]))).args["mass"] > 1
+
+
+def test_free_args_that_are_zero():
+    """Derivatives by other unknowns are complete although they are zero at the guess."""
+    gain = lambda p: p.args["gain"] * jnp.sum(p.u**2)
+    problem, guess = move(
+        args={"gain": 0.0, "mass": 1.0, "price": 2.0}, free={"gain": (0.0, 1.0)}, running=gain
+    )
+    program, start = problem.start(guess)
+    x = start.x + np.random.default_rng(0).normal(size=program.count)
+    x[program.transcription.builder.free] = 0.5
+    lower, upper, _, _ = program.bounds()
+    check_derivatives(program, x, lower < upper, 0)
+
+
 @pytest.mark.slow
-def test_derivatives_by_lengths():
-    """Loops, an impact and users' functions depend on the lengths of two bodies."""
+@pytest.mark.parametrize("intervals", [2, 8])
+def test_derivatives_by_lengths(intervals):
+    """Loops, an impact and users' functions depend on the lengths of two bodies.
+
+    Blocks of eight intervals and more are evaluated with the lanes last.
+    """
 
     down = jnp.array([0.0, 0.0, -1.0])
     longer = lambda chain, args: chain.replace(
@@ -158,12 +190,12 @@ def test_derivatives_by_lengths():
     )
     chain = svkc.load(models.MJCF.format(models.TWO_RODS), virtual_links=[pin])
     phases = [
-        optimize.Phase("free", duration=(0.2, 0.6), intervals=2),
+        optimize.Phase("free", duration=(0.2, 0.6), intervals=intervals),
         optimize.Phase(
             "held",
             connected=("hand",),
             duration=(0.2, 0.6),
-            intervals=2,
+            intervals=intervals,
             path=[lambda p: p.forces("hand")[2] + p.args["lengths"][0]],
             end=[optimize.constraint("height", lambda p: p.state.q[0], -1, 1)],
         ),
@@ -216,3 +248,20 @@ def test_wrong_guesses_of_free_args(solved):
         problem.guess(poses, free={"price": 1.0})
     with pytest.raises(ValueError, match=r"free\['mass'\]: got shape \(2,\), expected \(\)"):
         problem.guess(poses, free={"mass": jnp.ones(2)})
+    with pytest.raises(ValueError, match=r"value 9 of mass is not between its bounds 0\.5 and 5"):
+        problem.guess(poses, free={"mass": 9.0})
+
+
+def test_bounds_do_not_depend_on_free_args(solved):
+    problem, _, _ = solved
+    limit = optimize.constraint("limit", lambda p: (p.state.q[0], -1.0, p.args["mass"]))
+    phase = optimize.Phase("move", duration=(0.5, 8.0), intervals=1, path=[limit])
+    other = optimize.Problem(
+        problem.args_model.chain,
+        phase,
+        controls=problem.controls,
+        args={"mass": 1.0},
+        free={"mass": (0.5, 5.0)},
+    )
+    with pytest.raises(ValueError, match="constraint 'limit': its bounds depend on the point or"):
+        other.check(other.guess([{}, {}]))

@@ -78,7 +78,7 @@ def test_derivatives_of_functions_that_are_constant_at_most_points():
         svkc.load(models.ARM),
         [phase],
         controls=optimize.Torques(limit=5.0),
-        running=lambda p: over(-p.state.q[0], 5.0),
+        running=lambda p: over(-p.state.q[0], 5.0) + jnp.where(p.t > 0.6, p.u[0] ** 2, 0.0),
         final=lambda p: over(p.vdot[0], 400.0),
     )
     program, start = problem.start(problem.guess([{"arm": 0.0}, {"arm": 1.0}]))

@@ -17,10 +17,22 @@ from jax.extend.core import Literal
 NONE, LINEAR, NONLINEAR = np.uint8(0), np.uint8(1), np.uint8(2)
 # primitives whose outputs are linear in all inputs, element by element
 _SUMS = {"add", "sub", "add_any", "neg", "copy", "copy_p", "real", "reduce_precision"}
+# other primitives that act element by element
+_ELEMENTWISE = {
+    *("abs", "acos", "acosh", "and", "asin", "asinh", "atan", "atan2", "atanh", "cbrt", "ceil"),
+    *("clamp", "cos", "cosh", "digamma", "div", "eq", "erf", "erf_inv", "erfc", "exp", "exp2"),
+    *("expm1", "floor", "ge", "gt", "integer_pow", "is_finite", "le", "lgamma", "log", "log1p"),
+    *("logistic", "lt", "max", "min", "ne", "not", "or", "pow", "rem", "round", "rsqrt"),
+    *("select_n", "sign", "sin", "sinh", "sqrt", "square", "tan", "tanh", "xor"),
+}
 # primitives that only move entries of inputs, and the number of these inputs; indices follow
 _MOVES = {"gather": 1, "dynamic_slice": 1, "static_take": 1}
-# parameters that hold the expression of a call
-_CALLS = ("jaxpr", "call_jaxpr", "fun_jaxpr")
+# primitives that call an expression, and the parameters that may hold it
+_CALLS = {
+    *("jit", "pjit", "closed_call", "core_call", "checkpoint", "remat", "remat2"),
+    *("custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr"),
+}
+_EXPRESSIONS = ("jaxpr", "call_jaxpr", "fun_jaxpr")
 
 
 def dependence(function: Callable, *arguments: jax.Array) -> np.ndarray:
@@ -82,11 +94,14 @@ class _Walk:
         shapes, name = [var.aval.shape for var in eqn.outvars], eqn.primitive.name
         if not any(x.any() for x in inputs):
             return [np.zeros((*shape, self.n), np.uint8) for shape in shapes]
-        inner = next((eqn.params[key] for key in _CALLS if key in eqn.params), None)
-        if inner is not None and name not in ("scan", "while", "cond"):
+        inner = next((eqn.params[key] for key in _EXPRESSIONS if key in eqn.params), None)
+        if inner is not None and name in _CALLS:
             jaxpr, consts = getattr(inner, "jaxpr", inner), getattr(inner, "consts", ())
             if len(jaxpr.invars) == len(inputs) and len(jaxpr.constvars) == len(consts):
                 return self.outputs(jaxpr, consts, inputs)
+        if name == "split":
+            ends = np.cumsum(eqn.params["sizes"])
+            return np.split(inputs[0], ends[:-1], eqn.params["axis"])
         if len(shapes) > 1:
             return [self._anywhere(inputs, shape, NONLINEAR) for shape in shapes]
         if name in _MOVES and all(x is not None for x in constants[_MOVES[name] :]):
@@ -119,6 +134,8 @@ class _Walk:
             return moved
         if name == "concatenate":
             return np.concatenate(inputs, params["dimension"])
+        if name == "stack":
+            return np.stack(inputs, params["axis"])
         if name in _SUMS:
             return self._elementwise(inputs, shape)
         if name in ("mul", "dot_general"):
@@ -128,7 +145,7 @@ class _Walk:
             return self._elementwise(inputs, shape)
         if name == "select_n" and not x.any():
             return self._elementwise(rest, shape)
-        if all(y.shape[:-1] in ((), shape) for y in inputs):
+        if name in _ELEMENTWISE:
             return _used(self._elementwise(inputs, shape))
         return self._anywhere(inputs, shape, NONLINEAR)
 
