@@ -34,8 +34,8 @@ class Run:
 
     tolerance, max_iterations, max_seconds: of `InteriorPoint`. matrix: solver of linear systems.
     progress: called with the number of iterations as a fraction of the largest number.
-    x, duals: free unknowns and multipliers of the problem's last iterate. If the problem is
-        infeasible, x is instead the point of least violation.
+    x, duals: free unknowns and multipliers of the problem's last iterate that the line search
+        accepted. If the problem is infeasible, x is instead the point of least violation.
     begin: time of the start (s). iterations: number of iterations.
     """
 
@@ -91,10 +91,13 @@ class BarrierMethod:
 
     def _iterate(self) -> str:
         while True:
-            self._store()
+            if not self._watchdog.active:
+                self._store()
             self.run.progress(min(self.run.iterations / self.run.max_iterations, 1.0))
             status = self._ended() or self._update_parameter()
             if status:
+                if status in ("successful", "acceptable"):
+                    self._store()
                 return status
             step = self._step()
             if isinstance(step, str):
@@ -105,7 +108,7 @@ class BarrierMethod:
             self.run.iterations += 1
 
     def _store(self) -> None:
-        """Store the iterate as the last one of the problem. Those of restorations are not."""
+        """Store the iterate as the last one of the problem. Iterates of a restoration are not."""
         if self.restore is not None:
             self.run.x, self.run.duals = self.at.w[: self.program.count], self.duals
 
@@ -198,7 +201,8 @@ class BarrierMethod:
         self._reset_filter_if_blocked()
         is_short = step.length < _SHORT_LENGTH and self.at.theta > _SHORT_THETA
         self._short = self._short + 1 if is_short else 0
-        # while full steps are on trial the filter may not have accepted the iterate
+        # during an attempt of the watchdog, the iterate may be one that the filter refuses; a
+        # restoration must not begin there
         goes_on = self.restore is None or self._watchdog.active or self._short < _SHORT_STEPS
         if accepted is not None and goes_on:
             self._accept(step, accepted)

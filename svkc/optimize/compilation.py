@@ -93,7 +93,7 @@ def _sample_points(problem: Any, transcription: Transcription) -> np.ndarray:
     for phase, indices in zip(problem.phases, transcription.indices):
         middle = sum(phase.duration) / 2
         samples[:, indices.duration] = middle * random.uniform(0.8, 1.2, count)
-    free = transcription.builder.free
+    free = transcription.builder.free_args
     share = random.uniform(0.4, 0.6, (count, len(free)))
     samples[:, free] = (1 - share) * table.lower[free] + share * table.upper[free]
     fixed = table.lower == table.upper

@@ -38,7 +38,7 @@ def encode(
                 gaps_at(chain, jnp.asarray(motion.q[0]), transcription.model.rows)
             )[starts]
         kept = at.kept_gap
-    x[transcription.builder.free] = free
+    x[transcription.builder.free_args] = free
     return _with_noise(transcription, guess, np.clip(x, table.lower, table.upper))
 
 

@@ -96,8 +96,8 @@ class Accepted:
 class LineSearch:
     """Backtracking line search (section 2.3, with section 2.4 for second-order corrections).
 
-    by_filter: whether the filter alone refused the last trial point of the last search that was
-        refused.
+    by_filter: whether, in the last search, the last refused trial point was refused by the filter
+        alone.
     tiny: whether the last step was as small as round-off.
     """
 

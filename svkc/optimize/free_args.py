@@ -44,7 +44,7 @@ class ArgsModel:
         pairs = [self._bounds(name, free[name]) for name in free]
         self.lower, self.upper = (np.concatenate([np.zeros(0), *x]) for x in zip(*pairs, ((), ())))
         self.numbers(args)
-        resolved = self.params(Params(chain, args)).chain
+        resolved = self.resolve(Params(chain, args)).chain
         check_chain(resolved)
         if resolved.topology != chain.topology:
             raise ValueError("chain_from: expected a chain with the same bodies, joints and links")
@@ -112,7 +112,7 @@ class ArgsModel:
         ]
 
     def with_numbers(self, args: Any, numbers: Any) -> Any:
-        """Return args with other numbers of the free args; None: with those that it has."""
+        """Return args with other numbers of the free args. numbers: None: args unchanged."""
         if not self.names or numbers is None:
             return args
         counts = [int(np.prod(self.shapes[name])) for name in self.names]
@@ -121,7 +121,7 @@ class ArgsModel:
             name: x.reshape(self.shapes[name]) for name, x in zip(self.names, parts, strict=True)
         }
 
-    def params(self, params: Params, numbers: Any = None) -> Params:
+    def resolve(self, params: Params, numbers: Any = None) -> Params:
         """Return the chain and the args for some numbers of the free args.
 
         params: the chain that the user gave, and the args.
@@ -160,7 +160,7 @@ class ArgsBlock(Block):
     def _split(self, params: Any, z: Unknowns) -> tuple[Callable, jax.Array, jax.Array]:
         """Return the function numbers -> params, the numbers, and the unknowns of the block."""
         n = self.block.unknowns.shape[1]
-        return lambda x: self.model.params(params, x), z[0, n:], z[:, :n]
+        return lambda x: self.model.resolve(params, x), z[0, n:], z[:, :n]
 
     def values(self, params: Any, data: Any, z: Unknowns) -> jax.Array:
         at, x, z = self._split(params, z)

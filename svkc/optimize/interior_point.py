@@ -33,9 +33,9 @@ class InteriorPoint(AbstractSolver):
     only decreases (section 2.1), steps within a fraction of the boundary (2.2), a filter line
     search (2.3) with second-order correction (2.4), corrected inertia (3.1), a filter that is reset
     (3.2), and an elastic restoration (3.3). A watchdog tries full steps after shortened ones. The
-    linear systems are chains of dense blocks, one for each interval, with a border for durations.
-    LAPACK factors the blocks as L D L^T, which gives the inertia. A matrix with a singular block
-    counts as singular.
+    linear systems are chains of dense blocks, one for each interval, with a border for durations
+    and free args. LAPACK factors the blocks as L D L^T, which gives the inertia. A matrix with a
+    singular block counts as singular.
 
     A warm start begins from the unknowns and multipliers of the solution, with the barrier
     parameter 1e-6. On another mesh there are no multipliers; then the barrier parameter is 1e-4.

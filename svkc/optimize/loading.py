@@ -15,8 +15,8 @@ from svkc.optimize.structures import phase_structures
 def load_solution(path: Path, problem: Any) -> Solution:
     """Return a solution that `Solution.save` wrote.
 
-    `problem` of the result is the given problem with the mesh of the file. The problem is not
-    compiled.
+    `problem` of the result is the given problem with the mesh and the free args of the file. The
+    problem is not compiled.
 
     path: path of the file.
     problem: the `Problem` that the solution is of, on any mesh. Files hold no functions.

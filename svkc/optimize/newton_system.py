@@ -20,7 +20,7 @@ def interval_groups(functions: Functions) -> np.ndarray:
     """Return the group of each free unknown and then of each row; -1: the border.
 
     A group has the unknowns of one node and of the interval that starts there. A row belongs to the
-    last group of its unknowns. Durations, times and kept gaps are the border.
+    last group of its unknowns. Durations, times, kept gaps and free args are the border.
     """
     group, first = np.full(functions.program.count, -1), 0
     for of_phase in functions.program.transcription.indices:

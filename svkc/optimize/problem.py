@@ -80,7 +80,7 @@ class Problem:
         if chain_from is not None:
             check_function("chain_from", chain_from, "chain", "args")
         self.args_model: ArgsModel = ArgsModel(chain, self.args, free or {}, chain_from)
-        self.chain: Chain = self.args_model.params(Params(chain, self.args)).chain
+        self.chain: Chain = self.args_model.resolve(Params(chain, self.args)).chain
         self.phases: list[Phase] = [
             dataclasses.replace(p, bounds=(*bounds, *p.bounds)) for p in phases
         ]
@@ -202,7 +202,7 @@ class Problem:
         if not self.args_model.names:
             return self
         problem, params = copy.copy(self), Params(self.args_model.chain, self.args)
-        problem.chain, problem.args = self.args_model.params(params, numbers)
+        problem.chain, problem.args = self.args_model.resolve(params, numbers)
         return problem
 
     def multistart(

@@ -264,7 +264,7 @@ def solution(problem: Any, program: Program, result: SolverResult) -> Solution:
     """Return the `Solution` of a solver's result."""
     transcription, rows = program.transcription, program.rows(result.x)
     x = result.x * program.unit
-    problem = problem.with_free(x[transcription.builder.free])
+    problem = problem.with_free(x[transcription.builder.free_args])
     return solution_of(
         problem,
         decode(transcription, x),

@@ -60,15 +60,15 @@ class UnknownsBuilder:
         dofs = list(chain.dof_names[: chain.nv])
         self.names: Names = Names(dofs, controls.names(chain), of_rows)
         # indices of the free args' unknowns
-        self.free: np.ndarray = np.zeros(0, int)
+        self.free_args: np.ndarray = np.zeros(0, int)
         self._force_unit = np.where(rows % 6 < 3, units.torque, units.force)
 
     def add_free_args(self, model: ArgsModel) -> np.ndarray:
         """Append the free args; return the indices of their numbers."""
         low, high = model.lower, model.upper
         options = {"lower": low, "upper": high, "unit": high - low, "entries": model.labels}
-        self.free = self.table.add("arg", "the whole motion", (len(low),), **options)
-        return self.free
+        self.free_args = self.table.add("arg", "the whole motion", (len(low),), **options)
+        return self.free_args
 
     @property
     def node_units(self) -> np.ndarray:

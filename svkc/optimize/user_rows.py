@@ -105,7 +105,7 @@ class UserRows:
 
         def rows(y, numbers, *fill):
             block.options = {"fill": fill[0]} if fill else {}
-            params = self.args_model.params(self.params, numbers)
+            params = self.args_model.resolve(self.params, numbers)
             return block.function(params, lane, 1.0, y)
 
         kinds = dependence(rows, y, numbers, y[0])
@@ -138,7 +138,7 @@ class UserRows:
 
         def evaluate(y, numbers):
             active = np.asarray(self.transcription.structures[i].active)
-            params = self.args_model.params(self.params, numbers)
+            params = self.args_model.resolve(self.params, numbers)
             point = point_of_stage(
                 self.transcription.model, params, data, y, active, at_start=at_start
             )

@@ -31,8 +31,8 @@ class _Attempt:
 class Watchdog:
     """Line search that tries full steps after ten shortened ones.
 
-    If three full steps give no point that is accepted in comparison with the first, the method goes
-    back to the first.
+    If none of four full steps gives a point that is accepted in comparison with the first, the
+    method goes back to the first.
 
     search: the line search.
     """

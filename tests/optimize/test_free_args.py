@@ -168,7 +168,7 @@ def test_free_args_that_are_zero():
     )
     program, start = problem.start(guess)
     x = start.x + np.random.default_rng(0).normal(size=program.count)
-    x[program.transcription.builder.free] = 0.5
+    x[program.transcription.builder.free_args] = 0.5
     lower, upper, _, _ = program.bounds()
     check_derivatives(program, x, lower < upper, 0)
 
