@@ -78,6 +78,13 @@ def test_guesses_of_free_args(solved):
     assert int(many[1].iterations) < int(many[0].iterations)
 
 
+@pytest.mark.slow
+def test_free_args_in_other_processes(solved):
+    problem, guess, solution = solved
+    for other in problem.multistart([guess, solution], processes=2):
+        assert abs(float(other.args["mass"]) - float(solution.args["mass"])) < 1e-5
+
+
 def test_saved_solutions_have_their_args(solved, tmp_path):
     problem, _, solution = solved
     solution.save(tmp_path / "move.npz")
