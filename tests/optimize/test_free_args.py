@@ -59,6 +59,7 @@ def test_a_mass_with_a_known_optimum(solved, solver):
     assert "mass: 1.58" in str(solution)
 
 
+@pytest.mark.slow
 def test_simulations_and_refinement_use_the_optimal_args(solved):
     _, _, solution = solved
     assert max(x.max() for x in solution.report(replay=False).position) < 1e-6
@@ -68,6 +69,7 @@ def test_simulations_and_refinement_use_the_optimal_args(solved):
     assert abs(float(finer.args["mass"]) - float(solution.args["mass"])) < 1e-4
 
 
+@pytest.mark.slow
 def test_guesses_of_free_args(solved):
     problem, _, solution = solved
     guess = problem.guess([{"x": 0.0}, {"x": 1.0}], free={"mass": 4.0})
@@ -105,6 +107,7 @@ def test_the_optimal_cost_by_an_arg(solved):
     assert float(by_args["mass"]) == 0.0
 
 
+@pytest.mark.slow
 def test_the_optimal_cost_by_an_arg_of_the_chain():
     """Without free args: the duration 2 sqrt(m) has the derivative 1 / sqrt(m)."""
     problem, guess = move(free=None)
@@ -138,6 +141,7 @@ def held_rods(**options):
     return problem, problem.guess([{"upper": -0.4, "lower": 0.2}, {"upper": -0.4, "lower": 0.2}])
 
 
+@pytest.mark.slow
 def test_a_link_with_a_free_place():
     """Points, states and simulations have the link at its optimal place."""
     angle = lambda p: p.state.q[-1]  # of the pin
@@ -156,6 +160,7 @@ def test_a_link_with_a_free_place():
     assert max(x.max() for x in solution.report(replay=False).position) < 1e-3
 
 
+@pytest.mark.slow
 def test_a_solution_with_fixed_args_is_a_guess(solved):
     problem, _, solution = solved
     fixed, guess = move(free=None)
