@@ -94,3 +94,19 @@ def test_derivatives_of_functions_that_are_constant_at_most_points():
     assert len(own) == 6
     assert active[own].all()
     assert active[-1]
+
+
+def test_derivatives_of_joint_limits():
+    """At the guess and near it the cart is far inside its range."""
+    rail = models.MJCF.format(
+        '<body><joint name="x" type="slide" axis="1 0 0" limited="true" range="-9 9"'
+        ' solreflimit="-100 -10"/><geom size="0.1"/></body>'
+    )
+    phase = optimize.Phase("move", duration=1.0, intervals=2)
+    problem = optimize.Problem(svkc.load(rail), phase, controls=optimize.Torques())
+    program, start = problem.start(problem.guess([{"x": 0.0}, {"x": 0.0}]))
+    lower, upper, _, _ = program.bounds()
+    x = start.x.copy()
+    x[program.transcription.indices[0].nodes[:, 0]] = 12.0
+    assert np.abs(program.rows(x)).max() > 1
+    check_derivatives(program, x, lower < upper, 0)
