@@ -8,8 +8,6 @@ import numpy as np
 from svkc.optimize.equations import Model, Params
 from svkc.optimize.free_args import ArgsBlock
 from svkc.optimize.guesses import Guess
-from svkc.optimize.lift import Layout
-from svkc.optimize.loop_rows import LinkRows
 from svkc.optimize.points import PhaseStructure
 from svkc.optimize.program import Program
 from svkc.optimize.transcription import Transcription
@@ -32,21 +30,13 @@ def compile_problem(
     guess: its configurations are the origins of the charts.
     """
     chain, controls, model = problem.chain, problem.controls, problem.args_model
-    layout = Layout(
-        nv=chain.nv,
-        stages=problem.scheme.stages,
-        rows=len(rows),
-        control=controls.count(chain),
-        blocks=controls.blocks(problem.scheme),
-        stage_blocks=controls.stage_blocks,
-    )
     builder = UnknownsBuilder(
         chain, controls, rows, scheme=problem.scheme, units=problem.units, project=problem.project
     )
     transcription = Transcription(
         builder,
         problem.phases,
-        Model(layout, LinkRows.of(chain, rows), controls),
+        Model.of(chain, controls, problem.scheme, rows),
         scheme=problem.scheme,
         structures=structures,
         references=[m.q for m in guess.phases],

@@ -23,6 +23,7 @@ from svkc.optimize.points import (
     full_velocity,
     placed_as_in,
 )
+from svkc.optimize.schemes import Radau
 from svkc.tree.inverse_dynamics import (
     generalized_force,
     limit_forces,
@@ -54,6 +55,21 @@ class Model(NamedTuple):
     layout: Layout
     rows: LinkRows
     controls: AbstractControls
+
+    @classmethod
+    def of(
+        cls, chain: Chain, controls: AbstractControls, scheme: Radau, rows: np.ndarray
+    ) -> "Model":
+        """Return the static part for a chain. rows: the links' rows, as in `LinkRows`."""
+        layout = Layout(
+            nv=chain.nv,
+            stages=scheme.stages,
+            rows=len(rows),
+            control=controls.count(chain),
+            blocks=controls.blocks(scheme),
+            stage_blocks=controls.stage_blocks,
+        )
+        return cls(layout, LinkRows.of(chain, rows), controls)
 
 
 class IntervalData(eqx.Module):

@@ -12,8 +12,7 @@ from svkc.model.chain import Chain
 from svkc.optimize.charts import chart_from_motion, motion_from_chart, to_next_chart
 from svkc.optimize.equations import IntervalData, Model, Params, stage_equations
 from svkc.optimize.guesses import PhaseMotion
-from svkc.optimize.lift import Layout
-from svkc.optimize.loop_rows import LinkRows, rates_at
+from svkc.optimize.loop_rows import rates_at
 from svkc.optimize.plans import driven_coordinates
 from svkc.optimize.points import full_configuration, full_velocity, padded
 from svkc.optimize.structures import phase_structures
@@ -131,16 +130,8 @@ def _lanes(problem: Any, motion: tuple[PhaseMotion, ...]) -> tuple[Model, _Lane]
         )
         parts.append(lane)
         start += float(m.duration)
-    layout = Layout(
-        nv=chain.nv,
-        stages=problem.scheme.stages,
-        rows=len(rows),
-        control=controls.count(chain),
-        blocks=controls.blocks(problem.scheme),
-        stage_blocks=controls.stage_blocks,
-    )
     lanes = jax.tree.map(lambda *x: jnp.concatenate([jnp.asarray(y) for y in x]), *parts)
-    return Model(layout, LinkRows.of(chain, rows), controls), lanes
+    return Model.of(chain, controls, problem.scheme, rows), lanes
 
 
 def _moved(chain: Chain, q, dq):

@@ -84,13 +84,12 @@ class Program:
         self._second = _over_blocks(blocks, lambda b, *x: b.hessian(*x))
         first = [self._first(self.params, self._data, self._local(x)) for x in samples]
         self._set_row_units(first[:near])
-        self._near = near
         self.row_unit: np.ndarray = np.append(transcription.rows.unit, cost_unit)
         rows = [b.rows.reshape(-1) for b in blocks]
         self._target = np.concatenate(rows) if rows else np.zeros(0, int)
         linear = transcription.linear
         self._linear = linear[0], linear[1], linear[2] / self.row_unit[linear[0]]
-        entries, of_hessian = self._patterns(samples, first)
+        entries, of_hessian = self._patterns(samples, first, near)
         self.jacobian_entries: Entries = entries
         self.hessian_entries: Entries = of_hessian
         # rows whose unknowns are all fixed would make the solver's matrices singular
@@ -137,22 +136,24 @@ class Program:
             if np.isnan(table.unit[own]).any():
                 table.unit[own] = np.max(largest[own], initial=0.0) or 1.0
 
-    def _patterns(self, samples: np.ndarray, jacobians) -> tuple[Entries, Entries]:
+    def _patterns(self, samples: np.ndarray, jacobians, near: int) -> tuple[Entries, Entries]:
         """Return the entries of the Jacobian and of the lower half of the Hessian.
 
-        jacobians: dense Jacobians of the blocks at each sample.
+        jacobians: dense Jacobians of the blocks at each sample. near: number of samples at which
+            entries that are not finite count as nonzero.
         """
         random = np.random.default_rng(1)
         patterns = (
             [b.jacobian_pattern for b in self.blocks],
             [b.hessian_pattern for b in self.blocks],
         )
-        jacobian_used: list[Any] = [False] * len(self.blocks)
-        hessian_used: list[Any] = [False] * len(self.blocks)
+        masks = [(False, False) if b.masks is None else b.masks for b in self.blocks]
+        jacobian_used: list[Any] = [of_jacobian for of_jacobian, _ in masks]
+        hessian_used: list[Any] = [of_hessian for _, of_hessian in masks]
         unit = np.append(self.unit, 1.0)
         for k, (x, jacobian) in enumerate(zip(samples, jacobians, strict=True)):
             # far from the guess a function may not be defined
-            counts = lambda values, far=k >= self._near: np.isfinite(values) | (not far)
+            counts = lambda values, far=k >= near: np.isfinite(values) | (not far)
             multipliers = [
                 np.where(b.rows < 0, 0, random.normal(size=b.rows.shape)) for b in self.blocks
             ]
@@ -166,10 +167,6 @@ class Program:
                 scaled = np.asarray(hessian[i]) * scale[:, row] * scale[:, column]
                 own = above_round_off(scaled, axes=1)
                 hessian_used[i] = hessian_used[i] | own & counts(scaled)
-        for i, block in enumerate(self.blocks):
-            if block.masks is not None:
-                jacobian_used[i] = jacobian_used[i] | block.masks[0]
-                hessian_used[i] = hessian_used[i] | block.masks[1]
         jacobian = [
             self._part(used, b.rows, b.unknowns, at)
             for used, b, at in zip(jacobian_used, self.blocks, patterns[0])
