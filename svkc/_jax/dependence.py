@@ -1,8 +1,9 @@
 """On which of its inputs each output of a function depends, found in its JAX expression.
 
-The answer holds at all points. Values at sample points would not do: the derivatives of
-max(0, q - 3) are zero at most of them. The answer errs on one side only: an output may be said to
-depend on an input on which it does not.
+The result holds at all points. Derivatives at sample points would not do: those of max(0, q - 3)
+are zero at most points. The result is conservative: an output may be reported as dependent on an
+input on which it does not depend. Custom derivative rules are not looked at: they must agree with
+the values of the function.
 """
 
 from collections.abc import Callable, Sequence

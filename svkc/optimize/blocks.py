@@ -33,7 +33,8 @@ class Block:
     rows: [lanes m] index of the row to which each local row is added; -1: it is left out.
     masks: which entries of `jacobian_pattern` and of `hessian_pattern` may be nonzero although they
         are zero at a few random points; None: not known.
-    by_args: mask [rows of a stage, free args] of derivatives that may be nonzero in this way.
+    by_args: mask [rows of a stage, free args] of the same for derivatives by free args. Only blocks
+        with masks have it.
     data: constants of each lane, with a leading axis over lanes. Methods take the data as an
         argument, so that new data need no compilation.
     """

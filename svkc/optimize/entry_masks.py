@@ -10,8 +10,8 @@ from svkc.optimize.lift import Layout, StagePolynomials, dependencies
 def entry_masks(block: StageBlock, nonlinear: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return masks of entries of a block's `jacobian_pattern` and `hessian_pattern`.
 
-    They are the entries by variables in which the rows are not linear. Other entries do not depend
-    on these variables, so their values at any point show whether they are zero.
+    They are the entries by variables in which the rows are not linear. The rows' derivatives by the
+    other variables are constant, so their values at any point show whether they are zero.
 
     nonlinear: mask [rows y] of the variables in which a row of a stage is not linear. Those of any
         row are `block.variables`.

@@ -195,9 +195,9 @@ class Problem:
         return problem
 
     def with_free(self, numbers: np.ndarray) -> "Problem":
-        """Return the problem with other numbers of the free args, as their guess.
+        """Return the problem with other values of the free args, and with the chain for these.
 
-        numbers: of all free args, in the order of `free`.
+        numbers: values of all free args, flattened, in the order of `free`.
         """
         if not self.args_model.names:
             return self
