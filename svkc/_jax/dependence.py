@@ -23,7 +23,8 @@ _ELEMENTWISE = {
     *("abs", "acos", "acosh", "and", "asin", "asinh", "atan", "atan2", "atanh", "cbrt", "ceil"),
     *("clamp", "cos", "cosh", "digamma", "div", "eq", "erf", "erf_inv", "erfc", "exp", "exp2"),
     *("expm1", "floor", "ge", "gt", "integer_pow", "is_finite", "le", "lgamma", "log", "log1p"),
-    *("logistic", "lt", "max", "min", "ne", "not", "or", "pow", "rem", "round", "rsqrt"),
+    *("log2", "logistic", "lt", "max", "min", "ne", "not", "one_minus_square", "or", "pow"),
+    *("rem", "round", "rsqrt"),
     *("select_n", "sign", "sin", "sinh", "sqrt", "square", "tan", "tanh", "xor"),
 }
 # primitives that only move entries of inputs, and the number of these inputs; indices follow
@@ -103,6 +104,8 @@ class _Walk:
         if name == "split":
             ends = np.cumsum(eqn.params["sizes"])
             return np.split(inputs[0], ends[:-1], eqn.params["axis"])
+        if name == "unstack":
+            return list(np.moveaxis(inputs[0], eqn.params["axis"], 0))
         if len(shapes) > 1:
             return [self._anywhere(inputs, shape, NONLINEAR) for shape in shapes]
         if name in _MOVES and all(x is not None for x in constants[_MOVES[name] :]):

@@ -24,6 +24,11 @@ CASES = {
     "indices": (lambda x, y: x[np.array([2, 0])], [[0, 0, 1, 0, 0], [1, 0, 0, 0, 0]]),
     "static": (lambda x, y: static_take(x, np.array([1, 3])), [[0, 1, 0, 0, 0], [0] * 5]),
     "split": (lambda x, y: jnp.split(x, [2])[1], [[0, 0, 1, 0, 0]]),
+    "unpacked": (lambda x, y: jnp.stack(tuple(x))[1:2], [[0, 1, 0, 0, 0]]),
+    "columns": (
+        lambda x, y: jnp.stack(jnp.unstack(jnp.outer(x, MATRIX[0]), axis=1))[1, :2],
+        [[1, 0, 0, 0, 0], [0, 1, 0, 0, 0]],
+    ),
     "reversed": (lambda x, y: x[::-1].reshape(3, 1).T[0, :1], [[0, 0, 1, 0, 0]]),
     "whole": (lambda x, y: jnp.round(x[:1]).astype(int).astype(y.dtype) + y[:1], [[2, 0, 0, 1, 0]]),
     "call": (lambda x, y: jax.jit(jnp.multiply)(x[:1], y[:1]), [[2, 0, 0, 2, 0]]),
@@ -40,6 +45,7 @@ CASES = {
         [[2, 2, 2, 0, 0]],
     ),
     "custom": (lambda x, y: jax.nn.relu(x[:1]), [[2, 0, 0, 0, 0]]),
+    "base 2": (lambda x, y: jnp.log2(x[1:2]), [[0, 2, 0, 0, 0]]),
     "constant": (lambda x, y: jnp.ones(2), [[0] * 5] * 2),
 }
 
