@@ -42,6 +42,8 @@ UNBATCHED_AXES = {
     "squeeze",
 }
 CONCATENATIONS = {"concatenate", "stack"}
+# the primitives of one_kernel.py, which batches drop
+ONE_KERNEL = {"one_kernel_input", "one_kernel_output"}
 # primitives that call a jaxpr -> name of the parameter that holds the jaxpr
 CALL_JAXPR_PARAMETERS = {
     "closed_call": "call_jaxpr",
@@ -185,6 +187,8 @@ def _apply_rule(primitive, inputs: list, params: dict, shape: tuple[int, ...], l
             *(jnp.broadcast_to(broadcast_to_lanes(v, lanes), (*shape, lanes)) for v in inputs),
             **params,
         )
+    if name in ONE_KERNEL:
+        return inputs[0].x
     if name in SHAPE_RULES and len(inputs) == 1:
         return SHAPE_RULES[name](inputs[0].x, lanes, **params)
     if name == "static_take":

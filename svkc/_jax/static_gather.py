@@ -12,8 +12,9 @@ from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Float, Int
 
 # the transpose gathers by a padded index table [rows, most uses of one row]; if that table has
-# more than this many times the entries that are needed, the transpose is a scatter
-MAX_TABLE_RATIO = 8
+# more than this many times the entries that are needed, rows that are used more often are summed
+# one by one, or the transpose is a scatter if these rows are many
+MAX_TABLE_RATIO, MAX_ROWS_USED_OFTEN = 8, 4
 
 
 def static_take(
@@ -58,23 +59,28 @@ def _abstract_eval(x, *, index: bytes, axis: int):
 def _transpose(ct, x, *, index: bytes, axis: int):
     """Return, for each row of x, the sum of the cotangents of the rows gathered from that row."""
     table, n = np.frombuffer(index, np.int32), x.aval.shape[axis]
-    order = np.argsort(table, kind="stable")
     count = np.bincount(table, minlength=n + 1)[:n]
-    max_count = int(count.max(initial=0))
-    if n * max_count > MAX_TABLE_RATIO * (n + len(table)):
+    width = min(count.max(initial=0), MAX_TABLE_RATIO * (n + len(table)) // max(n, 1))
+    often = np.flatnonzero(count > width)
+    if len(often) > MAX_ROWS_USED_OFTEN:
         shape = (*x.aval.shape[:axis], n + 1, *x.aval.shape[axis + 1 :])
         scattered = jnp.zeros(shape, ct.dtype).at[(slice(None),) * axis + (table,)].add(ct)
         return [lax.slice_in_dim(scattered, 0, n, axis=axis)]
     # padding: an index one past the last row of ct gathers zeros
-    uses, first = np.full((n, max_count), len(table), np.int32), np.cumsum(count) - count
-    for row in range(n):
-        uses[row, : count[row]] = order[first[row] : first[row] + count[row]]
+    uses = np.full((n, width), len(table), np.int32)
+    for row in np.flatnonzero((count > 0) & (count <= width)):
+        uses[row, : count[row]] = np.flatnonzero(table == row)
     terms = static_take_p.bind(ct, index=uses.tobytes(), axis=axis)
-    return [
-        terms
-        if max_count == 1
-        else jnp.sum(terms.reshape(*ct.shape[:axis], n, max_count, *ct.shape[axis + 1 :]), axis + 1)
-    ]
+    shape = (*ct.shape[:axis], n, width, *ct.shape[axis + 1 :])
+    total = terms if width == 1 else jnp.sum(terms.reshape(shape), axis + 1)
+    for row in often.tolist():
+        places = np.flatnonzero(table == row).astype(np.int32).tobytes()
+        of_row = jnp.sum(static_take_p.bind(ct, index=places, axis=axis), axis, keepdims=True)
+        before, after = (
+            lax.slice_in_dim(total, *ends, axis=axis) for ends in ((0, row), (row + 1, n))
+        )
+        total = lax.concatenate([before, of_row, after], axis)
+    return [total]
 
 
 def _batch(args, axes, *, index: bytes, axis: int):

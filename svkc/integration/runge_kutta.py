@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from svkc._jax.one_kernel import one_kernel
 from svkc.integration.ode import FieldArgs, ODEState
 from svkc.integration.solution import PhaseProblem, StepRecord
 from svkc.integration.vector_field import VectorField, project_state
@@ -150,6 +151,7 @@ def step_and_tangent(
     increments = record.increments
     assert increments is not None
 
+    @one_kernel
     @eqx.filter_checkpoint
     def rate_tangent(t, primals, tangents):
         return eqx.filter_jvp(lambda y, p: p.field(t, y, with_rows(p)), primals, tangents)[1]
@@ -161,7 +163,8 @@ def step_and_tangent(
     d_increments = _scan_stages(tableau, stage, (t0, t1), y)
     b = tableau.b_sol[: _stage_count(tableau)]
     ends = (_add(y, b, increments), model), (_add(d_y, b, d_increments), d_model)
-    y1, d_y1 = eqx.filter_jvp(project, *ends)
+    projection_and_tangent = one_kernel(eqx.filter_checkpoint(eqx.filter_jvp))
+    y1, d_y1 = projection_and_tangent(project, *ends)
     return y1, d_y1, d_increments
 
 

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from svkc._jax.one_kernel import one_kernel
 from svkc.integration.ode import FieldArgs, ODEState
 from svkc.integration.stabilization import (
     AbstractStabilization,
@@ -56,39 +57,12 @@ class VectorField(eqx.Module):
         )
 
     def __call__(self, t: Scalar, y: ODEState, field_args: FieldArgs) -> ODEState:
-        chain, structure = field_args.chain, field_args.structure
-        stabilization = self.stabilization
-        if isinstance(stabilization, CoordinatePartitioning):
+        if isinstance(self.stabilization, CoordinatePartitioning):
             y, _ = project_state(self, field_args, y)
         tau, power = self.torques(t, y, field_args)
-        baumgarte = stabilization.rate if isinstance(stabilization, Baumgarte) else None
-        project_velocity = (
-            isinstance(stabilization, Projection) and not self.projects_by_loop_forces
-        )
-        if self._batches_lanes_last(chain) and not project_velocity:
-            v, vdot = velocity_and_acceleration_lanes_last(
-                chain, structure, (y.q, y.v), tau, baumgarte, field_args.row_choice
-            )
-        else:
-            v, vdot = velocity_and_acceleration(
-                chain,
-                structure,
-                y.q,
-                y.v,
-                tau,
-                dynamics=self.dynamics,
-                baumgarte=baumgarte,
-                project_velocity=project_velocity,
-                pivots=field_args.pivots,
-                choice=field_args.row_choice,
-            )
-        return ODEState(
-            configuration_derivative(chain, y.q, jnp.where(active_dofs(chain, structure), v, 0)),
-            vdot,
-            power,
-        )
+        return _rates(self, y, field_args, tau, power)
 
-    def _batches_lanes_last(self, chain: Chain) -> bool:
+    def batches_lanes_last(self, chain: Chain) -> bool:
         """Return whether a `vmap` of this field computes accelerations with lanes last.
 
         Lanes last are for articulated bodies whose levels are unrolled; they are never
@@ -122,6 +96,40 @@ class VectorField(eqx.Module):
         v = jnp.where(active_dofs(chain, field_args.structure), y.v, 0)
         of_dampers = jnp.zeros_like(v) if chain.damping is None else -chain.damping * v
         return tau + at_limits, jnp.stack([tau, of_dampers, at_limits]) @ v
+
+
+@one_kernel
+def _rates(
+    field: VectorField,
+    y: ODEState,
+    field_args: FieldArgs,
+    tau: Float[Array, " dofs"],
+    power: Float[Array, "3"] | None,
+) -> ODEState:
+    """Return dy/dt for joint torques tau (N m, N)."""
+    chain, structure = field_args.chain, field_args.structure
+    stabilization = field.stabilization
+    baumgarte = stabilization.rate if isinstance(stabilization, Baumgarte) else None
+    project_velocity = isinstance(stabilization, Projection) and not field.projects_by_loop_forces
+    if field.batches_lanes_last(chain) and not project_velocity:
+        v, vdot = velocity_and_acceleration_lanes_last(
+            chain, structure, (y.q, y.v), tau, baumgarte, field_args.row_choice
+        )
+    else:
+        v, vdot = velocity_and_acceleration(
+            chain,
+            structure,
+            y.q,
+            y.v,
+            tau,
+            dynamics=field.dynamics,
+            baumgarte=baumgarte,
+            project_velocity=project_velocity,
+            pivots=field_args.pivots,
+            choice=field_args.row_choice,
+        )
+    qdot = configuration_derivative(chain, y.q, jnp.where(active_dofs(chain, structure), v, 0))
+    return ODEState(qdot, vdot, power)
 
 
 def _control_torques(chain: Chain, value, dtype) -> Float[Array, " dofs"]:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from svkc._jax.dynamic_gather import take_rows
 from svkc._jax.static_gather import static_take
 from svkc.loops.frames import LoopFrames, frame_gaps, loop_frames
 from svkc.model.annotations import DType, Scalar
@@ -84,7 +85,7 @@ def loop_jacobian_dot_v(
     )
     parts = _virtual_motion_subspaces(chain, structure, frames) * rate[:, :, None]
     slide = jnp.sum(parts[:, 3:], 1)
-    V_parent = shift_motion(V[structure.parent], frames.from_parent_root)
+    V_parent = shift_motion(take_rows(V, structure.parent), frames.from_parent_root)
     V_base = V_parent + slide
     bias = motion_cross(V_parent, slide) + motion_cross(V_base, jnp.sum(parts[:, :3], 1))
     # rotations in sequence move the axes after them; a ball's axes move together and add nothing
@@ -92,8 +93,8 @@ def loop_jacobian_dot_v(
     x, y, z = parts[:, 0], parts[:, 1], parts[:, 2]
     moved_axes = motion_cross(x, y + z) + motion_cross(y, z)
     bias = bias + jnp.where(is_ball, 0, moved_axes)
-    A_virtual = shift_motion(A[structure.parent], frames.from_parent_root) + bias
-    A_real = shift_motion(A[structure.real], frames.real_position)
+    A_virtual = shift_motion(take_rows(A, structure.parent), frames.from_parent_root) + bias
+    A_real = shift_motion(take_rows(A, structure.real), frames.real_position)
     return jnp.where(structure.connected[:, None], A_virtual - A_real, 0).reshape(-1)
 
 

@@ -7,8 +7,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from svkc._jax.chunked_sum import sum_in_chunks
 from svkc._jax.control_flow import unvmap_any
 from svkc._jax.lanes_last import with_lanes_last
+from svkc._jax.one_kernel import one_kernel
 from svkc.loops.constrained_dynamics import ArticulatedBodies
 from svkc.loops.constraint import gap_norms, jacobian_scales, loop_kinematics
 from svkc.loops.constraint_rows import RowChoice, constraint_rows
@@ -56,6 +58,7 @@ def project_by_loop_forces(
     return jax.lax.fori_loop(0, iterations + 1, newton_step, (q, v, info))
 
 
+@one_kernel
 def _project_until_closed(
     chain: Chain, structure: Structure, start: tuple, choice: RowChoice | None, iterations: int
 ) -> tuple[Float[Array, " q"], Float[Array, " dofs"], ProjectionInfo]:
@@ -174,7 +177,8 @@ def margin_of_rows(
         G = jnp.where(used, 0, G - row[:, None] * (row / jnp.where(r > 0, r, 1))[None])
         return G, jnp.where(k < rank, jnp.minimum(least, r), least), jnp.maximum(largest, r)
 
-    start = J.T @ J, jnp.asarray(jnp.inf, J.dtype), jnp.zeros((), J.dtype)
+    gram = sum_in_chunks(J[:, :, None] * J[:, None], (0,))
+    start = gram, jnp.asarray(jnp.inf, J.dtype), jnp.zeros((), J.dtype)
     _, least, largest = jax.lax.fori_loop(0, min(J.shape), step, start)
     ratio = jnp.sqrt(jnp.maximum(least, 0) / jnp.where(largest > 0, largest, 1))
     return jnp.where(rank > 0, ratio, 1)

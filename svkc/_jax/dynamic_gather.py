@@ -1,0 +1,22 @@
+"""Gather of rows by an index known at run time, whose transpose is a sum instead of a scatter.
+
+A kernel of `one_kernel` cannot hold a scatter.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Int
+
+
+@jax.custom_jvp
+def take_rows(x: Array, index: Int[Array, " m"]) -> Array:
+    """Return x[index] along the first axis, for an index of few rows, all within x."""
+    return x[index]
+
+
+@take_rows.defjvp
+def _take_rows_jvp(primals, tangents):
+    (x, index), (dx, _) = primals, tangents
+    selected = index[:, None] == jnp.arange(x.shape[0], dtype=index.dtype)[None]
+    selected = selected.reshape(*selected.shape, *(1,) * (x.ndim - 1))
+    return take_rows(x, index), jnp.sum(jnp.where(selected, dx[None], 0), 1)

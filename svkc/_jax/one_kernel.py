@@ -1,0 +1,161 @@
+"""Functions that XLA compiles to one kernel on a CPU.
+
+XLA's CPU backend starts each kernel of a program separately, which takes 70 to 90 ns. An evaluation
+of the equations of motion consists of some 200 kernels of a few operations each. XLA compiles a
+called function that has the attribute `xla_cpu_small_call` to one kernel. XLA itself sets this
+attribute for small loops, and from jax 0.12 on for most sequences of operations.
+
+jax 0.11 puts some sums into fusions that such a kernel cannot hold. From 0.11 on nothing is
+done here, and this module can go with the support of jax 0.10.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+from jax.core import Tracer
+from jax.extend.core import Primitive
+from jax.extend.mlir.dialects import func, stablehlo
+from jax.interpreters import ad, batching, mlir
+from jax.interpreters.mlir import ir
+
+HAS_ONE_KERNEL = jax.__version__.startswith("0.10.")
+_ATTRIBUTES = "mhlo.frontend_attributes"
+# operations without XLA's runtime; sorts, scatters, random bits, LAPACK and others need it
+_STABLEHLO = set(
+    "abs add and atan2 bitcast_convert broadcast_in_dim case cbrt ceil clamp compare concatenate"
+    " constant convert cosine divide dynamic_slice dynamic_update_slice exponential"
+    " exponential_minus_one floor gather if iota is_finite log log_plus_one logistic maximum"
+    " minimum multiply negate not optimization_barrier or pad power reduce reduce_precision"
+    " reduce_window remainder reshape return reverse round_nearest_afz round_nearest_even rsqrt"
+    " select shift_left shift_right_arithmetic shift_right_logical sign sine slice sqrt subtract"
+    " tan tanh transpose while xor".split()
+)
+_CHLO = set(
+    "acos acosh asin asinh atan atanh constant cosh digamma erf erf_inv erfc lgamma next_after sinh"
+    " square tan".split()
+)
+
+
+def one_kernel(function: Callable) -> Callable:
+    """Return a function that compiled programs hold as one kernel on a CPU.
+
+    Its derivatives are one kernel, too. A kernel of a reverse derivative evaluates the function
+    again if `function` is a `jax.checkpoint`. Under `vmap`, and if an operation needs XLA's
+    runtime, the function is compiled as usual: for a batch, one kernel takes LLVM several times as
+    long (benchmarks/README.md).
+    """
+    if not HAS_ONE_KERNEL:
+        return function
+    jitted = eqx.filter_jit(function)
+
+    @functools.wraps(function)
+    def wrapped(*args: Any, **kwargs: Any) -> Any:
+        args, kwargs = _map_traced(_input_p.bind, (args, kwargs))
+        return _map_traced(_output_p.bind, jitted(*args, **kwargs))
+
+    return wrapped
+
+
+def _map_traced(function: Callable, tree: Any) -> Any:
+    """Apply a function to the traced arrays of a tree."""
+    return jax.tree.map(lambda x: function(x) if isinstance(x, Tracer) else x, tree)
+
+
+def _identity(name: str) -> Primitive:
+    """Return a primitive that returns its input. A `vmap` drops it."""
+    primitive = Primitive(name)
+    primitive.def_impl(lambda x: x)
+    primitive.def_abstract_eval(lambda x: x)
+    batching.primitive_batchers[primitive] = lambda inputs, axes: (inputs[0], axes[0])
+    mlir.register_lowering(primitive, lambda _, x: [x])
+    return primitive
+
+
+def _lower_output(ctx: mlir.LoweringRuleContext, x: Any) -> list[Any]:
+    """Lower an output of a call, and let XLA compile the called function to one kernel.
+
+    The call is redirected to a new function, whose only operation is a call of the kernel. XLA
+    aborts if a function that is compiled to one kernel does not use one of its parameters, be it
+    that XLA replaces this parameter by a constant. Its only parameter is therefore a tuple of all
+    inputs, as that of a loop.
+    """
+    if isinstance(x.owner, ir.Block) or x.owner.operation.name != "func.call":
+        return [x]
+    call, functions = x.owner.operation, ctx.module_context.symbol_table
+    if _ATTRIBUTES in call.attributes or not _fits(call, functions):
+        return [x]
+    inputs, outputs = [y.type for y in call.operands], [y.type for y in call.results]
+    if not inputs:
+        return [x]
+    of_all = ir.TupleType.get_tuple(inputs)
+    attributes = lambda **text: ir.DictAttr.get({k: ir.StringAttr.get(v) for k, v in text.items()})
+
+    def function(types: list[Any], callee: Any, operands: Callable, **attributes_of_call: str):
+        with ir.InsertionPoint(ctx.module_context.module.body), ir.Location.unknown():
+            new = func.FuncOp("one_kernel", (types, outputs), visibility="private")
+        functions.insert(new)
+        with ir.InsertionPoint(new.add_entry_block()), ir.Location.unknown():
+            inner = func.CallOp(outputs, callee, operands(new.arguments))
+            inner.operation.attributes[_ATTRIBUTES] = attributes(**attributes_of_call)
+            func.ReturnOp(inner.results)
+        return ir.FlatSymbolRefAttr.get(new.name.value)
+
+    entries = lambda args: [stablehlo.get_tuple_element(args[0], i) for i in range(len(inputs))]
+    kernel = function([of_all], call.attributes["callee"], entries, inlineable="false")
+    call.attributes["callee"] = function(
+        inputs,
+        kernel,
+        lambda args: [stablehlo.tuple(list(args))],
+        inlineable="false",
+        xla_cpu_small_call="true",
+    )
+    call.attributes[_ATTRIBUTES] = attributes(inlineable="true")
+    return [x]
+
+
+def _fits(operation: Any, functions: Any) -> bool:
+    """Return whether a kernel can hold an operation and those that it contains or calls."""
+    if operation.name == "func.call":
+        callee = ir.FlatSymbolRefAttr(operation.attributes["callee"]).value
+        return _fits(functions[callee].operation, functions)
+    dialect, _, name = operation.name.partition(".")
+    own = (
+        dialect == "func"
+        or (dialect == "chlo" and name in _CHLO)
+        or (dialect == "stablehlo" and (name in _STABLEHLO or _is_small_product(operation)))
+    )
+    return own and all(
+        _fits(inner.operation, functions)
+        for region in operation.regions
+        for block in region.blocks
+        for inner in block.operations
+    )
+
+
+def _is_small_product(operation: Any) -> bool:
+    """Return whether an operation is a product of a matrix and a vector, or an outer product.
+
+    Products of matrices call a library.
+    """
+    if operation.name != "stablehlo.dot_general":
+        return False
+    numbers = stablehlo.DotDimensionNumbers(operation.attributes["dot_dimension_numbers"])
+    batch_or_summed = (
+        (*numbers.lhs_batching_dimensions, *numbers.lhs_contracting_dimensions),
+        (*numbers.rhs_batching_dimensions, *numbers.rhs_contracting_dimensions),
+    )
+    shapes = [ir.RankedTensorType(x.type).shape for x in operation.operands]
+    return not numbers.lhs_contracting_dimensions or any(
+        all(size == 1 for i, size in enumerate(shape) if i not in axes)
+        for shape, axes in zip(shapes, batch_or_summed, strict=True)
+    )
+
+
+_input_p, _output_p = _identity("one_kernel_input"), _identity("one_kernel_output")
+ad.deflinear2(_output_p, lambda cotangent, _: [cotangent])
+# the cotangents of the inputs are the outputs of the derivative's call
+ad.deflinear2(_input_p, lambda cotangent, _: [_output_p.bind(cotangent)])
+mlir.register_lowering(_output_p, _lower_output, platform="cpu", cacheable=False)
