@@ -7,7 +7,8 @@ writes results/speed.csv and draws results/speed.png (extra `viz`). Libraries th
 
 One step is symplectic Euler of 2 ms. Rows hold microseconds per step and lane: median, least and
 most of rounds in which all compared libraries alternate. `times svkc` is relative to svkc on as
-many cores. XLA compiles each loop to one kernel (see README). svkc on one core is `vmap` of
+many cores. XLA compiles each loop to one kernel (see README); with `--default-options` it does
+not, and the rows are written to results/speed_default_options.csv. svkc on one core is `vmap` of
 `svkc.step` in one program; on all cores each device has its own lanes. Grips are hard in svkc, soft
 in MuJoCo and MJX. Compile seconds: tracing, lowering, XLA.
 """
@@ -16,13 +17,16 @@ import argparse
 import csv
 import os
 import pathlib
+import sys
 
 import peers  # first: saves XLA_FLAGS for its processes
 
+DEFAULT_OPTIONS = "--default-options" in sys.argv
 # before XLA compiles anything
-os.environ["XLA_FLAGS"] = (
-    peers.USER_XLA_FLAGS
-    + " --xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000000"
+os.environ["XLA_FLAGS"] = peers.USER_XLA_FLAGS + (
+    ""
+    if DEFAULT_OPTIONS
+    else " --xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000000000"
 )
 
 import jax
@@ -205,20 +209,23 @@ def main(cases, dtypes, batches):
 
 
 def save(key: tuple, rows):
-    """Replace rows in results/speed.csv and redraw the picture.
+    """Replace rows in results/ and redraw the picture.
 
     key: case, dtype and batch size of the rows.
     """
-    path = RESULTS / "speed.csv"
-    with path.open() as file:
-        rows_of_file = [row for row in list(csv.reader(file))[1:] if tuple(row[:3]) != key]
+    path = RESULTS / ("speed_default_options.csv" if DEFAULT_OPTIONS else "speed.csv")
+    rows_of_file = []
+    if path.exists():
+        with path.open() as file:
+            rows_of_file = [row for row in list(csv.reader(file))[1:] if tuple(row[:3]) != key]
     rows_of_file += [[*map(str, row), *map(str, machine().values())] for row in rows]
     rows_of_file.sort(
         key=lambda row: (speed_cases.CASES.index(row[0]), row[1] != "float64", int(row[2]))
     )
     with path.open("w", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows([[*HEAD, *machine()], *rows_of_file])
-    draw([[row[0], row[1], int(row[2]), *row[3:]] for row in rows_of_file])
+    if not DEFAULT_OPTIONS:
+        draw([[row[0], row[1], int(row[2]), *row[3:]] for row in rows_of_file])
 
 
 if __name__ == "__main__":
@@ -228,5 +235,6 @@ if __name__ == "__main__":
     )
     parser.add_argument("--dtype", nargs="+", default=["float64", "float32"])
     parser.add_argument("--batch", nargs="+", type=int, default=BATCHES, help="lanes")
+    parser.add_argument("--default-options", action="store_true", help="XLA's default options")
     options = parser.parse_args()
     main(options.cases or speed_cases.CASES, options.dtype, options.batch)

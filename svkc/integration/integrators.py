@@ -9,6 +9,7 @@ import optimistix
 from jaxtyping import Array, Float
 
 from svkc._jax.lanes_last import with_lanes_last
+from svkc._jax.one_kernel import one_kernel
 from svkc.loops.constrained_dynamics import ArticulatedBodies
 from svkc.loops.forward_dynamics import velocity_and_acceleration
 from svkc.model.annotations import Checked, Torques
@@ -154,6 +155,7 @@ def step(
     )
 
 
+@one_kernel
 @with_lanes_last
 def _step(
     chain: Chain,

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from svkc._jax.control_flow import unvmap_any
 from svkc._jax.lanes_last import with_lanes_last
+from svkc._jax.one_kernel import one_kernel
 from svkc.loops.constrained_dynamics import (
     AbstractDynamics,
     ArticulatedBodies,
@@ -160,6 +161,7 @@ def velocity_and_acceleration_lanes_last(
     )  # fmt: skip
 
 
+@one_kernel
 def acceleration(
     chain: Chain,
     structure: Structure,
