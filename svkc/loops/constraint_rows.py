@@ -158,19 +158,37 @@ def constraint_rows(
     near, kept = choice
     selects = jnp.where(kept[:, None], jnp.eye(len(scaled), dtype=J.dtype), 0)
     selected = jnp.where(kept[:, None], scaled, 0), selects, jnp.zeros_like(scaled)
-    virtual = jnp.sum(jnp.any(J[:, chain.nv :] != 0, 0), dtype=jnp.int32)
     # under `vmap`, one lane near a singular configuration makes all lanes reduce their rows
     A, T, pivots = jax.lax.cond(
         unvmap_any(near),
         lambda: jax.tree.map(
             lambda a, b: jnp.where(near, a, b),
-            reduce_rows(scaled, structure, structure.rank - virtual),
+            reduce_rows(scaled, structure, _rank_in_tree(chain, structure, J)),
             selected,
         ),
         lambda: selected,
     )
     kept = jnp.where(near, jnp.any(pivots > 0, 1), kept)
     return rows._replace(A=A * unscale, T=T, pivots=pivots, kept=kept)
+
+
+def _rank_in_tree(chain: Chain, structure: Structure, J) -> Int[Array, ""]:
+    """Return the rank of J_C less the number of its columns of virtual joints."""
+    return structure.rank - jnp.sum(jnp.any(J[:, chain.nv :] != 0, 0), dtype=jnp.int32)
+
+
+def independent_rows(
+    chain: Chain, structure: Structure, J: Float[Array, "rows dofs"], rows: ConstraintRows
+) -> Bool[Array, " delassus"]:
+    """Return which rows of Delassus' matrix are independent, by elimination.
+
+    rows: the `constraint_rows` of the scaled J_C, of any choice.
+    """
+    J = jax.lax.stop_gradient(J)
+    scaled = rows.reject(static_take(J[:, : chain.nv], rows.in_D.rows).T).T
+    rank = _rank_in_tree(chain, structure, J)
+    pivots = reduce_rows(scaled, structure, rank, with_transform=False)[2]
+    return jnp.any(pivots > 0, 1)
 
 
 def choose_rows(
@@ -185,23 +203,27 @@ def choose_rows(
 
     def independent() -> Bool[Array, " delassus"]:
         J = loop_kinematics(chain, structure, q).J
-        reduced = constraint_rows(chain, structure, J, first)
-        assert reduced.kept is not None
-        return jnp.where(redundant, reduced.kept, first.kept)
+        kept = independent_rows(chain, structure, J, constraint_rows(chain, structure, J))
+        return jnp.where(redundant, kept, first.kept)
 
     # under `vmap`, one lane with redundant loops makes all lanes choose rows
     return RowChoice(near, jax.lax.cond(unvmap_any(redundant), independent, lambda: first.kept))
 
 
 def reduce_rows(
-    B: Float[Array, "n nv"], structure: Structure, rank: Int[Array, ""]
-) -> tuple[Float[Array, "n nv"], Float[Array, "n n"], Float[Array, "n nv"]]:
+    B: Float[Array, "n nv"],
+    structure: Structure,
+    rank: Int[Array, ""],
+    with_transform: bool = True,
+) -> tuple[Float[Array, "n nv"], Float[Array, "n k"], Float[Array, "n nv"]]:
     """Return A = T B, T and the pivots, by Gauss-Jordan elimination with complete pivoting.
 
     Each row of A is one in its own pivot column and zero in those of other rows. A pivot counts
     only within the rank, and if it exceeds the first one times the larger of `rank_tolerance` and
     `release_threshold` times the margin; other rows are zero. Towards a singular configuration the
     condition number of B grows. That of A does not.
+
+    with_transform: whether T is computed; if not, it has no columns.
     """
     n, nv = B.shape
     weak = jnp.maximum(rank_tolerance(B.dtype), release_threshold(B.dtype) * structure.margin)
@@ -210,28 +232,30 @@ def reduce_rows(
         weight = jnp.where(structure.independent[:nv], rank_tolerance(B.dtype) ** 2, weight)
 
     def step(k, carry):
-        A, pivots, largest = carry
-        free = ~jnp.any(pivots > 0, 1)
-        size = jnp.where(free[:, None], jnp.abs(A[:, :nv]) * weight[None], 0)
-        at_row = jnp.arange(n) == jnp.argmax(jnp.max(size, 1))
+        A, pivot_column, largest = carry
+        size = jnp.max(jnp.abs(A[:, :nv]) * weight[None], 1)
+        i = jnp.argmax(jnp.where(pivot_column < nv, 0, size)).astype(jnp.int32)
+        at_row = jnp.arange(n, dtype=jnp.int32) == i
         row = jnp.sum(jnp.where(at_row[:, None], A, 0), 0)
-        size = jnp.max(jnp.where(at_row[:, None], size, 0), 0)
-        at_column = jnp.arange(nv) == jnp.argmax(size)
-        pivot = jnp.sum(jnp.where(at_column, row[:nv], 0))
+        j = jnp.argmax(jnp.abs(row[:nv]) * weight).astype(jnp.int32)
+        at_column = jnp.arange(A.shape[1], dtype=jnp.int32) == j
+        pivot = jnp.sum(jnp.where(at_column, row, 0))
         largest = jnp.where(k == 0, jnp.abs(pivot), largest)
         accept = (k < rank) & (jnp.abs(pivot) > weak * largest)
+        column = jnp.sum(jnp.where(at_column[None], A, 0), 1)
         row = row / jnp.where(accept, pivot, 1)
-        column = jnp.sum(jnp.where(at_column[None], A[:, :nv], 0), 1)
-        reduced = jnp.where(at_row[:, None], row[None], A - column[:, None] * row[None])
-        exact = jnp.where(at_column[None] & ~at_row[:, None], 0, reduced[:, :nv])
-        reduced = jnp.concatenate([exact, reduced[:, nv:]], 1)
-        pivots = jnp.where(accept & at_row[:, None] & at_column[None], 1, pivots)
-        return jnp.where(accept, reduced, A), pivots, largest
+        others = jnp.where(at_column[None], 0, A - column[:, None] * row[None])
+        reduced = jnp.where(at_row[:, None], row[None], others)
+        pivot_column = jnp.where(accept & at_row, j, pivot_column)
+        return jnp.where(accept, reduced, A), pivot_column, largest
 
-    start = jnp.concatenate([B, jnp.eye(n, dtype=B.dtype)], 1), jnp.zeros_like(B), B[0, 0]
-    A, pivots, _ = jax.lax.fori_loop(0, min(n, nv), step, start)
-    A = jnp.where(jnp.any(pivots > 0, 1)[:, None], A, 0)
-    return A[:, :nv], A[:, nv:], pivots
+    T = jnp.eye(n, n if with_transform else 0, dtype=B.dtype)
+    no_pivots = jnp.full(n, nv, jnp.int32)
+    start = jnp.concatenate([B, T], 1), no_pivots, B[0, 0]
+    A, pivot_column, _ = jax.lax.fori_loop(0, min(n, nv), step, start)
+    A = jnp.where((pivot_column < nv)[:, None], A, 0)
+    pivots = pivot_column[:, None] == jnp.arange(nv, dtype=jnp.int32)[None]
+    return A[:, :nv], A[:, nv:], pivots.astype(B.dtype)
 
 
 def with_consistent_velocities(

@@ -13,7 +13,7 @@ from svkc._jax.lanes_last import with_lanes_last
 from svkc._jax.one_kernel import one_kernel
 from svkc.loops.constrained_dynamics import ArticulatedBodies
 from svkc.loops.constraint import gap_norms, jacobian_scales, loop_kinematics
-from svkc.loops.constraint_rows import RowChoice, constraint_rows
+from svkc.loops.constraint_rows import RowChoice, constraint_rows, independent_rows
 from svkc.loops.pivoting import has_redundant_rows, rank_tolerance
 from svkc.loops.projection import ProjectionInfo
 from svkc.model.chain import Chain, Structure, active_dofs
@@ -125,11 +125,8 @@ def _step_by_loop_forces(
         # under `vmap`, one open lane lets all lanes take a step on q
         on_velocity = is_last | ~unvmap_any(jnp.max(gap) > jnp.finfo(J.dtype).eps ** _ROUND_OFF)
     residual = jnp.where(on_velocity, J @ jnp.where(active, v / column, 0), loops.gap)
-    if may_be_last and choice is not None:
-        # where rows are reduced, those to keep are found
-        near = choice.near | (on_velocity & has_redundant_rows(structure))
-        choice = choice._replace(near=near)
     rows = constraint_rows(chain, structure, J, choice)
+    kept = rows.kept
     solve = ArticulatedBodies().prepare(chain, structure, loops, rows)
     change = solve(jnp.zeros(chain.dofs, q.dtype), residual)
     if may_be_last and choice is not None:
@@ -138,8 +135,15 @@ def _step_by_loop_forces(
             lambda: margin_of_rows(J, structure.rank, structure.independent),
             lambda: jnp.ones((), J.dtype),
         )
+        # reduced rows are independent
+        chooses = on_velocity & ~choice.near & has_redundant_rows(structure)
+        kept = jax.lax.cond(
+            unvmap_any(chooses),
+            lambda: jnp.where(chooses, independent_rows(chain, structure, J, rows), kept),
+            lambda: kept,
+        )
     return _ProjectionStep(
-        change=change, gap=gap, margin=margin, kept=rows.kept, on_velocity=on_velocity
+        change=change, gap=gap, margin=margin, kept=kept, on_velocity=on_velocity
     )
 
 
