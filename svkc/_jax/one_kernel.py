@@ -77,21 +77,22 @@ def _identity(name: str) -> Primitive:
 def _lower_output(ctx: mlir.LoweringRuleContext, x: Any) -> list[Any]:
     """Lower an output of a call, and let XLA compile the called function to one kernel.
 
-    The call is redirected to a new function, whose only operation is a call of the kernel. XLA
-    aborts if a function that is compiled to one kernel does not use one of its parameters, be it
-    that XLA replaces this parameter by a constant. Its only parameter is therefore a tuple of all
-    inputs, as that of a loop.
+    The call is redirected to a function that packs its inputs into a tuple and calls the kernel.
+    XLA aborts the process if a function that becomes one kernel has a parameter that it does not
+    use, for example because XLA has replaced this parameter by a constant. The tuple stays in use.
     """
     if isinstance(x.owner, ir.Block) or x.owner.operation.name != "func.call":
         return [x]
     call, functions = x.owner.operation, ctx.module_context.symbol_table
-    if _ATTRIBUTES in call.attributes or not _fits(call, functions):
+    if _ATTRIBUTES in call.attributes:
         return [x]
+    attributes = lambda **text: ir.DictAttr.get({k: ir.StringAttr.get(v) for k, v in text.items()})
+    # the default, which marks a call whose other outputs need not look at it again
+    call.attributes[_ATTRIBUTES] = attributes(inlineable="true")
     inputs, outputs = [y.type for y in call.operands], [y.type for y in call.results]
-    if not inputs:
+    if not inputs or not _fits(call, functions):
         return [x]
     of_all = ir.TupleType.get_tuple(inputs)
-    attributes = lambda **text: ir.DictAttr.get({k: ir.StringAttr.get(v) for k, v in text.items()})
 
     def function(types: list[Any], callee: Any, operands: Callable, **attributes_of_call: str):
         with ir.InsertionPoint(ctx.module_context.module.body), ir.Location.unknown():
@@ -112,7 +113,6 @@ def _lower_output(ctx: mlir.LoweringRuleContext, x: Any) -> list[Any]:
         inlineable="false",
         xla_cpu_small_call="true",
     )
-    call.attributes[_ATTRIBUTES] = attributes(inlineable="true")
     return [x]
 
 
