@@ -94,6 +94,7 @@ class ConstraintRows(NamedTuple):
     of R J_D near a singular configuration, or it selects the rows that are kept of redundant loops.
 
     joints: the virtual joints. in_D: the rows of J in D.
+    scaled: R J_D with scaled columns. rank: the largest rank of A.
     T: None for the identity.
     pivots: one-hot rows: the pivot column of each row of A, zero where T is no row reduction. None
         if T is None.
@@ -102,6 +103,8 @@ class ConstraintRows(NamedTuple):
 
     joints: VirtualJoints
     in_D: DelassusRows
+    scaled: Float[Array, "delassus nv"]
+    rank: Int[Array, ""]
     A: Float[Array, "delassus nv"]
     T: Float[Array, "delassus delassus"] | None = None
     pivots: Float[Array, "delassus nv"] | None = None
@@ -150,11 +153,14 @@ def constraint_rows(
     """
     J, column = jax.lax.stop_gradient((J, jacobian_scales(chain)[1]))
     in_D = delassus_rows(chain, structure.locked is not None)
-    rows = ConstraintRows(virtual_joints(chain, J / column[None]), in_D, J)
+    joints = virtual_joints(chain, J / column[None])
+    moving = jnp.sum(jnp.any(J[:, chain.nv :] != 0, 0), dtype=jnp.int32)
     J_D = static_take(J[:, : chain.nv], in_D.rows)
+    rows = ConstraintRows(joints=joints, in_D=in_D, scaled=J_D, rank=structure.rank - moving, A=J_D)
     scaled, unscale = rows.reject(J_D.T).T, 1 / column[None, : chain.nv]
+    rows = rows._replace(scaled=scaled, A=scaled * unscale)
     if choice is None:
-        return rows._replace(A=scaled * unscale)
+        return rows
     near, kept = choice
     selects = jnp.where(kept[:, None], jnp.eye(len(scaled), dtype=J.dtype), 0)
     selected = jnp.where(kept[:, None], scaled, 0), selects, jnp.zeros_like(scaled)
@@ -163,7 +169,7 @@ def constraint_rows(
         unvmap_any(near),
         lambda: jax.tree.map(
             lambda a, b: jnp.where(near, a, b),
-            reduce_rows(scaled, structure, _rank_in_tree(chain, structure, J)),
+            reduce_rows(scaled, structure, rows.rank),
             selected,
         ),
         lambda: selected,
@@ -172,22 +178,12 @@ def constraint_rows(
     return rows._replace(A=A * unscale, T=T, pivots=pivots, kept=kept)
 
 
-def _rank_in_tree(chain: Chain, structure: Structure, J) -> Int[Array, ""]:
-    """Return the rank of J_C less the number of its columns of virtual joints."""
-    return structure.rank - jnp.sum(jnp.any(J[:, chain.nv :] != 0, 0), dtype=jnp.int32)
-
-
-def independent_rows(
-    chain: Chain, structure: Structure, J: Float[Array, "rows dofs"], rows: ConstraintRows
-) -> Bool[Array, " delassus"]:
+def independent_rows(structure: Structure, rows: ConstraintRows) -> Bool[Array, " delassus"]:
     """Return which rows of Delassus' matrix are independent, by elimination.
 
-    rows: the `constraint_rows` of the scaled J_C, of any choice.
+    rows: of any choice.
     """
-    J = jax.lax.stop_gradient(J)
-    scaled = rows.reject(static_take(J[:, : chain.nv], rows.in_D.rows).T).T
-    rank = _rank_in_tree(chain, structure, J)
-    pivots = reduce_rows(scaled, structure, rank, with_transform=False)[2]
+    pivots = reduce_rows(rows.scaled, structure, rows.rank, with_transform=False)[2]
     return jnp.any(pivots > 0, 1)
 
 
@@ -203,7 +199,7 @@ def choose_rows(
 
     def independent() -> Bool[Array, " delassus"]:
         J = loop_kinematics(chain, structure, q).J
-        kept = independent_rows(chain, structure, J, constraint_rows(chain, structure, J))
+        kept = independent_rows(structure, constraint_rows(chain, structure, J))
         return jnp.where(redundant, kept, first.kept)
 
     # under `vmap`, one lane with redundant loops makes all lanes choose rows

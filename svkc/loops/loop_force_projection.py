@@ -130,18 +130,19 @@ def _step_by_loop_forces(
     solve = ArticulatedBodies().prepare(chain, structure, loops, rows)
     change = solve(jnp.zeros(chain.dofs, q.dtype), residual)
     if may_be_last and choice is not None:
-        margin = jax.lax.cond(
-            on_velocity,
-            lambda: margin_of_rows(J, structure.rank, structure.independent),
-            lambda: jnp.ones((), J.dtype),
-        )
-        # reduced rows are independent
-        chooses = on_velocity & ~choice.near & has_redundant_rows(structure)
-        kept = jax.lax.cond(
-            unvmap_any(chooses),
-            lambda: jnp.where(chooses, independent_rows(chain, structure, J, rows), kept),
-            lambda: kept,
-        )
+        assert kept is not None
+        kept_before = kept
+
+        def of_next_step():
+            margin = margin_of_rows(J, structure.rank, structure.independent)
+            # reduced rows are independent
+            chooses = ~choice.near & has_redundant_rows(structure)
+            independent = lambda: independent_rows(structure, rows)
+            choose = lambda: jnp.where(chooses, independent(), kept_before)
+            return margin, jax.lax.cond(unvmap_any(chooses), choose, lambda: kept_before)
+
+        unchanged = jnp.ones((), J.dtype), kept_before
+        margin, kept = jax.lax.cond(on_velocity, of_next_step, lambda: unchanged)
     return _ProjectionStep(
         change=change, gap=gap, margin=margin, kept=kept, on_velocity=on_velocity
     )
