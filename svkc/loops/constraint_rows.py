@@ -154,9 +154,11 @@ def constraint_rows(
     J, column = jax.lax.stop_gradient((J, jacobian_scales(chain)[1]))
     in_D = delassus_rows(chain, structure.locked is not None)
     joints = virtual_joints(chain, J / column[None])
-    moving = jnp.sum(jnp.any(J[:, chain.nv :] != 0, 0), dtype=jnp.int32)
+    joint_columns = jnp.sum(jnp.any(J[:, chain.nv :] != 0, 0), dtype=jnp.int32)
     J_D = static_take(J[:, : chain.nv], in_D.rows)
-    rows = ConstraintRows(joints=joints, in_D=in_D, scaled=J_D, rank=structure.rank - moving, A=J_D)
+    rows = ConstraintRows(
+        joints=joints, in_D=in_D, scaled=J_D, rank=structure.rank - joint_columns, A=J_D
+    )
     scaled, unscale = rows.reject(J_D.T).T, 1 / column[None, : chain.nv]
     rows = rows._replace(scaled=scaled, A=scaled * unscale)
     if choice is None:
