@@ -42,10 +42,11 @@ _CHLO = set(
 def one_kernel(function: Callable) -> Callable:
     """Return a function that compiled programs hold as one kernel on a CPU.
 
-    Its derivatives are one kernel, too. A kernel of a reverse derivative evaluates the function
-    again if `function` is a `jax.checkpoint`. Under `vmap`, and if an operation needs XLA's
-    runtime, the function is compiled as usual: for a batch, one kernel takes LLVM several times as
-    long (benchmarks/README.md).
+    Its forward derivative is one kernel, too; a reverse derivative is two. With
+    `jax.checkpoint(function)`, the second one computes the function again. If an operation needs
+    XLA's runtime, or if the function holds another such kernel, it is compiled as usual; so it is
+    under `vmap`, unless one of its outputs is the same for the whole batch: for a batch, one kernel
+    takes LLVM twice as long (benchmarks/README.md).
     """
     if not HAS_ONE_KERNEL:
         return function
