@@ -1,4 +1,4 @@
-"""Gather of rows by an index known at run time, whose transpose is a sum instead of a scatter.
+"""Gather of rows by an index known at run time; its derivative is a masked sum, not a scatter.
 
 A kernel of `one_kernel` cannot hold a scatter.
 """
@@ -10,8 +10,8 @@ from jaxtyping import Array, Int
 
 @jax.custom_jvp
 def take_rows(x: Array, index: Int[Array, " m"]) -> Array:
-    """Return x[index] along the first axis, for an index of few rows, all within x."""
-    return x[index]
+    """Return x[index] along the first axis, for a short index from 0 to the last row of x."""
+    return x.at[index].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 @take_rows.defjvp

@@ -90,9 +90,10 @@ def _integrate_jvp(primals, tangents, *, with_records: bool):
     options = dataclasses.replace(options, record_capacity=record_capacity(start, options))
     solution, t, y = _integrate_with_records(start, times, problem, options, guards)
     (t0, stop, save_ts), (d_t0, d_stop, d_save_ts) = times, d_times
-    # One program evaluates the field at both ends. It runs once in a phase.
-    rates = jax.vmap(lambda t, y: problem.field(t, y, with_rows_at(y.q, problem.field_args)))(
-        jnp.stack([t0, t]), jax.tree.map(lambda *x: jnp.stack(x), start, y)
+    # One program evaluates the field at both ends.
+    rates = jax.lax.map(
+        lambda x: problem.field(*x, with_rows_at(x[1].q, problem.field_args)),
+        (jnp.stack([t0, t]), jax.tree.map(lambda *x: jnp.stack(x), start, y)),
     )
     rate_start, rate_end = (jax.tree.map(lambda x, i=i: x[i], rates) for i in range(2))
     grid = _step_grid(*stop_gradient_tree((t0, save_ts, solution)))

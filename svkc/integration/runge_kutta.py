@@ -151,7 +151,6 @@ def step_and_tangent(
     increments = record.increments
     assert increments is not None
 
-    @one_kernel
     @eqx.filter_checkpoint
     def rate_tangent(t, primals, tangents):
         return eqx.filter_jvp(lambda y, p: p.field(t, y, with_rows(p)), primals, tangents)[1]
@@ -163,7 +162,7 @@ def step_and_tangent(
     d_increments = _scan_stages(tableau, stage, (t0, t1), y)
     b = tableau.b_sol[: _stage_count(tableau)]
     ends = (_add(y, b, increments), model), (_add(d_y, b, d_increments), d_model)
-    projection_and_tangent = one_kernel(eqx.filter_checkpoint(eqx.filter_jvp))
+    projection_and_tangent = one_kernel(eqx.filter_jvp)
     y1, d_y1 = projection_and_tangent(project, *ends)
     return y1, d_y1, d_increments
 

@@ -85,7 +85,9 @@ def loop_jacobian_dot_v(
     )
     parts = _virtual_motion_subspaces(chain, structure, frames) * rate[:, :, None]
     slide = jnp.sum(parts[:, 3:], 1)
-    V_parent = shift_motion(take_rows(V, structure.parent), frames.from_parent_root)
+    ends = jnp.concatenate([structure.parent, structure.real])
+    at_parent, at_real = jnp.split(take_rows(jnp.concatenate([V, A], 1), ends), 2)
+    V_parent = shift_motion(at_parent[:, :6], frames.from_parent_root)
     V_base = V_parent + slide
     bias = motion_cross(V_parent, slide) + motion_cross(V_base, jnp.sum(parts[:, :3], 1))
     # rotations in sequence move the axes after them; a ball's axes move together and add nothing
@@ -93,8 +95,8 @@ def loop_jacobian_dot_v(
     x, y, z = parts[:, 0], parts[:, 1], parts[:, 2]
     moved_axes = motion_cross(x, y + z) + motion_cross(y, z)
     bias = bias + jnp.where(is_ball, 0, moved_axes)
-    A_virtual = shift_motion(take_rows(A, structure.parent), frames.from_parent_root) + bias
-    A_real = shift_motion(take_rows(A, structure.real), frames.real_position)
+    A_virtual = shift_motion(at_parent[:, 6:], frames.from_parent_root) + bias
+    A_real = shift_motion(at_real[:, 6:], frames.real_position)
     return jnp.where(structure.connected[:, None], A_virtual - A_real, 0).reshape(-1)
 
 

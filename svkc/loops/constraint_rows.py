@@ -183,10 +183,9 @@ def constraint_rows(
 def independent_rows(structure: Structure, rows: ConstraintRows) -> Bool[Array, " delassus"]:
     """Return which rows of Delassus' matrix are independent, by elimination.
 
-    rows: of any choice.
+    rows: made with any choice; only `scaled` and `rank` are used.
     """
-    pivots = reduce_rows(rows.scaled, structure, rows.rank, with_transform=False)[2]
-    return jnp.any(pivots > 0, 1)
+    return _eliminate(rows.scaled, rows.scaled.shape[1], structure, rows.rank)[1] >= 0
 
 
 def choose_rows(
@@ -209,33 +208,44 @@ def choose_rows(
 
 
 def reduce_rows(
-    B: Float[Array, "n nv"],
-    structure: Structure,
-    rank: Int[Array, ""],
-    with_transform: bool = True,
-) -> tuple[Float[Array, "n nv"], Float[Array, "n k"], Float[Array, "n nv"]]:
+    B: Float[Array, "n nv"], structure: Structure, rank: Int[Array, ""]
+) -> tuple[Float[Array, "n nv"], Float[Array, "n n"], Float[Array, "n nv"]]:
     """Return A = T B, T and the pivots, by Gauss-Jordan elimination with complete pivoting.
 
     Each row of A is one in its own pivot column and zero in those of other rows. A pivot counts
     only within the rank, and if it exceeds the first one times the larger of `rank_tolerance` and
     `release_threshold` times the margin; other rows are zero. Towards a singular configuration the
     condition number of B grows. That of A does not.
-
-    with_transform: whether T is computed; if not, it has no columns.
     """
     n, nv = B.shape
-    weak = jnp.maximum(rank_tolerance(B.dtype), release_threshold(B.dtype) * structure.margin)
-    weight = jnp.ones(nv, B.dtype)
+    with_T = jnp.concatenate([B, jnp.eye(n, dtype=B.dtype)], 1)
+    A, pivot_column = _eliminate(with_T, nv, structure, rank)
+    A = jnp.where((pivot_column >= 0)[:, None], A, 0)
+    pivots = pivot_column[:, None] == jnp.arange(nv, dtype=jnp.int32)[None]
+    return A[:, :nv], A[:, nv:], pivots.astype(B.dtype)
+
+
+def _eliminate(
+    A: Float[Array, "n m"], nv: int, structure: Structure, rank: Int[Array, ""]
+) -> tuple[Float[Array, "n m"], Int[Array, " n"]]:
+    """Return A after the elimination of `reduce_rows`, and the pivot column of each row (-1: none).
+
+    nv: number of columns, the first ones, in which pivots are chosen.
+    """
+    n = len(A)
+    weak = jnp.maximum(rank_tolerance(A.dtype), release_threshold(A.dtype) * structure.margin)
+    weight = jnp.ones(nv, A.dtype)
     if structure.independent is not None:
-        weight = jnp.where(structure.independent[:nv], rank_tolerance(B.dtype) ** 2, weight)
+        weight = jnp.where(structure.independent[:nv], rank_tolerance(A.dtype) ** 2, weight)
 
     def step(k, carry):
         A, pivot_column, largest = carry
         size = jnp.max(jnp.abs(A[:, :nv]) * weight[None], 1)
-        i = jnp.argmax(jnp.where(pivot_column < nv, 0, size)).astype(jnp.int32)
+        # rows with a pivot come after rows of zeros
+        i = jax.lax.argmax(jnp.where(pivot_column >= 0, -1, size), 0, jnp.int32)
         at_row = jnp.arange(n, dtype=jnp.int32) == i
         row = jnp.sum(jnp.where(at_row[:, None], A, 0), 0)
-        j = jnp.argmax(jnp.abs(row[:nv]) * weight).astype(jnp.int32)
+        j = jax.lax.argmax(jnp.abs(row[:nv]) * weight, 0, jnp.int32)
         at_column = jnp.arange(A.shape[1], dtype=jnp.int32) == j
         pivot = jnp.sum(jnp.where(at_column, row, 0))
         largest = jnp.where(k == 0, jnp.abs(pivot), largest)
@@ -247,13 +257,9 @@ def reduce_rows(
         pivot_column = jnp.where(accept & at_row, j, pivot_column)
         return jnp.where(accept, reduced, A), pivot_column, largest
 
-    T = jnp.eye(n, n if with_transform else 0, dtype=B.dtype)
-    no_pivots = jnp.full(n, nv, jnp.int32)
-    start = jnp.concatenate([B, T], 1), no_pivots, B[0, 0]
+    start = A, jnp.full(n, -1, jnp.int32), A[0, 0]
     A, pivot_column, _ = jax.lax.fori_loop(0, min(n, nv), step, start)
-    A = jnp.where((pivot_column < nv)[:, None], A, 0)
-    pivots = pivot_column[:, None] == jnp.arange(nv, dtype=jnp.int32)[None]
-    return A[:, :nv], A[:, nv:], pivots.astype(B.dtype)
+    return A, pivot_column
 
 
 def with_consistent_velocities(

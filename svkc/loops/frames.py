@@ -93,21 +93,24 @@ def loop_frames(
     top = chain.topology
     angle, slide, ball = _virtual_joint_coordinates(chain, q)
     p, r = structure.parent, structure.real
-    of_parent, of_real = take_rows(kin.quat, p), take_rows(kin.quat, r)
-    roots = take_rows(kin.root_position, p), take_rows(kin.root_position, r)
+    of_bodies = jnp.concatenate([kin.quat, kin.r, kin.root_position], 1)
+    both = take_rows(of_bodies, jnp.concatenate([p, r]))
+    (of_parent, r_parent, root_parent), (of_real, r_real, root_real) = (
+        jnp.split(x, [4, 7], 1) for x in jnp.split(both, 2)
+    )
     base_quat = quat_normalize(quat_multiply(of_parent, structure.quat))
     base = quat_matrix(base_quat)
     rotation, rotation_axes = _virtual_joint_rotations(top, angle, ball)
     axes = jnp.sum(base[:, None] * rotation_axes[:, :, None], -1)
-    from_parent_root = take_rows(kin.r, p) + quat_rotate(of_parent, structure.pos)
+    from_parent_root = r_parent + quat_rotate(of_parent, structure.pos)
     if np.any(np.array(top.link_freedoms, bool).reshape(-1, 6)[:, 3:]):
         from_parent_root = from_parent_root + matvec(base, slide)
     return LoopFrames(
         base_quat=base_quat,
         virtual_quat=base_quat if rotation is None else quat_multiply(base_quat, rotation),
-        virtual_position=from_parent_root + (roots[0] - roots[1]),
+        virtual_position=from_parent_root + (root_parent - root_real),
         real_quat=quat_normalize(quat_multiply(of_real, structure.real_quat)),
-        real_position=take_rows(kin.r, r) + quat_rotate(of_real, structure.real_pos),
+        real_position=r_real + quat_rotate(of_real, structure.real_pos),
         from_parent_root=from_parent_root,
         axes=jnp.concatenate([axes, jnp.swapaxes(base, -1, -2)], 1),
     )
