@@ -5,8 +5,8 @@ of the equations of motion consists of some 200 kernels of a few operations each
 called function that has the attribute `xla_cpu_small_call` to one kernel. XLA itself sets this
 attribute for small loops, and from jax 0.12 on for most sequences of operations.
 
-jax 0.11 puts some sums into fusions that such a kernel cannot hold. From 0.11 on nothing is
-done here, and this module can go with the support of jax 0.10.
+jax 0.11 puts some sums into fusions that such a kernel cannot hold. From 0.11 on, `one_kernel`
+returns the function unchanged. Remove this module when jax 0.10 is no longer supported.
 """
 
 import functools
@@ -23,7 +23,7 @@ from jax.interpreters.mlir import ir
 
 HAS_ONE_KERNEL = jax.__version__.startswith("0.10.")
 _ATTRIBUTES = "mhlo.frontend_attributes"
-# operations without XLA's runtime; sorts, scatters, random bits, LAPACK and others need it
+# operations that do not call XLA's runtime, as sorts, scatters, random bits and LAPACK do
 _STABLEHLO = set(
     "abs add and atan2 bitcast_convert broadcast_in_dim case cbrt ceil clamp compare concatenate"
     " constant convert cosine divide dynamic_slice dynamic_update_slice exponential"
@@ -40,13 +40,15 @@ _CHLO = set(
 
 
 def one_kernel(function: Callable) -> Callable:
-    """Return a function that compiled programs hold as one kernel on a CPU.
+    """Return a function that XLA compiles to one kernel on a CPU.
 
-    Its forward derivative is one kernel, too; a reverse derivative is two. With
-    `jax.checkpoint(function)`, the second one computes the function again. If an operation needs
-    XLA's runtime, or if the function holds another such kernel, it is compiled as usual; so it is
-    under `vmap`, unless one of its outputs is the same for the whole batch: for a batch, one kernel
-    takes LLVM twice as long (benchmarks/README.md).
+    Its forward derivative is one kernel, too. Its reverse derivative is two: the first stores what
+    the second needs. With `jax.checkpoint(function)` the second kernel recomputes it instead.
+
+    The function is compiled as usual if an operation calls XLA's runtime, if the function contains
+    another such kernel, or under `vmap`, because LLVM takes twice as long for a batch
+    (benchmarks/README.md). Exception: a `vmap` with an output that is the same for all lanes is
+    still one kernel.
     """
     if not HAS_ONE_KERNEL:
         return function
@@ -93,9 +95,9 @@ def _lower_output(ctx: mlir.LoweringRuleContext, x: Any) -> list[Any]:
     inputs, outputs = [y.type for y in call.operands], [y.type for y in call.results]
     if not inputs or not _fits(call, functions):
         return [x]
-    of_all = ir.TupleType.get_tuple(inputs)
+    tuple_type = ir.TupleType.get_tuple(inputs)
 
-    def function(types: list[Any], callee: Any, operands: Callable, **attributes_of_call: str):
+    def add_function(types: list[Any], callee: Any, operands: Callable, **attributes_of_call: str):
         with ir.InsertionPoint(ctx.module_context.module.body), ir.Location.unknown():
             new = func.FuncOp("one_kernel", (types, outputs), visibility="private")
         functions.insert(new)
@@ -106,8 +108,8 @@ def _lower_output(ctx: mlir.LoweringRuleContext, x: Any) -> list[Any]:
         return ir.FlatSymbolRefAttr.get(new.name.value)
 
     entries = lambda args: [stablehlo.get_tuple_element(args[0], i) for i in range(len(inputs))]
-    kernel = function([of_all], call.attributes["callee"], entries, inlineable="false")
-    call.attributes["callee"] = function(
+    kernel = add_function([tuple_type], call.attributes["callee"], entries, inlineable="false")
+    call.attributes["callee"] = add_function(
         inputs,
         kernel,
         lambda args: [stablehlo.tuple(list(args))],
@@ -123,12 +125,12 @@ def _fits(operation: Any, functions: Any) -> bool:
         callee = ir.FlatSymbolRefAttr(operation.attributes["callee"]).value
         return _fits(functions[callee].operation, functions)
     dialect, _, name = operation.name.partition(".")
-    own = (
+    is_supported = (
         dialect == "func"
         or (dialect == "chlo" and name in _CHLO)
         or (dialect == "stablehlo" and (name in _STABLEHLO or _is_small_product(operation)))
     )
-    return own and all(
+    return is_supported and all(
         _fits(inner.operation, functions)
         for region in operation.regions
         for block in region.blocks

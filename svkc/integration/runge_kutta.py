@@ -119,7 +119,7 @@ def recorded_step(
     """
     tableau, increments = _explicit_tableau(solver), None
     if tableau is not None:
-        increments = _increments(tableau, eqx.filter_checkpoint(field), times, y, field_args)
+        increments = _increments(tableau, field, times, y, field_args)
     return StepRecord(increments, field_args.row_choice)
 
 
@@ -151,7 +151,6 @@ def step_and_tangent(
     increments = record.increments
     assert increments is not None
 
-    @eqx.filter_checkpoint
     def rate_tangent(t, primals, tangents):
         return eqx.filter_jvp(lambda y, p: p.field(t, y, with_rows(p)), primals, tangents)[1]
 
@@ -172,7 +171,7 @@ def _step_of_any_solver(solver, field, times, y: ODEState, field_args: FieldArgs
 
     times: start and end.
     """
-    solver, term = with_scan_kind(solver, "bounded"), diffrax.ODETerm(eqx.filter_checkpoint(field))
+    solver, term = with_scan_kind(solver, "bounded"), diffrax.ODETerm(field)
     t0, t1 = times
     solver_state = solver.init(term, t0, t1, y, field_args)
     return solver.step(term, t0, t1, y, field_args, solver_state, made_jump=False)[0]

@@ -37,6 +37,8 @@ from svkc.tree.traversal import LEVELS_UNROLLED
 class VectorField(eqx.Module):
     """The vector field of one phase: (t, y, field_args) -> dy/dt = (qdot, vdot, power).
 
+    Reverse mode stores the arguments of the torques and of the rates, and recomputes both.
+
     control: joint torques as a function (t, state, args), or None for no torques.
     differentiated: whether derivatives are taken through this field. False in the stepping loop,
         which is never differentiated; accelerations may then be batched with lanes last.
@@ -58,8 +60,8 @@ class VectorField(eqx.Module):
 
     def __call__(self, t: Scalar, y: ODEState, field_args: FieldArgs) -> ODEState:
         if isinstance(self.stabilization, CoordinatePartitioning):
-            y, _ = project_state(self, field_args, y)
-        tau, power = self.torques(t, y, field_args)
+            y, _ = eqx.filter_checkpoint(project_state)(self, field_args, y)
+        tau, power = _torques(self, t, y, field_args)
         return _rates(self, y, field_args, tau, power)
 
     def batches_lanes_last(self, chain: Chain) -> bool:
@@ -99,6 +101,16 @@ class VectorField(eqx.Module):
 
 
 @one_kernel
+@eqx.filter_checkpoint
+def _torques(
+    field: VectorField, t: Scalar, y: ODEState, field_args: FieldArgs
+) -> tuple[Float[Array, " dofs"], Float[Array, "3"] | None]:
+    """Return `field.torques`, as a kernel of its own: a control may hold what no kernel can."""
+    return field.torques(t, y, field_args)
+
+
+@one_kernel
+@eqx.filter_checkpoint
 def _rates(
     field: VectorField,
     y: ODEState,

@@ -1,6 +1,6 @@
 """Functions compiled to one kernel: same values and derivatives, and what a kernel cannot hold.
 
-With a newer jaxlib the functions are plain: values and derivatives hold, and no call is marked.
+From jax 0.11 on the functions are unchanged: values and derivatives hold, and no call is marked.
 """
 
 import equinox as eqx
@@ -59,12 +59,12 @@ def test_derivatives(transform, checkpoint):
         np.testing.assert_allclose(got, value, rtol=1e-12, atol=1e-13)
 
 
-def test_a_reverse_derivative_is_one_kernel():
+def test_the_gradient_of_a_checkpointed_function_is_one_kernel():
     smooth = lambda x, A: jnp.sum(jnp.sin(A @ jnp.sin(x)) ** 2)
     gradient = jax.grad(one_kernel(jax.checkpoint(smooth)), (0, 1))
     compiled = jax.jit(gradient).lower(X, A).compile()
     main = compiled.as_text().split("ENTRY")[1]
-    assert main.count("xla_cpu_small_call") >= HAS_ONE_KERNEL
+    assert main.count("xla_cpu_small_call") == HAS_ONE_KERNEL
     for got, value in zip(compiled(X, A), jax.grad(smooth, (0, 1))(X, A)):
         np.testing.assert_allclose(got, value, rtol=1e-12)
 
@@ -84,10 +84,10 @@ def test_batches_are_compiled_as_usual():
     np.testing.assert_allclose(jax.jit(function)(batch, A), expected, rtol=1e-14)
 
 
-def test_a_kernel_within_another():
+def test_a_function_that_contains_kernels_is_compiled_as_usual():
     inner = one_kernel(lambda x: jnp.sin(x) + jnp.flip(x))
     outer = one_kernel(lambda x: jnp.cumsum(inner(x)) * inner(2 * x)[0])
-    assert kernels(outer, X) >= HAS_ONE_KERNEL
+    assert kernels(outer, X) == 2 * HAS_ONE_KERNEL  # both calls of the inner function
     plain = lambda x: jnp.sin(x) + jnp.flip(x)
     expected = jnp.cumsum(plain(X)) * plain(2 * X)[0]
     np.testing.assert_allclose(jax.jit(outer)(X), expected, rtol=1e-14)
