@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from svkc._jax.static_gather import static_take
@@ -74,8 +75,8 @@ def spatial_inertias(chain: Chain, kin: Kinematics) -> Float[Array, "rows 6 6"]:
     Axes are the world's.
     """
     (c, central), m = central_inertias(chain, kin), chain.mass[:, None, None]
-    cx = skew(c)
-    square = jnp.sum(cx[:, :, None, :] * cx[:, None, :, :], -1)
+    cx, eye = skew(c), np.eye(3, dtype=c.dtype)[None]
+    square = jnp.sum(c * c, -1)[:, None, None] * eye - c[:, :, None] * c[:, None, :]
     upper = jnp.concatenate([central + m * square, m * cx], -1)
     lower = jnp.concatenate([-m * cx, m * jnp.eye(3, dtype=c.dtype)[None]], -1)
     return jnp.concatenate([upper, lower], -2)
