@@ -4,12 +4,8 @@ Quaternions are wxyz and rotate body vectors into world axes. Spatial vectors ha
 part first (Featherstone, Rigid Body Dynamics Algorithms, 2008, chapter 2).
 """
 
-import functools
-
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 # Bilinear products as sums over a table, out_k = table[i, k, j] a_i b_j. These are a few operations
@@ -25,11 +21,6 @@ for i in range(4):
 CONJUGATE = np.array([1.0, -1, -1, -1])
 # the table of x -> x q*
 RIGHT_CONJUGATE = CONJUGATE[:, None, None] * HAMILTON.transpose(2, 1, 0)
-# the vector part of x -> q x q*, as a 3 x 3 matrix of 9 entries, in each of which q_i q_j and
-# q_j q_i have the same coefficient
-ROTATION = np.einsum("ikl,jlm->ikmj", HAMILTON, RIGHT_CONJUGATE)[:, 1:, 1:].reshape(4, 9, 4)
-ROTATION = (ROTATION + ROTATION.transpose(2, 1, 0)) / 2
-TABLES = {"cross": SKEW, "quaternion": HAMILTON, "rotation": ROTATION}
 
 
 def _table_like(a: Float[Array, "*n i"], table: np.ndarray) -> np.ndarray:
@@ -42,33 +33,6 @@ def _left_product_matrix(table: np.ndarray, a: Float[Array, "*n i"]) -> Float[Ar
     return jnp.sum(a[..., None, None] * _table_like(a, table), -3)
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _product(name: str, a: Float[Array, "*#n i"], b: Float[Array, "*#n j"]) -> Float[Array, "*n k"]:
-    """Return table[i, k, j] a_i b_j, summed over i and j.
-
-    The derivatives are products of a matrix and a vector, and so are their transposes, which then
-    read the cotangent once for each entry of such a matrix. The transpose of the sum over the table
-    reads it for each entry of the table, and XLA recomputes it each time.
-
-    name: of the table.
-    """
-    return matvec(_left_product_matrix(TABLES[name], a), b)
-
-
-def _product_jvp(name: str, primals, tangents):
-    (a, b), (da, db) = primals, tangents
-    terms = []
-    if not isinstance(db, SymbolicZero):
-        terms.append(matvec(_left_product_matrix(TABLES[name], a), db))
-    if not isinstance(da, SymbolicZero):
-        terms.append(matvec(_left_product_matrix(TABLES[name].transpose(2, 1, 0), b), da))
-    value = _product(name, a, b)
-    return value, sum(terms[1:], terms[0]) if terms else jnp.zeros_like(value)
-
-
-_product.defjvp(_product_jvp, symbolic_zeros=True)
-
-
 def angular_linear(x: Float[Array, "*n 6"]) -> tuple[Float[Array, "*n 3"], Float[Array, "*n 3"]]:
     """Return the angular and the linear part of a spatial vector."""
     # The transpose of a split is one concatenation; that of two slices is two paddings and a sum.
@@ -78,7 +42,7 @@ def angular_linear(x: Float[Array, "*n 6"]) -> tuple[Float[Array, "*n 3"], Float
 
 def cross(a: Float[Array, "*#n 3"], b: Float[Array, "*#n 3"]) -> Float[Array, "*n 3"]:
     """Return the vector product a x b."""
-    return _product("cross", a, b)
+    return matvec(_left_product_matrix(SKEW, a), b)
 
 
 def matvec(A: Float[Array, "*#n i k"], x: Float[Array, "*#n k"]) -> Float[Array, "*n i"]:
@@ -126,7 +90,8 @@ def inverse_positive(D: Float[Array, "*n k k"]) -> Float[Array, "*n k k"]:
 def motion_cross(a: Float[Array, "*#n 6"], b: Float[Array, "*#n 6"]) -> Float[Array, "*n 6"]:
     """Return the spatial product a x b of two motion vectors (Featherstone (2.31))."""
     (w, v), (m, n) = angular_linear(a), angular_linear(b)
-    return jnp.concatenate([cross(w, m), cross(v, m) + cross(w, n)], -1)
+    by_w, by_v = _left_product_matrix(SKEW, w), _left_product_matrix(SKEW, v)
+    return jnp.concatenate([matvec(by_w, m), matvec(by_v, m) + matvec(by_w, n)], -1)
 
 
 def shift_motion(S: Float[Array, "*#n 6"], r: Float[Array, "*#n 3"]) -> Float[Array, "*n 6"]:
@@ -142,7 +107,7 @@ def shift_motion(S: Float[Array, "*#n 6"], r: Float[Array, "*#n 3"]) -> Float[Ar
 
 def quat_multiply(a: Float[Array, "*#n 4"], b: Float[Array, "*#n 4"]) -> Float[Array, "*n 4"]:
     """Return the Hamilton product of two quaternions."""
-    return _product("quaternion", a, b)
+    return matvec(_left_product_matrix(HAMILTON, a), b)
 
 
 def quat_conjugate(q: Float[Array, "*n 4"]) -> Float[Array, "*n 4"]:
@@ -158,8 +123,9 @@ def quat_normalize(q: Float[Array, "*n 4"]) -> Float[Array, "*n 4"]:
 
 
 def quat_matrix(q: Float[Array, "*n 4"]) -> Float[Array, "*n 3 3"]:
-    """Return the rotation matrix of a unit quaternion."""
-    return _product("rotation", q, q).reshape(*q.shape[:-1], 3, 3)
+    """Return the rotation matrix of a unit quaternion, the vector part of x -> q x q*."""
+    left, right = _left_product_matrix(HAMILTON, q), _left_product_matrix(RIGHT_CONJUGATE, q)
+    return jnp.sum(left[..., 1:, :, None] * right[..., None, :, 1:], -2)
 
 
 def quat_rotate(q: Float[Array, "*#n 4"], x: Float[Array, "*#n 3"]) -> Float[Array, "*n 3"]:
