@@ -23,7 +23,7 @@ from jax.interpreters.mlir import ir
 
 HAS_ONE_KERNEL = jax.__version__.startswith("0.10.")
 _ATTRIBUTES = "mhlo.frontend_attributes"
-# operations that do not call XLA's runtime, as sorts, scatters, random bits and LAPACK do
+# operations that do not call XLA's runtime. Sorts, scatters, random bits and LAPACK call it.
 _STABLEHLO = set(
     "abs add and atan2 bitcast_convert broadcast_in_dim case cbrt ceil clamp compare concatenate"
     " constant convert cosine divide dynamic_slice dynamic_update_slice exponential"
@@ -40,15 +40,16 @@ _CHLO = set(
 
 
 def one_kernel(function: Callable) -> Callable:
-    """Return a function that XLA compiles to one kernel on a CPU.
+    """Return a function that XLA compiles to one kernel on a CPU, with jax 0.10.
 
-    Its forward derivative is one kernel, too. Its reverse derivative is two: the first stores what
-    the second needs. With `jax.checkpoint(function)` the second kernel recomputes it instead.
+    Its forward derivative is one kernel, too. In reverse mode the forward pass is a kernel that
+    stores residuals, and the backward pass is another. With `jax.checkpoint(function)` the backward
+    pass recomputes the residuals in its own kernel.
 
-    The function is compiled as usual if an operation calls XLA's runtime, if the function contains
-    another such kernel, or under `vmap`, because LLVM takes twice as long for a batch
-    (benchmarks/README.md). Exception: a `vmap` with an output that is the same for all lanes is
-    still one kernel.
+    The function is compiled as usual if an operation calls XLA's runtime or a library (products of
+    two matrices), if the function contains another such kernel, or under `vmap`, because LLVM takes
+    twice as long for a batch (benchmarks/README.md). Exception: a `vmap` with an output that is the
+    same for all lanes is still one kernel.
     """
     if not HAS_ONE_KERNEL:
         return function

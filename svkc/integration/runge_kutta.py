@@ -131,8 +131,8 @@ def step_and_tangent(
 ) -> tuple[ODEState, ODEState, ODEState | None]:
     """Return the end of a projected step, its tangent and the tangent of the increments.
 
-    Reverse mode stores the arguments of each evaluation of the field and of each iteration of the
-    projection, and recomputes everything else.
+    Reverse mode stores the arguments of the torques and of the rates in each evaluation of the
+    field, and those of each iteration of the projection, and recomputes these functions.
 
     step: start, end and record.
     problem, start: pairs of primal and tangent.

@@ -37,7 +37,8 @@ from svkc.tree.traversal import LEVELS_UNROLLED
 class VectorField(eqx.Module):
     """The vector field of one phase: (t, y, field_args) -> dy/dt = (qdot, vdot, power).
 
-    Reverse mode stores the arguments of the torques and of the rates, and recomputes both.
+    Reverse mode stores the arguments of the torques, of the rates and of the projection of
+    `CoordinatePartitioning`, and recomputes these functions.
 
     control: joint torques as a function (t, state, args), or None for no torques.
     differentiated: whether derivatives are taken through this field. False in the stepping loop,
@@ -61,7 +62,9 @@ class VectorField(eqx.Module):
     def __call__(self, t: Scalar, y: ODEState, field_args: FieldArgs) -> ODEState:
         if isinstance(self.stabilization, CoordinatePartitioning):
             y, _ = eqx.filter_checkpoint(project_state)(self, field_args, y)
-        tau, power = _torques(self, t, y, field_args)
+        without_torques = self.control is None and field_args.chain.limit is None
+        torques = VectorField.torques if without_torques else _torques
+        tau, power = torques(self, t, y, field_args)
         return _rates(self, y, field_args, tau, power)
 
     def batches_lanes_last(self, chain: Chain) -> bool:
@@ -105,7 +108,7 @@ class VectorField(eqx.Module):
 def _torques(
     field: VectorField, t: Scalar, y: ODEState, field_args: FieldArgs
 ) -> tuple[Float[Array, " dofs"], Float[Array, "3"] | None]:
-    """Return `field.torques`, as a kernel of its own: a control may hold what no kernel can."""
+    """Return `field.torques`. It is a kernel of its own, as not every control fits into one."""
     return field.torques(t, y, field_args)
 
 

@@ -241,7 +241,7 @@ def _eliminate(
     def step(k, carry):
         A, pivot_column, largest = carry
         size = jnp.max(jnp.abs(A[:, :nv]) * weight[None], 1)
-        # rows with a pivot come after rows of zeros
+        # the argmax prefers rows of zeros to rows that have a pivot
         i = jax.lax.argmax(jnp.where(pivot_column >= 0, -1, size), 0, jnp.int32)
         at_row = jnp.arange(n, dtype=jnp.int32) == i
         row = jnp.sum(jnp.where(at_row[:, None], A, 0), 0)

@@ -64,7 +64,8 @@ def test_the_gradient_of_a_checkpointed_function_is_one_kernel():
     gradient = jax.grad(one_kernel(jax.checkpoint(smooth)), (0, 1))
     compiled = jax.jit(gradient).lower(X, A).compile()
     main = compiled.as_text().split("ENTRY")[1]
-    assert main.count("xla_cpu_small_call") == HAS_ONE_KERNEL
+    if HAS_ONE_KERNEL:  # nothing of the forward pass is left
+        assert main.count("xla_cpu_small_call") == 1
     for got, value in zip(compiled(X, A), jax.grad(smooth, (0, 1))(X, A)):
         np.testing.assert_allclose(got, value, rtol=1e-12)
 

@@ -41,22 +41,22 @@ CASES = {
 def test_products(case):
     ours, expected, size = CASES[case]
     a, b = jax.random.normal(jax.random.key(0), (2, size))
-    np.testing.assert_allclose(ours(a, b), expected(a, b), atol=1e-14)
+    np.testing.assert_allclose(ours(a, b), expected(a, b), rtol=1e-13, atol=1e-14)
     for transform in (jax.jacfwd, jax.jacrev, jax.hessian):
         # by both factors, and by one alone, whose other tangent is zero
         for by in ((0, 1), 0, 1):
             got, value = (jax.jit(transform(f, by))(a, b) for f in (ours, expected))
             for x, y in zip(jax.tree.leaves(got), jax.tree.leaves(value), strict=True):
-                np.testing.assert_allclose(x, y, atol=1e-14)
+                np.testing.assert_allclose(x, y, rtol=1e-13, atol=1e-14)
 
 
 def test_products_broadcast_leading_axes():
     a = jax.random.normal(jax.random.key(0), (1, 4))
     b = jax.random.normal(jax.random.key(1), (5, 4))
     expected = jax.vmap(lambda b: quat_multiply(a[0], b))(b)
-    np.testing.assert_array_equal(quat_multiply(a, b), expected)
+    np.testing.assert_allclose(quat_multiply(a, b), expected, rtol=1e-13, atol=1e-14)
     loss = lambda product: lambda a, b: jnp.sum(jnp.sin(product(a, b)))
     rows = lambda a, b: jax.vmap(lambda b: quat_multiply(a[0], b))(b)
     got, value = (jax.grad(loss(f), (0, 1))(a, b) for f in (quat_multiply, rows))
     for x, y in zip(got, value, strict=True):
-        np.testing.assert_allclose(x, y, atol=1e-14)
+        np.testing.assert_allclose(x, y, rtol=1e-13, atol=1e-14)
