@@ -62,9 +62,7 @@ class VectorField(eqx.Module):
     def __call__(self, t: Scalar, y: ODEState, field_args: FieldArgs) -> ODEState:
         if isinstance(self.stabilization, CoordinatePartitioning):
             y, _ = eqx.filter_checkpoint(project_state)(self, field_args, y)
-        without_torques = self.control is None and field_args.chain.limit is None
-        torques = VectorField.torques if without_torques else _torques
-        tau, power = torques(self, t, y, field_args)
+        tau, power = _torques(self, t, y, field_args)
         return _rates(self, y, field_args, tau, power)
 
     def batches_lanes_last(self, chain: Chain) -> bool:
