@@ -44,18 +44,15 @@ def newton_euler(
     c = kin.r + matvec(kin.R, chain.com)
     alpha, acceleration = angular_linear(A)
     acceleration = acceleration + cross(alpha, c)
-    R = kin.R
-
-    def angular_momentum(w):
-        return matvec(R, matvec(chain.symmetric_inertia, matvec(jnp.swapaxes(R, -1, -2), w)))
-
-    moment = angular_momentum(alpha)
+    to_body = lambda x: matvec(jnp.swapaxes(kin.R, -1, -2), x)
+    moment = matvec(chain.symmetric_inertia, to_body(alpha))
     if V is not None:
         w, u = angular_linear(V)
         acceleration = acceleration + cross(w, u + cross(w, c))
-        moment = moment + cross(w, angular_momentum(w))
+        w = to_body(w)
+        moment = moment + cross(w, matvec(chain.symmetric_inertia, w))
     force = chain.mass[:, None] * acceleration
-    wrenches = jnp.concatenate([moment + cross(c, force), force], -1)
+    wrenches = jnp.concatenate([matvec(kin.R, moment) + cross(c, force), force], -1)
     return generalized_force(chain, kin, wrenches)
 
 
