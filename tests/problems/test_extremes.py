@@ -41,8 +41,9 @@ BOUNDS = {
         # two hundred links: energy drift
         links=1e-6,
         links_by={},
-        # twenty loops: median energy drift, loop gap
+        # twenty loops: energy drift of each run, loop gap
         loops=(1e-5, 1e-12),
+        drift_of_runs=np.max,
         # 1e9 N/m: angle of a pendulum (rad), the most steps of an implicit solver
         springs=1e-6,
         springs_steps=200,
@@ -58,6 +59,7 @@ BOUNDS = {
         links=5e-2,
         links_by={"dt": 1e-3},
         loops=(5e-4, 1e-5),
+        drift_of_runs=np.median,
         springs=1e-5,
         springs_steps=100,
     ),
@@ -292,14 +294,14 @@ def test_twenty_loops(bounds):
     """Twenty-one parallel legs under one plate have one freedom: most loops are redundant.
 
     In float32 the energy drift of one run depends on round-off: 2e-5 to 6e-4 from angles that
-    differ by 1e-6. The bound is that of the median of five runs.
+    differ by 1e-6. Its bound is that of the median of five runs, in float64 that of each run.
     """
     chain = parallel_legs(20)
     run = jax.jit(lambda state: svkc.simulate(chain, state, 1.0, ts=TIMES))
     trajectories = [run(chain.state({"leg0": 0.3 + 1e-6 * i})) for i in range(5)]
     assert svkc.mobility(chain, chain.state({"leg0": 0.3})).freedoms == 1
     drifts = [relative_energy_drift(chain, traj) for traj in trajectories]
-    assert np.median(drifts) < bounds.loops[0]
+    assert bounds.drift_of_runs(drifts) < bounds.loops[0]
     assert max(float(traj.gaps.max()) for traj in trajectories) < bounds.loops[1]
     for traj in trajectories:
         angles = np.asarray(traj.final.q)[[chain.dof_names.index(f"leg{i}") for i in range(21)]]
