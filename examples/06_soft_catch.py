@@ -73,6 +73,6 @@ for panel, what, x in zip(panels, ("before", "after"), (first, best)):
     panel.set(title=what, xticks=[], yticks=[])
 folder = pathlib.Path(sys.argv[1] if len(sys.argv) > 1 else ".")
 figure.savefig(folder / "06_soft_catch.png", dpi=110, bbox_inches="tight")
+cost = lambda p: loss(p)[0]  # one function for both checks, so that JAX compiles its gradient once
 for when, at in (("start", first), ("end", best)):
-    check = svkc.check_grad(lambda p: loss(p)[0], at, mode="reverse", directions=1)
-    print(f"gradient at the {when}: {check}")
+    print(f"gradient at the {when}: {svkc.check_grad(cost, at, mode='reverse', directions=1)}")

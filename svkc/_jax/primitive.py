@@ -1,6 +1,7 @@
 """Functions with custom derivative rules that survive every transformation and a second
 differentiation, and functions converted so that their closures are differentiable."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -8,7 +9,10 @@ import equinox as eqx
 import equinox.internal as eqxi
 import jax
 from jax import core
-from jax.interpreters import ad
+from jax.interpreters import ad, batching
+
+# number of kinds of arguments for which a primitive remembers the shapes of its results
+SHAPES_CACHE_SIZE = 32
 
 
 def custom_primitive(
@@ -17,6 +21,7 @@ def custom_primitive(
     jvp: Callable,
     transpose: Callable | None = None,
     like: Callable | None = None,
+    inlined_by_vmap: bool = False,
 ) -> Callable:
     """Return `function` as a JAX primitive with the given derivative rules.
 
@@ -28,7 +33,38 @@ def custom_primitive(
     linear, and transposing raises NotImplementedError.
     like: a function that is cheaper to trace and whose result has the same shapes and types; None:
         `function` itself.
+    inlined_by_vmap: whether `vmap` replaces the primitive by `jax.vmap(function)`. The transpose
+        rule of a batched primitive cannot sum over the lanes, and JAX's derivative of `function`
+        can.
     """
+
+    def not_linear(*_, **__):
+        raise NotImplementedError(f"{name} is not linear")
+
+    implementation = eqxi.filter_primitive_def(function)
+    primitive = eqxi.create_vprim(
+        name,
+        implementation,
+        eqxi.filter_primitive_def(_abstract_evaluation(like or function)),
+        eqxi.filter_primitive_jvp(jvp),
+        not_linear
+        if transpose is None
+        else eqxi.filter_primitive_transpose(transpose, materialise_zeros=True),
+    )
+    if inlined_by_vmap:
+        batching.axis_primitive_batchers[primitive] = _inlining(implementation)
+    return lambda *args: eqxi.filter_primitive_bind(primitive, *args)
+
+
+def _abstract_evaluation(function: Callable) -> Callable:
+    """Return a function that computes the shapes and types of `function`'s results.
+
+    JAX asks for them in every transformation. The latest are remembered.
+    """
+
+    @functools.lru_cache(maxsize=SHAPES_CACHE_SIZE)
+    def output_shapes(treedef, leaves: tuple, types: tuple, default_dtype: Any):
+        return eqx.filter_eval_shape(function, *jax.tree.unflatten(treedef, leaves))
 
     def abstract_eval(*args):
         to_struct = lambda x: (
@@ -37,27 +73,48 @@ def custom_primitive(
         to_aval = lambda x: (
             core.ShapedArray(x.shape, x.dtype) if isinstance(x, jax.ShapeDtypeStruct) else x
         )
-        out = eqx.filter_eval_shape(like or function, *jax.tree.map(to_struct, args))
-        return jax.tree.map(to_aval, out)
+        leaves, treedef = jax.tree.flatten(jax.tree.map(to_struct, args))
+        # True == 1, so the key has the types, too
+        key = treedef, tuple(leaves), tuple(map(type, leaves)), jax.dtypes.canonicalize_dtype(float)
+        shapes = output_shapes if _is_hashable(key) else output_shapes.__wrapped__
+        return jax.tree.map(to_aval, shapes(*key))
 
-    def not_linear(*_, **__):
-        raise NotImplementedError(f"{name} is not linear")
+    return abstract_eval
 
-    primitive = eqxi.create_vprim(
-        name,
-        eqxi.filter_primitive_def(function),
-        eqxi.filter_primitive_def(abstract_eval),
-        eqxi.filter_primitive_jvp(jvp),
-        not_linear
-        if transpose is None
-        else eqxi.filter_primitive_transpose(transpose, materialise_zeros=True),
+
+def _inlining(implementation: Callable) -> Callable:
+    """Return a batching rule that replaces a primitive by its batched implementation."""
+
+    def inline(axis_size, axis_name, _, inputs, batch_axes, **params):
+        batched = jax.vmap(
+            functools.partial(implementation, **params),
+            in_axes=batch_axes,
+            axis_name=axis_name,
+            axis_size=axis_size,
+        )(*inputs)
+        return batched, [0] * len(batched)
+
+    return inline
+
+
+def _is_hashable(x: Any) -> bool:
+    """Return whether `hash(x)` is defined."""
+    try:
+        hash(x)
+    except TypeError:
+        return False
+    return True
+
+
+def undefined_primals(tree: Any) -> tuple[Any, Any]:
+    """Split the inputs of a transpose rule: shapes of those whose cotangents the rule returns, and
+    the other inputs. Each of the two trees has None in place of the leaves of the other."""
+    is_undefined = lambda x: isinstance(x, ad.UndefinedPrimal)
+    struct = lambda x: jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype)
+    split = lambda f, g: jax.tree.map(
+        lambda x: f(x) if is_undefined(x) else g(x), tree, is_leaf=is_undefined
     )
-    return lambda *args: eqxi.filter_primitive_bind(primitive, *args)
-
-
-def is_undefined_primal(x) -> bool:
-    """Return whether an input of a transpose rule is one whose cotangent the rule returns."""
-    return isinstance(x, ad.UndefinedPrimal)
+    return split(struct, lambda _: None), split(lambda _: None, lambda x: x)
 
 
 class ClosureConverted(eqx.Module):

@@ -14,10 +14,11 @@ import jax
 import jax.numpy as jnp
 
 from svkc._jax.control_flow import unvmap_any
+from svkc._jax.primitive import custom_primitive, undefined_primals
 from svkc._jax.pytrees import tree_where
 from svkc.integration.ode import FieldArgs, ODEState
 from svkc.integration.runge_kutta import increment_bytes, recorded_step, step_and_tangent
-from svkc.integration.solution import PhaseSolution, StepperOptions, StepRecord
+from svkc.integration.solution import PhaseProblem, PhaseSolution, StepperOptions, StepRecord
 from svkc.loops.constraint_rows import choose_rows
 
 # Unused blocks are skipped in groups of at most this size; unused groups are skipped in groups of
@@ -109,7 +110,7 @@ def replay_tangents(
         def differentiate():
             first = i * interval
             d_after, (d_steps, d_increments) = _block_tangent(
-                d_y, (y, steps, records), problem, options.solver
+                (d_y, problem[1]), (y, steps, records), problem[0], options.solver
             )
             last = jnp.minimum(first + interval, solution.accepted)
             in_block = used & (save_index > first) & (save_index <= last)
@@ -173,36 +174,60 @@ def _records_of_blocks(records: StepRecord | None, index, interval: int):
     return jax.tree.map(rows, records), jnp.broadcast_to(first < capacity, index.shape)
 
 
-@eqx.filter_checkpoint
-def _block_tangent(d_y: ODEState, block, problem, solver):
+def _tangents_of_block(tangents, block, problem: PhaseProblem, solver):
     """Return the tangents after a block of steps, after each of its steps, and of its increments.
 
+    tangents: of the state at its start and of the problem.
     block: state at its start, starts and ends of its steps and which of them have reduced rows,
     and as from `_records_of_blocks`.
-    problem: pair of primal and tangent.
     """
-    y, steps, stored = block
+    (d_y, d_problem), (y, steps, stored) = tangents, block
     records, is_stored = (None, False) if stored is None else stored
 
     def step(carry, x):
         (start, stop, near), record = x
 
         def take_again(y):
-            field_args = with_rows_at(y.q, problem[0].field_args, near)
-            return recorded_step(solver, problem[0].field, (start, stop), y, field_args)
+            field_args = with_rows_at(y.q, problem.field_args, near)
+            return recorded_step(solver, problem.field, (start, stop), y, field_args)
 
         if record is None:
             record = take_again(carry[0])
         else:
             stored = record
             record = jax.lax.cond(is_stored, lambda y: stored, take_again, carry[0])
-        *end, d_increments = step_and_tangent(solver, (start, stop, record), problem, carry)
+        *end, d_increments = step_and_tangent(
+            solver, (start, stop, record), (problem, d_problem), carry
+        )
         # rows past the end of the phase hold no step
         end = tree_where(stop > start, tuple(end), carry)
         return end, (end[1], d_increments)
 
     (_, d_end), d_steps = jax.lax.scan(step, (y, d_y), (steps, records))
     return d_end, d_steps
+
+
+def _block_tangent_jvp(primals, tangents):
+    return eqx.filter_jvp(eqx.filter_checkpoint(_tangents_of_block), primals, tangents)
+
+
+def _block_tangent_transpose(inputs, cotangents):
+    tangents, *rest = inputs
+    shapes, known = undefined_primals(tangents)
+    linear = lambda unknown: _tangents_of_block(eqx.combine(unknown, known), *rest)
+    (cotangents,) = jax.linear_transpose(linear, shapes)(cotangents)
+    return cotangents, *jax.tree.map(lambda _: None, tuple(rest))
+
+
+# JAX traces the steps of a block once for a gradient. Without the primitive, JAX would transform
+# their equations again for every scan, condition and checkpoint around them.
+_block_tangent = custom_primitive(
+    "block_tangent",
+    eqx.filter_checkpoint(_tangents_of_block),
+    _block_tangent_jvp,
+    _block_tangent_transpose,
+    inlined_by_vmap=True,
+)
 
 
 def _broadcast_mask(mask, like):

@@ -20,7 +20,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from svkc._jax.primitive import custom_primitive, is_undefined_primal
+from svkc._jax.primitive import custom_primitive, undefined_primals
 from svkc._jax.pytrees import materialise_zeros
 from svkc.integration.event_location import EventInfo, vector_field_of
 from svkc.integration.ode import FieldArgs, ODEState
@@ -122,13 +122,7 @@ def _transport_jvp(primals, tangents):
 
 def _transport_transpose(inputs, cotangent: ODEState):
     changes, *where = inputs
-    shapes = jax.tree.map(
-        lambda x: (
-            jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) if is_undefined_primal(x) else None
-        ),
-        changes,
-        is_leaf=is_undefined_primal,
-    )
+    shapes, _ = undefined_primals(changes)
     y = where[2]
     cotangents = _transport_cotangent(materialise_zeros(y, cotangent), shapes, *where)
     return cotangents, *jax.tree.map(lambda _: None, tuple(where))
