@@ -11,7 +11,7 @@ import jax
 from jax import core
 from jax.interpreters import ad, batching
 
-# number of kinds of arguments for which a primitive remembers the shapes of its results
+# number of structures of arguments for which a primitive remembers the shapes of its results
 SHAPES_CACHE_SIZE = 32
 
 
@@ -27,8 +27,8 @@ def custom_primitive(
 
     `jax.custom_jvp` would lose its rule where a scan is linearized and then differentiated again.
 
-    jvp: jvp(primals, tangents) -> (value, tangent), over pytrees with None for zero tangents; the
-    rule calls the primitive again for the value.
+    jvp: jvp(primals, tangents) -> (value, tangent), over pytrees with None for zero tangents. A
+    rule that is to apply in later differentiations, too, calls the primitive for the value.
     transpose: transpose(inputs, cotangents) -> cotangents of the inputs; None: the primitive is not
     linear, and transposing raises NotImplementedError.
     like: a function that is cheaper to trace and whose result has the same shapes and types; None:
@@ -74,7 +74,7 @@ def _abstract_evaluation(function: Callable) -> Callable:
             core.ShapedArray(x.shape, x.dtype) if isinstance(x, jax.ShapeDtypeStruct) else x
         )
         leaves, treedef = jax.tree.flatten(jax.tree.map(to_struct, args))
-        # True == 1, so the key has the types, too
+        # the types are part of the key because True == 1
         key = treedef, tuple(leaves), tuple(map(type, leaves)), jax.dtypes.canonicalize_dtype(float)
         shapes = output_shapes if _is_hashable(key) else output_shapes.__wrapped__
         return jax.tree.map(to_aval, shapes(*key))
@@ -107,8 +107,11 @@ def _is_hashable(x: Any) -> bool:
 
 
 def undefined_primals(tree: Any) -> tuple[Any, Any]:
-    """Split the inputs of a transpose rule: shapes of those whose cotangents the rule returns, and
-    the other inputs. Each of the two trees has None in place of the leaves of the other."""
+    """Split the inputs of a transpose rule into undefined primals and known values.
+
+    Returns the shapes and types of the undefined primals, whose cotangents the rule returns, and
+    the known values. Each of the two trees has None in place of the leaves of the other.
+    """
     is_undefined = lambda x: isinstance(x, ad.UndefinedPrimal)
     struct = lambda x: jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype)
     split = lambda f, g: jax.tree.map(

@@ -208,6 +208,7 @@ def _tangents_of_block(tangents, block, problem: PhaseProblem, solver):
 
 
 def _block_tangent_jvp(primals, tangents):
+    # without the primitive, which would compute the value a second time
     return eqx.filter_jvp(eqx.filter_checkpoint(_tangents_of_block), primals, tangents)
 
 
