@@ -28,7 +28,7 @@ from svkc.mjcf.load import load as load
 from svkc.simulation.archive import load_chain as load_chain, load_trajectory as load_trajectory
 
 # bodies: how they are placed and move
-from svkc.tree.kinematics import poses as poses, velocities as velocities
+from svkc.tree.bodies import poses as poses, velocities as velocities
 from svkc.tree.points import (
     center_of_mass as center_of_mass,
     jacobian as _jacobian,

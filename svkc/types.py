@@ -14,6 +14,6 @@ from svkc.simulation.report import Report as Report
 from svkc.tools.gradient_check import GradientCheck as GradientCheck
 from svkc.tools.inverse_dynamics_along import InverseDynamics as InverseDynamics
 from svkc.transitions.guards import AbstractGuard as AbstractGuard
+from svkc.tree.bodies import Jacobian as Jacobian, Poses as Poses, Velocities as Velocities
 from svkc.tree.energy import Momentum as Momentum
-from svkc.tree.kinematics import Jacobian as Jacobian, Poses as Poses, Velocities as Velocities
 from svkc.tree.points import CenterOfMass as CenterOfMass

@@ -17,6 +17,9 @@ def take_rows(x: Array, index: Int[Array, " m"]) -> Array:
 @take_rows.defjvp
 def _take_rows_jvp(primals, tangents):
     (x, index), (dx, _) = primals, tangents
-    selected = index[:, None] == jnp.arange(x.shape[0], dtype=index.dtype)[None]
-    selected = selected.reshape(*selected.shape, *(1,) * (x.ndim - 1))
-    return take_rows(x, index), jnp.sum(jnp.where(selected, dx[None], 0), 1)
+    rows = jnp.arange(x.shape[0], dtype=index.dtype).reshape(-1, *(1,) * (x.ndim - 1))
+    # A loop: XLA would fuse one masked sum with what computes the cotangents, and compute them anew
+    # for each row of x.
+    return take_rows(x, index), jax.lax.map(
+        lambda i: jnp.sum(jnp.where(rows == i, dx, 0), 0), index
+    )

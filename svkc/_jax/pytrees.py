@@ -1,5 +1,8 @@
 """Operations on pytrees of arrays."""
 
+from collections.abc import Callable
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -29,3 +32,14 @@ def tree_where(condition, new, old):
 def is_concrete(*values) -> bool:
     """Return whether no leaf of the values is a tracer, so that Python can read the numbers."""
     return not any(isinstance(x, Tracer) for v in values for x in jax.tree.leaves(v))
+
+
+def keep_leaves(tree: Any, leaves: Callable) -> Any:
+    """Return the tree with None in place of all leaves but those that `leaves` selects.
+
+    A function with custom derivatives that takes the result depends on nothing else.
+
+    leaves: as in `equinox.tree_at`.
+    """
+    empty = jax.tree.map(lambda _: None, tree)
+    return eqx.tree_at(leaves, empty, leaves(tree), is_leaf=lambda x: x is None)

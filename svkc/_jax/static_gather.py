@@ -60,9 +60,9 @@ def _transpose(ct, x, *, index: bytes, axis: int):
     """Return, for each row of x, the sum of the cotangents of the rows gathered from that row."""
     table, n = np.frombuffer(index, np.int32), x.aval.shape[axis]
     count = np.bincount(table, minlength=n + 1)[:n]
-    width = min(count.max(initial=0), MAX_TABLE_RATIO * (n + len(table)) // max(n, 1))
+    width = _table_width(count)
     often = np.flatnonzero(count > width)
-    if len(often) > MAX_ROWS_USED_OFTEN:
+    if n * width > MAX_TABLE_RATIO * (n + len(table)):
         shape = (*x.aval.shape[:axis], n + 1, *x.aval.shape[axis + 1 :])
         scattered = jnp.zeros(shape, ct.dtype).at[(slice(None),) * axis + (table,)].add(ct)
         return [lax.slice_in_dim(scattered, 0, n, axis=axis)]
@@ -81,6 +81,18 @@ def _transpose(ct, x, *, index: bytes, axis: int):
         )
         total = lax.concatenate([before, of_row, after], axis)
     return [total]
+
+
+def _table_width(count: np.ndarray) -> int:
+    """Return the width of an index table at which the fewest entries are gathered.
+
+    Rows used more often than that are gathered one by one. They are at most `MAX_ROWS_USED_OFTEN`.
+
+    count: number of uses of each row.
+    """
+    widths = np.sort(np.append(count, 0))[::-1][: MAX_ROWS_USED_OFTEN + 1]
+    entries = [len(count) * width + np.sum(count[count > width]) for width in widths]
+    return int(widths[np.argmin(entries)])
 
 
 def _batch(args, axes, *, index: bytes, axis: int):

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from svkc._jax.batched_lapack import batched_solve_triangular, cholesky_solver
-from svkc.loops.constraint import LoopKinematics, jacobian_scales
+from svkc.loops.constraint import LoopKinematics, jacobian_scales, loop_rates_by_twists
 from svkc.loops.constraint_rows import constraint_rows
 from svkc.loops.coordinates import Coordinates, partition_coordinates
 from svkc.loops.delassus import loop_force_solver
@@ -232,15 +232,16 @@ def _implicit_solve(
     select_rows: the linear map from all loop rows to the selected ones.
     active_rows: which of the selected rows count.
     """
-    nv, column = chain.nv, jacobian_scales(chain)[1]
     active = active_dofs(chain, structure)
+    rates = lambda x: select_rows(loop_rates_by_twists(chain, loops, x))
 
     def equations(unknown):
         x, mu = unknown
-        J = select_rows(loops.J) / column[None]
         active_x = jnp.where(active, x, 0)
-        force = pad_to_dofs(chain, mass_matrix_product(chain, loops.kin, active_x[:nv])) + J.T @ mu
-        return jnp.where(active, force, x), J @ x + jnp.where(active_rows, 0, mu)
+        inertial = pad_to_dofs(chain, mass_matrix_product(chain, loops.kin, active_x[: chain.nv]))
+        (transmitted,) = jax.linear_transpose(rates, x)(mu)
+        force = jnp.where(active, inertial + transmitted, x)
+        return force, rates(active_x) + jnp.where(active_rows, 0, mu)
 
     def solve(force: Float[Array, " dofs"], bias: Float[Array, " rows"]) -> Float[Array, " dofs"]:
         right_sides = _link_tangents(jnp.where(active, force, 0), -select_rows(bias))

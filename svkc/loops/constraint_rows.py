@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.control_flow import unvmap_any
 from svkc._jax.static_gather import static_take
-from svkc.loops.constraint import jacobian_scales, loop_kinematics
+from svkc.loops.constraint import LoopKinematics, jacobian_scales, loop_kinematics, loop_rates
 from svkc.loops.pivoting import has_redundant_rows, rank_tolerance, release_threshold
 from svkc.loops.virtual_joints import VirtualJoints, virtual_joints
 from svkc.model.chain import Chain, Structure
@@ -263,24 +263,23 @@ def _eliminate(
 
 
 def with_consistent_velocities(
-    chain: Chain,
-    J: Float[Array, "rows dofs"],
-    v: Float[Array, " dofs"],
-    rows: ConstraintRows,
+    chain: Chain, loops: LoopKinematics, v: Float[Array, " dofs"], rows: ConstraintRows
 ) -> Float[Array, " dofs"]:
     """Return v, changed at the pivots of reduced rows and of virtual joints such that J v = 0.
 
-    J: the scaled J_C. v: zero where inactive.
+    v: zero where inactive.
     """
     assert rows.pivots is not None
-    nv, column = chain.nv, jacobian_scales(chain)[1]
-    frozen = jax.lax.stop_gradient(column)
-    # The second correction changes v by round-off alone. It makes derivatives exact, although T
-    # is constant in them.
-    for _ in range(2):
-        rate = J @ (v / column)
-        at_pivots = frozen[:nv] * (rows.reduce(rate) @ rows.pivots)
-        v = jnp.concatenate([v[:nv] - at_pivots, v[nv:]])
-        rate = J @ (v / column)
-        v = jnp.concatenate([v[:nv], v[nv:] - rows.joints.scatter(rows.joints.joint_rates(rate))])
-    return v
+    nv, column = chain.nv, jax.lax.stop_gradient(jacobian_scales(chain)[1])
+
+    frozen_v, frozen = jax.lax.stop_gradient((v, loops))
+
+    def correct(loops, v):
+        rate = loop_rates(chain, loops, v)
+        at_pivots = rows.reduce(rate) @ rows.pivots
+        of_joints = rows.joints.joint_rates(rate - frozen.J[:, :nv] @ at_pivots)
+        return v - jnp.concatenate([column[:nv] * at_pivots, rows.joints.scatter(of_joints)])
+
+    # The second correction changes v by round-off alone. Its derivative is that of consistent
+    # velocities, although T is constant in it, because its argument satisfies T J v = 0.
+    return correct(loops, correct(frozen, frozen_v) + (v - frozen_v))

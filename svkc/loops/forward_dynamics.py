@@ -18,7 +18,12 @@ from svkc.loops.constrained_dynamics import (
     ArticulatedBodies,
     default_dynamics,
 )
-from svkc.loops.constraint import constraint_bias, jacobian_scales, loop_kinematics
+from svkc.loops.constraint import (
+    LoopKinematics,
+    constraint_bias,
+    jacobian_scales,
+    loop_kinematics,
+)
 from svkc.loops.constraint_rows import (
     ConstraintRows,
     RowChoice,
@@ -75,9 +80,9 @@ def velocity_and_acceleration(
     """
     if chain.topology.link_names:
         loops = loop_kinematics(chain, structure, q)
-        kin, J = loops.kin, loops.J
+        kin = loops.kin
         selection, v = _select_rows(
-            chain, structure, J, v, dynamics=dynamics, project_velocity=project_velocity,
+            chain, structure, loops, v, dynamics=dynamics, project_velocity=project_velocity,
             pivots=pivots, choice=choice,
         )  # fmt: skip
     else:
@@ -97,12 +102,12 @@ def velocity_and_acceleration(
 
 
 def _select_rows(
-    chain: Chain, structure: Structure, J, v, *, dynamics: AbstractDynamics, project_velocity: bool,
-    pivots, choice: RowChoice | None,
+    chain: Chain, structure: Structure, loops: LoopKinematics, v, *, dynamics: AbstractDynamics,
+    project_velocity: bool, pivots, choice: RowChoice | None,
 ) -> tuple[Any, Float[Array, " dofs"]]:  # fmt: skip
     """Return the `selection` of `AbstractDynamics.prepare`, and v or, near a singular
     configuration, consistent velocities. The options are those of `velocity_and_acceleration`."""
-    selection = None
+    selection, J = None, loops.J
     if project_velocity or dynamics.uses_pivots:
         selection = select_pivots(structure, J, pivots)
     if project_velocity:
@@ -111,7 +116,7 @@ def _select_rows(
     if not dynamics.uses_pivots:
         selection = constraint_rows(chain, structure, J, choice)
         if choice is not None:
-            v = _with_consistent_velocities_if(choice.near, chain, structure, J, v, selection)
+            v = _with_consistent_velocities_if(choice.near, chain, structure, loops, v, selection)
     return selection, v
 
 
@@ -125,13 +130,18 @@ def _projected_if_near_singular(
 
 
 def _with_consistent_velocities_if(
-    near: Bool[Array, ""], chain: Chain, structure: Structure, J, v, rows: ConstraintRows
+    near: Bool[Array, ""],
+    chain: Chain,
+    structure: Structure,
+    loops: LoopKinematics,
+    v,
+    rows: ConstraintRows,
 ) -> Float[Array, " dofs"]:
     """Return v, where `near` holds with its dependent part from the independent one."""
     active_v = jnp.where(active_dofs(chain, structure), v, 0)
     return jax.lax.cond(
         unvmap_any(near),
-        lambda: jnp.where(near, with_consistent_velocities(chain, J, active_v, rows), v),
+        lambda: jnp.where(near, with_consistent_velocities(chain, loops, active_v, rows), v),
         lambda: v,
     )
 

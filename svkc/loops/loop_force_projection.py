@@ -12,7 +12,7 @@ from svkc._jax.control_flow import unvmap_any
 from svkc._jax.lanes_last import with_lanes_last
 from svkc._jax.one_kernel import one_kernel
 from svkc.loops.constrained_dynamics import ArticulatedBodies
-from svkc.loops.constraint import gap_norms, jacobian_scales, loop_kinematics
+from svkc.loops.constraint import gap_norms, loop_kinematics, loop_rates
 from svkc.loops.constraint_rows import RowChoice, constraint_rows, independent_rows
 from svkc.loops.pivoting import has_redundant_rows, rank_tolerance
 from svkc.loops.projection import ProjectionInfo
@@ -116,7 +116,6 @@ def _step_by_loop_forces(
     may_be_last: whether the step is the last, too, if the gaps are round-off. The margin is then
     computed, unless `choice` is None.
     """
-    column = jacobian_scales(chain)[1]
     loops = loop_kinematics(chain, structure, q)
     J, active = loops.J, active_dofs(chain, structure)
     gap = jax.lax.stop_gradient(gap_norms(loops.gap))
@@ -124,7 +123,7 @@ def _step_by_loop_forces(
     if may_be_last:
         # under `vmap`, one open lane lets all lanes take a step on q
         on_velocity = is_last | ~unvmap_any(jnp.max(gap) > jnp.finfo(J.dtype).eps ** _ROUND_OFF)
-    residual = jnp.where(on_velocity, J @ jnp.where(active, v / column, 0), loops.gap)
+    residual = jnp.where(on_velocity, loop_rates(chain, loops, jnp.where(active, v, 0)), loops.gap)
     rows = constraint_rows(chain, structure, J, choice)
     kept = rows.kept
     solve = ArticulatedBodies().prepare(chain, structure, loops, rows)

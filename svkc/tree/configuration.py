@@ -40,6 +40,25 @@ def configuration_derivative(
     return static_take(jnp.concatenate([static_take(v, scalar_v), quat_dot.ravel()]), order)
 
 
+def velocities_from_derivative(
+    chain: Chain, q: Float[Array, " q"], qdot: Float[Array, " q"]
+) -> Float[Array, " dofs"]:
+    """Return the velocities v at which `configuration_derivative` is qdot.
+
+    A quaternion's w is the vector part of 2 q* qdot / |q|^2. What changes the quaternion's length
+    is dropped, and w is zero where the quaternion is zero.
+    """
+    quat_q, quat_v = chain.topology.quaternion_starts
+    scalar_q, scalar_v = chain.topology.scalar_coordinates
+    at = quat_q[:, None] + np.arange(4)
+    quat = static_take(q, at)
+    square = jnp.sum(quat * quat, -1, keepdims=True)
+    inverse = 2 * quat_conjugate(quat) / jnp.where(square == 0, 1, square)
+    w = quat_multiply(inverse, static_take(qdot, at))[..., 1:]
+    order = np.argsort(np.concatenate([scalar_v, (quat_v[:, None] + np.arange(3)).ravel()]))
+    return static_take(jnp.concatenate([static_take(qdot, scalar_q), w.ravel()]), order)
+
+
 @checked_jit
 def integrate(chain: Chain, q: Float[Array, " q"], dv: Float[Array, " dofs"]) -> Float[Array, " q"]:
     """Return the configuration q moved by the tangent vector dv, by the exponential map.

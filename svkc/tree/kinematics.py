@@ -1,10 +1,8 @@
-"""Poses, twists and accelerations of the tree.
+"""Kinematics of the tree: poses, twists and accelerations of its rows.
 
 The kinds of joints are few and static: all joints of one kind are one array, and each level of the
 tree is one operation.
 """
-
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,11 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from svkc._jax.pytrees import keep_leaves
 from svkc._jax.static_gather import static_take
-from svkc.model.chain import Chain, State
-from svkc.model.checked_jit import checked_jit
+from svkc.model.chain import Chain
 from svkc.model.topology import BALL, FREE, HINGE, SLIDE, Topology
+from svkc.tree.configuration import velocities_from_derivative
 from svkc.tree.spatial import (
+    angular_linear,
     cross,
     matvec,
     motion_cross,
@@ -24,6 +24,7 @@ from svkc.tree.spatial import (
     quat_matrix,
     quat_multiply,
     quat_normalize,
+    skew,
 )
 from svkc.tree.traversal import (
     LEVELS_UNROLLED,
@@ -109,9 +110,57 @@ def _absolute_rotations(top: Topology, quat: Float[Array, "rows 4"]) -> Float[Ar
     return jnp.concatenate(levels)
 
 
-@jax.jit
 def kinematics(chain: Chain, q: Float[Array, " q"]) -> Kinematics:
-    """Return the poses of the rows and the motion subspaces at q (Featherstone section 4.4)."""
+    """Return the poses of the rows and the motion subspaces at q (Featherstone section 4.4).
+
+    The derivative with respect to q is in closed form: a change of q moves each row by a twist.
+    """
+    geometry = lambda c: (c.quat, c.pos, c.axis, c.anchor, c.q_load)
+    return _with_closed_form(keep_leaves(chain, geometry), q)
+
+
+@eqx.filter_custom_jvp
+def _with_closed_form(chain: Chain, q: Float[Array, " q"]) -> Kinematics:
+    return _kinematics(chain, q)
+
+
+@_with_closed_form.def_jvp
+def _kinematics_jvp(primals, tangents):
+    (chain, q), (d_chain, dq) = primals, tangents
+    kin = _with_closed_form(chain, q)
+    d_kin = jax.tree.map(lambda _: None, kin)
+    if jax.tree.leaves(d_chain):
+        d_kin = eqx.filter_jvp(lambda c: _kinematics(c, q), (chain,), (d_chain,))[1]
+    if dq is not None:
+        by_q = _tangent_of_motion(chain, kin, velocities_from_derivative(chain, q, dq))
+        add = lambda a, b: b if a is None else a + b
+        d_kin = jax.tree.map(add, d_kin, by_q, is_leaf=lambda x: x is None)
+    return kin, d_kin
+
+
+def _tangent_of_motion(chain: Chain, kin: Kinematics, v: Float[Array, " dofs"]) -> Kinematics:
+    """Return the derivative of the kinematics in a motion with the velocities v.
+
+    Positions and motion subspaces are about the root's origin, which moves too.
+    """
+    top = chain.topology
+    # In products, the factor that does not depend on v comes first: they are cheaper to transpose.
+    w, at_origin = angular_linear(twists(chain, kin, v))
+    of_root = static_take(at_origin, top.root)
+    V = jnp.concatenate([w, at_origin - of_root], -1)
+    S = -motion_cross(kin.S, static_take(V, np.array(top.dof_row)))
+    return Kinematics(
+        R=jnp.sum(skew(w)[..., None] * kin.R[:, None], 2),
+        quat=quat_multiply(jnp.concatenate([jnp.zeros_like(w[:, :1]), w], -1), kin.quat) / 2,
+        r=at_origin - of_root - cross(kin.r, w),
+        root_position=of_root,
+        S=jnp.where(_fixed_in_row(top)[:, None], S, 0),
+    )
+
+
+@jax.jit
+def _kinematics(chain: Chain, q: Float[Array, " q"]) -> Kinematics:
+    """Return `kinematics`, differentiated automatically."""
     top = chain.topology
     local, at_load, offset = _joint_poses(chain, q)
     quat = quat_normalize(_absolute_rotations(top, local))
@@ -197,12 +246,15 @@ def velocity_products(
     world and contribute nothing.
     """
     top = chain.topology
-    fixed_in_row = np.ones(chain.nv, bool)
-    free = top.rows_of_kind(FREE)
-    fixed_in_row[(np.array(top.v_start)[free][:, None] + np.arange(3)).ravel()] = False
-    return motion_cross(
-        V, sum_dofs_per_row(top, kin.S * jnp.where(fixed_in_row, v[: chain.nv], 0)[:, None])
-    )
+    v = jnp.where(_fixed_in_row(top), v[: chain.nv], 0)
+    return motion_cross(V, sum_dofs_per_row(top, kin.S * v[:, None]))
+
+
+def _fixed_in_row(top: Topology) -> np.ndarray:
+    """Return which coordinates have an axis fixed in their row: not a free joint's translations."""
+    fixed, free = np.ones(top.nv, bool), top.rows_of_kind(FREE)
+    fixed[(np.array(top.v_start)[free][:, None] + np.arange(3)).ravel()] = False
+    return fixed
 
 
 def bias_accelerations(
@@ -210,58 +262,3 @@ def bias_accelerations(
 ) -> Float[Array, "rows 6"]:
     """Return each row's spatial acceleration for vdot = 0, without gravity."""
     return accumulate_from_root(chain.topology, velocity_products(chain, kin, V, v))
-
-
-class Poses(NamedTuple):
-    """Poses of body frames in the world.
-
-    position: origins (m).
-    quaternion: unit quaternions wxyz, body to world.
-    """
-
-    position: Float[Array, "bodies 3"]
-    quaternion: Float[Array, "bodies 4"]
-
-
-class Velocities(NamedTuple):
-    """Velocities of bodies in world axes.
-
-    linear: of the body's origin (m/s).
-    angular: rad/s.
-    """
-
-    linear: Float[Array, "bodies 3"]
-    angular: Float[Array, "bodies 3"]
-
-
-class Jacobian(NamedTuple):
-    """Velocities for a unit rate of each joint coordinate, in world axes.
-
-    linear: m/s; angular: rad/s; each per rad/s or m/s of the coordinate.
-    """
-
-    linear: Float[Array, "*n 3 dofs"]
-    angular: Float[Array, "*n 3 dofs"]
-
-
-@checked_jit
-def poses(chain: Chain, state: State) -> Poses:
-    """Return the position (m) and the quaternion (wxyz, body to world) of every body frame.
-
-    Body 0 is the world (Featherstone section 4.4).
-    """
-    rows = np.array(chain.topology.body_row)
-    kin = kinematics(chain, state.q)
-    return Poses((kin.root_position + kin.r)[rows], kin.quat[rows])
-
-
-@checked_jit
-def velocities(chain: Chain, state: State) -> Velocities:
-    """Return the linear velocity (m/s) of every body's origin and its angular velocity (rad/s).
-
-    Both are in world axes. Body 0 is the world (Featherstone section 5.3).
-    """
-    rows = np.array(chain.topology.body_row)
-    kin = kinematics(chain, state.q)
-    V = twists(chain, kin, state.v)
-    return Velocities((V[:, 3:] + cross(V[:, :3], kin.r))[rows], V[rows, :3])

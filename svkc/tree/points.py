@@ -18,9 +18,10 @@ from svkc.model.checked_jit import check_state, checked_jit
 from svkc.model.names import body_or_site, body_rows
 from svkc.model.topology import FixedFrame
 from svkc.model.validation import names
+from svkc.tree.bodies import Jacobian
 from svkc.tree.energy import body_motions
 from svkc.tree.inverse_dynamics import pad_to_dofs
-from svkc.tree.kinematics import Jacobian, Kinematics, kinematics, twists
+from svkc.tree.kinematics import Kinematics, kinematics, twists
 from svkc.tree.spatial import angular_linear, cross, matvec, quat_rotate, shift_motion
 
 

@@ -31,9 +31,11 @@ def accumulate_from_root(top: Topology, x: Float[Array, "rows *n"]) -> Float[Arr
         for above, _ in _doubling_tables(top):
             x = x + static_take(x, above)
         return x
-    parent, levels = np.array(top.parent), [x[:1]]
-    for (start, _), (first, last) in zip(top.levels[:-1], top.levels[1:], strict=True):
-        levels.append(x[first:last] + static_take(levels[-1], parent[first:last] - start))
+    tables, (ground, *own) = level_tables(top), _split_levels(top, x)
+    assert isinstance(tables, list)
+    levels = [ground]
+    for level, rows in zip(tables, own, strict=True):
+        levels.append(rows + static_take(levels[-1], level.parent))
     return jnp.concatenate(levels)
 
 
@@ -45,15 +47,22 @@ def accumulate_to_root(top: Topology, x: Float[Array, "rows *n"]) -> Float[Array
         for _, below in _doubling_tables(top):
             x = x + jnp.sum(static_take(x, below), 1)
         return x
-    levels = level_tables(top)
-    assert isinstance(levels, list)
+    tables, (ground, *own) = level_tables(top), _split_levels(top, x)
+    assert isinstance(tables, list)
     sums, below = [], None
-    for level, (first, last) in reversed(list(zip(levels, top.levels[1:], strict=True))):
-        own = x[first:last]
-        below = own if below is None else own + sum_children(level.children, below)
+    for level, rows in reversed(list(zip(tables, own, strict=True))):
+        below = rows if below is None else rows + sum_children(level.children, below)
         sums.append(below)
     assert below is not None  # the world has a level of its own
-    return jnp.concatenate([x[:1] + jnp.sum(below, 0, keepdims=True), *sums[::-1]])
+    return jnp.concatenate([ground + jnp.sum(below, 0, keepdims=True), *sums[::-1]])
+
+
+def _split_levels(top: Topology, x: Float[Array, "rows *n"]) -> list[Float[Array, "_ *n"]]:
+    """Return the rows of each level, the world's first.
+
+    The transpose of a split is one concatenation; that of slices is paddings and a sum.
+    """
+    return jnp.split(x, [first for first, _ in top.levels[1:]])
 
 
 @functools.cache
@@ -97,18 +106,20 @@ def replace_rows(
 
 def sum_dofs_per_row(top: Topology, x: Float[Array, "nv *n"]) -> Float[Array, "rows *n"]:
     """Return, for each row, the sum of x over the coordinates of the row's joint."""
-    parts, order = [], []
-    for kinds, size in (((HINGE, SLIDE), 1), ((BALL,), 3), ((FREE,), 6)):
-        rows = top.rows_of_kind(*kinds)
-        if len(rows):
-            start = np.array(top.v_start)[rows]
-            parts.append(sum(static_take(x, start + k) for k in range(size)))
-            order.append(rows)
-    fixed = np.setdiff1d(
-        np.arange(len(top.parent)), np.concatenate(order) if order else np.zeros(0, int)
-    )
+    kinds = [(top.rows_of_kind(HINGE, SLIDE), 1), (top.rows_of_kind(BALL), 3)]
+    groups = [(rows, size) for rows, size in (*kinds, (top.rows_of_kind(FREE), 6)) if len(rows)]
+    groups.sort(key=lambda group: top.v_start[group[0][0]])
+    dofs = [np.array(top.v_start)[rows][:, None] + np.arange(size) for rows, size in groups]
+    in_groups = static_take(x, np.concatenate([d.ravel() for d in dofs]) if dofs else np.arange(0))
+    parts = jnp.split(in_groups, np.cumsum([d.size for d in dofs])[:-1]) if dofs else []
+    parts = [
+        part if size == 1 else jnp.sum(part.reshape(-1, size, *x.shape[1:]), 1)
+        for part, (_, size) in zip(parts, groups, strict=True)
+    ]
+    moved = [rows for rows, _ in groups]
+    fixed = np.setdiff1d(np.arange(len(top.parent)), np.concatenate(moved) if moved else [])
     parts.append(jnp.zeros((len(fixed), *x.shape[1:]), x.dtype))
-    return static_take(jnp.concatenate(parts), np.argsort(np.concatenate([*order, fixed])))
+    return static_take(jnp.concatenate(parts), np.argsort(np.concatenate([*moved, fixed])))
 
 
 class Level(NamedTuple):

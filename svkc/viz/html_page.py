@@ -18,8 +18,8 @@ from svkc.model.annotations import Integer
 from svkc.model.chain import Chain, State, Structure, active_dofs
 from svkc.model.validation import integer
 from svkc.simulation.trajectory import Trajectory
+from svkc.tree.bodies import poses
 from svkc.tree.energy import energy
-from svkc.tree.kinematics import poses
 from svkc.viz.meshes import MIN_FACES, Mesh, decimate, load_mesh, mesh_key
 from svkc.viz.outlines import geom_color, geom_kind, visible_geoms
 from svkc.viz.run_data import (

@@ -10,7 +10,7 @@ import numpy as np
 from svkc.model.chain import Chain, State
 from svkc.simulation.run_tables import changes_of_run, link_labels
 from svkc.simulation.trajectory import Trajectory
-from svkc.tree.kinematics import poses
+from svkc.tree.bodies import poses
 
 # of structures in a strobe, and of trails in an animation
 COLORS = ("#1f5fa8", "#d9822b", "#2f8f4e", "#8e3b8e", "#b03030")
