@@ -269,15 +269,16 @@ def with_consistent_velocities(
 
     v: zero where inactive.
     """
-    assert rows.pivots is not None
-    nv, column = chain.nv, jax.lax.stop_gradient(jacobian_scales(chain)[1])
+    nv, pivots = chain.nv, rows.pivots
+    assert pivots is not None
+    column = jax.lax.stop_gradient(jacobian_scales(chain)[1])
 
-    frozen_v, frozen = jax.lax.stop_gradient((v, loops))
+    frozen_v, frozen, J_tree = jax.lax.stop_gradient((v, loops, loops.J[:, :nv]))
 
     def correct(loops, v):
         rate = loop_rates(chain, loops, v)
-        at_pivots = rows.reduce(rate) @ rows.pivots
-        of_joints = rows.joints.joint_rates(rate - frozen.J[:, :nv] @ at_pivots)
+        at_pivots = rows.reduce(rate) @ pivots
+        of_joints = rows.joints.joint_rates(rate - J_tree @ at_pivots)
         return v - jnp.concatenate([column[:nv] * at_pivots, rows.joints.scatter(of_joints)])
 
     # The second correction changes v by round-off alone. Its derivative is that of consistent
