@@ -18,8 +18,8 @@ def take_rows(x: Array, index: Int[Array, " m"]) -> Array:
 def _take_rows_jvp(primals, tangents):
     (x, index), (dx, _) = primals, tangents
     rows = jnp.arange(x.shape[0], dtype=index.dtype).reshape(-1, *(1,) * (x.ndim - 1))
-    # A loop: XLA would fuse one masked sum with what computes the cotangents, and compute them anew
-    # for each row of x.
-    return take_rows(x, index), jax.lax.map(
-        lambda i: jnp.sum(jnp.where(rows == i, dx, 0), 0), index
-    )
+    take_row = lambda i: jnp.sum(jnp.where(rows == i, dx, 0), 0)
+    # On a CPU a loop: XLA would fuse one sum for all rows of the index with the operations that
+    # compute their cotangents, and repeat these operations for each row of x.
+    mapped = jax.lax.map if jax.default_backend() == "cpu" else lambda f, xs: jax.vmap(f)(xs)
+    return take_rows(x, index), mapped(take_row, index)
