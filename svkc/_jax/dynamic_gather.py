@@ -19,7 +19,6 @@ def _take_rows_jvp(primals, tangents):
     (x, index), (dx, _) = primals, tangents
     rows = jnp.arange(x.shape[0], dtype=index.dtype).reshape(-1, *(1,) * (x.ndim - 1))
     take_row = lambda i: jnp.sum(jnp.where(rows == i, dx, 0), 0)
-    # On a CPU a loop: XLA would fuse one sum for all rows of the index with the operations that
-    # compute their cotangents, and repeat these operations for each row of x.
+    # On a CPU a loop: from one masked sum, XLA would recompute the cotangents for each row of x.
     mapped = jax.lax.map if jax.default_backend() == "cpu" else lambda f, xs: jax.vmap(f)(xs)
     return take_rows(x, index), mapped(take_row, index)

@@ -34,12 +34,12 @@ def is_concrete(*values) -> bool:
     return not any(isinstance(x, Tracer) for v in values for x in jax.tree.leaves(v))
 
 
-def keep_leaves(tree: Any, leaves: Callable) -> Any:
-    """Return the tree with None in place of all leaves but those that `leaves` selects.
+def only_leaves(tree: Any, select: Callable) -> Any:
+    """Return the tree with None in place of all leaves that are not selected.
 
-    A function with custom derivatives that takes the result depends on nothing else.
+    Pass the result to a function with a custom derivative, which then sees no other tangents.
 
-    leaves: as in `equinox.tree_at`.
+    select: as `where` of `equinox.tree_at`.
     """
     empty = jax.tree.map(lambda _: None, tree)
-    return eqx.tree_at(leaves, empty, leaves(tree), is_leaf=lambda x: x is None)
+    return eqx.tree_at(select, empty, select(tree), is_leaf=lambda x: x is None)

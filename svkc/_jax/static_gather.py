@@ -11,9 +11,9 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Float, Int
 
-# the transpose gathers by a padded index table [rows, most uses of one row]; if that table has
-# more than this many times the entries that are needed, rows that are used more often are summed
-# one by one, or the transpose is a scatter if these rows are many
+# The transpose gathers by a padded index table; at most so many rows with more uses than the
+# table's width are summed one by one. If the table has more than MAX_TABLE_RATIO times the entries
+# that are needed, the transpose is a scatter.
 MAX_TABLE_RATIO, MAX_ROWS_USED_OFTEN = 8, 4
 
 
@@ -84,9 +84,9 @@ def _transpose(ct, x, *, index: bytes, axis: int):
 
 
 def _table_width(count: np.ndarray) -> int:
-    """Return the width of an index table at which the fewest entries are gathered.
+    """Return the table width at which the fewest entries are gathered in all.
 
-    Rows used more often than that are gathered one by one. They are at most `MAX_ROWS_USED_OFTEN`.
+    Rows with more uses, at most `MAX_ROWS_USED_OFTEN`, are gathered separately.
 
     count: number of uses of each row.
     """

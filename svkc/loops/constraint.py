@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from svkc._jax.dynamic_gather import take_rows
-from svkc._jax.pytrees import keep_leaves
+from svkc._jax.pytrees import only_leaves
 from svkc._jax.static_gather import static_take
 from svkc.loops.frames import LoopFrames, frame_gaps, loop_frames
 from svkc.model.annotations import DType, Scalar
@@ -153,32 +153,35 @@ def loop_rates(
 ) -> Float[Array, " rows"]:
     """Return J_C v with scaled rows. In its derivative, J_C is not differentiated.
 
-    v: zero where inactive.
+    v: zero where inactive, as its tangent.
     """
-    return _differentiated_by_twists(keep_leaves(chain, lambda c: c.length), loops, v)
+    return _loop_rates_with_jvp(only_leaves(chain, lambda c: c.length), loops, v)
 
 
 @eqx.filter_custom_jvp
-def _differentiated_by_twists(chain: Chain, loops: LoopKinematics, v) -> Float[Array, " rows"]:
+def _loop_rates_with_jvp(chain: Chain, loops: LoopKinematics, v) -> Float[Array, " rows"]:
     return loops.J @ (v / jacobian_scales(chain)[1])
 
 
-@_differentiated_by_twists.def_jvp
+@_loop_rates_with_jvp.def_jvp
 def _loop_rates_jvp(primals, tangents):
-    rates = _differentiated_by_twists(*primals)
+    rates = _loop_rates_with_jvp(*primals)
     return rates, eqx.filter_jvp(loop_rates_by_twists, primals, tangents)[1]
 
 
 def loop_rates_by_twists(
     chain: Chain, loops: LoopKinematics, v: Float[Array, " dofs"]
 ) -> Float[Array, " rows"]:
-    """Return `loop_rates` without J_C: its derivative costs less than that of J_C."""
+    """Return `loop_rates` from the twists of the links, which is cheaper to differentiate.
+
+    v: zero where inactive, as its tangent.
+    """
     top, structure, frames = chain.topology, loops.structure, loops.frames
     above = jnp.asarray(top.ancestor_mask[:, top.dof_row])
     of_parent, of_real = above[structure.parent], above[structure.real]
     moved = loops.kin.S * v[: chain.nv, None]
-    # coordinates above both links move both ends
-    twist = lambda above: jnp.sum(jnp.where(above[:, :, None], moved[None], 0), 1)
+    # coordinates above both links cancel, as in J_C
+    twist = lambda mask: jnp.sum(jnp.where(mask[:, :, None], moved[None], 0), 1)
     at_parent = shift_motion(twist(of_parent & ~of_real), frames.from_parent_root)
     at_real = shift_motion(twist(of_real & ~of_parent), frames.real_position)
     S = _virtual_motion_subspaces(chain, structure, frames)

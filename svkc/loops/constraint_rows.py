@@ -273,14 +273,14 @@ def with_consistent_velocities(
     assert pivots is not None
     column = jax.lax.stop_gradient(jacobian_scales(chain)[1])
 
-    frozen_v, frozen, J_tree = jax.lax.stop_gradient((v, loops, loops.J[:, :nv]))
+    J_tree = jax.lax.stop_gradient(loops.J[:, :nv])
 
-    def correct(loops, v):
+    def correct(v):
         rate = loop_rates(chain, loops, v)
         at_pivots = rows.reduce(rate) @ pivots
         of_joints = rows.joints.joint_rates(rate - J_tree @ at_pivots)
         return v - jnp.concatenate([column[:nv] * at_pivots, rows.joints.scatter(of_joints)])
 
-    # The second correction changes v by round-off alone. Its derivative is that of consistent
-    # velocities, although T is constant in it, because its argument satisfies T J v = 0.
-    return correct(loops, correct(frozen, frozen_v) + (v - frozen_v))
+    # The second correction changes v by round-off alone. It makes derivatives exact, although T
+    # and J_tree are constant in them.
+    return correct(correct(v))

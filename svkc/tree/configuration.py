@@ -43,10 +43,9 @@ def configuration_derivative(
 def velocities_from_derivative(
     chain: Chain, q: Float[Array, " q"], qdot: Float[Array, " q"]
 ) -> Float[Array, " dofs"]:
-    """Return the velocities v at which `configuration_derivative` is qdot.
+    """Return the v at which `configuration_derivative` is qdot, up to quaternions' lengths.
 
-    A quaternion's w is the vector part of 2 q* qdot / |q|^2. What changes the quaternion's length
-    is dropped, and w is zero where the quaternion is zero.
+    A quaternion's w is the vector part of 2 q* qdot / |q|^2, and zero where the quaternion is zero.
     """
     quat_q, quat_v = chain.topology.quaternion_starts
     scalar_q, scalar_v = chain.topology.scalar_coordinates

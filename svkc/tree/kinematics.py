@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from svkc._jax.pytrees import keep_leaves
+from svkc._jax.pytrees import only_leaves
 from svkc._jax.static_gather import static_take
 from svkc.model.chain import Chain
 from svkc.model.topology import BALL, FREE, HINGE, SLIDE, Topology
@@ -116,44 +116,44 @@ def kinematics(chain: Chain, q: Float[Array, " q"]) -> Kinematics:
     The derivative with respect to q is in closed form: a change of q moves each row by a twist.
     """
     geometry = lambda c: (c.quat, c.pos, c.axis, c.anchor, c.q_load)
-    return _with_closed_form(keep_leaves(chain, geometry), q)
+    return _kinematics_with_jvp(only_leaves(chain, geometry), q)
 
 
 @eqx.filter_custom_jvp
-def _with_closed_form(chain: Chain, q: Float[Array, " q"]) -> Kinematics:
+def _kinematics_with_jvp(chain: Chain, q: Float[Array, " q"]) -> Kinematics:
     return _kinematics(chain, q)
 
 
-@_with_closed_form.def_jvp
+@_kinematics_with_jvp.def_jvp
 def _kinematics_jvp(primals, tangents):
     (chain, q), (d_chain, dq) = primals, tangents
-    kin = _with_closed_form(chain, q)
+    kin = _kinematics_with_jvp(chain, q)
     d_kin = jax.tree.map(lambda _: None, kin)
     if jax.tree.leaves(d_chain):
         d_kin = eqx.filter_jvp(lambda c: _kinematics(c, q), (chain,), (d_chain,))[1]
     if dq is not None:
-        by_q = _tangent_of_motion(chain, kin, velocities_from_derivative(chain, q, dq))
+        by_q = _kinematics_rate(chain, kin, velocities_from_derivative(chain, q, dq))
         add = lambda a, b: b if a is None else a + b
         d_kin = jax.tree.map(add, d_kin, by_q, is_leaf=lambda x: x is None)
     return kin, d_kin
 
 
-def _tangent_of_motion(chain: Chain, kin: Kinematics, v: Float[Array, " dofs"]) -> Kinematics:
+def _kinematics_rate(chain: Chain, kin: Kinematics, v: Float[Array, " dofs"]) -> Kinematics:
     """Return the derivative of the kinematics in a motion with the velocities v.
 
     Positions and motion subspaces are about the root's origin, which moves too.
     """
     top = chain.topology
-    # In products, the factor that does not depend on v comes first: they are cheaper to transpose.
+    # Vector products have the factor that depends on v second, where it is cheaper to transpose.
     w, at_origin = angular_linear(twists(chain, kin, v))
-    of_root = static_take(at_origin, top.root)
-    V = jnp.concatenate([w, at_origin - of_root], -1)
-    S = -motion_cross(kin.S, static_take(V, np.array(top.dof_row)))
+    root_velocity = static_take(at_origin, top.root)
+    relative = at_origin - root_velocity
+    S = -motion_cross(kin.S, static_take(jnp.concatenate([w, relative], -1), np.array(top.dof_row)))
     return Kinematics(
         R=jnp.sum(skew(w)[..., None] * kin.R[:, None], 2),
         quat=quat_multiply(jnp.concatenate([jnp.zeros_like(w[:, :1]), w], -1), kin.quat) / 2,
-        r=at_origin - of_root - cross(kin.r, w),
-        root_position=of_root,
+        r=relative - cross(kin.r, w),
+        root_position=root_velocity,
         S=jnp.where(_fixed_in_row(top)[:, None], S, 0),
     )
 
