@@ -1,4 +1,4 @@
-"""Gather of rows by an index known at run time; its derivative is a masked sum, not a scatter.
+"""Gather of rows by an index known at run time; its derivative has masked sums, not a scatter.
 
 A kernel of `one_kernel` cannot hold a scatter.
 """

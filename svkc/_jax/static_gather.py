@@ -11,9 +11,9 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Float, Int
 
-# The transpose gathers by a padded index table; at most so many rows with more uses than the
-# table's width are summed one by one. If the table has more than MAX_TABLE_RATIO times the entries
-# that are needed, the transpose is a scatter.
+# The transpose gathers by a padded index table. Rows with more uses than the table is wide, at most
+# MAX_ROWS_USED_OFTEN, are summed one by one. If the table has more than MAX_TABLE_RATIO times the
+# entries that are needed, the transpose is a scatter.
 MAX_TABLE_RATIO, MAX_ROWS_USED_OFTEN = 8, 4
 
 

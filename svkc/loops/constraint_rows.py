@@ -271,9 +271,7 @@ def with_consistent_velocities(
     """
     nv, pivots = chain.nv, rows.pivots
     assert pivots is not None
-    column = jax.lax.stop_gradient(jacobian_scales(chain)[1])
-
-    J_tree = jax.lax.stop_gradient(loops.J[:, :nv])
+    column, J_tree = jax.lax.stop_gradient((jacobian_scales(chain)[1], loops.J[:, :nv]))
 
     def correct(v):
         rate = loop_rates(chain, loops, v)
@@ -281,6 +279,6 @@ def with_consistent_velocities(
         of_joints = rows.joints.joint_rates(rate - J_tree @ at_pivots)
         return v - jnp.concatenate([column[:nv] * at_pivots, rows.joints.scatter(of_joints)])
 
-    # The second correction changes v by round-off alone. It makes derivatives exact, although T
-    # and J_tree are constant in them.
+    # The second correction changes v by round-off alone. It makes first derivatives exact, and
+    # second derivatives where J v = 0, although T and J_tree are constant in them.
     return correct(correct(v))

@@ -106,20 +106,22 @@ def replace_rows(
 
 def sum_dofs_per_row(top: Topology, x: Float[Array, "nv *n"]) -> Float[Array, "rows *n"]:
     """Return, for each row, the sum of x over the coordinates of the row's joint."""
-    kinds = [(top.rows_of_kind(HINGE, SLIDE), 1), (top.rows_of_kind(BALL), 3)]
-    groups = [(rows, size) for rows, size in (*kinds, (top.rows_of_kind(FREE), 6)) if len(rows)]
+    kinds = ((HINGE, SLIDE), 1), ((BALL,), 3), ((FREE,), 6)
+    groups = [(rows, n) for names, n in kinds if len(rows := top.rows_of_kind(*names))]
+    # sorted by coordinate, as then the coordinates of most trees need no gather
     groups.sort(key=lambda group: top.v_start[group[0][0]])
-    dofs = [np.array(top.v_start)[rows][:, None] + np.arange(size) for rows, size in groups]
-    in_groups = static_take(x, np.concatenate([d.ravel() for d in dofs]) if dofs else np.arange(0))
-    parts = jnp.split(in_groups, np.cumsum([d.size for d in dofs])[:-1]) if dofs else []
+    with_joint, parts = [rows for rows, _ in groups], []
+    if groups:
+        dofs = [np.array(top.v_start)[rows][:, None] + np.arange(n) for rows, n in groups]
+        ordered = static_take(x, np.concatenate([d.ravel() for d in dofs]))
+        parts = jnp.split(ordered, np.cumsum([d.size for d in dofs])[:-1])
     parts = [
-        part if size == 1 else jnp.sum(part.reshape(-1, size, *x.shape[1:]), 1)
-        for part, (_, size) in zip(parts, groups, strict=True)
+        part if n == 1 else jnp.sum(part.reshape(-1, n, *x.shape[1:]), 1)
+        for part, (_, n) in zip(parts, groups, strict=True)
     ]
-    moved = [rows for rows, _ in groups]
-    fixed = np.setdiff1d(np.arange(len(top.parent)), np.concatenate(moved) if moved else [])
+    fixed = np.setdiff1d(np.arange(len(top.parent)), np.concatenate([*with_joint, []]))
     parts.append(jnp.zeros((len(fixed), *x.shape[1:]), x.dtype))
-    return static_take(jnp.concatenate(parts), np.argsort(np.concatenate([*moved, fixed])))
+    return static_take(jnp.concatenate(parts), np.argsort(np.concatenate([*with_joint, fixed])))
 
 
 class Level(NamedTuple):
