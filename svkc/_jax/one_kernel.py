@@ -28,10 +28,10 @@ _STABLEHLO = set(
     "abs add and atan2 bitcast_convert broadcast_in_dim case cbrt ceil clamp compare concatenate"
     " constant convert cosine divide dynamic_slice dynamic_update_slice exponential"
     " exponential_minus_one floor gather if iota is_finite log log_plus_one logistic maximum"
-    " minimum multiply negate not optimization_barrier or pad power reduce reduce_precision"
-    " reduce_window remainder reshape return reverse round_nearest_afz round_nearest_even rsqrt"
-    " select shift_left shift_right_arithmetic shift_right_logical sign sine slice sqrt subtract"
-    " tan tanh transpose while xor".split()
+    " get_tuple_element minimum multiply negate not optimization_barrier or pad power reduce"
+    " reduce_precision reduce_window remainder reshape return reverse round_nearest_afz"
+    " round_nearest_even rsqrt select shift_left shift_right_arithmetic shift_right_logical sign"
+    " sine slice sqrt subtract tan tanh transpose tuple while xor".split()
 )
 _CHLO = set(
     "acos acosh asin asinh atan atanh constant cosh digamma erf erf_inv erfc lgamma next_after sinh"
@@ -47,9 +47,10 @@ def one_kernel(function: Callable) -> Callable:
     pass recomputes the residuals in its own kernel.
 
     The function is compiled as usual if an operation calls XLA's runtime or a library (products of
-    two matrices), if the function contains another such kernel, or under `vmap`, because LLVM takes
-    twice as long for a batch (benchmarks/README.md). Exception: a `vmap` with an output that is the
-    same for all lanes is still one kernel.
+    two matrices), or under `vmap`, because LLVM takes twice as long for a batch
+    (benchmarks/README.md). Exception: a `vmap` with an output that is the same for all lanes is
+    still one kernel. A kernel may contain others: if it is compiled as usual, they remain kernels.
+    It copies arrays that it changes, so keep buffers that are written in place out of it.
     """
     if not HAS_ONE_KERNEL:
         return function
@@ -129,7 +130,10 @@ def _fits(operation: Any, functions: Any) -> bool:
     is_supported = (
         dialect == "func"
         or (dialect == "chlo" and name in _CHLO)
-        or (dialect == "stablehlo" and (name in _STABLEHLO or _is_small_product(operation)))
+        or (
+            dialect == "stablehlo"
+            and (name in _STABLEHLO or _is_small_product(operation) or _writes_one_slice(operation))
+        )
     )
     return is_supported and all(
         _fits(inner.operation, functions)
@@ -156,6 +160,19 @@ def _is_small_product(operation: Any) -> bool:
         all(size == 1 for i, size in enumerate(shape) if i not in axes)
         for shape, axes in zip(shapes, batch_or_summed, strict=True)
     )
+
+
+def _writes_one_slice(operation: Any) -> bool:
+    """Return whether an operation is a scatter at one index.
+
+    XLA replaces it by the update of a slice.
+    """
+    if operation.name != "stablehlo.scatter":
+        return False
+    numbers = stablehlo.ScatterDimensionNumbers(operation.attributes["scatter_dimension_numbers"])
+    indices = operation.operands[(len(operation.operands) - 1) // 2]
+    shape = ir.RankedTensorType(indices.type).shape
+    return all(size == 1 for i, size in enumerate(shape) if i != numbers.index_vector_dim)
 
 
 _input_p, _output_p = _identity("one_kernel_input"), _identity("one_kernel_output")

@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 from jax.core import Tracer
 
+from svkc._jax.select import where
+
 
 def stop_gradient_tree(tree):
     """Apply `lax.stop_gradient` to every array of a pytree."""
@@ -25,8 +27,17 @@ def materialise_zeros(x, dx):
 
 
 def tree_where(condition, new, old):
-    """Return `new` where `condition` holds, else `old`, leaf by leaf (`jnp.where`)."""
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
+    """Return `new` where the scalar `condition` holds, else `old`, leaf by leaf.
+
+    Leaves of equal shape and dtype take one operation, where `jnp.where` takes six.
+    """
+
+    def select(a, b):
+        a, b = jnp.asarray(a), jnp.asarray(b)
+        same = a.shape == b.shape and a.dtype == b.dtype and a.weak_type == b.weak_type
+        return jax.lax.select(condition, a, b) if same else where(condition, a, b)
+
+    return jax.tree.map(select, new, old)
 
 
 def is_concrete(*values) -> bool:

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from svkc._jax.control_flow import unvmap_any
 from svkc._jax.primitive import custom_primitive, undefined_primals
 from svkc._jax.pytrees import tree_where
+from svkc._jax.select import where
 from svkc.integration.ode import FieldArgs, ODEState
 from svkc.integration.runge_kutta import increment_bytes, recorded_step, step_and_tangent
 from svkc.integration.solution import PhaseProblem, PhaseSolution, StepperOptions, StepRecord
@@ -75,7 +76,7 @@ def _blocks(start: ODEState, step_grid, solution: PhaseSolution, options: Steppe
     )
     # Unused blocks get a finite state.
     states = jax.tree.map(
-        lambda s, c: jnp.where(used.reshape(-1, *(1,) * s.ndim), c, s[None]), start, states
+        lambda s, c: where(used.reshape(-1, *(1,) * s.ndim), c, s[None]), start, states
     )
     rest = count * interval + 1 - step_grid.shape[0]
     times = jnp.concatenate([step_grid, jnp.broadcast_to(step_grid[-1:], (rest,))])
@@ -115,7 +116,7 @@ def replay_tangents(
             last = jnp.minimum(first + interval, solution.accepted)
             in_block = used & (save_index > first) & (save_index <= last)
             step_index = jnp.clip(save_index - first - 1, 0, interval - 1)
-            save = lambda old, new: jnp.where(_broadcast_mask(in_block, old), new[step_index], old)
+            save = lambda old, new: where(_broadcast_mask(in_block, old), new[step_index], old)
             d_written = None if d_recorded is None else _write(d_recorded, d_increments, first)
             return tree_where(used, d_after, d_y), jax.tree.map(save, d_ys, d_steps), d_written
 
@@ -126,7 +127,7 @@ def replay_tangents(
         return jax.lax.scan(block, carry, (x, _records_of_blocks(solution.records, x[0], interval)))
 
     many_groups = lambda carry, x: jax.lax.scan(_skipped_if_unused(group), carry, x)
-    at_start = lambda d: jnp.where(_broadcast_mask(save_index == 0, d[None]), d[None], 0)
+    at_start = lambda d: where(_broadcast_mask(save_index == 0, d[None]), d[None], 0)
     d_recorded = None
     if with_increments and solution.records is not None:
         d_recorded = jax.tree.map(jnp.zeros_like, solution.records.increments)
@@ -136,7 +137,7 @@ def replay_tangents(
     )
     written = jnp.arange(1, count + 1, dtype=jnp.int32) * interval <= solution.accepted
     d_checkpoints = jax.tree.map(lambda d: d.reshape(-1, *d.shape[3:])[:count], d_after)
-    mask = lambda d: jnp.where(_broadcast_mask(written, d), d, 0)
+    mask = lambda d: where(_broadcast_mask(written, d), d, 0)
     return d_end, d_ys, jax.tree.map(mask, d_checkpoints), d_recorded
 
 

@@ -11,6 +11,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 
+from svkc._jax.select import where
 from svkc.integration.dense_output import make_interpolation
 from svkc.integration.event_location import EventInfo
 from svkc.integration.ode import FieldArgs, ODEState, Times
@@ -136,7 +137,7 @@ def _result_code(solution: diffrax.Solution, event: EventInfo | None):
     """Return the result code of a phase."""
     result = solution.result._value
     # `FixedSteps` reports a non-finite state as an internal error.
-    result = jnp.where(result == diffrax.RESULTS.internal_error._value, NON_FINITE, result)
+    result = where(result == diffrax.RESULTS.internal_error._value, NON_FINITE, result)
     if event is None:
         return result
-    return jnp.where((result == SUCCESSFUL) & event.occurred, EVENT, result)
+    return where((result == SUCCESSFUL) & event.occurred, EVENT, result)

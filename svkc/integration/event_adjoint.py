@@ -22,6 +22,7 @@ import jax.numpy as jnp
 
 from svkc._jax.primitive import custom_primitive, undefined_primals
 from svkc._jax.pytrees import materialise_zeros
+from svkc._jax.select import where
 from svkc.integration.event_location import EventInfo, vector_field_of
 from svkc.integration.ode import FieldArgs, ODEState
 from svkc.integration.vector_field import VectorField
@@ -62,7 +63,7 @@ def end_of_phase_tangent(
     if event is not None:
         changes = d_t, dy, d_field_args, d_guards
         dt_event = _event_time_tangent(event, (t_end, y_end, field_args, guards), changes, rate)
-        dt = jnp.where(event.occurred, dt_event, dt)
+        dt = where(event.occurred, dt_event, dt)
     return d_t + dt, jax.tree.map(lambda d, r: d + r * dt, dy, rate)
 
 
@@ -80,8 +81,8 @@ def _event_time_tangent(event: EventInfo, primals, tangents, rate: ODEState):
     change = materialise_zeros(*eqx.filter_jvp(guard, primals, tangents))
     fixed = event.jumps | ~event.occurred
     # The time of a grazing event has no derivative: NaN rather than a plausible number.
-    denominator = jnp.where(fixed, 1, jnp.where(event.grazing, jnp.nan, slope))
-    return jnp.where(fixed, 0, -change) / denominator
+    denominator = where(fixed, 1, where(event.grazing, jnp.nan, slope))
+    return where(fixed, 0, -change) / denominator
 
 
 def _end_of_phase(t, y: ODEState, stop_shift, field_args: FieldArgs, guards, event):

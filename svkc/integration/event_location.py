@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.pytrees import tree_where
+from svkc._jax.select import where
 from svkc.integration.ode import FieldArgs, ODEState
 from svkc.integration.vector_field import VectorField
 from svkc.model.annotations import Scalar
@@ -54,24 +55,24 @@ class Bracket(eqx.Module):
     def next_point(self) -> Float[Array, ""]:
         """Return the point of the next evaluation: the root of the secant, or the midpoint."""
         weight = self.fb - self.fa
-        secant = self.b - self.fb * (self.b - self.a) / jnp.where(weight == 0, 1, weight)
+        secant = self.b - self.fb * (self.b - self.a) / where(weight == 0, 1, weight)
         bisect = (self.count % 3 == 2) | (weight == 0)
-        c = jnp.where(bisect, self.a + (self.b - self.a) / 2, secant)
+        c = where(bisect, self.a + (self.b - self.a) / 2, secant)
         return jnp.clip(c, self.a + self.tol / 4, self.b - self.tol / 4)
 
     def update(self, c: Float[Array, ""], fc: Float[Array, ""]) -> "Bracket":
         """Return the bracket shrunk by the value fc of the function at c."""
         right = fc >= 0
         # Illinois rule: halve the value at an end that has not moved twice in a row.
-        fa = jnp.where(right & (self.last_side == 1), self.fa / 2, self.fa)
-        fb = jnp.where(~right & (self.last_side == -1), self.fb / 2, self.fb)
+        fa = where(right & (self.last_side == 1), self.fa / 2, self.fa)
+        fb = where(~right & (self.last_side == -1), self.fb / 2, self.fb)
         return Bracket(
-            a=jnp.where(right, self.a, c),
-            b=jnp.where(right, c, self.b),
-            fa=jnp.where(right, fa, fc),
-            fb=jnp.where(right, fc, fb),
+            a=where(right, self.a, c),
+            b=where(right, c, self.b),
+            fa=where(right, fa, fc),
+            fb=where(right, fc, fb),
             tol=self.tol,
-            last_side=jnp.where(right, 1, -1).astype(jnp.int32),
+            last_side=where(right, 1, -1).astype(jnp.int32),
             count=self.count + 1,
         )
 
@@ -216,8 +217,8 @@ class EventSearch(eqx.Module):
         tnext: end of the next step if there is neither a search nor a shorter step to take.
         """
         b = self.bracket.b
-        locate = jnp.where(self.narrowing, self.bracket.next_point(), b + event_tolerance(b))
-        return jnp.where(self.active, locate, jnp.minimum(tnext, self.retry_time))
+        locate = where(self.narrowing, self.bracket.next_point(), b + event_tolerance(b))
+        return where(self.active, locate, jnp.minimum(tnext, self.retry_time))
 
 
 def update_search(
@@ -246,10 +247,10 @@ def update_search(
     crossed = armed_guards.evaluate.plan.crossed(before, values)
     crossed = crossed & armed_guards.armed & keep_step & ~old.active
     starts = jnp.any(crossed)
-    new_sides = jnp.where(crossed, jnp.where(values >= before, 1, -1), 0).astype(values.dtype)
-    sides = jnp.where(starts, new_sides, old.sides)
+    new_sides = where(crossed, where(values >= before, 1, -1), 0).astype(values.dtype)
+    sides = where(starts, new_sides, old.sides)
     # The largest of `sides * x` is negative until the first of these guards crosses zero.
-    f0, f1 = (jnp.max(jnp.where(sides != 0, sides * x, -jnp.inf)) for x in (before, values))
+    f0, f1 = (jnp.max(where(sides != 0, sides * x, -jnp.inf)) for x in (before, values))
     bracket = tree_where(old.narrowing, old.bracket.update(t1, f1), old.bracket)
     bracket = tree_where(starts, Bracket.around(t0, t1, f0, f1), bracket)
     at_right_end = starts | (old.narrowing & (f1 >= 0))
@@ -257,19 +258,19 @@ def update_search(
     done = old.active & ~old.narrowing
     active = starts | (old.active & ~done)
     search = EventSearch(
-        step_size=jnp.where(starts, t1 - t0, old.step_size),
+        step_size=where(starts, t1 - t0, old.step_size),
         sides=sides,
-        magnitudes=jnp.where(starts, magnitudes, old.magnitudes),
+        magnitudes=where(starts, magnitudes, old.magnitudes),
         bracket=bracket,
         y=tree_where(at_right_end, y, old.y),
-        values=jnp.where(at_right_end, values, old.values),
-        values_after=jnp.where(done, values, old.values_after),
+        values=where(at_right_end, values, old.values),
+        values_after=where(done, values, old.values_after),
         active=active,
         narrowing=active & bracket.not_converged(),
         done=done,
         retry_time=retry_time,
     )
-    return jnp.where(done, search.values, values), search
+    return where(done, search.values, values), search
 
 
 def event_info(
@@ -280,19 +281,18 @@ def event_info(
     guard_values: values of the guards at t.
     """
     crossed, beyond = search.sides != 0, search.sides * search.values
-    first = jnp.argmax(jnp.where(crossed, beyond, -jnp.inf)).astype(jnp.int32)
+    first = jnp.argmax(where(crossed, beyond, -jnp.inf)).astype(jnp.int32)
     crossed_after = crossed & (search.sides * search.values_after >= 0)
     fired = crossed_after | (jnp.arange(crossed.shape[0], dtype=jnp.int32) == first)
     fired = fired & search.done
-    value = jnp.abs(beyond[first])
+    value, threshold = jnp.abs(beyond[first]), GRAZING_THRESHOLD * search.magnitudes[first]
     change = jnp.abs(search.values_after - search.values)[first]
-    threshold = GRAZING_THRESHOLD * search.magnitudes[first]
     jumps = search.done & (value > change) & (value > threshold)
     change_in_step = change / event_tolerance(t) * search.step_size
     return EventInfo(
         fired=fired,
         # A guard at zero is not armed until it has left zero.
-        values=jnp.where(fired, 0, guard_values),
+        values=where(fired, 0, guard_values),
         first=first,
         occurred=search.done,
         jumps=jumps,

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.pytrees import tree_where
+from svkc._jax.select import where
 from svkc.integration.dense_output import ProjectedInterpolation
 from svkc.integration.event_location import (
     EventSearch,
@@ -103,7 +104,7 @@ class GuardScan(eqx.Module):
 
     def next_point(self) -> Float[Array, ""]:
         """Return the point of the next evaluation: the interval's right end, then its midpoint."""
-        return jnp.where(self.has_right, (self.left + self.right) / 2, self.right)
+        return where(self.has_right, (self.left + self.right) / 2, self.right)
 
     def update(self, values: Guards, armed: Bool[Array, " guards"], intervals: int) -> "GuardScan":
         """Return the scan after an evaluation at `next_point`.
@@ -111,7 +112,7 @@ class GuardScan(eqx.Module):
         values: guards at this point.
         armed: mask of the guards that may end the phase.
         """
-        point, at_right = self.next_point(), jnp.where(self.has_right, self.at_right, values)
+        point, at_right = self.next_point(), where(self.has_right, self.at_right, values)
         width = self.right - self.left
         hides = armed & _may_hide_crossings(
             (self.at_left, values, at_right), width, self.round_off()
@@ -127,9 +128,9 @@ class GuardScan(eqx.Module):
         next_width = jnp.minimum(2 * width, 1 / intervals)
         next_right = self.right + next_width
         is_last = next_right + next_width / 2 > 1
-        next_right = jnp.where(is_last, 1, next_right)
-        choose = lambda advanced, halved, backed, same: jnp.where(
-            advance, advanced, jnp.where(halve, halved, jnp.where(back, backed, same))
+        next_right = where(is_last, 1, next_right)
+        choose = lambda advanced, halved, backed, same: where(
+            advance, advanced, where(halve, halved, where(back, backed, same))
         )
         left, right, at_left = self.left, self.right, self.at_left
         return dataclasses.replace(
@@ -140,7 +141,7 @@ class GuardScan(eqx.Module):
             at_right=choose(self.at_end, values, at_left, at_right),
             middle=choose(point, self.middle, self.middle, self.middle),
             at_middle=choose(values, self.at_middle, self.at_middle, self.at_middle),
-            has_right=jnp.where(advance, is_last, True),
+            has_right=where(advance, is_last, True),
             count=self.count + 1,
             done=advance & (right >= 1),
         )
@@ -152,7 +153,7 @@ class GuardScan(eqx.Module):
         `left` shows the kink. values: of the guards at `point`, the midpoint of this interval.
         """
         width = self.left - self.middle
-        slope = (self.at_left - self.at_middle) / jnp.where(width == 0, 1, width)
+        slope = (self.at_left - self.at_middle) / where(width == 0, 1, width)
         bend = jnp.abs((values - self.at_left) / (point - self.left) - slope) * width
         near = jnp.minimum(jnp.abs(self.at_middle), jnp.abs(self.at_left))
         one_sign = (self.at_middle * self.at_left > 0) & (self.at_left * values > 0)
@@ -167,15 +168,13 @@ class GuardScan(eqx.Module):
     def _count_changes(self, values, point, active) -> "GuardScan":
         """Return the scan with changes of sign at a point counted where `active` holds."""
         beyond = (point >= 1) | (jnp.abs(values) > self.round_off())
-        signs = jnp.where(beyond & active, _signs(values), 0)
+        signs = where(beyond & active, _signs(values), 0)
         changed = (signs != 0) & (signs != self.sides)
         return dataclasses.replace(
             self,
-            sides=jnp.where(changed, signs, self.sides),
+            sides=where(changed, signs, self.sides),
             changes=self.changes + changed.astype(jnp.int32),
-            first_change=jnp.where(
-                changed, jnp.minimum(self.first_change, point), self.first_change
-            ),
+            first_change=where(changed, jnp.minimum(self.first_change, point), self.first_change),
         )
 
 
@@ -207,8 +206,8 @@ def _may_hide_crossings(values, width, round_off) -> Bool[Array, " guards"]:
         & (bend < jnp.minimum(jnp.abs(rise), jnp.abs(rise_after)))
         & (width <= CROSSING_INTERVAL)
     )
-    least = jnp.min(jnp.where(values == 0, jnp.inf, jnp.abs(values)), 0)
-    return jnp.where(changes_sign, ~monotonic, (least < 2 * bend) & (bend > round_off))
+    least = jnp.min(where(values == 0, jnp.inf, jnp.abs(values)), 0)
+    return where(changes_sign, ~monotonic, (least < 2 * bend) & (bend > round_off))
 
 
 def _scan_step(
@@ -236,10 +235,10 @@ def _scan_step(
 
     def body_fun(scan: GuardScan):
         at_end, point = scan.count == 0, scan.next_point()
-        t = jnp.where(at_end, t1, s.t + point * (t1 - s.t))
+        t = where(at_end, t1, s.t + point * (t1 - s.t))
         y = tree_where(at_end, attempt.y, _state_within(interpolation, t, field_args.chain))
         values = guards.evaluate(t, y, field_args)
-        values = jnp.where((before == 0) & (jnp.abs(values) < round_off), 0, values)
+        values = where((before == 0) & (jnp.abs(values) < round_off), 0, values)
         start = GuardScan.from_end(before, values, intervals)
         return tree_where(at_end, start, scan.update(values, guards.armed, intervals))
 
@@ -275,7 +274,7 @@ def locate_event(
     scan = _scan_step(s, attempt, t1, problem, options)
     is_nan = attempt.keep_step & jnp.any(jnp.isnan(scan.at_end))
     several = options.armed_guards.armed & (scan.changes > 1)
-    first = jnp.min(jnp.where(several, scan.first_change, jnp.inf))
+    first = jnp.min(where(several, scan.first_change, jnp.inf))
     shorter = s.t + first * (t1 - s.t)
     # Crossings closer than simultaneous events are not separated.
     divide = (first < 1) & (shorter - s.t > event_tolerance(s.t)) & ~is_nan
@@ -287,7 +286,7 @@ def locate_event(
         t1=t1,
         y=attempt.y,
         keep_step=attempt.keep_step & ~divide,
-        retry_time=jnp.where(divide, shorter, jnp.inf),
+        retry_time=where(divide, shorter, jnp.inf),
         armed_guards=options.armed_guards,
     )
     locating = s.search.active | search.active
@@ -295,6 +294,6 @@ def locate_event(
     advance = (attempt.keep_step & ~is_nan & ~locating & ~divide) | land
     hold = (locating | divide | (jnp.isfinite(s.search.retry_time) & advance)) & ~is_nan
     t, y = tree_where(land, (search.bracket.b, search.y), (attempt.t, attempt.y))
-    result = jnp.where(is_nan, NON_FINITE, attempt.result)
+    result = where(is_nan, NON_FINITE, attempt.result)
     attempt = dataclasses.replace(attempt, t=t, y=y, keep_step=advance, result=result)
     return attempt, guard_values, search, hold

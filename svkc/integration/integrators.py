@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from svkc._jax.lanes_last import with_lanes_last
 from svkc._jax.one_kernel import one_kernel
+from svkc._jax.select import where
 from svkc.loops.constrained_dynamics import ArticulatedBodies
 from svkc.loops.forward_dynamics import velocity_and_acceleration
 from svkc.model.annotations import Checked, Torques
@@ -55,7 +56,7 @@ class RodriguesEuler(diffrax.AbstractSolver[Any]):
         if y0.work is not None:
             y1 = eqx.tree_at(lambda y: y.work, y1, y0.work + dt * rate.work)
         active = active_dofs(args.chain, args.structure)
-        v = jnp.where(active, self._position_velocity(y0.v, y1.v), 0)
+        v = where(active, self._position_velocity(y0.v, y1.v), 0)
         y1 = eqx.tree_at(lambda y: y.q, y1, integrate(args.chain, y0.q, dt * v))
         return y1, None, {"y0": y0, "y1": y1}, None, diffrax.RESULTS.successful
 
@@ -177,7 +178,7 @@ def _step(
     )
     v = v + dt * vdot
     return State(
-        integrate(chain, state.q, dt * jnp.where(active_dofs(chain, state.structure), v, 0)),
+        integrate(chain, state.q, dt * where(active_dofs(chain, state.structure), v, 0)),
         v,
         state.structure,
     )

@@ -5,6 +5,7 @@ import dataclasses
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
+from svkc._jax.select import where
 from svkc.integration.solution import PhaseProblem, StepAttempt, StepperState
 from svkc.loops.pivoting import singularity_threshold
 
@@ -41,6 +42,6 @@ def redone_if_near(
     # false for NaN
     away = margin > singularity_threshold(structure)
     redo = ~s.near & ~(away & attempt.closed)
-    near = jnp.where(s.near, ~(attempt.keep_step & away), redo)
+    near = where(s.near, ~(attempt.keep_step & away), redo)
     keep_step = attempt.keep_step & ~redo
     return dataclasses.replace(attempt, keep_step=keep_step), near, redo

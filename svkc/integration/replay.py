@@ -18,6 +18,7 @@ import jax.numpy as jnp
 
 from svkc._jax.primitive import custom_primitive
 from svkc._jax.pytrees import materialise_zeros, stop_gradient_tree
+from svkc._jax.select import where
 from svkc.integration.block_tangents import record_capacity, replay_tangents, with_rows_at
 from svkc.integration.event_adjoint import end_of_phase_tangent, transport_tangent
 from svkc.integration.integrate import integrate_phase
@@ -62,7 +63,7 @@ def _step_grid(t0, save_ts, solution: PhaseSolution):
     times = jnp.concatenate([t0[None], solution.step_ts])
     save_index = jnp.searchsorted(times, save_ts).astype(jnp.int32)
     unused = jnp.arange(times.shape[0], dtype=jnp.int32) > solution.accepted
-    return jnp.where(unused, times[solution.accepted], times), save_index
+    return where(unused, times[solution.accepted], times), save_index
 
 
 def _integrate(start: ODEState, times, problem: PhaseProblem, options: StepperOptions, guards):
@@ -114,8 +115,8 @@ def _integrate_jvp(primals, tangents, *, with_records: bool):
         solution = dataclasses.replace(solution, records=None)
     d_solution = _solution_tangent(solution, (d_y, d_ys, d_checkpoints), d_increments)
     at_scheduled_end = solution.result == SUCCESSFUL
-    stop_shift = jnp.where(at_scheduled_end, stop - solution.t, 0)
-    d_stop_shift = None if d_stop is None else jnp.where(at_scheduled_end, d_stop, 0)
+    stop_shift = where(at_scheduled_end, stop - solution.t, 0)
+    d_stop_shift = None if d_stop is None else where(at_scheduled_end, d_stop, 0)
     event = stop_gradient_tree(solution.event)
     d_end = end_of_phase_tangent(
         (solution.t, solution.y, stop_shift, problem.field_args, guards, event),

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from svkc._jax.one_kernel import one_kernel
+from svkc._jax.select import where
 from svkc.integration.ode import FieldArgs, ODEState
 from svkc.integration.solution import PhaseProblem, StepRecord
 from svkc.integration.vector_field import VectorField, project_state
@@ -199,7 +200,7 @@ def _scan_stages(tableau: diffrax.ButcherTableau, stage, times, y: ODEState) -> 
     def body(increments, x):
         weights, fraction, is_row = x
         k = stage(t0 + fraction * (t1 - t0), weights, increments)
-        write = lambda ks, k: jnp.where(is_row.reshape(-1, *(1,) * k.ndim), (t1 - t0) * k, ks)
+        write = lambda ks, k: where(is_row.reshape(-1, *(1,) * k.ndim), (t1 - t0) * k, ks)
         return jax.tree.map(write, increments, k), None
 
     zeros = jax.tree.map(lambda y: jnp.zeros((count, *y.shape), y.dtype), y)

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from svkc._jax.select import where
 from svkc.integration.dense_output import ProjectedInterpolation
 from svkc.integration.event_location import ArmedGuards, EventInfo, EventSearch
 from svkc.integration.ode import FieldArgs, ODEState
@@ -223,7 +224,7 @@ def update_stats(
     old, keep_step, info = s.stats, attempt.keep_step, attempt.projection_info
     margin, swaps, loop, gap = old.margin, old.swaps, old.loop, old.gap
     if info is not None and info.margin is not None:
-        margin = jnp.where(keep_step, jnp.minimum(margin, info.margin), margin)
+        margin = where(keep_step, jnp.minimum(margin, info.margin), margin)
     if info is not None and info.pivots is not None:
         assert s.projection_info is not None
         dependent = s.projection_info.dependent
@@ -232,12 +233,12 @@ def update_stats(
         swaps = swaps + (keep_step & swapped).astype(jnp.int32)
     if info is not None:
         widest = jnp.argmax(jnp.max(info.gap, 1)).astype(jnp.int32)
-        loop = jnp.where(result == LOOP_OPEN, widest, loop)
+        loop = where(result == LOOP_OPEN, widest, loop)
     if len(field_args.chain.link_names):
-        gap = jnp.where(keep_step, jnp.maximum(gap, _max_gaps(attempt, field_args)), gap)
+        gap = where(keep_step, jnp.maximum(gap, _max_gaps(attempt, field_args)), gap)
     return Stats(
         attempts=old.attempts + 1,
-        error=old.error + jnp.where(keep_step, attempt.error_norm, 0),
+        error=old.error + where(keep_step, attempt.error_norm, 0),
         margin=margin,
         swaps=swaps,
         loop=loop,

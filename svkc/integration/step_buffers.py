@@ -4,40 +4,38 @@ import jax
 import jax.numpy as jnp
 
 from svkc._jax.control_flow import buffer_at_set
+from svkc._jax.select import where
 from svkc.integration.ode import ODEState
-from svkc.integration.solution import PhaseProblem, StepAttempt, StepperState, StepRecord
+from svkc.integration.solution import StepperState, StepRecord
 
 
 def write_states(
-    s: StepperState, attempt: StepAttempt, t, save_ts, accepted, interval: int
+    s: StepperState, after: StepperState, save_ts, interval: int
 ) -> tuple[ODEState, ODEState]:
     """Write the state after an attempt into the saved states and the checkpoints it belongs to.
 
-    t, accepted: time and number of accepted steps after the attempt.
+    s, after: states of the loop before and after the attempt.
     interval: number of steps between checkpoints.
     """
-    ys, checkpoints = s.ys, s.checkpoints
+    ys, checkpoints, kept = s.ys, s.checkpoints, after.accepted > s.accepted
     if save_ts.shape[0]:
-        i = jnp.minimum(jnp.sum(save_ts < t, dtype=jnp.int32), save_ts.shape[0] - 1)
-        ys = write_row(ys, i, attempt.y, attempt.keep_step & (save_ts[i] == t))
+        i = jnp.minimum(jnp.sum(save_ts < after.t, dtype=jnp.int32), save_ts.shape[0] - 1)
+        ys = write_row(ys, i, after.y, kept & (save_ts[i] == after.t))
     if checkpoints.q.shape[0]:
-        is_checkpoint = attempt.keep_step & (accepted % interval == 0)
-        checkpoints = write_row(checkpoints, accepted // interval - 1, attempt.y, is_checkpoint)
+        is_checkpoint = kept & (after.accepted % interval == 0)
+        checkpoints = write_row(checkpoints, after.accepted // interval - 1, after.y, is_checkpoint)
     return ys, checkpoints
 
 
-def write_record(
-    s: StepperState, attempt: StepAttempt, problem: PhaseProblem, capacity: int
-) -> StepRecord | None:
-    """Write the record of an attempt that is kept, if there is room for it."""
+def write_record(s: StepperState, record: StepRecord, kept, capacity: int) -> StepRecord | None:
+    """Write the record of a step that is kept, if there is room for it."""
     if s.records is None:
         return None
-    record = StepRecord(attempt.increments, problem.field_args.row_choice)
-    return write_row(s.records, s.accepted, record, attempt.keep_step & (s.accepted < capacity))
+    return write_row(s.records, s.accepted, record, kept & (s.accepted < capacity))
 
 
 def write_row(rows, i, row, pred):
     """Write a row at index i in place where `pred` holds."""
     # The index of a row that is not written may be out of bounds.
-    i = jnp.where(pred, i, 0)
+    i = where(pred, i, 0)
     return jax.tree.map(lambda x, b: buffer_at_set(b, i, x, pred=pred), row, rows)

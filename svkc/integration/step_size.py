@@ -7,6 +7,7 @@ import diffrax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from svkc._jax.select import where
 from svkc.integration.ode import Times, is_finite
 
 # A step is stretched by up to this fraction of its length if it then ends at a save time.
@@ -31,9 +32,9 @@ class FixedSteps(diffrax.AbstractStepSizeController[None, Any]):
 
     def _tnext(self, t):
         """Return the end of the step from t."""
-        times = jnp.where(self.ts > t, self.ts, jnp.inf)
+        times = where(self.ts > t, self.ts, jnp.inf)
         stop = jnp.min(times, initial=jnp.inf)
-        return jnp.where(t + self.dt * (1 + MAX_STRETCH) >= stop, stop, t + self.dt)
+        return where(t + self.dt * (1 + MAX_STRETCH) >= stop, stop, t + self.dt)
 
     def init(
         self,
@@ -63,7 +64,7 @@ class FixedSteps(diffrax.AbstractStepSizeController[None, Any]):
         result = diffrax.RESULTS.where(
             keep_step, diffrax.RESULTS.successful, diffrax.RESULTS.internal_error
         )
-        next_t0 = jnp.where(keep_step, t1, t0)
+        next_t0 = where(keep_step, t1, t0)
         return keep_step, next_t0, self._tnext(t1), False, controller_state, result
 
 
@@ -88,8 +89,8 @@ class LimitedPIDController(diffrax.PIDController):
             t0, t1, y0, y1_candidate, args, y_error, error_order=error_order, controller_state=state
         )
         # the size proposed by the rejection, as a save time may have clipped the step since
-        next_t1 = jnp.where(keep_step, jnp.minimum(next_t1, next_t0 + longest), next_t1)
-        longest = jnp.where(keep_step, jnp.inf, next_t1 - next_t0)
+        next_t1 = where(keep_step, jnp.minimum(next_t1, next_t0 + longest), next_t1)
+        longest = where(keep_step, jnp.inf, next_t1 - next_t0)
         return keep_step, next_t0, next_t1, made_jump, (state, longest), result
 
 
@@ -106,9 +107,9 @@ def clip_step(
     _, stop, save_ts = times
     if max_step is not None:
         proposed = jnp.minimum(proposed, t + max_step / (1 + MAX_STRETCH))
-    next_save_t = jnp.min(jnp.where(save_ts > t, save_ts, jnp.inf), initial=jnp.inf)
+    next_save_t = jnp.min(where(save_ts > t, save_ts, jnp.inf), initial=jnp.inf)
     limit = jnp.minimum(stop, next_save_t)
-    return jnp.where(t + (proposed - t) * (1 + MAX_STRETCH) >= limit, limit, proposed)
+    return where(t + (proposed - t) * (1 + MAX_STRETCH) >= limit, limit, proposed)
 
 
 def unclipped_step_size(
@@ -131,4 +132,4 @@ def unclipped_step_size(
     if not isinstance(controller, diffrax.PIDController):
         return proposed
     at_bound = keep_step & (proposed >= 0.99 * controller.factormax * taken)
-    return jnp.where(at_bound, jnp.maximum(proposed, before), proposed)
+    return where(at_bound, jnp.maximum(proposed, before), proposed)

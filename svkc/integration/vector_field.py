@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from svkc._jax.one_kernel import one_kernel
+from svkc._jax.select import where
 from svkc.integration.ode import FieldArgs, ODEState
 from svkc.integration.stabilization import (
     AbstractStabilization,
@@ -62,6 +63,8 @@ class VectorField(eqx.Module):
     def __call__(self, t: Scalar, y: ODEState, field_args: FieldArgs) -> ODEState:
         if isinstance(self.stabilization, CoordinatePartitioning):
             y, _ = eqx.filter_checkpoint(project_state)(self, field_args, y)
+        if self.control is None:
+            return _rates_without_control(self, t, y, field_args)
         tau, power = _torques(self, t, y, field_args)
         return _rates(self, y, field_args, tau, power)
 
@@ -96,7 +99,7 @@ class VectorField(eqx.Module):
             at_limits = limit_forces(chain, y.q, y.v)
         if y.work is None:
             return tau + at_limits, None
-        v = jnp.where(active_dofs(chain, field_args.structure), y.v, 0)
+        v = where(active_dofs(chain, field_args.structure), y.v, 0)
         of_dampers = jnp.zeros_like(v) if chain.damping is None else -chain.damping * v
         return tau + at_limits, jnp.stack([tau, of_dampers, at_limits]) @ v
 
@@ -110,9 +113,7 @@ def _torques(
     return field.torques(t, y, field_args)
 
 
-@one_kernel
-@eqx.filter_checkpoint
-def _rates(
+def _rates_of_motion(
     field: VectorField,
     y: ODEState,
     field_args: FieldArgs,
@@ -141,8 +142,20 @@ def _rates(
             pivots=field_args.pivots,
             choice=field_args.row_choice,
         )
-    qdot = configuration_derivative(chain, y.q, jnp.where(active_dofs(chain, structure), v, 0))
+    qdot = configuration_derivative(chain, y.q, where(active_dofs(chain, structure), v, 0))
     return ODEState(qdot, vdot, power)
+
+
+_rates = one_kernel(eqx.filter_checkpoint(_rates_of_motion))
+
+
+@one_kernel
+@eqx.filter_checkpoint
+def _rates_without_control(
+    field: VectorField, t: Scalar, y: ODEState, field_args: FieldArgs
+) -> ODEState:
+    """Return dy/dt where no control acts."""
+    return _rates_of_motion(field, y, field_args, *field.torques(t, y, field_args))
 
 
 def _control_torques(chain: Chain, value, dtype) -> Float[Array, " dofs"]:

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from svkc._jax.batched_lapack import solve_general
 from svkc._jax.eager import eager_jit
 from svkc._jax.pytrees import is_concrete
+from svkc._jax.select import where
 from svkc.loops.constraint import jacobian_scales, loop_kinematics
 from svkc.loops.coordinates import closed_coordinates, open_coordinates
 from svkc.loops.forward_dynamics import constraint_forces
@@ -192,9 +193,9 @@ def _null_space_basis(
     qr, rank = pivoted_qr_with_rank(B) if rank is None else (pivoted_qr(B, rank), rank)
     P = qr.P
     Bm = qr.Q @ B
-    R = Bm @ P.T + jnp.diag(jnp.where(qr.active, 0, 1).astype(B.dtype))
+    R = Bm @ P.T + jnp.diag(where(qr.active, 0, 1).astype(B.dtype))
     null_space = jnp.eye(B.shape[1], dtype=B.dtype) - P.T @ solve_general(R, Bm)
-    return qr, rank, jnp.where(jnp.any(P > 0, 0)[None], 0, null_space)
+    return qr, rank, where(jnp.any(P > 0, 0)[None], 0, null_space)
 
 
 @eager_jit
@@ -203,21 +204,21 @@ def solve_unbounded(chain: Chain, state: State, vdot_G, weight, actuated: Bool[A
     nv = chain.nv
     co, kin, V = _coordinates_and_twists(chain, state)
     _, column = jacobian_scales(chain)
-    vdot = co.W @ jnp.where(co.independent, vdot_G, 0) + co.bias
+    vdot = co.W @ where(co.independent, vdot_G, 0) + co.bias
     forces = pad_to_dofs(chain, rnea(chain, kin, V, state.v, vdot[:nv])) - passive_forces(
         chain, state.q, state.v
     )
     target_force = co.W.T @ forces
     # dimensionless, scaled as the columns of J_C
-    S = jnp.where(actuated[:, None], co.W, 0)
+    S = where(actuated[:, None], co.W, 0)
     B = column[:, None] * S.T / column[None]
     # the null spaces of S^T and of S, which have the same size, by one compiled function
     both, ranks, bases = jax.lax.map(_null_space_basis, jnp.stack([B, B.T]))
     qr, rank, null = jax.tree.map(lambda x: x[0], (both, ranks, bases))
     y = least_cost_solution(qr, B, column * target_force, weight / column**2)
-    null = column[:, None] ** -1 * jnp.where(actuated[None], null, 0)
+    null = column[:, None] ** -1 * where(actuated[None], null, 0)
     reachable = actuated & jnp.any(co.W != 0, 1)
-    undriven = co.W @ (column[:, None] * jnp.where(co.independent[None], bases[1], 0))
+    undriven = co.W @ (column[:, None] * where(co.independent[None], bases[1], 0))
     if len(chain.link_names):
         wrenches = jax.vmap(
             lambda tau: constraint_forces(chain, co.selection, co.J, tau), in_axes=1, out_axes=-1
@@ -225,9 +226,7 @@ def solve_unbounded(chain: Chain, state: State, vdot_G, weight, actuated: Bool[A
         _, _, stress = _null_space_basis(co.J.T, state.structure.rank)
         row, _ = jacobian_scales(chain)
         connected_rows = jnp.repeat(state.structure.connected, 6)
-        stress = jnp.where(connected_rows[None], row[:, None] * stress, 0).reshape(
-            -1, 6, row.shape[0]
-        )
+        stress = where(connected_rows[None], row[:, None] * stress, 0).reshape(-1, 6, row.shape[0])
     else:
         wrenches, stress = jnp.zeros((0, 6, chain.dofs), y.dtype), jnp.zeros((0, 6, 0), y.dtype)
     count = lambda mask: jnp.sum(mask, dtype=jnp.int32)

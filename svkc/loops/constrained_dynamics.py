@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from svkc._jax.batched_lapack import batched_solve_triangular, cholesky_solver
+from svkc._jax.select import where
 from svkc.loops.constraint import LoopKinematics, jacobian_scales, loop_rates_by_twists
 from svkc.loops.constraint_rows import constraint_rows
 from svkc.loops.coordinates import Coordinates, partition_coordinates
@@ -29,7 +30,7 @@ def reduced_mass_matrix(
 ) -> Float[Array, "dofs dofs"]:
     """Return A = W^T M W (paper (23)), with ones on the diagonal of other coordinates."""
     W = co.W[: chain.nv]
-    return W.T @ (M @ W) + jnp.diag(jnp.where(co.independent, 0, 1).astype(M.dtype))
+    return W.T @ (M @ W) + jnp.diag(where(co.independent, 0, 1).astype(M.dtype))
 
 
 class AbstractDynamics(eqx.Module):
@@ -102,7 +103,7 @@ class ArticulatedBodies(AbstractDynamics):
         )
         solve = loop_force_solver(
             *chain_and_kin,
-            jnp.where(active[None], J / column[None], 0),
+            where(active[None], J / column[None], 0),
             rows,
             None if locked is None else active[: chain.nv],
         )
@@ -141,7 +142,7 @@ class AbstractMassMatrix(AbstractDynamics):
         M = self.mass_matrix(*jax.lax.stop_gradient((chain, kin)))
         if structure.locked is not None:
             free = ~structure.locked
-            M = jnp.where(free[:, None] & free[None], M, jnp.eye(chain.nv, dtype=M.dtype))
+            M = where(free[:, None] & free[None], M, jnp.eye(chain.nv, dtype=M.dtype))
         return _implicit_open_solve(chain, structure, kin, cholesky_solver(M))
 
 
@@ -237,14 +238,14 @@ def _implicit_solve(
 
     def equations(unknown):
         x, mu = unknown
-        active_x = jnp.where(active, x, 0)
+        active_x = where(active, x, 0)
         inertial = pad_to_dofs(chain, mass_matrix_product(chain, loops.kin, active_x[: chain.nv]))
         (transmitted,) = jax.linear_transpose(rates, x)(mu)
-        force = jnp.where(active, inertial + transmitted, x)
-        return force, rates(active_x) + jnp.where(active_rows, 0, mu)
+        force = where(active, inertial + transmitted, x)
+        return force, rates(active_x) + where(active_rows, 0, mu)
 
     def solve(force: Float[Array, " dofs"], bias: Float[Array, " rows"]) -> Float[Array, " dofs"]:
-        right_sides = _link_tangents(jnp.where(active, force, 0), -select_rows(bias))
+        right_sides = _link_tangents(where(active, force, 0), -select_rows(bias))
         return jax.lax.custom_linear_solve(
             equations, right_sides, solve=lambda _, sides: factor_solve(*sides), symmetric=True
         )[0]
@@ -274,7 +275,7 @@ def _solve_by_partitioning(
         x = column * (qr.P.T @ batched_solve_triangular(JS, loop_bias))
         x = x + W @ A_inverse(W.T @ (force - pad_to_dofs(chain, M @ x[:nv])))
         rest = qr.P @ (column * (force - pad_to_dofs(chain, M @ x[:nv])))
-        return x, jnp.where(qr.active, batched_solve_triangular(JS, rest, trans=True), loop_bias)
+        return x, where(qr.active, batched_solve_triangular(JS, rest, trans=True), loop_bias)
 
     return solve
 
@@ -287,14 +288,11 @@ def _implicit_open_solve(
     free = jnp.ones(chain.nv, bool) if locked is None else ~locked
 
     def equations(x):
-        return jnp.where(free, mass_matrix_product(chain, kin, jnp.where(free, x, 0)), x)
+        return where(free, mass_matrix_product(chain, kin, where(free, x, 0)), x)
 
     def solve(force: Float[Array, " nv"]) -> Float[Array, " nv"]:
         return jax.lax.custom_linear_solve(
-            equations,
-            jnp.where(free, force, 0),
-            solve=lambda _, x: factor_solve(x),
-            symmetric=True,
+            equations, where(free, force, 0), solve=lambda _, x: factor_solve(x), symmetric=True
         )
 
     return solve

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from svkc._jax.dynamic_gather import take_rows
 from svkc._jax.pytrees import only_leaves
+from svkc._jax.select import where
 from svkc._jax.static_gather import static_take
 from svkc.loops.frames import LoopFrames, frame_gaps, loop_frames
 from svkc.model.annotations import DType, Scalar
@@ -36,7 +37,7 @@ def _virtual_motion_subspaces(
     rotations = jnp.concatenate([frames.axes[:, :3], zero], -1)
     slides = jnp.concatenate([zero, frames.axes[:, 3:]], -1)
     S = jnp.concatenate([rotations, slides], 1)
-    return jnp.where((structure.connected[:, None] & structure.freedoms)[:, :, None], S, 0)
+    return where((structure.connected[:, None] & structure.freedoms)[:, :, None], S, 0)
 
 
 def assemble_loop_jacobian(
@@ -51,7 +52,7 @@ def assemble_loop_jacobian(
     sign = above[structure.parent].astype(kin.r.dtype) - above[structure.real].astype(kin.r.dtype)
     # the joint's position from the root of each coordinate's tree
     of_parent = above[structure.parent][:, :, None]
-    position = jnp.where(
+    position = where(
         of_parent, frames.from_parent_root[:, None, :], frames.real_position[:, None, :]
     )
     tree = sign[:, :, None] * shift_motion(kin.S[None], position)
@@ -64,7 +65,7 @@ def assemble_loop_jacobian(
     virtual = static_take(S.reshape(-1, 6), source[:, top.nv : top.dofs])
     J = jnp.concatenate([tree, virtual], 1)
     active = structure.connected[:, None, None] & active_dofs(chain, structure)[None, :, None]
-    J = jnp.where(active, J, 0)
+    J = where(active, J, 0)
     return jnp.swapaxes(J, 1, 2).reshape(-1, top.dofs)
 
 
@@ -82,7 +83,7 @@ def loop_jacobian_dot_v(
     V: twists of the tree. A: spatial accelerations of the tree with vdot = 0.
     """
     top = chain.topology
-    rate = jnp.where(
+    rate = where(
         structure.connected[:, None] & structure.freedoms, static_take(v, top.links.dof), 0
     )
     parts = _virtual_motion_subspaces(chain, structure, frames) * rate[:, :, None]
@@ -96,10 +97,10 @@ def loop_jacobian_dot_v(
     is_ball = np.array([sum(f[:3]) == 3 for f in top.link_freedoms], bool)[:, None]
     x, y, z = parts[:, 0], parts[:, 1], parts[:, 2]
     moved_axes = motion_cross(x, y + z) + motion_cross(y, z)
-    bias = bias + jnp.where(is_ball, 0, moved_axes)
+    bias = bias + where(is_ball, 0, moved_axes)
     A_virtual = shift_motion(at_parent[:, 6:], frames.from_parent_root) + bias
     A_real = shift_motion(at_real[:, 6:], frames.real_position)
-    return jnp.where(structure.connected[:, None], A_virtual - A_real, 0).reshape(-1)
+    return where(structure.connected[:, None], A_virtual - A_real, 0).reshape(-1)
 
 
 def jacobian_scales(chain: Chain) -> tuple[Float[Array, " rows"], Float[Array, " dofs"]]:
@@ -108,14 +109,14 @@ def jacobian_scales(chain: Chain) -> tuple[Float[Array, " rows"], Float[Array, "
     They are 1 / chain.length for linear rows, chain.length for columns of slides, and 1 otherwise.
     """
     top = chain.topology
-    rows = jnp.tile(jnp.where(np.arange(6) < 3, 1, 1 / chain.length), len(top.link_names))
+    rows = jnp.tile(where(np.arange(6) < 3, 1, 1 / chain.length), len(top.link_names))
     linear = np.zeros(top.dofs, bool)
     linear[: top.nv] = np.array(top.kind)[top.dof_row] == SLIDE
     for i in top.rows_of_kind(FREE):
         linear[top.v_start[i] : top.v_start[i] + 3] = True
     slides = top.links.dof[:, 3:]
     linear[slides[slides < top.dofs]] = True
-    return rows, jnp.where(linear, chain.length, 1)
+    return rows, where(linear, chain.length, 1)
 
 
 class LoopKinematics(eqx.Module):
@@ -181,12 +182,12 @@ def loop_rates_by_twists(
     of_parent, of_real = above[structure.parent], above[structure.real]
     moved = loops.kin.S * v[: chain.nv, None]
     # coordinates above both links cancel, as in J_C
-    twist = lambda mask: jnp.sum(jnp.where(mask[:, :, None], moved[None], 0), 1)
+    twist = lambda mask: jnp.sum(where(mask[:, :, None], moved[None], 0), 1)
     at_parent = shift_motion(twist(of_parent & ~of_real), frames.from_parent_root)
     at_real = shift_motion(twist(of_real & ~of_parent), frames.real_position)
     S = _virtual_motion_subspaces(chain, structure, frames)
     virtual = jnp.sum(S * static_take(v, top.links.dof)[:, :, None], 1)
-    rates = jnp.where(structure.connected[:, None], at_parent + virtual - at_real, 0)
+    rates = where(structure.connected[:, None], at_parent + virtual - at_real, 0)
     return loops.row_scale * rates.ravel()
 
 
@@ -203,7 +204,7 @@ def constraint_bias(
     V: twists of the tree. baumgarte: rate (1/s) of the gaps' decay (None: no such terms).
     """
     row = jacobian_scales(chain)[0]
-    active_v = jnp.where(active_dofs(chain, structure), v, 0)
+    active_v = where(active_dofs(chain, structure), v, 0)
     A = bias_accelerations(chain, loops.kin, V, v)
     bias = row * loop_jacobian_dot_v(chain, structure, loops.frames, active_v, V=V, A=A)
     if baumgarte is not None:
@@ -234,7 +235,7 @@ def largest_norms(x: Float[Array, "links 6"]) -> Float[Array, "2"]:
     square = jnp.sum(x.reshape(-1, 2, 3) ** 2, -1)
     closed = square == 0
     # the derivative of the square root is not finite where a gap is exactly zero
-    return jnp.max(jnp.where(closed, 0, jnp.sqrt(jnp.where(closed, 1, square))), 0)
+    return jnp.max(where(closed, 0, jnp.sqrt(where(closed, 1, square))), 0)
 
 
 def largest_gaps(chain: Chain, state: State) -> tuple[Float[Array, "2"], Float[Array, "2"]]:

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.control_flow import unvmap_any
+from svkc._jax.select import where
 from svkc._jax.static_gather import static_take
 from svkc.loops.constraint import LoopKinematics, jacobian_scales, loop_kinematics, loop_rates
 from svkc.loops.pivoting import has_redundant_rows, rank_tolerance, release_threshold
@@ -128,7 +129,7 @@ class ConstraintRows(NamedTuple):
         projector = eye - self.reject(eye)
         if self.kept is None:
             return projector
-        return jnp.where(jnp.all(self.kept), projector, jnp.where(self.kept[:, None], 0, eye))
+        return where(jnp.all(self.kept), projector, where(self.kept[:, None], 0, eye))
 
     def reduce(self, bias: Float[Array, " rows"]) -> Float[Array, " delassus"]:
         """Return T R bias."""
@@ -164,19 +165,19 @@ def constraint_rows(
     if choice is None:
         return rows
     near, kept = choice
-    selects = jnp.where(kept[:, None], jnp.eye(len(scaled), dtype=J.dtype), 0)
-    selected = jnp.where(kept[:, None], scaled, 0), selects, jnp.zeros_like(scaled)
+    selects = where(kept[:, None], jnp.eye(len(scaled), dtype=J.dtype), 0)
+    selected = where(kept[:, None], scaled, 0), selects, jnp.zeros_like(scaled)
     # under `vmap`, one lane near a singular configuration makes all lanes reduce their rows
     A, T, pivots = jax.lax.cond(
         unvmap_any(near),
         lambda: jax.tree.map(
-            lambda a, b: jnp.where(near, a, b),
+            lambda a, b: where(near, a, b),
             reduce_rows(scaled, structure, rows.rank),
             selected,
         ),
         lambda: selected,
     )
-    kept = jnp.where(near, jnp.any(pivots > 0, 1), kept)
+    kept = where(near, jnp.any(pivots > 0, 1), kept)
     return rows._replace(A=A * unscale, T=T, pivots=pivots, kept=kept)
 
 
@@ -201,7 +202,7 @@ def choose_rows(
     def independent() -> Bool[Array, " delassus"]:
         J = loop_kinematics(chain, structure, q).J
         kept = independent_rows(structure, constraint_rows(chain, structure, J))
-        return jnp.where(redundant, kept, first.kept)
+        return where(redundant, kept, first.kept)
 
     # under `vmap`, one lane with redundant loops makes all lanes choose rows
     return RowChoice(near, jax.lax.cond(unvmap_any(redundant), independent, lambda: first.kept))
@@ -220,7 +221,7 @@ def reduce_rows(
     n, nv = B.shape
     with_T = jnp.concatenate([B, jnp.eye(n, dtype=B.dtype)], 1)
     A, pivot_column = _eliminate(with_T, nv, structure, rank)
-    A = jnp.where((pivot_column >= 0)[:, None], A, 0)
+    A = where((pivot_column >= 0)[:, None], A, 0)
     pivots = pivot_column[:, None] == jnp.arange(nv, dtype=jnp.int32)[None]
     return A[:, :nv], A[:, nv:], pivots.astype(B.dtype)
 
@@ -236,26 +237,26 @@ def _eliminate(
     weak = jnp.maximum(rank_tolerance(A.dtype), release_threshold(A.dtype) * structure.margin)
     weight = jnp.ones(nv, A.dtype)
     if structure.independent is not None:
-        weight = jnp.where(structure.independent[:nv], rank_tolerance(A.dtype) ** 2, weight)
+        weight = where(structure.independent[:nv], rank_tolerance(A.dtype) ** 2, weight)
 
     def step(k, carry):
         A, pivot_column, largest = carry
         size = jnp.max(jnp.abs(A[:, :nv]) * weight[None], 1)
         # the argmax prefers rows of zeros to rows that have a pivot
-        i = jax.lax.argmax(jnp.where(pivot_column >= 0, -1, size), 0, jnp.int32)
+        i = jax.lax.argmax(where(pivot_column >= 0, -1, size), 0, jnp.int32)
         at_row = jnp.arange(n, dtype=jnp.int32) == i
-        row = jnp.sum(jnp.where(at_row[:, None], A, 0), 0)
+        row = jnp.sum(where(at_row[:, None], A, 0), 0)
         j = jax.lax.argmax(jnp.abs(row[:nv]) * weight, 0, jnp.int32)
         at_column = jnp.arange(A.shape[1], dtype=jnp.int32) == j
-        pivot = jnp.sum(jnp.where(at_column, row, 0))
-        largest = jnp.where(k == 0, jnp.abs(pivot), largest)
+        pivot = jnp.sum(where(at_column, row, 0))
+        largest = where(k == 0, jnp.abs(pivot), largest)
         accept = (k < rank) & (jnp.abs(pivot) > weak * largest)
-        column = jnp.sum(jnp.where(at_column[None], A, 0), 1)
-        row = row / jnp.where(accept, pivot, 1)
-        others = jnp.where(at_column[None], 0, A - column[:, None] * row[None])
-        reduced = jnp.where(at_row[:, None], row[None], others)
-        pivot_column = jnp.where(accept & at_row, j, pivot_column)
-        return jnp.where(accept, reduced, A), pivot_column, largest
+        column = jnp.sum(where(at_column[None], A, 0), 1)
+        row = row / where(accept, pivot, 1)
+        others = where(at_column[None], 0, A - column[:, None] * row[None])
+        reduced = where(at_row[:, None], row[None], others)
+        pivot_column = where(accept & at_row, j, pivot_column)
+        return where(accept, reduced, A), pivot_column, largest
 
     start = A, jnp.full(n, -1, jnp.int32), A[0, 0]
     A, pivot_column, _ = jax.lax.fori_loop(0, min(n, nv), step, start)

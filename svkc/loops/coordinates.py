@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from svkc._jax.select import where
 from svkc.loops.constraint import LoopKinematics, constraint_bias, jacobian_scales, loop_kinematics
 from svkc.loops.pivoting import PivotedQR, pivot_blocks, select_pivots, solve_pivot_block
 from svkc.model.chain import Chain, State, Structure, active_dofs
@@ -40,12 +41,12 @@ class Coordinates(eqx.Module):
     @property
     def H(self) -> Float[Array, "dofs dofs"]:
         """Return the derivative of theta_S with respect to theta_G (17): W's dependent rows."""
-        return jnp.where(self.dependent[:, None], self.W, 0)
+        return where(self.dependent[:, None], self.W, 0)
 
     @property
     def S(self) -> Float[Array, "dofs dofs"]:
         """Return the derivative of theta_A with respect to theta_G (6): W's actuated rows."""
-        return jnp.where(self.actuated[:, None], self.W, 0)
+        return where(self.actuated[:, None], self.W, 0)
 
     @property
     def Hdot_v(self) -> Float[Array, " dofs"]:
@@ -76,7 +77,7 @@ def partition_coordinates(
     independent = active_dofs(chain, structure) & ~dependent
     JS_inverse_rows = solve_pivot_block(JS, jnp.concatenate([Jm, (qr.Q @ bias)[:, None]], 1))
     from_pivots = qr.P.T @ JS_inverse_rows
-    W = jnp.where(independent[None], jnp.eye(len(column), dtype=J.dtype) - from_pivots[:, :-1], 0)
+    W = where(independent[None], jnp.eye(len(column), dtype=J.dtype) - from_pivots[:, :-1], 0)
     W = column[:, None] * W / column[None]
     return Coordinates(
         W=W,
@@ -110,7 +111,7 @@ def open_coordinates(chain: Chain, structure: Structure) -> Coordinates:
     free = jnp.ones(n, bool) if structure.locked is None else ~structure.locked
     none = jnp.zeros((0, n), dtype)
     return Coordinates(
-        W=jnp.diag(jnp.where(free, 1, 0).astype(dtype)),
+        W=jnp.diag(where(free, 1, 0).astype(dtype)),
         bias=jnp.zeros(n, dtype),
         independent=free,
         dependent=jnp.zeros(n, bool),

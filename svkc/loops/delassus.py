@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from svkc._jax.batched_lapack import cholesky_solver
+from svkc._jax.select import where
 from svkc.loops.constraint_rows import ConstraintRows
 from svkc.loops.diagonal_inertia import auxiliary_inertia, with_armature, with_inertia
 from svkc.model.chain import Chain
@@ -40,9 +41,9 @@ def _regularized_inverse(
     along_joints: projector onto directions in which D and x are zero. D is regular with its largest
     entry there, whereas inverses of 3 x 3 blocks lose all digits where two pivots are tiny.
     """
-    largest = jnp.max(jnp.where(np.eye(D.shape[0], dtype=bool), D, 0))
+    largest = jnp.max(where(np.eye(D.shape[0], dtype=bool), D, 0))
     # the largest entry is zero if no loop is closed
-    largest = jnp.where(largest > 0, largest, 1)
+    largest = where(largest > 0, largest, 1)
     regularization = jnp.finfo(D.dtype).eps ** 0.625 * largest
     regularized = D + regularization * jnp.eye(D.shape[0], dtype=D.dtype) + largest * along_joints
     if D.shape[0] >= LAPACK_MIN_ROWS:
@@ -73,7 +74,7 @@ def loop_force_solver(
         return _solver_of_regular_mass_matrix(chain, kin, J, rows, free)
     inertia = auxiliary_inertia(chain)
     solve = _solver_of_regular_mass_matrix(with_armature(chain, inertia), kin, J, rows, free)
-    removed = -inertia if free is None else jnp.where(free, -inertia, 0)
+    removed = -inertia if free is None else where(free, -inertia, 0)
     solve = with_inertia(chain, solve, massless, removed[massless])
     nv = chain.nv
 
@@ -81,7 +82,7 @@ def loop_force_solver(
         x, mu = solve(force, loop_bias)
         rest = force - pad_to_dofs(chain, mass_matrix_product(chain, kin, x[:nv])) - mu @ J
         if free is not None:
-            rest = jnp.concatenate([jnp.where(free, rest[:nv], 0), rest[nv:]])
+            rest = jnp.concatenate([where(free, rest[:nv], 0), rest[nv:]])
         dx, dmu = solve(rest, loop_bias - J @ x)
         return x + dx, mu + dmu
 

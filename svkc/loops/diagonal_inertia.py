@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from svkc._jax.batched_lapack import solve_general
+from svkc._jax.select import where
 from svkc.loops.constraint import jacobian_scales
 from svkc.model.chain import Chain
 
@@ -61,4 +62,4 @@ def auxiliary_inertia(chain: Chain) -> Float[Array, " nv"]:
     mask = np.isin(np.arange(chain.nv), chain.topology.massless_dofs)
     column = jacobian_scales(chain)[1][: chain.nv]
     size = jnp.finfo(column.dtype).eps ** 0.25 * jnp.max(chain.mass) * (chain.length / column) ** 2
-    return jnp.where(mask, size, 0)
+    return where(mask, size, 0)

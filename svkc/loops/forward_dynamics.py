@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float
 from svkc._jax.control_flow import unvmap_any
 from svkc._jax.lanes_last import with_lanes_last
 from svkc._jax.one_kernel import one_kernel
+from svkc._jax.select import where
 from svkc.loops.constrained_dynamics import (
     AbstractDynamics,
     ArticulatedBodies,
@@ -125,8 +126,8 @@ def _projected_if_near_singular(
 ) -> Float[Array, " dofs"]:
     """Return v, near a singular configuration with its dependent part from the independent one."""
     near = pivot_ratio(qr) < NEAR_SINGULAR * structure.margin
-    active_v = jnp.where(active_dofs(chain, structure), v, 0)
-    return jnp.where(near, with_dependent_velocities(chain, qr, J, active_v), v)
+    active_v = where(active_dofs(chain, structure), v, 0)
+    return where(near, with_dependent_velocities(chain, qr, J, active_v), v)
 
 
 def _with_consistent_velocities_if(
@@ -138,10 +139,10 @@ def _with_consistent_velocities_if(
     rows: ConstraintRows,
 ) -> Float[Array, " dofs"]:
     """Return v, where `near` holds with its dependent part from the independent one."""
-    active_v = jnp.where(active_dofs(chain, structure), v, 0)
+    active_v = where(active_dofs(chain, structure), v, 0)
     return jax.lax.cond(
         unvmap_any(near),
-        lambda: jnp.where(near, with_consistent_velocities(chain, loops, active_v, rows), v),
+        lambda: where(near, with_consistent_velocities(chain, loops, active_v, rows), v),
         lambda: v,
     )
 

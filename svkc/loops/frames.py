@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from svkc._jax.dynamic_gather import take_rows
+from svkc._jax.select import where
 from svkc._jax.static_gather import static_take
 from svkc.model.chain import Chain, Structure
 from svkc.model.topology import Topology
@@ -75,7 +76,7 @@ def _virtual_joint_rotations(
     axes = jnp.stack(axes, 1)
     if is_ball.any():
         ball_axes = jnp.swapaxes(quat_matrix(ball), -1, -2)
-        axes = jnp.where(is_ball[:, None, None], ball_axes, axes)
+        axes = where(is_ball[:, None, None], ball_axes, axes)
         # of joints that are not balls the quaternion is the identity
         rotation = ball if rotation is None else quat_multiply(ball, rotation)
     return rotation, axes
@@ -123,4 +124,4 @@ def frame_gaps(structure: Structure, frames: LoopFrames) -> Float[Array, "links 
     """
     rotation = quat_log(quat_multiply(frames.virtual_quat, quat_conjugate(frames.real_quat)))
     gaps = jnp.concatenate([rotation, frames.virtual_position - frames.real_position], -1)
-    return jnp.where(structure.connected[:, None], gaps, 0)
+    return where(structure.connected[:, None], gaps, 0)

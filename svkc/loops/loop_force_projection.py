@@ -11,6 +11,7 @@ from svkc._jax.chunked_sum import sum_in_chunks
 from svkc._jax.control_flow import unvmap_any
 from svkc._jax.lanes_last import with_lanes_last
 from svkc._jax.one_kernel import one_kernel
+from svkc._jax.select import where
 from svkc.loops.constrained_dynamics import ArticulatedBodies
 from svkc.loops.constraint import gap_norms, loop_kinematics, loop_rates
 from svkc.loops.constraint_rows import RowChoice, constraint_rows, independent_rows
@@ -51,8 +52,8 @@ def project_by_loop_forces(
         q, v, _ = carry
         is_last = i == iterations
         step = _step_by_loop_forces(chain, structure, q, v, is_last, choice)
-        q = integrate(chain, q, jnp.where(is_last, 0, step.change))
-        v = jnp.where(is_last, v + step.change, v)
+        q = integrate(chain, q, where(is_last, 0, step.change))
+        v = where(is_last, v + step.change, v)
         return q, v, jax.lax.stop_gradient(ProjectionInfo(gap=step.gap))
 
     return jax.lax.fori_loop(0, iterations + 1, newton_step, (q, v, info))
@@ -75,10 +76,10 @@ def _project_until_closed(
         i, (q, v, info) = carry
         step = _step_lanes_last(chain, structure, q, v, i == iterations, choice)
         on_velocity = step.on_velocity
-        q = integrate(chain, q, jnp.where(on_velocity, 0, step.change))
-        v = jnp.where(on_velocity, v + step.change, v)
+        q = integrate(chain, q, where(on_velocity, 0, step.change))
+        v = where(on_velocity, v + step.change, v)
         info = ProjectionInfo(gap=step.gap, margin=step.margin, kept=step.kept)
-        return jnp.where(on_velocity, iterations, i) + 1, (q, v, info)
+        return where(on_velocity, iterations, i) + 1, (q, v, info)
 
     return jax.lax.while_loop(cond_fun, body_fun, (jnp.zeros((), jnp.int32), start))[1]
 
@@ -123,7 +124,7 @@ def _step_by_loop_forces(
     if may_be_last:
         # under `vmap`, one open lane lets all lanes take a step on q
         on_velocity = is_last | ~unvmap_any(jnp.max(gap) > jnp.finfo(J.dtype).eps ** _ROUND_OFF)
-    residual = jnp.where(on_velocity, loop_rates(chain, loops, jnp.where(active, v, 0)), loops.gap)
+    residual = where(on_velocity, loop_rates(chain, loops, where(active, v, 0)), loops.gap)
     rows = constraint_rows(chain, structure, J, choice)
     kept = rows.kept
     solve = ArticulatedBodies().prepare(chain, structure, loops, rows)
@@ -137,7 +138,7 @@ def _step_by_loop_forces(
             # reduced rows are independent
             chooses = ~choice.near & has_redundant_rows(structure)
             independent = lambda: independent_rows(structure, rows)
-            choose = lambda: jnp.where(chooses, independent(), kept_before)
+            choose = lambda: where(chooses, independent(), kept_before)
             return margin, jax.lax.cond(unvmap_any(chooses), choose, lambda: kept_before)
 
         unchanged = jnp.ones((), J.dtype), kept_before
@@ -166,7 +167,7 @@ def margin_of_rows(
     dofs = J.shape[1]
     weight = 1.0
     if independent is not None:
-        weight = jnp.where(independent, rank_tolerance(J.dtype) ** 2, 1).astype(J.dtype)
+        weight = where(independent, rank_tolerance(J.dtype) ** 2, 1).astype(J.dtype)
     J = jax.lax.stop_gradient(J)
 
     def step(k, carry):
@@ -175,14 +176,14 @@ def margin_of_rows(
         pivot = jnp.arange(dofs) == jnp.argmax(
             norms >= (1 - rank_tolerance(J.dtype)) * jnp.max(norms)
         )
-        row = jnp.sum(jnp.where(pivot[:, None], G, 0), 0)
-        r = jnp.sum(jnp.where(pivot, row, 0))
+        row = jnp.sum(where(pivot[:, None], G, 0), 0)
+        r = jnp.sum(where(pivot, row, 0))
         used = pivot[:, None] | pivot[None]
-        G = jnp.where(used, 0, G - row[:, None] * (row / jnp.where(r > 0, r, 1))[None])
-        return G, jnp.where(k < rank, jnp.minimum(least, r), least), jnp.maximum(largest, r)
+        G = where(used, 0, G - row[:, None] * (row / where(r > 0, r, 1))[None])
+        return G, where(k < rank, jnp.minimum(least, r), least), jnp.maximum(largest, r)
 
     gram = sum_in_chunks(J[:, :, None] * J[:, None], (0,))
     start = gram, jnp.asarray(jnp.inf, J.dtype), jnp.zeros((), J.dtype)
     _, least, largest = jax.lax.fori_loop(0, min(J.shape), step, start)
-    ratio = jnp.sqrt(jnp.maximum(least, 0) / jnp.where(largest > 0, largest, 1))
-    return jnp.where(rank > 0, ratio, 1)
+    ratio = jnp.sqrt(jnp.maximum(least, 0) / where(largest > 0, largest, 1))
+    return where(rank > 0, ratio, 1)

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from svkc._jax.select import where
 from svkc.loops.constraint import loop_kinematics
 from svkc.loops.coordinates import coordinates
 from svkc.loops.pivoting import count_rank, pivot_ratio, pivoted_qr
@@ -106,11 +107,11 @@ def mobility(chain: Chain, state: State) -> Mobility:
     first_loops = np.arange(6 * links)[None] < 6 * np.arange(1, links + 1)[:, None]
     ranks = jax.lax.map(
         lambda rows: count_rank(
-            pivoted_qr(jnp.where(rows[:, None], jax.lax.stop_gradient(J), 0)).diag_R
+            pivoted_qr(where(rows[:, None], jax.lax.stop_gradient(J), 0)).diag_R
         ),
         jnp.asarray(first_loops),
     )
-    rows = jnp.where(state.structure.connected, 6, 0).astype(jnp.int32)
+    rows = where(state.structure.connected, 6, 0).astype(jnp.int32)
     redundant = rows - jnp.diff(ranks, prepend=jnp.zeros(1, jnp.int32))
     rank = state.structure.rank
     return Mobility(

@@ -20,7 +20,9 @@ from svkc._jax.batched_lapack import (
     solve_lower,
 )
 from svkc._jax.control_flow import unvmap_any
+from svkc._jax.one_kernel import one_kernel
 from svkc._jax.primitive import custom_primitive
+from svkc._jax.select import where
 from svkc.model.annotations import DType
 from svkc.model.chain import Structure
 
@@ -62,8 +64,8 @@ def release_threshold(dtype: DType) -> float:
 def _with_active(qr: PivotedQR, keep: Bool[Array, " steps"]) -> PivotedQR:
     """Return the decomposition in which only the steps `keep` are active."""
     return PivotedQR(
-        Q=jnp.where(keep[:, None], qr.Q, 0),
-        P=jnp.where(keep[:, None], qr.P, 0),
+        Q=where(keep[:, None], qr.Q, 0),
+        P=where(keep[:, None], qr.P, 0),
         diag_R=qr.diag_R,
         active=keep,
     )
@@ -84,47 +86,53 @@ def pivoted_qr(
 ) -> PivotedQR:
     """Return the column-pivoted QR of J by Gram-Schmidt with re-orthogonalisation.
 
-    It takes min(rows, dofs) steps.
-
     rank: number of active steps (None: all whose column is not zero).
     independent: columns that become pivots only if no other column is left (None: none).
     """
+    Q, P, diag_R = _search_pivots(jax.lax.stop_gradient(J), rank, independent)
+    Q, diag_R = frozen_qr(J, Q, P, diag_R)
+    return PivotedQR(Q=Q, P=P, diag_R=diag_R, active=jnp.any(P > 0, 1))
+
+
+@one_kernel
+def _search_pivots(
+    J: Float[Array, "rows dofs"],
+    rank: Int[Array, ""] | None,
+    independent: Bool[Array, " dofs"] | None,
+) -> tuple[Float[Array, "steps rows"], Float[Array, "steps dofs"], Float[Array, " steps"]]:
+    """Return Q, P and diag_R of `pivoted_qr` after min(rows, dofs) steps, without derivatives."""
     rows, dofs = J.shape
     steps = min(rows, dofs)
-    weight = (
-        None
-        if independent is None
-        else jnp.where(independent, rank_tolerance(J.dtype) ** 2, 1).astype(J.dtype)
-    )
+    weight = 1.0
+    if independent is not None:
+        weight = where(independent, rank_tolerance(J.dtype) ** 2, 1).astype(J.dtype)
 
     def step(k, carry):
         A, Q, P, diag_R = carry
-        norms = jnp.sum(A * A, 0) * (1 if weight is None else weight)
+        norms = jnp.sum(A * A, 0) * weight
         # Of columns equal but for round-off, such as those of mirrored limbs, the first is taken,
         # so that every machine takes the same.
         pivot = jnp.arange(dofs) == jnp.argmax(
             norms >= (1 - rank_tolerance(J.dtype)) * jnp.max(norms)
         )
-        column = jnp.sum(jnp.where(pivot[None], A, 0), 1)
+        column = jnp.sum(where(pivot[None], A, 0), 1)
         column = column - (Q @ column) @ Q
         r = jnp.sqrt(jnp.sum(column * column))
         accept = r > 0 if rank is None else (r > 0) & (k < rank)
-        q = jnp.where(accept, column / jnp.where(accept, r, 1), 0)
-        A = jnp.where(pivot[None], 0, A - q[:, None] * (q @ A)[None])
+        q = where(accept, column / where(accept, r, 1), 0)
+        A = where(pivot[None], 0, A - q[:, None] * (q @ A)[None])
         at_k = jnp.arange(steps) == k
-        Q = jnp.where(at_k[:, None], q[None], Q)
-        P = jnp.where(at_k[:, None] & pivot[None] & accept, 1, P)
-        return A, Q, P, jnp.where(at_k, r, diag_R)
+        Q = where(at_k[:, None], q[None], Q)
+        P = where(at_k[:, None] & pivot[None] & accept, 1, P)
+        return A, Q, P, where(at_k, r, diag_R)
 
     start = (
-        jax.lax.stop_gradient(J),
+        J,
         jnp.zeros((steps, rows), J.dtype),
         jnp.zeros((steps, dofs), J.dtype),
         jnp.zeros(steps, J.dtype),
     )
-    _, Q, P, diag_R = jax.lax.fori_loop(0, steps, step, start)
-    Q, diag_R = frozen_qr(J, Q, P, diag_R)
-    return PivotedQR(Q=Q, P=P, diag_R=diag_R, active=jnp.any(P > 0, 1))
+    return jax.lax.fori_loop(0, steps, step, start)[1:]
 
 
 def refactor(J: Float[Array, "rows dofs"], P: Float[Array, "steps dofs"]) -> PivotedQR:
@@ -139,9 +147,7 @@ def refactor(J: Float[Array, "rows dofs"], P: Float[Array, "steps dofs"]) -> Piv
             column = column - (Q @ column) @ Q
         r = jnp.sqrt(jnp.sum(column * column))
         at_k = (jnp.arange(active.shape[0]) == k) & (r > 0)
-        return jnp.where(at_k[:, None], (column / jnp.where(r > 0, r, 1))[None], Q), jnp.where(
-            at_k, r, diag_R
-        )
+        return where(at_k[:, None], (column / where(r > 0, r, 1))[None], Q), where(at_k, r, diag_R)
 
     start = jnp.zeros((active.shape[0], J.shape[0]), J.dtype), jnp.zeros(active.shape[0], J.dtype)
     Q, diag_R = jax.lax.fori_loop(0, active.shape[0], step, start)
@@ -160,7 +166,7 @@ def _frozen_qr_jvp(primals, tangents):
     """
     J, _, P, _ = primals
     Q, diag_R = frozen_qr(*primals)
-    unused = jnp.diag(jnp.where(jnp.any(P > 0, 1), 0, 1).astype(J.dtype))
+    unused = jnp.diag(where(jnp.any(P > 0, 1), 0, 1).astype(J.dtype))
     R = jax.lax.stop_gradient(Q @ J @ P.T) + unused
     dQ = solve_pivot_block(R, (tangents[0] @ P.T).T, trans=True)
     L = cholesky(Q @ Q.T + unused)
@@ -185,7 +191,7 @@ def pivot_ratio(qr: PivotedQR) -> Float[Array, ""]:
     """Return the least |R_kk| of the active steps over the largest, and 1 if no step is active."""
     diag_R, has_active = qr.diag_R, jnp.any(qr.active)
     least = jnp.min(diag_R, initial=jnp.inf, where=qr.active)
-    return jnp.where(has_active, least, 1) / jnp.where(has_active, jnp.max(diag_R), 1)
+    return where(has_active, least, 1) / where(has_active, jnp.max(diag_R), 1)
 
 
 def pivoted_qr_with_rank(J: Float[Array, "rows dofs"]) -> tuple[PivotedQR, Int[Array, ""]]:
@@ -242,7 +248,7 @@ def pivot_blocks(
     on the diagonal of inert steps.
     """
     Jm = qr.Q @ J
-    return Jm, Jm @ qr.P.T + jnp.diag(jnp.where(qr.active, 0, 1).astype(J.dtype))
+    return Jm, Jm @ qr.P.T + jnp.diag(where(qr.active, 0, 1).astype(J.dtype))
 
 
 # Fraction of the phase's margin below which a configuration counts as near a singular one.
@@ -287,7 +293,7 @@ def select_pivots(
         # under `vmap`, one lane near a singular configuration makes all lanes compute new pivots
         qr = jax.lax.cond(
             unvmap_any(near),
-            lambda: jax.tree.map(lambda a, b: jnp.where(near, a, b), choose(), kept),
+            lambda: jax.tree.map(lambda a, b: where(near, a, b), choose(), kept),
             lambda: kept,
         )
     return drop_below(qr, release_threshold(J.dtype) * structure.margin)

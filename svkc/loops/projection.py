@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from svkc._jax.select import where
 from svkc.loops.constrained_dynamics import CompositeBodies
 from svkc.loops.constraint import LoopKinematics, gap_norms, jacobian_scales, loop_kinematics
 from svkc.loops.constraint_rows import RowChoice
@@ -33,7 +34,7 @@ def least_norm_change(
 ) -> Float[Array, "dofs n"]:
     """Return the y (m, rad, or rates) with J (y / column) = x, of least norm of y / column."""
     Jm, _ = pivot_blocks(qr, J)
-    gram = Jm @ Jm.T + jnp.diag(jnp.where(qr.active, 0, 1).astype(J.dtype))
+    gram = Jm @ Jm.T + jnp.diag(where(qr.active, 0, 1).astype(J.dtype))
     return jacobian_scales(chain)[1][:, None] * (Jm.T @ solve_positive(gram, qr.Q @ x))
 
 
@@ -158,8 +159,8 @@ def project(
         )
         step, gap = _step_by_pivots(chain, structure, loops, v, new, dependent_only)
         info = ProjectionInfo(gap=gap_norms(gap), margin=pivot_ratio(new), pivots=kept)
-        q = integrate(chain, q, jnp.where(is_velocity_iteration, 0, step[:, 0]))
-        v = jnp.where(is_velocity_iteration, v + step[:, 1], v)
+        q = integrate(chain, q, where(is_velocity_iteration, 0, step[:, 0]))
+        v = where(is_velocity_iteration, v + step[:, 1], v)
         return q, v, jax.lax.stop_gradient(info)
 
     start = (
@@ -183,9 +184,7 @@ def _pivots_to_keep(
         (pivot_ratio(refactor(J, pivots)) < hold * pivot_ratio(new))
         | lacks_pivots(pivots, structure.rank)
     )
-    return jax.lax.cond(
-        is_velocity_iteration, lambda: jnp.where(poor(), new.P, pivots), lambda: pivots
-    )
+    return jax.lax.cond(is_velocity_iteration, lambda: where(poor(), new.P, pivots), lambda: pivots)
 
 
 def _step_by_pivots(
@@ -197,7 +196,7 @@ def _step_by_pivots(
     dependent_only: bool,
 ) -> tuple[Float[Array, "dofs 2"], Float[Array, " rows"]]:
     """Return the changes of q and of v that close the loops, as two columns, and the scaled gap."""
-    scaled_v = jnp.where(active_dofs(chain, structure), v / jacobian_scales(chain)[1], 0)
+    scaled_v = where(active_dofs(chain, structure), v / jacobian_scales(chain)[1], 0)
     gap, J, qr = loops.gap, loops.J, _drop_unsolvable(structure, qr)
     residual = jnp.stack([gap, J @ scaled_v], 1)
     if dependent_only:

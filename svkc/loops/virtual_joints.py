@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from svkc._jax.select import where
 from svkc._jax.static_gather import static_take
 from svkc.model.chain import Chain
 from svkc.tree.spatial import inverse_positive, matvec
@@ -67,7 +68,7 @@ def virtual_joints(chain: Chain, J: Float[Array, "rows dofs"]) -> VirtualJoints:
     columns = jnp.concatenate([J[:, chain.nv :], jnp.zeros_like(J[:, :1])], 1)
     columns = columns.reshape(-1, 6, count + 1)
     S = jnp.swapaxes(columns[np.arange(len(dof))[:, None], :, np.minimum(dof, count)], -1, -2)
-    is_padding = jnp.where(jnp.all(S == 0, 1), 1, 0).astype(J.dtype)
+    is_padding = where(jnp.all(S == 0, 1), 1, 0).astype(J.dtype)
     gram = (
         jnp.sum(S[:, :, :, None] * S[:, :, None], 1)
         + is_padding[:, :, None] * np.eye(dof.shape[1], dtype=J.dtype)[None]

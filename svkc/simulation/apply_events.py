@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from svkc._jax.control_flow import unvmap_any
+from svkc._jax.select import where
 from svkc.integration.ode import ODEState, is_finite
 from svkc.model.chain import Chain, State, Structure
 from svkc.simulation.codes import RESULTS
@@ -64,7 +65,7 @@ def apply_events(
     overflow = run.events.count + jnp.sum(fired, dtype=jnp.int32) > run.events.time.shape[0]
     failure = RESULTS.where(overflow, RESULTS.max_events, failure)
     applied = any_fired & (failure == RESULTS.successful)
-    after = jax.tree.map(lambda new, old: jnp.where(applied, new, old), change.state, end_state)
+    after = jax.tree.map(lambda new, old: where(applied, new, old), change.state, end_state)
     events = _write_events(run.events, outcome.t, fired & applied, connects, change)
     stops = jnp.any(fired & np.array([a.stop for a in plan.actions], bool))
     result = RESULTS.where(stops, RESULTS.stopped, outcome.result)
@@ -177,13 +178,11 @@ def _write_events(
     first = written & (rows == r.count)
     connected_by_row = jnp.any(row_of_event[:, :, None] & connects[None], 1)[:, :, None]
     return Events(
-        time=jnp.where(written, t, r.time),
-        which=jnp.where(written, jnp.argmax(row_of_event, 1).astype(jnp.int32), r.which),
-        impulse=jnp.where(connected_by_row, change.impulse[None], r.impulse),
-        angular_impulse=jnp.where(
-            connected_by_row, change.angular_impulse[None], r.angular_impulse
-        ),
-        energy_lost=jnp.where(first, change.energy_lost, r.energy_lost),
+        time=where(written, t, r.time),
+        which=where(written, jnp.argmax(row_of_event, 1).astype(jnp.int32), r.which),
+        impulse=where(connected_by_row, change.impulse[None], r.impulse),
+        angular_impulse=where(connected_by_row, change.angular_impulse[None], r.angular_impulse),
+        energy_lost=where(first, change.energy_lost, r.energy_lost),
         count=r.count + jnp.sum(fired, dtype=jnp.int32),
     )
 
@@ -206,7 +205,7 @@ def _bind_slots(
             bound, slot, no_slot = bind_grip(chain, occupied, grip)
             bound = eqx.tree_at(lambda s: s.connected, bound, structure.connected)
             structure = jax.tree.map(
-                lambda new, old, e=event: jnp.where(fired[e], new, old), bound, structure
+                lambda new, old, e=event: where(fired[e], new, old), bound, structure
             )
             to_connect = to_connect | (slot & fired[event])
             any_no_slot = any_no_slot | (no_slot & fired[event])

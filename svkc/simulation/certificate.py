@@ -13,7 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from svkc._jax.one_kernel import one_kernel
 from svkc._jax.pytrees import stop_gradient_tree
+from svkc._jax.select import where
 from svkc.loops.constraint import assemble_loop_jacobian, jacobian_scales, largest_norms
 from svkc.loops.frames import frame_gaps, loop_frames
 from svkc.loops.pivoting import pivot_ratio, pivoted_qr, rank_tolerance
@@ -68,11 +70,11 @@ def certificate(
     written = jnp.arange(rows, dtype=jnp.int32) < count
     margin = stop_gradient_tree(jnp.minimum(first.margin, last.margin))
     lost = written & (margin < rank_tolerance(margin.dtype))
-    lost_at = jnp.where(jnp.any(lost), jnp.argmax(lost).astype(jnp.int32), rows)
+    lost_at = where(jnp.any(lost), jnp.argmax(lost).astype(jnp.int32), rows)
     at_ends = jnp.maximum(first.kinetic, last.kinetic)
     within = (ts[None] >= records.start[:, None]) & (ts[None] <= records.stop[:, None])
-    at_saves = jnp.max(jnp.where(within, saved_checks.kinetic[None], 0), 1, initial=0)
-    kinetic = jnp.where(written, jnp.maximum(at_ends, at_saves), 0)
+    at_saves = jnp.max(where(within, saved_checks.kinetic[None], 0), 1, initial=0)
+    kinetic = where(written, jnp.maximum(at_ends, at_saves), 0)
     phases = _phases(chain, records, count, (first, last), stages)
     phases = dataclasses.replace(phases, kinetic_energy=kinetic)
     return phases, saved_checks, lost_at
@@ -92,9 +94,7 @@ def _check_states(
         jax.tree.map(join, r.structure, r.structure, saved.structure),
     )
     is_phase_end = np.arange(states.q.shape[0]) < 2 * rows
-    checks = jax.lax.map(
-        jax.checkpoint(lambda x: _check_state(chain, *x)), (states, jnp.asarray(is_phase_end))
-    )
+    checks = jax.lax.map(lambda x: _check_state(chain, *x), (states, jnp.asarray(is_phase_end)))
     parts = slice(rows), slice(rows, 2 * rows), slice(2 * rows, None)
     return tuple(jax.tree.map(lambda x, part=part: x[part], checks) for part in parts)
 
@@ -112,7 +112,7 @@ def _phases(
     """
     r, (first, last) = records, checks
     written = jnp.arange(r.start.shape[0], dtype=jnp.int32) < count
-    fill = lambda value, none: jnp.where(
+    fill = lambda value, none: where(
         written.reshape(-1, *(1,) * (jnp.ndim(value) - 1)), value, none
     )
     free, joint_freedoms = jax.vmap(
@@ -146,11 +146,13 @@ def _phases(
         gap=fill(jnp.maximum(gap, r.stats.gap), 0),
         gap_rate=fill(gap_rate, 0),
         free=fill(free, False),
-        momentum_drift=jnp.where((written & free)[:, None], drift, 0),
+        momentum_drift=where((written & free)[:, None], drift, 0),
         count=count,
     )
 
 
+@one_kernel
+@eqx.filter_checkpoint
 def _check_state(chain: Chain, state: State, is_phase_end: Bool[Array, ""]) -> StateCheck:
     """Return the check of one state.
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.pytrees import stop_gradient_tree
+from svkc._jax.select import where
 from svkc.integration.diffrax_adjoint import integrate_with_diffrax
 from svkc.integration.event_adjoint import end_of_phase
 from svkc.integration.event_location import ArmedGuards, GuardValues
@@ -107,7 +108,7 @@ def solve_phase(
     # Save times outside the phase are clipped to its ends. Only save times within the phase, ends
     # included, have derivatives here; the states saved at the others are those of other phases.
     t_start, t_stop = stop_gradient_tree((run.t, jnp.maximum(stop, run.t)))
-    clipped_ts = jnp.where(ts < t_start, t_start, jnp.where(ts > t_stop, t_stop, ts))
+    clipped_ts = where(ts < t_start, t_start, where(ts > t_stop, t_stop, ts))
     solution, event, t, y = _integrate(
         y0,
         (run.t, stop, clipped_ts),
@@ -148,7 +149,7 @@ def _stepper_options(options: Options, armed: ArmedGuards | None) -> StepperOpti
     max_step = None
     if armed_guards is not None and armed_guards.evaluate.plan.max_steps is not None:
         limits = armed_guards.evaluate.plan.max_steps
-        max_step = jnp.min(jnp.where(armed_guards.armed, limits, jnp.inf))
+        max_step = jnp.min(where(armed_guards.armed, limits, jnp.inf))
     return StepperOptions(
         solver=solver,
         armed_guards=armed_guards,
@@ -189,8 +190,8 @@ def _integrate(
         constants = stop_gradient_tree((y0, times, problem))
         located = integrate_phase(constants[0], constants[1], constants[2], stepper_options)
         assert located.event is not None
-        stop = jnp.where(located.event.occurred, located.t, stop)
-        ts, event = jnp.where(ts > stop, stop, ts), located.event
+        stop = where(located.event.occurred, located.t, stop)
+        ts, event = where(ts > stop, stop, ts), located.event
     controller, first_step = options.step_size_control(ts)
     stepper_options = dataclasses.replace(
         stepper_options,

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from svkc._jax.select import where
 from svkc.integration.solution import PhaseSolution, Stats
 from svkc.model.annotations import DType
 from svkc.model.chain import State, Structure
@@ -110,7 +111,7 @@ def write_phase_row(
         rejected=solution.rejected,
         stats=solution.stats,
     )
-    write = lambda old, new: jnp.where(
+    write = lambda old, new: where(
         row.reshape(-1, *(1,) * jnp.ndim(new)), jnp.asarray(new)[None], old
     )
     return jax.tree.map(write, records, new)

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.pytrees import stop_gradient_tree
+from svkc._jax.select import where
 from svkc.integration.event_location import GuardValues, event_tolerance
 from svkc.integration.ode import ODEState, Times
 from svkc.integration.vector_field import phase_field_args
@@ -90,8 +91,8 @@ def _reevaluate_stale_guards(
         *stop_gradient_tree((run.t, ODEState(run.state.q, run.state.v), field_args))
     )
     at_zero = jnp.abs(values) < guard_round_off(values.dtype)
-    values = jnp.where(at_zero, run.guard_values, values)
-    return replace(run, guard_values=jnp.where(run.stale, values, run.guard_values))
+    values = where(at_zero, run.guard_values, values)
+    return replace(run, guard_values=where(run.stale, values, run.guard_values))
 
 
 def _guard_values_after(
@@ -115,7 +116,7 @@ def _guard_values_after(
     on_first_side = jnp.sign(values) == jnp.sign(before)
     may_cross = at_zero & (on_first_side | ~jnp.any(outcome.fired))
     may_cross = may_cross & armed_guards(chain, run.state.structure, plan, run.schedule)
-    return jnp.where(stale & ~may_cross, 0, values), stale
+    return where(stale & ~may_cross, 0, values), stale
 
 
 def _next_stop(run: RunState, t1):
@@ -125,8 +126,8 @@ def _next_stop(run: RunState, t1):
     that has ended keeps its time, so that its phases have zero length.
     """
     next_time = run.schedule.next_time()
-    stop = jnp.where(next_time <= t1, next_time, t1)
-    return jnp.where((stop < run.t) | (run.result != RESULTS.successful), run.t, stop)
+    stop = where(next_time <= t1, next_time, t1)
+    return where((stop < run.t) | (run.result != RESULTS.successful), run.t, stop)
 
 
 def run_phase(
@@ -203,7 +204,7 @@ def _check_derivative(
         jnp.sum(outcome.fired) + jnp.sum(timed) > 1, DERIVATIVE.together, outcome.derivative
     )
     first = (run.derivative == DERIVATIVE.successful) & active & (code != DERIVATIVE.successful)
-    return DERIVATIVE.where(first, code, run.derivative), jnp.where(
+    return DERIVATIVE.where(first, code, run.derivative), where(
         first, index.astype(jnp.int32), run.invalid_from
     )
 
@@ -217,9 +218,7 @@ def _write_saved_states(
     hold the state and the work at its end until a later phase overwrites them.
     """
     within, later = ((ts >= run.t) & (ts <= outcome.t))[:, None], (ts > outcome.t)[:, None]
-    rows = lambda at_saves, at_end, old: jnp.where(
-        within, at_saves, jnp.where(later, at_end[None], old)
-    )
+    rows = lambda at_saves, at_end, old: where(within, at_saves, where(later, at_end[None], old))
     q = rows(outcome.ys.q, end_state.q, run.saved.q)
     v = rows(outcome.ys.v, end_state.v, run.saved.v)
     work = None
@@ -227,6 +226,6 @@ def _write_saved_states(
         work = rows(outcome.ys.work, outcome.y.work, run.saved_work)
 
     def write(new, old):
-        return jnp.where((ts >= run.t).reshape(-1, *(1,) * new.ndim), new[None], old)
+        return where((ts >= run.t).reshape(-1, *(1,) * new.ndim), new[None], old)
 
     return State(q, v, jax.tree.map(write, end_state.structure, run.saved.structure)), work

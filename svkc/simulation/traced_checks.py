@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from svkc._jax.pytrees import stop_gradient_tree
+from svkc._jax.select import where
 from svkc.integration.ode import Times
 from svkc.model.chain import Chain
 from svkc.model.inertial_parameters import has_invalid_inertial_parameters
@@ -43,7 +44,7 @@ def _check_times(times, plan: Plan) -> RESULTS:
     slack = 8 * jnp.finfo(ts.dtype).eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
     in_order = (
         (t0 <= t1)
-        & jnp.all(event_times >= jnp.where(waits, 0, t0))
+        & jnp.all(event_times >= where(waits, 0, t0))
         & jnp.all(ts >= t0 - slack)
         & jnp.all(ts[1:] >= ts[:-1])
     )

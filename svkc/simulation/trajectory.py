@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.eager import eager_jit
+from svkc._jax.select import where
 from svkc.model.annotations import Function, Names, Path, Scalar
 from svkc.model.chain import Chain
 from svkc.model.chain_names import ChainNames
@@ -154,7 +155,7 @@ class Trajectory(Printed):
 def _report(traj: Trajectory) -> "Report":
     """Return the certificate of a trajectory; of a batch if its arrays have leading axes."""
     p = traj.phases
-    largest = lambda x: jnp.max(jnp.where(jnp.isfinite(x), x, 0), -2)
+    largest = lambda x: jnp.max(where(jnp.isfinite(x), x, 0), -2)
     largest_of = lambda at_save_times, at_ends: jnp.maximum(
         largest(at_save_times), largest(at_ends)
     )
@@ -169,7 +170,7 @@ def _report(traj: Trajectory) -> "Report":
         angular_gap=gaps[..., 0],
         gap_rate=rates[..., 1],
         angular_gap_rate=rates[..., 0],
-        energy_drift=jnp.sum(jnp.where(written, p.energy_drift, 0), -1),
+        energy_drift=jnp.sum(where(written, p.energy_drift, 0), -1),
         energy_lost=jnp.sum(traj.events.energy_lost, -1),
         momentum_drift=momentum[..., 0],
         angular_momentum_drift=momentum[..., 1],
@@ -196,7 +197,7 @@ def _report(traj: Trajectory) -> "Report":
 
 def _sum_of_counts(counts: Int[Array, "*lanes phases"]) -> Int[Array, "*lanes"]:
     """Return the sum over phases, and -1 where a phase was not counted."""
-    return jnp.where(jnp.any(counts < 0, -1), -1, jnp.sum(counts, -1))
+    return where(jnp.any(counts < 0, -1), -1, jnp.sum(counts, -1))
 
 
 def _drift_share(p: Phases) -> Float[Array, "..."]:
@@ -204,13 +205,13 @@ def _drift_share(p: Phases) -> Float[Array, "..."]:
 
     Drift within round-off of the energy counts as zero. NaN if no kinetic energy is recorded.
     """
-    drift = jnp.sum(jnp.where(jnp.isfinite(p.start), jnp.abs(p.energy_drift), 0), -1)
+    drift = jnp.sum(where(jnp.isfinite(p.start), jnp.abs(p.energy_drift), 0), -1)
     if p.kinetic_energy is None:
         return drift * jnp.nan
     round_off = ROUND_OFF_DRIFT * jnp.finfo(drift.dtype).eps * jnp.max(jnp.abs(p.energy), (-2, -1))
     kinetic = jnp.max(p.kinetic_energy, -1)
-    share = drift / jnp.where(kinetic > 0, kinetic, 1)
-    return jnp.where(drift <= round_off, 0, jnp.where(kinetic > 0, share, drift * jnp.inf))
+    share = drift / where(kinetic > 0, kinetic, 1)
+    return where(drift <= round_off, 0, where(kinetic > 0, share, drift * jnp.inf))
 
 
 def _error_share(traj: Trajectory) -> Float[Array, "..."]:

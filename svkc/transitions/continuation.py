@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.batched_lapack import factor_general, solve_factored
+from svkc._jax.select import where
 from svkc.loops.constraint import LoopKinematics, jacobian_scales, loop_kinematics
 from svkc.loops.frames import LoopFrames
 from svkc.loops.pivoting import PivotedQR, pivoted_qr
@@ -115,7 +116,7 @@ class PathState(eqx.Module):
         steps, zero = min(rows, dofs), jnp.zeros((), dtype)
         count, no = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
         y, multiplier = jnp.zeros(dofs, dtype), jnp.zeros(rows, dtype)
-        v = jnp.where(active_dofs(chain, structure), targets.v, 0)
+        v = where(active_dofs(chain, structure), targets.v, 0)
         point = PathPoint(
             q=targets.start,
             correction=y,
@@ -187,10 +188,8 @@ def _jacobian_and_gaps(loops: LoopKinematics):
     J, gap = loops.J.reshape(count, 6, -1), loops.gap.reshape(count, 6)
     vector = gap[:, :3]
     squared = jnp.sum(vector * vector, 1)
-    half = jnp.sqrt(jnp.where(squared < _SMALL_ANGLE**2, 1, squared)) / 2
-    factor = jnp.where(
-        squared < _SMALL_ANGLE**2, 1 / 12, (1 - half / jnp.tan(half)) / (2 * half) ** 2
-    )
+    half = jnp.sqrt(where(squared < _SMALL_ANGLE**2, 1, squared)) / 2
+    factor = where(squared < _SMALL_ANGLE**2, 1 / 12, (1 - half / jnp.tan(half)) / (2 * half) ** 2)
     to_real = quat_matrix(quat_conjugate(loops.frames.real_quat))
     across = skew(vector)
     inverse = jnp.eye(3, dtype=gap.dtype)[None] - across / 2
@@ -223,10 +222,10 @@ def _initial_values(path: PathState, offset, gap):
 
     offset, gap: values of this iteration, at the start of the leg if it has no accepted point.
     """
-    gap_to_close = jnp.where(path.kind == CLOSE_START, gap, 0)
+    gap_to_close = where(path.kind == CLOSE_START, gap, 0)
     return (
-        jnp.where(path.has_point, path.initial_offset, offset),
-        jnp.where(path.has_point, path.initial_gap, gap_to_close),
+        where(path.has_point, path.initial_offset, offset),
+        where(path.has_point, path.initial_gap, gap_to_close),
     )
 
 
@@ -240,27 +239,27 @@ def linearize(
     on_leg, moved = is_any_of(kind, CLOSE_START, FOLLOW), path.held & (kind == FOLLOW)
     projects_held = (kind == PROJECT_VELOCITY_HELD) & targets.held_v
     fixed = moved | projects_held | ~active_dofs(chain, structure)
-    free_J = jnp.where(fixed, 0, J)
-    rank = jnp.where(path.rank_known, path.newton.rank, min(J.shape))
+    free_J = where(fixed, 0, J)
+    rank = where(path.rank_known, path.newton.rank, min(J.shape))
     all_pivots = pivoted_qr(free_J, rank, targets.held_q & (kind == SELECT_HELD))
     with_margin = eqx.tree_at(lambda s: s.margin, structure, path.newton.margin)
     selection = independent_rows(with_margin, free_J, all_pivots, path.rank_known)
     gradient_at = lambda q, J: gradient(chain, path.origin, q, J, path.multiplier, weight)
     gradients = jax.vmap(gradient_at)(qs, Js)
     hessian_on_leg = (gradients[1:] - gradients[:1]).T / size
-    diagonal = jnp.diag(jnp.where(kind == CLOSE_PERTURBED, 1, weight))
+    diagonal = jnp.diag(where(kind == CLOSE_PERTURBED, 1, weight))
     gradient_of_change = gradients[0] - path.multiplier @ J
     offset = difference(chain, q, targets.requested) / column
     initial_offset, initial_gap = _initial_values(path, offset, gap)
     # gaps and offsets shrink as 1 - s from their values where the leg begins
-    residual = jnp.where(on_leg, gap - (1 - path.s) * initial_gap, gap)
+    residual = where(on_leg, gap - (1 - path.s) * initial_gap, gap)
     projects = is_any_of(kind, PROJECT_VELOCITY_HELD, PROJECT_VELOCITY)
-    residual = jnp.where(projects, J @ (path.newton.v / column), residual)
-    for_fixed = jnp.where(moved, offset - (1 - path.s) * initial_offset, 0)
-    upper = jnp.where(fixed, for_fixed, jnp.where(on_leg, -gradient_of_change, 0))
+    residual = where(projects, J @ (path.newton.v / column), residual)
+    for_fixed = where(moved, offset - (1 - path.s) * initial_offset, 0)
+    upper = where(fixed, for_fixed, where(on_leg, -gradient_of_change, 0))
     right_side = jnp.concatenate([upper, -selection.Q @ residual])
-    along = jnp.concatenate([jnp.where(moved, initial_offset, 0), selection.Q @ -initial_gap])
-    hessian = jnp.where(on_leg, hessian_on_leg, diagonal)
+    along = jnp.concatenate([where(moved, initial_offset, 0), selection.Q @ -initial_gap])
+    hessian = where(on_leg, hessian_on_leg, diagonal)
     matrix = optimality_matrix(hessian, selection.Q @ J, selection.active, fixed)
     # one call of LAPACK for both matrices
     orientation = _orientation_matrix(path.point, free_J)
@@ -289,7 +288,7 @@ def _orientation_matrix(point: PathPoint, J) -> Float[Array, "n n"]:
     The determinant was positive at `point`. It is negative on a branch that nearly crosses the
     path.
     """
-    unused = jnp.diag(jnp.where(jnp.any(point.P > 0, 1), 0, 1).astype(J.dtype))
+    unused = jnp.diag(where(jnp.any(point.P > 0, 1), 0, 1).astype(J.dtype))
     steps, n = point.P.shape
     block = point.Q @ J @ point.P.T + unused
     return jnp.pad(block - jnp.eye(steps, dtype=J.dtype), (0, n)) + jnp.eye(

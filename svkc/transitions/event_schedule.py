@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from svkc._jax.select import where
 from svkc.model.chain import Chain, Structure
 from svkc.transitions.plan import Plan
 
@@ -29,14 +30,14 @@ class EventSchedule(eqx.Module):
         waits = np.array([plan.after[i] is not None for i in plan.timed], bool)
         guard_waits = any(plan.after[i] is not None for i in plan.guarded)
         return cls(
-            times=jnp.where(waits, jnp.inf, plan.times),
+            times=where(waits, jnp.inf, plan.times),
             pending=jnp.ones(len(plan.timed), bool),
             happened=jnp.zeros(len(plan.actions), bool) if guard_waits else None,
         )
 
     def next_time(self) -> Float[Array, ""]:
         """Return the time of the next timed event (s), inf if there is none."""
-        return jnp.min(jnp.where(self.pending, self.times, jnp.inf), initial=jnp.inf)
+        return jnp.min(where(self.pending, self.times, jnp.inf), initial=jnp.inf)
 
     def due(self, t: Float[Array, ""]) -> Bool[Array, " timed"]:
         """Return which timed events are pending and happen up to the time t (s)."""
@@ -68,7 +69,7 @@ class EventSchedule(eqx.Module):
         started = jnp.any(starts & fired[None], 1)
         return replace(
             new,
-            times=jnp.where(started, t + plan.times, new.times),
+            times=where(started, t + plan.times, new.times),
             pending=new.pending | started,
         )
 

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from svkc._jax.primitive import ClosureConverted
+from svkc._jax.select import where
 from svkc.loops.forward_dynamics import loop_forces
 from svkc.loops.frames import loop_frames
 from svkc.model.annotations import Numbers, Scalar
@@ -111,7 +112,7 @@ class Touch(LinkGuard):
             return offset[0] - self.distance
         squared = jnp.sum(offset * offset)
         # the derivative of sqrt at zero is not finite
-        norm = jnp.where(squared == 0, 0, jnp.sqrt(jnp.where(squared == 0, 1, squared)))
+        norm = where(squared == 0, 0, jnp.sqrt(where(squared == 0, 1, squared)))
         return norm - self.distance
 
 
@@ -129,7 +130,7 @@ class Leaves(LinkGuard):
         normal_force = jnp.sum(loop_forces(chain, state, tau).force[i] * normal)
         # positive while the link is cut, so that a link that would have to pull as soon as it
         # connects crosses zero
-        return jnp.where(s.connected[i], normal_force, self.initial_value)
+        return where(s.connected[i], normal_force, self.initial_value)
 
 
 class Overload(LinkGuard):

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from svkc._jax.select import where
 from svkc.loops.constrained_dynamics import ArticulatedBodies, CompositeBodies
 from svkc.loops.constraint import LoopKinematics, jacobian_scales
 from svkc.loops.forward_dynamics import constraint_forces
@@ -32,7 +33,7 @@ def velocity_after_impact(
     solve = CompositeBodies().prepare(chain, structure, loops, qr)
     momentum, remaining = jnp.zeros_like(v), v
     if structure.locked is not None:
-        stopped = jnp.where(structure.locked, v, 0)
+        stopped = where(structure.locked, v, 0)
         momentum = pad_to_dofs(chain, mass_matrix_product(chain, loops.kin, stopped[: chain.nv]))
         remaining = v - stopped
     delta_v = solve(momentum, loops.J @ (remaining / jacobian_scales(chain)[1])) + remaining - v

@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from svkc._jax.eager import eager_jit
 from svkc._jax.pytrees import is_concrete
+from svkc._jax.select import where
 from svkc.loops.constraint import gap_tolerance, jacobian_scales, loop_gaps
 from svkc.model.annotations import Checked, Names, Numbers, Scalar
 from svkc.model.chain import Chain, State, Structure
@@ -139,20 +140,20 @@ def _follow_and_compare(
     end, column = follow_path(chain, structure, targets), jacobian_scales(chain)[1]
     structure = eqx.tree_at(lambda s: (s.rank, s.margin), structure, (end.rank, end.margin))
     last, requested, v = jax.lax.stop_gradient((end, targets.requested, targets.v))
-    deviation_q = jnp.where(held.q, jnp.abs(difference(chain, last.q, requested)), 0)
-    deviation_v = jnp.where(held.v, jnp.abs(v - last.v), 0)
+    deviation_q = where(held.q, jnp.abs(difference(chain, last.q, requested)), 0)
+    deviation_v = where(held.v, jnp.abs(v - last.v), 0)
     limit = targets.tolerance * column
     missed_q = ~(deviation_q <= limit)
     missed_v = ~(deviation_v <= limit * (1 + jnp.max(jnp.abs(v / column))))
     is_open = structure.connected & ~(last.residual_gaps < gap_tolerance(last.q.dtype))
     deviations = Deviations(
-        q=jnp.where(missed_q, deviation_q, 0),
-        v=jnp.where(missed_v, deviation_v, 0),
+        q=where(missed_q, deviation_q, 0),
+        v=where(missed_v, deviation_v, 0),
         is_open=is_open,
         failed=~last.reached | jnp.any(missed_q) | jnp.any(missed_v) | jnp.any(is_open),
     )
     # the given velocity itself, without the round-off of the projection
-    correction = jnp.where(targets.held_v & ~missed_v, v - last.v, 0)
+    correction = where(targets.held_v & ~missed_v, v - last.v, 0)
     return State(end.q, end.v + correction, structure), deviations
 
 
@@ -233,7 +234,7 @@ def _warn_of_precision(chain: Chain, q, v):
 def _check_reached(chain: Chain, state: State, deviations: Deviations, throw: bool) -> State:
     """Return the state if it is the requested one; otherwise raise, or fill it with NaN."""
     if not throw:
-        nan_if_failed = lambda x: jnp.where(deviations.failed, jnp.nan, x)
+        nan_if_failed = lambda x: where(deviations.failed, jnp.nan, x)
         return State(nan_if_failed(state.q), nan_if_failed(state.v), state.structure)
     if not is_concrete(deviations, state):
         return eqx.error_if(
@@ -253,7 +254,7 @@ def _check_reached(chain: Chain, state: State, deviations: Deviations, throw: bo
     # a path that failed with closed loops failed in all of them
     is_open = np.asarray(deviations.is_open)
     is_open = is_open if is_open.any() else np.asarray(state.structure.connected)
-    return check_closed(chain, state, jnp.where(is_open, jnp.inf, 0))
+    return check_closed(chain, state, where(is_open, jnp.inf, 0))
 
 
 def _describe_deviations(chain: Chain, deviation: np.ndarray, per: str) -> list[str]:

@@ -15,7 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from svkc._jax.one_kernel import one_kernel
 from svkc._jax.primitive import custom_primitive
+from svkc._jax.select import where
 from svkc.loops.constraint import jacobian_scales, loop_kinematics
 from svkc.loops.pivoting import (
     PivotedQR,
@@ -61,10 +63,8 @@ class _Iteration(eqx.Module):
         chain, structure = self.chain, self.structure
         q_eval = current.q
         if DECIDE_RANK in self.kinds:
-            q_eval = jnp.where(
-                is_any_of(kind, CLOSE_PERTURBED, DECIDE_RANK), current.probe, current.q
-            )
-        loops = loop_kinematics(chain, structure, q_eval)
+            q_eval = where(is_any_of(kind, CLOSE_PERTURBED, DECIDE_RANK), current.probe, current.q)
+        loops = one_kernel(loop_kinematics)(chain, structure, q_eval)
         J = loops.J
         all_pivots, qr = self._pivots(J, current, kind, rank_known)
         step = -least_norm_change(chain, qr, J, loops.gap[:, None])[:, 0]
@@ -81,7 +81,7 @@ class _Iteration(eqx.Module):
         q, probe = self._updated_configuration(q_eval, kind, step), current.probe
         if DECIDE_RANK in self.kinds:
             in_rank_search = is_any_of(kind, *RANK_SEARCH)
-            q, probe = jnp.where(in_rank_search, current.q, q), jnp.where(in_rank_search, q, probe)
+            q, probe = where(in_rank_search, current.q, q), where(in_rank_search, q, probe)
         return dataclasses.replace(
             current,
             q=q,
@@ -97,11 +97,11 @@ class _Iteration(eqx.Module):
         independent, max_rank, dtype = None, min(J.shape), J.dtype
         if self.structure.independent is not None and IMPACT in self.kinds:
             independent = self.structure.independent & (kind == IMPACT)
-        all_pivots = pivoted_qr(J, jnp.where(rank_known, current.rank, max_rank), independent)
-        weak_threshold = jnp.where(rank_known, release_threshold(dtype) * current.margin, 0)
+        all_pivots = pivoted_qr(J, where(rank_known, current.rank, max_rank), independent)
+        weak_threshold = where(rank_known, release_threshold(dtype) * current.margin, 0)
         # along rows with weaker pivots a gap is of second order in the change of q, and dividing by
         # these pivots amplifies round-off; an impact does not solve for gaps
-        threshold = jnp.where(
+        threshold = where(
             kind == IMPACT, weak_threshold, jnp.maximum(rank_tolerance(dtype), weak_threshold)
         )
         return all_pivots, drop_below(all_pivots, threshold)
@@ -109,8 +109,8 @@ class _Iteration(eqx.Module):
     def _updated_configuration(self, q, kind, step) -> Float[Array, " q"]:
         """Return q moved by the Newton step or by the perturbation, as the kind says; for other
         kinds return q."""
-        delta = jnp.where(is_any_of(kind, CLOSE, CLOSE_PERTURBED), step, 0)
-        return integrate(self.chain, q, jnp.where(kind == PERTURB, self.perturbation, delta))
+        delta = where(is_any_of(kind, CLOSE, CLOSE_PERTURBED), step, 0)
+        return integrate(self.chain, q, where(kind == PERTURB, self.perturbation, delta))
 
 
 def rank_search_perturbation(chain: Chain, structure: Structure) -> Float[Array, " dofs"]:
@@ -119,7 +119,7 @@ def rank_search_perturbation(chain: Chain, structure: Structure) -> Float[Array,
     The change has a fixed direction without symmetry, as q itself may be singular.
     """
     change = 0.05 * np.sin(1.0 + 2.3 * np.arange(chain.dofs)) * jacobian_scales(chain)[1]
-    return jnp.where(active_dofs(chain, structure), change, 0).astype(chain.q_load.dtype)
+    return where(active_dofs(chain, structure), change, 0).astype(chain.q_load.dtype)
 
 
 def _iterate(
@@ -131,7 +131,7 @@ def _iterate(
     """
     kinds, unlocked = schedule.kinds, dataclasses.replace(structure, locked=None)
     # locked joints have a velocity before the impact that stops them
-    v = jnp.where(active_dofs(chain, unlocked), v, 0)
+    v = where(active_dofs(chain, unlocked), v, 0)
     perturbation = rank_search_perturbation(chain, structure)
     iteration = _Iteration(chain, structure, perturbation=perturbation, kinds=kinds)
 

@@ -11,6 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from svkc._jax.select import where
 from svkc.loops.pivoting import count_rank
 from svkc.model.chain import Chain, Structure
 from svkc.tree.configuration import normalize
@@ -94,14 +95,14 @@ class NewtonState(eqx.Module):
         rows = jnp.stack([kind == PERTURB, kind == DECIDE_RANK])[:, None]
         recorded = dataclasses.replace(
             self,
-            search_diag_R=jnp.where(rows, diag_R[None], self.search_diag_R),
-            search_gaps=jnp.where(rows, gaps[None], self.search_gaps),
+            search_diag_R=where(rows, diag_R[None], self.search_diag_R),
+            search_gaps=where(rows, gaps[None], self.search_gaps),
         )
         rank, margin = recorded.rank_and_margin()
         return dataclasses.replace(
             recorded,
-            rank=jnp.where(kind == DECIDE_RANK, rank, self.rank),
-            margin=jnp.where(kind == DECIDE_RANK, margin, self.margin),
+            rank=where(kind == DECIDE_RANK, rank, self.rank),
+            margin=where(kind == DECIDE_RANK, margin, self.margin),
         )
 
     def rank_and_margin(self) -> tuple[Int[Array, ""], Float[Array, ""]]:
@@ -111,9 +112,9 @@ class NewtonState(eqx.Module):
         """
         diag_R, eps = self.search_diag_R, jnp.finfo(self.search_diag_R.dtype)
         closed = jnp.max(self.search_gaps[1]) < eps.eps**0.75
-        rank = jnp.where(
+        rank = where(
             closed, jnp.maximum(count_rank(diag_R[0]), count_rank(diag_R[1])), count_rank(diag_R[0])
         )
         last = jnp.arange(diag_R.shape[1], dtype=jnp.int32) == rank - 1
-        margin = jnp.sum(jnp.where(last, diag_R, 0), 1) / jnp.maximum(diag_R[:, 0], eps.tiny)
-        return rank, jnp.where(closed, jnp.max(margin), margin[0])
+        margin = jnp.sum(where(last, diag_R, 0), 1) / jnp.maximum(diag_R[:, 0], eps.tiny)
+        return rank, where(closed, jnp.max(margin), margin[0])

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.primitive import custom_primitive
+from svkc._jax.select import where
 from svkc.loops.constraint import gap_tolerance, jacobian_scales, loop_kinematics
 from svkc.model.chain import Chain, Structure
 from svkc.transitions.continuation import DONE, SELECT_HELD, PathState, linearize
@@ -53,7 +54,7 @@ def _follow(chain: Chain, structure: Structure, targets: Targets) -> PathEnd:
         path = dataclasses.replace(path, iterations=path.iterations + 1)
         # q may be singular, so the rank and the held coordinates are decided at the probe
         at_probe = is_any_of(path.kind, CLOSE_PERTURBED, DECIDE_RANK, SELECT_HELD)
-        q = jnp.where(at_probe, path.newton.probe, path.newton.q)
+        q = where(at_probe, path.newton.probe, path.newton.q)
         linear = linearize(chain, structure, targets, path, q)
         return next_path_state(chain, structure, targets, path, q, linear)
 
@@ -61,7 +62,7 @@ def _follow(chain: Chain, structure: Structure, targets: Targets) -> PathEnd:
     path = jax.lax.while_loop(unfinished, body, PathState.init(chain, structure, targets))
     # the requested values themselves, without the round-off of the steps towards them
     round_off = difference(chain, path.newton.q, targets.requested)
-    q = integrate(chain, path.newton.q, jnp.where(path.held & path.reached, round_off, 0))
+    q = integrate(chain, path.newton.q, where(path.held & path.reached, round_off, 0))
     return _path_end(path, q)
 
 
@@ -111,7 +112,7 @@ def _follow_jvp(primals, tangents):
     with_rank = eqx.tree_at(lambda s: (s.rank, s.margin), structure, rank)
 
     def inputs(chain, structure, targets):
-        start = jnp.where(end.from_requested, targets.requested, targets.start)
+        start = where(end.from_requested, targets.requested, targets.start)
         start = _with_joint_coordinates(chain, structure, targets.read_links, start)
         return chain, structure, start, targets.requested
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.pytrees import tree_where
+from svkc._jax.select import where
 from svkc.loops.constraint import gap_tolerance, jacobian_scales
 from svkc.model.chain import Chain, Structure
 from svkc.transitions.continuation import (
@@ -75,7 +76,7 @@ def _decide(path: PathState, linear: LinearSolution) -> _StepDecision:
     on_leg, rank_unknown = is_any_of(path.kind, CLOSE_START, FOLLOW), ~path.rank_known
     size, length = jnp.max(jnp.abs(linear.step)), jnp.max(jnp.abs(linear.tangent))
     at_end = path.s > 1 - 4 * eps
-    small = size <= jnp.where(at_end, eps**0.5, eps ** (1 / 3))
+    small = size <= where(at_end, eps**0.5, eps ** (1 / 3))
     # Until the rank is known the first leg uses all rows. An over-constrained loop has a higher
     # rank while open: its corrections converge slowly, and the orientation of its pivot block has
     # no meaning.
@@ -86,20 +87,20 @@ def _decide(path: PathState, linear: LinearSolution) -> _StepDecision:
     accept = on_leg & ((small & same_branch) | closed)
     predicted = path.step_size * jnp.max(jnp.abs(path.point.tangent))
     first = path.corrections == 0
-    contraction = jnp.where(rank_unknown, 0.95, 0.5)
-    converges = jnp.where(
+    contraction = where(rank_unknown, 0.95, 0.5)
+    converges = where(
         first & path.has_point,
         size <= 0.2 * predicted + eps ** (1 / 3),
         first | (size <= contraction * path.correction_size),
     )
-    converges &= ~(small & ~same_branch) & (path.corrections < jnp.where(rank_unknown, 60, 10))
+    converges &= ~(small & ~same_branch) & (path.corrections < where(rank_unknown, 60, 10))
     reject = on_leg & ~accept & ~converges
-    grown = jnp.where(path.has_point, 2 * path.step_size, 1)
+    grown = where(path.has_point, 2 * path.step_size, 1)
     limit = _LARGEST_STEP / jnp.maximum(length, eps)
     step_size = jnp.minimum(jnp.minimum(grown, 1 - path.s), limit)
     too_small = (predicted < 2 * _SMALLEST_STEP) | (path.step_size < 1e-8)
     far = jnp.max(jnp.abs(linear.initial_gap)) + jnp.max(
-        jnp.where(path.held, jnp.abs(linear.initial_offset), 0)
+        where(path.held, jnp.abs(linear.initial_offset), 0)
     )
     longest = _ITERATIONS + _ITERATIONS_PER_UNIT * far
     too_long = on_leg & (path.iterations.astype(far.dtype) > longest)
@@ -110,7 +111,7 @@ def _decide(path: PathState, linear: LinearSolution) -> _StepDecision:
         stuck=too_long | (reject & (~path.has_point | too_small)),
         rank_drops=closed & ~small,
         correction_size=size,
-        step_size=jnp.where(reject, path.step_size / 2, step_size),
+        step_size=where(reject, path.step_size / 2, step_size),
     )
 
 
@@ -136,31 +137,31 @@ def _advance(
     point = tree_where(onward, accepted, path.point)
     predicts, on_leg = onward | decision.reject, is_any_of(kind, CLOSE_START, FOLLOW)
     corrects = on_leg | (kind == CLOSE_PERTURBED)
-    correction = jnp.where(corrects & ~decision.rank_drops, linear.step, 0)
-    step = jnp.where(predicts, point.correction + h * point.tangent, correction)
+    correction = where(corrects & ~decision.rank_drops, linear.step, 0)
+    step = where(predicts, point.correction + h * point.tangent, correction)
     perturbation = rank_search_perturbation(chain, structure)
-    change = column * step + jnp.where(kind == PERTURB, perturbation, 0)
-    q_next = integrate(chain, jnp.where(predicts, point.q, q), change)
+    change = column * step + where(kind == PERTURB, perturbation, 0)
+    q_next = integrate(chain, where(predicts, point.q, q), change)
     newton, in_rank_search = path.newton, is_any_of(kind, *RANK_SEARCH)
     projects = is_any_of(kind, PROJECT_VELOCITY_HELD, PROJECT_VELOCITY)
     newton = dataclasses.replace(
         newton.record_rank_search(kind, linear.all_pivots.diag_R, _gap_norms(linear)),
-        q=jnp.where(in_rank_search | (kind == SELECT_HELD), newton.q, q_next),
-        probe=jnp.where(in_rank_search, q_next, newton.probe),
-        v=newton.v + jnp.where(projects, column * linear.step, 0),
+        q=where(in_rank_search | (kind == SELECT_HELD), newton.q, q_next),
+        probe=where(in_rank_search, q_next, newton.probe),
+        v=newton.v + where(projects, column * linear.step, 0),
         residual_gaps=_gap_norms(linear),
     )
-    multiplier = jnp.where(on_leg, linear.multiplier, path.multiplier)
+    multiplier = where(on_leg, linear.multiplier, path.multiplier)
     return dataclasses.replace(
         path,
         newton=newton,
         point=point,
-        s=jnp.where(predicts, point.s + h, path.s),
-        step_size=jnp.where(predicts, h, path.step_size),
+        s=where(predicts, point.s + h, path.s),
+        step_size=where(predicts, h, path.step_size),
         correction_size=decision.correction_size,
-        corrections=jnp.where(corrects & ~predicts, path.corrections + 1, 0),
+        corrections=where(corrects & ~predicts, path.corrections + 1, 0),
         has_point=path.has_point | onward,
-        multiplier=jnp.where(predicts, point.multiplier + h * point.multiplier_rate, multiplier),
+        multiplier=where(predicts, point.multiplier + h * point.multiplier_rate, multiplier),
         initial_gap=linear.initial_gap,
         initial_offset=linear.initial_offset,
     )
@@ -186,32 +187,32 @@ def next_path_state(
     start_closed = decision.leg_done & (kind == CLOSE_START)
     used_rows = jnp.sum(linear.selection.active, dtype=jnp.int32)
     # no number of rows: the start is closed again once the rank is known
-    used_rows = jnp.where(decision.rank_drops, -1, used_rows)
+    used_rows = where(decision.rank_drops, -1, used_rows)
     # coordinates that are no pivots are independent, and can be held
     independent = targets.held_q & ~jnp.any(linear.all_pivots.P > 0, 0)
     after = dataclasses.replace(
         after,
-        held=jnp.where(kind == SELECT_HELD, independent, path.held),
+        held=where(kind == SELECT_HELD, independent, path.held),
         rank_known=path.rank_known | (kind == DECIDE_RANK),
-        closing_rows=jnp.where(start_closed, used_rows, path.closing_rows),
+        closing_rows=where(start_closed, used_rows, path.closing_rows),
     )
     scaled_offset = difference(chain, q, targets.requested) / jacobian_scales(chain)[1]
-    deviation = jnp.where(targets.held_q, jnp.abs(scaled_offset - linear.step), 0)
+    deviation = where(targets.held_q, jnp.abs(scaled_offset - linear.step), 0)
     missed = ~(jnp.max(deviation) <= targets.tolerance)
     failed = decision.stuck | (decision.leg_done & (kind == FOLLOW) & missed)
     # An over-constrained loop was closed with more rows than its rank when closed. The closed point
     # need not be stationary: close the loop again, with the rank known.
     close_again = (kind == SELECT_HELD) & (path.closing_rows != path.newton.rank)
     new_leg = decision.leg_done | close_again
-    last_q = jnp.where(decision.stuck, path.point.q, after.newton.q)
+    last_q = where(decision.stuck, path.point.q, after.newton.q)
     after = dataclasses.replace(
         after,
-        kind=jnp.where(failed, DONE, _next_kind(path, decision, close_again)),
+        kind=where(failed, DONE, _next_kind(path, decision, close_again)),
         has_point=after.has_point & ~new_leg,
-        s=jnp.where(new_leg, 0, after.s),
+        s=where(new_leg, 0, after.s),
         reached=path.reached | (kind == PROJECT_VELOCITY),
-        multiplier=jnp.where(close_again, 0, after.multiplier),
-        newton=dataclasses.replace(after.newton, q=jnp.where(close_again, path.origin, last_q)),
+        multiplier=where(close_again, 0, after.multiplier),
+        newton=dataclasses.replace(after.newton, q=where(close_again, path.origin, last_q)),
     )
     return tree_where(
         failed & ~path.from_requested & jnp.any(targets.held_q & ~(path.held & path.rank_known)),
@@ -238,20 +239,20 @@ def _next_kind(path: PathState, decision: _StepDecision, close_again) -> Int[Arr
     """Return the kind of the next iteration of a path that does not fail."""
     kind, last_search = path.kind, RANK_SEARCH.count(CLOSE_PERTURBED) - 1
     search_closed = (kind == CLOSE_PERTURBED) & (path.corrections >= last_search)
-    after_closing = jnp.where(path.rank_known, FOLLOW, PERTURB)
+    after_closing = where(path.rank_known, FOLLOW, PERTURB)
     table = (
         (kind == READ_COORDINATES, CLOSE_START),
         (decision.leg_done & (kind == CLOSE_START), after_closing),
         (kind == PERTURB, CLOSE_PERTURBED),
         (search_closed, DECIDE_RANK),
         (kind == DECIDE_RANK, SELECT_HELD),
-        (kind == SELECT_HELD, jnp.where(close_again, CLOSE_START, FOLLOW)),
+        (kind == SELECT_HELD, where(close_again, CLOSE_START, FOLLOW)),
         (decision.leg_done & (kind == FOLLOW), PROJECT_VELOCITY_HELD),
         (kind == PROJECT_VELOCITY_HELD, PROJECT_VELOCITY),
         (kind == PROJECT_VELOCITY, DONE),
     )
     for condition, following in table:
-        kind = jnp.where(condition, following, kind)
+        kind = where(condition, following, kind)
     return kind
 
 
@@ -275,5 +276,5 @@ def _read_coordinates(
     return dataclasses.replace(
         path,
         newton=dataclasses.replace(path.newton, q=q),
-        origin=jnp.where(kind == READ_COORDINATES, q, path.origin),
+        origin=where(kind == READ_COORDINATES, q, path.origin),
     )

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from svkc._jax.select import where
 from svkc.loops.frames import LoopFrames, loop_frames
 from svkc.model.chain import Chain, Structure
 from svkc.tree.kinematics import Kinematics
@@ -39,16 +40,14 @@ def joint_coordinates(
         + quat_rotate(kin.quat[p], structure.pos)
         + (kin.root_position[p] - kin.root_position[structure.real])
     )
-    translation = jnp.where(
+    translation = where(
         structure.freedoms[:, 3:],
         quat_rotate(quat_conjugate(frames.base_quat), frames.real_position - origin),
         0,
     )
     angle = _euler_angles(rotation, structure.freedoms)
     ball_quat = quat_normalize(
-        jnp.concatenate(
-            [rotation[:, :1], jnp.where(structure.freedoms[:, :3], rotation[:, 1:], 0)], -1
-        )
+        jnp.concatenate([rotation[:, :1], where(structure.freedoms[:, :3], rotation[:, 1:], 0)], -1)
     )
     table = top.links
     for values, index in (
@@ -71,7 +70,7 @@ def with_coordinates(
         at = np.flatnonzero((index < top.nq_all).ravel())
         slots = index.ravel()[at]
         if len(at):
-            q = q.at[slots].set(jnp.where(links[at // index.shape[1]], new[slots], q[slots]))
+            q = q.at[slots].set(where(links[at // index.shape[1]], new[slots], q[slots]))
     return q
 
 
@@ -84,16 +83,12 @@ def _euler_angles(
 
     def angle(s, c):
         # arctan2(0, 0) has the derivative NaN
-        return jnp.arctan2(s, jnp.where((s == 0) & (c == 0), 1, c))
+        return jnp.arctan2(s, where((s == 0) & (c == 0), 1, c))
 
     # each angle from entries of Rx Ry, Rx Rz or Ry Rz that depend on this angle alone
-    x = jnp.where(
-        fx, jnp.where(fz, angle(-R[:, 1, 2], R[:, 2, 2]), angle(R[:, 2, 1], R[:, 1, 1])), 0
-    )
-    y = jnp.where(fy, angle(R[:, 0, 2], jnp.where(fz, R[:, 2, 2], R[:, 0, 0])), 0)
-    z = jnp.where(
-        fz, jnp.where(fx, angle(-R[:, 0, 1], R[:, 0, 0]), angle(R[:, 1, 0], R[:, 1, 1])), 0
-    )
+    x = where(fx, where(fz, angle(-R[:, 1, 2], R[:, 2, 2]), angle(R[:, 2, 1], R[:, 1, 1])), 0)
+    y = where(fy, angle(R[:, 0, 2], where(fz, R[:, 2, 2], R[:, 0, 0])), 0)
+    z = where(fz, where(fx, angle(-R[:, 0, 1], R[:, 0, 0]), angle(R[:, 1, 0], R[:, 1, 1])), 0)
     return jnp.stack([x, y, z], -1)
 
 
@@ -123,5 +118,5 @@ def place_at_current_pose(
     return eqx.tree_at(
         lambda s: (s.pos, s.real_quat),
         structure,
-        (jnp.where(mask, pos, structure.pos), jnp.where(mask, real_quat, structure.real_quat)),
+        (where(mask, pos, structure.pos), where(mask, real_quat, structure.real_quat)),
     )

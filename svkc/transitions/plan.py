@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from svkc._jax.pytrees import is_concrete
+from svkc._jax.select import where
 from svkc.model.annotations import DType
 from svkc.model.chain import Chain, Structure
 from svkc.model.names import body_rows, link_index, spare_slot, v_slice
@@ -149,7 +150,7 @@ class Plan(eqx.Module):
         rises, falls = (before < 0) & (after >= 0), (before > 0) & (after <= 0)
         either = np.array([d is None for d in self.directions], bool)
         rising = np.array([d is True for d in self.directions], bool)
-        return jnp.where(either, rises | falls, jnp.where(rising, rises, falls))
+        return where(either, rises | falls, where(rising, rises, falls))
 
 
 def guard_round_off(dtype: DType) -> float:

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from svkc._jax.pytrees import is_concrete
+from svkc._jax.select import where
 from svkc.model.annotations import Checked, DType, Numbers
 from svkc.model.chain import Chain, State, Structure
 from svkc.model.checked_jit import check_state
@@ -105,13 +106,13 @@ def set_links(
         lambda s: (s.parent, s.real, s.freedoms, s.quat, s.real_quat, s.pos, s.real_pos),
         structure,
         (
-            jnp.where(links, jnp.asarray(rows[0], structure.parent.dtype), structure.parent),
-            jnp.where(links, jnp.asarray(rows[1], structure.real.dtype), structure.real),
-            jnp.where(column, np.array(freedoms)[None], structure.freedoms),
-            jnp.where(column, quat, structure.quat),
-            jnp.where(column, quat, structure.real_quat),
-            jnp.where(column, jnp.asarray(pos, dtype)[None], structure.pos),
-            jnp.where(column, jnp.asarray(real_pos, dtype)[None], structure.real_pos),
+            where(links, jnp.asarray(rows[0], structure.parent.dtype), structure.parent),
+            where(links, jnp.asarray(rows[1], structure.real.dtype), structure.real),
+            where(column, np.array(freedoms)[None], structure.freedoms),
+            where(column, quat, structure.quat),
+            where(column, quat, structure.real_quat),
+            where(column, jnp.asarray(pos, dtype)[None], structure.pos),
+            where(column, jnp.asarray(real_pos, dtype)[None], structure.real_pos),
         ),
     )
 

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from svkc._jax.batched_lapack import solve_general
+from svkc._jax.select import where
 from svkc.loops.constraint import jacobian_scales, loop_kinematics
 from svkc.loops.pivoting import (
     PivotedQR,
@@ -71,7 +72,7 @@ def weights(chain: Chain, structure: Structure) -> Float[Array, " dofs"]:
     for link, row in enumerate(top.link_child):
         if row >= 0:
             body = np.isin(np.arange(top.dofs), top.v_start[row] + np.arange(V_SIZE[FREE]))
-            weight = jnp.where(body & structure.connected[link], 0, weight)
+            weight = where(body & structure.connected[link], 0, weight)
     return weight
 
 
@@ -86,7 +87,7 @@ def independent_rows(
     qr: pivoted QR of J.
     rank_known: whether the rank and the margin of the structure have been decided.
     """
-    weak = jnp.where(rank_known, release_threshold(J.dtype) * structure.margin, 0)
+    weak = where(rank_known, release_threshold(J.dtype) * structure.margin, 0)
     return drop_below(qr, jnp.maximum(rank_tolerance(J.dtype), weak))
 
 
@@ -106,7 +107,7 @@ def optimality_matrix(
     """
     dtype = rows.dtype
     free = ~fixed[:, None]
-    upper = jnp.concatenate([jnp.where(free, hessian, 0), jnp.where(free, rows.T, 0)], 1)
+    upper = jnp.concatenate([where(free, hessian, 0), where(free, rows.T, 0)], 1)
     lower = jnp.concatenate([rows, jnp.diag((~used).astype(dtype))], 1)
     no_rows = jnp.zeros(rows.shape[0], bool)
     identity = jnp.diag(jnp.concatenate([fixed, no_rows]).astype(dtype))
@@ -132,9 +133,9 @@ def _multiplier(J, selection: PivotedQR, gradient_of_change, fixed):
 
     fixed: coordinates without a condition of stationarity.
     """
-    rows = selection.Q @ jnp.where(fixed, 0, J)
+    rows = selection.Q @ where(fixed, 0, J)
     gram = rows @ rows.T + jnp.diag((~selection.active).astype(J.dtype))
-    return -solve_positive(gram, rows @ jnp.where(fixed, 0, gradient_of_change)) @ selection.Q
+    return -solve_positive(gram, rows @ where(fixed, 0, gradient_of_change)) @ selection.Q
 
 
 def stationary_tangent(
@@ -155,7 +156,7 @@ def stationary_tangent(
     column, weight = jacobian_scales(chain)[1], weights(chain, structure)
     fixed = held | ~active_dofs(chain, structure)
     J = loop_kinematics(chain, structure, q).J
-    free_J = jax.lax.stop_gradient(jnp.where(fixed, 0, J))
+    free_J = jax.lax.stop_gradient(where(fixed, 0, J))
     selection = independent_rows(structure, free_J, pivoted_qr(free_J, structure.rank))
     selection = jax.lax.stop_gradient(selection)
     change = weight * difference(chain, start, q) / column
@@ -169,8 +170,8 @@ def stationary_tangent(
     def residual(chain, structure, start, requested):
         loops = loop_kinematics(chain, structure, q)
         slope = gradient(chain, start, q, loops.J, multiplier, weight)
-        target = jnp.where(held, difference(chain, q, requested), difference(chain, q, start))
-        return jnp.concatenate([jnp.where(fixed, -target / column, slope), selection.Q @ loops.gap])
+        target = where(held, difference(chain, q, requested), difference(chain, q, start))
+        return jnp.concatenate([where(fixed, -target / column, slope), selection.Q @ loops.gap])
 
     hessian = jax.jacfwd(stationarity)(jnp.zeros_like(column))
     matrix = optimality_matrix(hessian, selection.Q @ J, selection.active, fixed)
@@ -195,11 +196,11 @@ def projected_velocity(
     column, active = jacobian_scales(chain)[1], active_dofs(chain, structure)
     fixed = held | ~active
     J = loop_kinematics(chain, structure, q).J
-    qr = pivoted_qr(jax.lax.stop_gradient(jnp.where(fixed, 0, J)), structure.rank)
+    qr = pivoted_qr(jax.lax.stop_gradient(where(fixed, 0, J)), structure.rank)
     selection = independent_rows(structure, J, qr)
     Q = jax.lax.stop_gradient(selection.Q)
     hessian = jnp.diag(weights(chain, structure))
     matrix = optimality_matrix(hessian, Q @ J, selection.active, fixed)
-    v_scaled = jnp.where(active, v, 0) / column
+    v_scaled = where(active, v, 0) / column
     right_side = jnp.concatenate([jnp.zeros_like(v), -(Q @ (J @ v_scaled))])
     return column * (v_scaled + solve_general(matrix, right_side)[: len(column)])

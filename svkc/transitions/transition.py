@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from svkc._jax.eager import eager_jit
 from svkc._jax.pytrees import is_concrete
+from svkc._jax.select import where
 from svkc.loops.constraint import gap_tolerance
 from svkc.model.annotations import Names, Numbers
 from svkc.model.chain import Chain, State, Structure
@@ -93,10 +94,10 @@ def _lock_without_links(
     v, energy_lost = lock_projection(chain, structure, state.q, state.v)
     no_impulse = jnp.zeros((0, 3), state.v.dtype)
     return StructureChange(
-        state=State(state.q, jnp.where(any_new, v, state.v), structure),
+        state=State(state.q, where(any_new, v, state.v), structure),
         impulse=no_impulse,
         angular_impulse=no_impulse,
-        energy_lost=jnp.where(any_new, energy_lost, 0),
+        energy_lost=where(any_new, energy_lost, 0),
         initial_gap=jnp.zeros((), state.v.dtype),
         residual_gaps=no_impulse[:, 0],
     )
@@ -108,15 +109,15 @@ def _select_change(
     """Return the solution as a change of structure, with the old q and v where nothing is new."""
     rank = (solution.rank, solution.margin)
     structure = eqx.tree_at(lambda s: (s.rank, s.margin), structure, rank)
-    q, v = jnp.where(any_new, solution.q, state.q), jnp.where(any_new, solution.v, state.v)
-    impulse = jnp.where(any_new, solution.spatial_impulse, 0)
+    q, v = where(any_new, solution.q, state.q), where(any_new, solution.v, state.v)
+    impulse = where(any_new, solution.spatial_impulse, 0)
     return StructureChange(
         state=State(q, v, structure),
         impulse=impulse[:, 3:],
         angular_impulse=impulse[:, :3],
-        energy_lost=jnp.where(any_new, solution.energy_lost, 0),
-        initial_gap=jnp.where(any_new, jnp.max(solution.search_gaps[0]), 0),
-        residual_gaps=jnp.where(any_new, solution.residual_gaps, solution.search_gaps[0]),
+        energy_lost=where(any_new, solution.energy_lost, 0),
+        initial_gap=where(any_new, jnp.max(solution.search_gaps[0]), 0),
+        residual_gaps=where(any_new, solution.residual_gaps, solution.search_gaps[0]),
     )
 
 

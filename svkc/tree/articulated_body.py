@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from svkc._jax.chunked_sum import sum_in_chunks
+from svkc._jax.select import where
 from svkc._jax.static_gather import static_take
 from svkc.model.chain import Chain
 from svkc.model.topology import Topology
@@ -47,9 +48,9 @@ def articulated_factors(
     free: coordinates that are not locked (None: all).
     """
     top, own = chain.topology, spatial_inertias(chain, kin)
-    S = kin.S if free is None else jnp.where(free[:, None], kin.S, 0)
+    S = kin.S if free is None else where(free[:, None], kin.S, 0)
     armature = jnp.zeros(chain.nv, S.dtype) if chain.armature is None else chain.armature
-    armature = armature if free is None else jnp.where(free, armature, 1)
+    armature = armature if free is None else where(free, armature, 1)
     # The last entry is the padding's.
     armature = jnp.concatenate([armature, jnp.ones(1, S.dtype)])
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from svkc._jax.select import where
 from svkc._jax.static_gather import static_take
 from svkc.model.annotations import Numbers
 from svkc.model.chain import Chain
@@ -52,7 +53,7 @@ def velocities_from_derivative(
     at = quat_q[:, None] + np.arange(4)
     quat = static_take(q, at)
     square = jnp.sum(quat * quat, -1, keepdims=True)
-    inverse = 2 * quat_conjugate(quat) / jnp.where(square == 0, 1, square)
+    inverse = 2 * quat_conjugate(quat) / where(square == 0, 1, square)
     w = quat_multiply(inverse, static_take(qdot, at))[..., 1:]
     order = np.argsort(np.concatenate([scalar_v, (quat_v[:, None] + np.arange(3)).ravel()]))
     return static_take(jnp.concatenate([static_take(qdot, scalar_q), w.ravel()]), order)

@@ -6,6 +6,7 @@ from typing import NamedTuple, TypeAlias
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from svkc._jax.select import where
 from svkc.model.chain import Chain, State, active_dofs
 from svkc.model.checked_jit import checked_jit
 from svkc.tree.configuration import difference
@@ -52,7 +53,7 @@ def _energies(
         stretch = difference(chain, chain.q_spring, state.q)
         # the springs of cut joints are gone; those of locked joints stay stretched
         existing = active_dofs(chain, replace(state.structure, locked=None))
-        stretch = jnp.where(existing, stretch, 0)
+        stretch = where(existing, stretch, 0)
         potential = potential + jnp.sum(chain.stiffness * stretch**2) / 2
     return kinetic, potential
 

@@ -6,6 +6,7 @@ Also the forces of springs, dampers and joint limits, which act on joints as tor
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from svkc._jax.select import where
 from svkc._jax.static_gather import static_take
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import checked_jit
@@ -124,9 +125,7 @@ def limit_forces(
     lower, upper = chain.limit[:, scalar_v]
     x = static_take(q, scalar_q)
     outside = jnp.maximum(x - upper, 0) - jnp.maximum(lower - x, 0)
-    onset = jnp.where(
-        outside != 0, jnp.exp(-0.02 / jnp.where(outside != 0, jnp.abs(outside), 1)), 0
-    )
+    onset = where(outside != 0, jnp.exp(-0.02 / where(outside != 0, jnp.abs(outside), 1)), 0)
     return replace_rows(
         tau, scalar_v, -(k[scalar_v] * outside + c[scalar_v] * static_take(v, scalar_v)) * onset
     )

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from svkc._jax.pytrees import only_leaves
+from svkc._jax.select import where
 from svkc._jax.static_gather import static_take
 from svkc.model.chain import Chain
 from svkc.model.topology import BALL, FREE, HINGE, SLIDE, Topology
@@ -154,7 +155,7 @@ def _kinematics_rate(chain: Chain, kin: Kinematics, v: Float[Array, " dofs"]) ->
         quat=quat_multiply(jnp.concatenate([jnp.zeros_like(w[:, :1]), w], -1), kin.quat) / 2,
         r=relative - cross(kin.r, w),
         root_position=root_velocity,
-        S=jnp.where(_fixed_in_row(top)[:, None], S, 0),
+        S=where(_fixed_in_row(top)[:, None], S, 0),
     )
 
 
@@ -183,7 +184,7 @@ def _kinematics(chain: Chain, q: Float[Array, " q"]) -> Kinematics:
             step, free, static_take(q, np.array(top.q_start)[free][:, None] + np.arange(3))
         )
     roots = np.array(top.parent) <= 0
-    r = accumulate_from_root(top, jnp.where(roots[:, None], 0, step))
+    r = accumulate_from_root(top, where(roots[:, None], 0, step))
     return Kinematics(
         R=R,
         quat=quat,
@@ -246,7 +247,7 @@ def velocity_products(
     world and contribute nothing.
     """
     top = chain.topology
-    v = jnp.where(_fixed_in_row(top), v[: chain.nv], 0)
+    v = where(_fixed_in_row(top), v[: chain.nv], 0)
     return motion_cross(V, sum_dofs_per_row(top, kin.S * v[:, None]))
 
 

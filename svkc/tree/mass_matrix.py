@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from svkc._jax.select import where
 from svkc._jax.static_gather import static_take
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import checked_jit
@@ -55,8 +56,8 @@ def mass_matrix_crba(chain: Chain, kin: Kinematics) -> Float[Array, "nv nv"]:
     # momentum of the composite body beyond a joint, for a unit of the joint's velocity
     F = jnp.concatenate([matvec(I, w) + cross(h, u), m * u + cross(w, h)], -1)
     related = top.ancestor_mask[top.dof_row][:, top.dof_row]
-    M = jnp.where(related, F @ kin.S.T, 0)
-    M = jnp.where(related.T & ~related, M.T, M)
+    M = where(related, F @ kin.S.T, 0)
+    M = where(related.T & ~related, M.T, M)
     return M if chain.armature is None else M + jnp.diag(chain.armature)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from svkc._jax.pytrees import is_concrete
+from svkc._jax.select import where
 from svkc._jax.static_gather import static_take
 from svkc.model.annotations import Names, Numbers
 from svkc.model.chain import Chain, State
@@ -175,4 +176,4 @@ def _from_root(kin: Kinematics, frame: FixedFrame, point: Any) -> Float[Array, "
 def _motion_subspaces_of(chain: Chain, kin: Kinematics, frame: FixedFrame) -> Float[Array, "nv 6"]:
     """Return the motion subspaces of the joints that move a row; those of other joints are zero."""
     top = chain.topology
-    return jnp.where(top.ancestor_mask[frame.row, top.dof_row][:, None], kin.S, 0)
+    return where(top.ancestor_mask[frame.row, top.dof_row][:, None], kin.S, 0)

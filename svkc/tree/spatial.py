@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from svkc._jax.select import where
+
 # Bilinear products as sums over a table, out_k = table[i, k, j] a_i b_j. These are a few operations
 # on arrays instead of dozens on entries; compiled programs of a four-bar's run and of its gradient
 # have a fifth fewer operations.
@@ -119,7 +121,7 @@ def quat_normalize(q: Float[Array, "*n 4"]) -> Float[Array, "*n 4"]:
     """Return q / |q|, and the identity where q is zero."""
     square = jnp.sum(q * q, -1, keepdims=True)
     zero = square == 0
-    return jnp.where(zero, _table_like(q, np.eye(4)[0]), q / jnp.sqrt(jnp.where(zero, 1, square)))
+    return where(zero, _table_like(q, np.eye(4)[0]), q / jnp.sqrt(where(zero, 1, square)))
 
 
 def quat_matrix(q: Float[Array, "*n 4"]) -> Float[Array, "*n 3 3"]:
@@ -149,24 +151,24 @@ def quat_exp(u: Float[Array, "*n 3"]) -> Float[Array, "*n 4"]:
     """
     square = jnp.sum(u * u, -1, keepdims=True)
     small = square < 1e-8
-    angle = jnp.sqrt(jnp.where(small, 1, square))
+    angle = jnp.sqrt(where(small, 1, square))
     # where `small`, the next terms of Taylor's series are below round-off
-    c = jnp.where(small, 1 - square / 8, jnp.cos(angle / 2))
-    s = jnp.where(small, 0.5 - square / 48, jnp.sin(angle / 2) / angle)
+    c = where(small, 1 - square / 8, jnp.cos(angle / 2))
+    s = where(small, 0.5 - square / 48, jnp.sin(angle / 2) / angle)
     return jnp.concatenate([c, s * u], -1)
 
 
 def quat_log(q: Float[Array, "*n 4"]) -> Float[Array, "*n 3"]:
     """Return the rotation vector (rad, at most pi) of a unit quaternion, smooth at the identity."""
-    q = jnp.where(q[..., :1] < 0, -q, q)
+    q = where(q[..., :1] < 0, -q, q)
     square = jnp.sum(q[..., 1:] ** 2, -1, keepdims=True)
     small = square < 1e-8
-    s = jnp.sqrt(jnp.where(small, 1, square))
+    s = jnp.sqrt(where(small, 1, square))
     w = q[..., :1]
     # where `small`: 2 atan(x) / s with x = s / w, by atan(x) / x = 1 - x^2 / 3
-    factor = jnp.where(
+    factor = where(
         small,
-        2 / jnp.where(small, w, 1) * (1 - square / (3 * jnp.where(small, w * w, 1))),
+        2 / where(small, w, 1) * (1 - square / (3 * where(small, w * w, 1))),
         2 * jnp.arctan2(s, w) / s,
     )
     return factor * q[..., 1:]

@@ -85,13 +85,31 @@ def test_batches_are_compiled_as_usual():
     np.testing.assert_allclose(jax.jit(function)(batch, A), expected, rtol=1e-14)
 
 
-def test_a_function_that_contains_kernels_is_compiled_as_usual():
-    inner = one_kernel(lambda x: jnp.sin(x) + jnp.flip(x))
-    outer = one_kernel(lambda x: jnp.cumsum(inner(x)) * inner(2 * x)[0])
-    assert kernels(outer, X) == 2 * HAS_ONE_KERNEL  # both calls of the inner function
+@pytest.mark.parametrize("fits", [True, False])
+def test_kernels_within_a_kernel(fits):
+    """The inner ones remain kernels where the outer function cannot be one."""
     plain = lambda x: jnp.sin(x) + jnp.flip(x)
-    expected = jnp.cumsum(plain(X)) * plain(2 * X)[0]
-    np.testing.assert_allclose(jax.jit(outer)(X), expected, rtol=1e-14)
+    inner, last = one_kernel(plain), jnp.cumsum if fits else jnp.sort
+    outer = one_kernel(lambda x: last(inner(x)) * inner(2 * x)[0])
+    compiled = jax.jit(outer).lower(X).compile()
+    assert kernels(outer, X) == (2 + fits) * HAS_ONE_KERNEL
+    if HAS_ONE_KERNEL:
+        assert compiled.as_text().split("ENTRY")[1].count("xla_cpu_small_call") == (
+            1 if fits else 2
+        )
+    np.testing.assert_allclose(compiled(X), last(plain(X)) * plain(2 * X)[0], rtol=1e-14)
+
+
+def test_a_row_that_is_written_at_a_traced_index():
+    """XLA replaces a scatter at one index by the update of a slice."""
+
+    def function(x, A, i):
+        return jax.lax.fori_loop(0, 3, lambda k, A: A.at[i + k].set(jnp.sin(x) * k), A)
+
+    assert kernels(one_kernel(function), X, A, 1) == HAS_ONE_KERNEL
+    for i in (0, 1, 3, 7):  # indices that are out of bounds are left out
+        got = jax.jit(one_kernel(function))(X, A, i)
+        np.testing.assert_array_equal(got, jax.jit(function)(X, A, i))
 
 
 def test_arguments_that_are_not_used():
