@@ -1,6 +1,6 @@
 """Gather of rows by an index known at run time; its derivative has masked sums, not a scatter.
 
-A kernel of `one_kernel` cannot hold a scatter.
+A kernel of `one_kernel` cannot hold a scatter at several indices.
 """
 
 import jax

@@ -43,7 +43,7 @@ UNBATCHED_AXES = {
 }
 CONCATENATIONS = {"concatenate", "stack"}
 # the primitives of one_kernel.py, which batches drop
-ONE_KERNEL = {"one_kernel_input", "one_kernel_output"}
+ONE_KERNEL = {"one_kernel_input", "one_kernel_output", "one_kernel_batched_output"}
 # primitives that call a jaxpr -> name of the parameter that holds the jaxpr
 CALL_JAXPR_PARAMETERS = {
     "closed_call": "call_jaxpr",

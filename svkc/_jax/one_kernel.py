@@ -23,12 +23,13 @@ from jax.interpreters.mlir import ir
 
 HAS_ONE_KERNEL = jax.__version__.startswith("0.10.")
 _ATTRIBUTES = "mhlo.frontend_attributes"
-# operations that do not call XLA's runtime. Sorts, scatters, random bits and LAPACK call it.
+# operations that do not call XLA's runtime. Sorts, random bits, LAPACK and scatters at several
+# indices call it.
 _STABLEHLO = set(
     "abs add and atan2 bitcast_convert broadcast_in_dim case cbrt ceil clamp compare concatenate"
     " constant convert cosine divide dynamic_slice dynamic_update_slice exponential"
-    " exponential_minus_one floor gather if iota is_finite log log_plus_one logistic maximum"
-    " get_tuple_element minimum multiply negate not optimization_barrier or pad power reduce"
+    " exponential_minus_one floor gather get_tuple_element if iota is_finite log log_plus_one"
+    " logistic maximum minimum multiply negate not optimization_barrier or pad power reduce"
     " reduce_precision reduce_window remainder reshape return reverse round_nearest_afz"
     " round_nearest_even rsqrt select shift_left shift_right_arithmetic shift_right_logical sign"
     " sine slice sqrt subtract tan tanh transpose tuple while xor".split()
@@ -48,9 +49,9 @@ def one_kernel(function: Callable) -> Callable:
 
     The function is compiled as usual if an operation calls XLA's runtime or a library (products of
     two matrices), or under `vmap`, because LLVM takes twice as long for a batch
-    (benchmarks/README.md). Exception: a `vmap` with an output that is the same for all lanes is
-    still one kernel. A kernel may contain others: if it is compiled as usual, they remain kernels.
-    It copies arrays that it changes, so keep buffers that are written in place out of it.
+    (benchmarks/README.md). A kernel may contain others: if the outer function is compiled as usual,
+    the inner ones remain kernels. A kernel copies arrays that it changes: keep buffers that are
+    written in place out of it.
     """
     if not HAS_ONE_KERNEL:
         return function
@@ -69,14 +70,25 @@ def _map_traced(function: Callable, tree: Any) -> Any:
     return jax.tree.map(lambda x: function(x) if isinstance(x, Tracer) else x, tree)
 
 
-def _identity(name: str) -> Primitive:
-    """Return a primitive that returns its input. A `vmap` drops it."""
+def _identity(name: str, batched: Primitive | None = None) -> Primitive:
+    """Return a primitive that returns its input.
+
+    batched: replaces the primitive under `vmap`. None: `vmap` drops it.
+    """
     primitive = Primitive(name)
     primitive.def_impl(lambda x: x)
     primitive.def_abstract_eval(lambda x: x)
-    batching.primitive_batchers[primitive] = lambda inputs, axes: (inputs[0], axes[0])
+    replace = (lambda x: x) if batched is None else batched.bind
+    batching.primitive_batchers[primitive] = lambda inputs, axes: (replace(inputs[0]), axes[0])
     mlir.register_lowering(primitive, lambda _, x: [x])
     return primitive
+
+
+def _call_of(x: Any) -> Any:
+    """Return the call that x is an output of. None: x is no output of a call."""
+    if isinstance(x.owner, ir.Block) or x.owner.operation.name != "func.call":
+        return None
+    return x.owner.operation
 
 
 def _lower_output(ctx: mlir.LoweringRuleContext, x: Any) -> list[Any]:
@@ -86,10 +98,8 @@ def _lower_output(ctx: mlir.LoweringRuleContext, x: Any) -> list[Any]:
     XLA aborts the process if a function that becomes one kernel has a parameter that it does not
     use, for example because XLA has replaced this parameter by a constant. The tuple stays in use.
     """
-    if isinstance(x.owner, ir.Block) or x.owner.operation.name != "func.call":
-        return [x]
-    call, functions = x.owner.operation, ctx.module_context.symbol_table
-    if _ATTRIBUTES in call.attributes:
+    call, functions = _call_of(x), ctx.module_context.symbol_table
+    if call is None or _ATTRIBUTES in call.attributes:
         return [x]
     attributes = lambda **text: ir.DictAttr.get({k: ir.StringAttr.get(v) for k, v in text.items()})
     # the default, which marks a call whose other outputs need not look at it again
@@ -121,18 +131,45 @@ def _lower_output(ctx: mlir.LoweringRuleContext, x: Any) -> list[Any]:
     return [x]
 
 
+def _lower_batched_output(ctx: mlir.LoweringRuleContext, x: Any) -> list[Any]:
+    """Lower an output of a call under `vmap`, which is compiled as usual.
+
+    Another output that is the same for all lanes may have made the call one kernel.
+    """
+    call, functions = _call_of(x), ctx.module_context.symbol_table
+    if call is None:
+        return [x]
+    callee = call.attributes["callee"]
+    if _ATTRIBUTES in call.attributes and _name(callee).startswith("one_kernel"):
+        for _ in range(2):  # the function that packs the inputs calls the one that unpacks them
+            body = functions[_name(callee)].operation.regions[0].blocks[0]
+            (inner,) = (op.operation for op in body.operations if op.operation.name == "func.call")
+            callee = inner.attributes["callee"]
+        call.attributes["callee"] = callee
+    call.attributes[_ATTRIBUTES] = ir.DictAttr.get({"inlineable": ir.StringAttr.get("true")})
+    return [x]
+
+
+def _name(callee: Any) -> str:
+    """Return the name of a called function."""
+    return ir.FlatSymbolRefAttr(callee).value
+
+
 def _fits(operation: Any, functions: Any) -> bool:
     """Return whether a kernel can hold an operation and those that it contains or calls."""
     if operation.name == "func.call":
-        callee = ir.FlatSymbolRefAttr(operation.attributes["callee"]).value
-        return _fits(functions[callee].operation, functions)
+        return _fits(functions[_name(operation.attributes["callee"])].operation, functions)
     dialect, _, name = operation.name.partition(".")
     is_supported = (
         dialect == "func"
         or (dialect == "chlo" and name in _CHLO)
         or (
             dialect == "stablehlo"
-            and (name in _STABLEHLO or _is_small_product(operation) or _writes_one_slice(operation))
+            and (
+                name in _STABLEHLO
+                or _is_small_product(operation)
+                or _is_scatter_at_one_index(operation)
+            )
         )
     )
     return is_supported and all(
@@ -162,7 +199,7 @@ def _is_small_product(operation: Any) -> bool:
     )
 
 
-def _writes_one_slice(operation: Any) -> bool:
+def _is_scatter_at_one_index(operation: Any) -> bool:
     """Return whether an operation is a scatter at one index.
 
     XLA replaces it by the update of a slice.
@@ -175,8 +212,16 @@ def _writes_one_slice(operation: Any) -> bool:
     return all(size == 1 for i, size in enumerate(shape) if i != numbers.index_vector_dim)
 
 
-_input_p, _output_p = _identity("one_kernel_input"), _identity("one_kernel_output")
-ad.deflinear2(_output_p, lambda cotangent, _: [cotangent])
+_batched_output_p = _identity("one_kernel_batched_output")
+batching.primitive_batchers[_batched_output_p] = lambda inputs, axes: (
+    _batched_output_p.bind(inputs[0]),
+    axes[0],
+)
+_input_p = _identity("one_kernel_input")
+_output_p = _identity("one_kernel_output", batched=_batched_output_p)
+for _primitive in (_output_p, _batched_output_p):
+    ad.deflinear2(_primitive, lambda cotangent, _: [cotangent])
 # the cotangents of the inputs are the outputs of the derivative's call
 ad.deflinear2(_input_p, lambda cotangent, _: [_output_p.bind(cotangent)])
 mlir.register_lowering(_output_p, _lower_output, platform="cpu", cacheable=False)
+mlir.register_lowering(_batched_output_p, _lower_batched_output, platform="cpu", cacheable=False)

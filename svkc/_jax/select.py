@@ -13,8 +13,11 @@ from jax import Array
 
 
 def where(condition: Any, new: Any, old: Any) -> Array:
-    """Return `new` where `condition` holds, else `old`, with shapes broadcast as by `jnp.where`."""
-    if _is_weak(new) and _is_weak(old):
+    """Return `new` where the boolean `condition` holds, else `old`.
+
+    Shapes and dtypes are those of `jnp.where`. The result is weakly typed only if both values are.
+    """
+    if _is_weak(new) and _is_weak(old):  # `lax.select` would lose the weak type
         return jnp.where(condition, new, old)
     dtype = jnp.result_type(new, old)
     shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in (condition, new, old)))
@@ -26,5 +29,5 @@ def where(condition: Any, new: Any, old: Any) -> Array:
 
 
 def _is_weak(x: Any) -> bool:
-    """Return whether the type of x gives way to that of any array, as that of a Python number."""
+    """Return whether x is weakly typed: a Python number, or an array made from one."""
     return isinstance(x, bool | int | float) or getattr(x, "weak_type", False)

@@ -140,12 +140,13 @@ def _init_stepper(
 def _body_fun(
     s: StepperState, times, problem: PhaseProblem, options: StepperOptions
 ) -> StepperState:
-    """Advance by one attempted step, or locate a root by one more evaluation, and write buffers."""
+    """Attempt one step, and write the buffers and the progress meter."""
     before = _without_buffers(s)
     after, increments = attempt_and_advance(before, times, problem, options)
     (t0, stop, save_ts), kept = times, after.accepted > s.accepted
     ys, checkpoints = write_states(s, after, save_ts, options.checkpoint_interval)
     progress = (after.t - t0) / where(stop > t0, stop - t0, 1)
+    # again, so that the kernel of the attempt need not return the rows
     row_choice = with_rows_of_projection(before, problem).field_args.row_choice
     record = StepRecord(increments, row_choice)
     return dataclasses.replace(
@@ -160,6 +161,9 @@ def _body_fun(
 
 
 def _without_buffers(s: StepperState) -> StepperState:
-    """Return the state of the loop without the buffers, which are written in place."""
-    buffers = ("step_ts", "step_near", "checkpoints", "records", "ys")
-    return dataclasses.replace(s, progress_meter_state=None, **dict.fromkeys(buffers))
+    """Return the state of the loop without what `_body_fun` itself updates.
+
+    These are the buffers, which are written in place, and the state of the progress meter.
+    """
+    without = ("step_ts", "step_near", "checkpoints", "records", "ys", "progress_meter_state")
+    return dataclasses.replace(s, **dict.fromkeys(without))

@@ -124,6 +124,7 @@ def recorded_step(
     return StepRecord(increments, field_args.row_choice)
 
 
+@one_kernel
 def step_and_tangent(
     solver: diffrax.AbstractSolver[Any],
     step: tuple[Array, Array, StepRecord],

@@ -160,6 +160,7 @@ class StepperState(eqx.Module):
     near: whether the next step is taken with reduced rows of the loops, as near a singular
         configuration. None: rows are never reduced.
     step_ts, step_near, checkpoints, records, ys: as in `PhaseSolution`, as buffers of the loop.
+        None, as `progress_meter_state`, in the states of `step_attempt`.
     projection_info: that of the last projection. None: steps are not projected.
     """
 

@@ -1,4 +1,7 @@
-"""One attempted step, its acceptance, and the state of the stepping loop after it."""
+"""One attempted step, its acceptance, and the state of the stepping loop after it.
+
+Nothing in this module is differentiated.
+"""
 
 import dataclasses
 from typing import Any
@@ -35,10 +38,11 @@ from svkc.integration.vector_field import project_state
 def attempt_and_advance(
     s: StepperState, times: Times, problem: PhaseProblem, options: StepperOptions
 ) -> tuple[StepperState, ODEState | None]:
-    """Attempt one step and advance if it is kept; or evaluate the guards once to locate a root.
+    """Attempt one step, and advance if it is kept. While a root is located, the step is one more
+    evaluation of the guards.
 
-    Return the state of the loop after it, and the increments of a `StepRecord`. The state has no
-    buffers: a kernel would copy them.
+    Return the state of the loop after the attempt, and the increments of its `StepRecord` if steps
+    are recorded. Neither `s` nor the result has buffers, which a kernel would copy.
     """
     problem = with_rows_of_projection(s, problem)
     t1 = s.tnext if s.search is None else s.search.end_of_attempt(s.tnext)
@@ -47,7 +51,7 @@ def attempt_and_advance(
     if s.search is not None:
         attempt, guard_values, search, hold = locate_event(s, attempt, t1, problem, options)
         search = tree_where(redo, s.search, search)
-    after = _advance(s, attempt, hold | redo, times, options)
+    after = _state_after(s, attempt, hold | redo, times, options)
     rejected = (~attempt.keep_step & ~hold) | redo
     if search is not None:
         rejected = rejected | jnp.isfinite(search.retry_time)
@@ -60,35 +64,38 @@ def attempt_and_advance(
         rejected=s.rejected + rejected.astype(jnp.int32),
         stats=update_stats(s, attempt, after.result, problem.field_args),
     )
-    return after, attempt.increments
+    return after, attempt.increments if options.record_capacity else None
 
 
-def _advance(
+def _state_after(
     s: StepperState,
     attempt: StepAttempt,
     hold: Bool[Array, ""],
     times: Times,
     options: StepperOptions,
 ) -> StepperState:
-    """Return the state of the loop after an attempt, without guards and statistics.
+    """Return the state of the loop after an attempt, except for guards, counts and statistics.
 
-    hold: whether the loop stands still, as a root is located or a step is divided or redone.
+    hold: whether the size of the next step and the controller are unchanged, because a root is
+        located, or a step is divided or redone.
     """
     if_advancing = lambda new, old: tree_where(attempt.keep_step, new, old)
     unless_held = lambda new, old: tree_where(hold, old, new)
     t = if_advancing(attempt.t, s.t)
     return dataclasses.replace(
         s,
+        # These change when a step is kept.
         t=t,
+        accepted=s.accepted + attempt.keep_step.astype(jnp.int32),
         y=if_advancing(attempt.y, s.y),
         made_jump=if_advancing(attempt.made_jump, s.made_jump),
         solver_state=if_advancing(attempt.solver_state, s.solver_state),
         projection_info=if_advancing(attempt.projection_info, s.projection_info),
+        # These are unchanged while a root is located, or a step is divided or redone.
         tnext=unless_held(clip_step(t, t + attempt.step_size, times, options.max_step), s.tnext),
         step_size=unless_held(attempt.step_size, s.step_size),
         controller_state=unless_held(attempt.controller_state, s.controller_state),
         result=unless_held(attempt.result, s.result),
-        accepted=s.accepted + attempt.keep_step.astype(jnp.int32),
     )
 
 

@@ -12,7 +12,7 @@ from svkc.integration.solution import StepperState, StepRecord
 def write_states(
     s: StepperState, after: StepperState, save_ts, interval: int
 ) -> tuple[ODEState, ODEState]:
-    """Write the state after an attempt into the saved states and the checkpoints it belongs to.
+    """Write the state after a kept attempt into the saved states and checkpoints it belongs to.
 
     s, after: states of the loop before and after the attempt.
     interval: number of steps between checkpoints.

@@ -39,7 +39,8 @@ class VectorField(eqx.Module):
     """The vector field of one phase: (t, y, field_args) -> dy/dt = (qdot, vdot, power).
 
     Reverse mode stores the arguments of the torques, of the rates and of the projection of
-    `CoordinatePartitioning`, and recomputes these functions.
+    `CoordinatePartitioning`, and recomputes these functions. Without control, torques and rates are
+    one function.
 
     control: joint torques as a function (t, state, args), or None for no torques.
     differentiated: whether derivatives are taken through this field. False in the stepping loop,
@@ -113,14 +114,14 @@ def _torques(
     return field.torques(t, y, field_args)
 
 
-def _rates_of_motion(
+def _rates_for_torques(
     field: VectorField,
     y: ODEState,
     field_args: FieldArgs,
     tau: Float[Array, " dofs"],
     power: Float[Array, "3"] | None,
 ) -> ODEState:
-    """Return dy/dt for joint torques tau (N m, N)."""
+    """Return dy/dt for joint torques. tau, power: as `VectorField.torques` returns them."""
     chain, structure = field_args.chain, field_args.structure
     stabilization = field.stabilization
     baumgarte = stabilization.rate if isinstance(stabilization, Baumgarte) else None
@@ -146,7 +147,7 @@ def _rates_of_motion(
     return ODEState(qdot, vdot, power)
 
 
-_rates = one_kernel(eqx.filter_checkpoint(_rates_of_motion))
+_rates = one_kernel(eqx.filter_checkpoint(_rates_for_torques))
 
 
 @one_kernel
@@ -154,8 +155,8 @@ _rates = one_kernel(eqx.filter_checkpoint(_rates_of_motion))
 def _rates_without_control(
     field: VectorField, t: Scalar, y: ODEState, field_args: FieldArgs
 ) -> ODEState:
-    """Return dy/dt where no control acts."""
-    return _rates_of_motion(field, y, field_args, *field.torques(t, y, field_args))
+    """Return dy/dt of a field without control: torques and rates in one kernel."""
+    return _rates_for_torques(field, y, field_args, *field.torques(t, y, field_args))
 
 
 def _control_torques(chain: Chain, value, dtype) -> Float[Array, " dofs"]:

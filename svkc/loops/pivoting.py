@@ -100,7 +100,7 @@ def _search_pivots(
     rank: Int[Array, ""] | None,
     independent: Bool[Array, " dofs"] | None,
 ) -> tuple[Float[Array, "steps rows"], Float[Array, "steps dofs"], Float[Array, " steps"]]:
-    """Return Q, P and diag_R of `pivoted_qr` after min(rows, dofs) steps, without derivatives."""
+    """Choose pivots in min(rows, dofs) steps; return Q, P and diag_R. J has no derivative."""
     rows, dofs = J.shape
     steps = min(rows, dofs)
     weight = 1.0

@@ -156,7 +156,8 @@ def _phases(
 def _check_state(chain: Chain, state: State, is_phase_end: Bool[Array, ""]) -> StateCheck:
     """Return the check of one state.
 
-    is_phase_end: whether to compute energy, momenta and margin.
+    is_phase_end: whether a phase starts or ends at the state. Only then are energy, momenta and
+        margin computed.
     """
     kin, dtype, has_links = kinematics(chain, state.q), state.q.dtype, bool(chain.link_names)
     gaps = rates = jnp.zeros(2, dtype)

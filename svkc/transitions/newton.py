@@ -42,6 +42,8 @@ from svkc.transitions.newton_state import (
 )
 from svkc.tree.configuration import integrate
 
+_loop_kinematics = one_kernel(loop_kinematics)
+
 
 class _Iteration(eqx.Module):
     """The body of the scan: one iteration of one of `kinds`.
@@ -64,7 +66,7 @@ class _Iteration(eqx.Module):
         q_eval = current.q
         if DECIDE_RANK in self.kinds:
             q_eval = where(is_any_of(kind, CLOSE_PERTURBED, DECIDE_RANK), current.probe, current.q)
-        loops = one_kernel(loop_kinematics)(chain, structure, q_eval)
+        loops = _loop_kinematics(chain, structure, q_eval)
         J = loops.J
         all_pivots, qr = self._pivots(J, current, kind, rank_known)
         step = -least_norm_change(chain, qr, J, loops.gap[:, None])[:, 0]

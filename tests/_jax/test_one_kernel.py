@@ -85,6 +85,22 @@ def test_batches_are_compiled_as_usual():
     np.testing.assert_allclose(jax.jit(function)(batch, A), expected, rtol=1e-14)
 
 
+@pytest.mark.parametrize("batched_first", [True, False])
+def test_batches_with_an_output_that_is_the_same_for_all_lanes(batched_first):
+    def plain(x, A):
+        outputs = jnp.sin(x) * 2, A @ A[0]
+        return outputs if batched_first else outputs[::-1]
+
+    batch = jnp.stack([X, X + 1])
+    both = lambda f: jax.vmap(f, (0, None), (0, None) if batched_first else (None, 0))
+    assert kernels(both(one_kernel(plain)), batch, A) == 0
+    for got, value in zip(jax.jit(both(one_kernel(plain)))(batch, A), both(plain)(batch, A)):
+        np.testing.assert_allclose(got, value, rtol=1e-14)
+    loss = lambda f: lambda x: jnp.sum(both(f)(x, A)[0] ** 2) + jnp.sum(both(f)(x, A)[1])
+    got, expected = jax.jit(jax.grad(loss(one_kernel(plain))))(batch), jax.grad(loss(plain))(batch)
+    np.testing.assert_allclose(got, expected, rtol=1e-13)
+
+
 @pytest.mark.parametrize("fits", [True, False])
 def test_kernels_within_a_kernel(fits):
     """The inner ones remain kernels where the outer function cannot be one."""
