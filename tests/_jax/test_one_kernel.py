@@ -116,14 +116,25 @@ def test_kernels_within_a_kernel(fits):
     np.testing.assert_allclose(compiled(X), last(plain(X)) * plain(2 * X)[0], rtol=1e-14)
 
 
-def test_a_row_that_is_written_at_a_traced_index():
+AT_ONE_INDEX = {
+    "rows in a loop": lambda x, A, i: jax.lax.fori_loop(
+        0, 3, lambda k, A: A.at[i + k].set(jnp.sin(x) * k), A
+    ),
+    "column": lambda x, A, i: A.at[:, i].set(x),
+    "entry added": lambda x, A, i: A.at[i, 2].add(x[0]),
+    "row multiplied": lambda x, A, i: A.at[i].multiply(x),
+    "largest": lambda x, A, i: A.at[i].max(x),
+    "booleans": lambda x, A, i: jnp.where((A > 0).at[i].set(False), A, x[None]),
+    "transpose of a row": lambda x, A, i: jax.grad(lambda A: jnp.sum(A[i] * x))(A),
+}
+
+
+@pytest.mark.parametrize("case", AT_ONE_INDEX)
+def test_writing_at_one_traced_index(case):
     """XLA replaces a scatter at one index by the update of a slice."""
-
-    def function(x, A, i):
-        return jax.lax.fori_loop(0, 3, lambda k, A: A.at[i + k].set(jnp.sin(x) * k), A)
-
+    function = AT_ONE_INDEX[case]
     assert kernels(one_kernel(function), X, A, 1) == HAS_ONE_KERNEL
-    for i in (0, 1, 3, 7):  # indices that are out of bounds are left out
+    for i in (0, 1, 3, 7):  # out of bounds at last
         got = jax.jit(one_kernel(function))(X, A, i)
         np.testing.assert_array_equal(got, jax.jit(function)(X, A, i))
 
