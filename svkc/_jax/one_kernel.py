@@ -70,16 +70,15 @@ def _map_traced(function: Callable, tree: Any) -> Any:
     return jax.tree.map(lambda x: function(x) if isinstance(x, Tracer) else x, tree)
 
 
-def _identity(name: str, batched: Primitive | None = None) -> Primitive:
+def _identity(name: str, batched: Callable = lambda x: x) -> Primitive:
     """Return a primitive that returns its input.
 
-    batched: replaces the primitive under `vmap`. None: `vmap` drops it.
+    batched: what a `vmap` puts in place of the primitive. The default drops it.
     """
     primitive = Primitive(name)
     primitive.def_impl(lambda x: x)
     primitive.def_abstract_eval(lambda x: x)
-    replace = (lambda x: x) if batched is None else batched.bind
-    batching.primitive_batchers[primitive] = lambda inputs, axes: (replace(inputs[0]), axes[0])
+    batching.primitive_batchers[primitive] = lambda inputs, axes: (batched(inputs[0]), axes[0])
     mlir.register_lowering(primitive, lambda _, x: [x])
     return primitive
 
@@ -212,13 +211,9 @@ def _is_scatter_at_one_index(operation: Any) -> bool:
     return all(size == 1 for i, size in enumerate(shape) if i != numbers.index_vector_dim)
 
 
-_batched_output_p = _identity("one_kernel_batched_output")
-batching.primitive_batchers[_batched_output_p] = lambda inputs, axes: (
-    _batched_output_p.bind(inputs[0]),
-    axes[0],
-)
 _input_p = _identity("one_kernel_input")
-_output_p = _identity("one_kernel_output", batched=_batched_output_p)
+_batched_output_p = _identity("one_kernel_batched_output", lambda x: _batched_output_p.bind(x))
+_output_p = _identity("one_kernel_output", _batched_output_p.bind)
 for _primitive in (_output_p, _batched_output_p):
     ad.deflinear2(_primitive, lambda cotangent, _: [cotangent])
 # the cotangents of the inputs are the outputs of the derivative's call

@@ -1,7 +1,7 @@
 """`jnp.where` in fewer operations.
 
 `jnp.where` calls a jitted function, which takes six operations if one of its values is a Python
-number. A run has some 400 of these calls. `where` takes one to three operations for each, which are
+number. A run would have some 400 of these calls. `where` takes one to three operations, which are
 traced, lowered and compiled in less time.
 """
 
