@@ -3,8 +3,9 @@
 `python benchmarks/gpu.py [case ...] [--by ..] [--dtype ..] [--lanes ..] [--gradient-lanes ..]`
 (extras `bench` and `viz`, and a jax for the accelerator) prints and writes gpu.csv and draws
 gpu.png, in results/ or in `--out FOLDER`. Each group of rows is saved when it is measured; a later
-call replaces equal rows and keeps the others. `--small` runs all of it with a few lanes on any
-machine, and writes to out/.
+call replaces equal rows and keeps the others. Several calls at once (with
+XLA_PYTHON_CLIENT_PREALLOCATE=false) compile side by side and use the device in turns. `--small`
+runs all of it with a few lanes on any machine, and writes to out/.
 
 Cases, models and initial states are those of speed_cases.py, dt is 2 ms. Both libraries take the
 steps in one `lax.scan` of a `vmap`, in this process, in turns. Grips are hard in svkc and soft in
@@ -22,6 +23,7 @@ Columns: million steps per second, all lanes together (median, least, most of RO
 
 import argparse
 import collections
+import contextlib
 import functools
 import os
 import pathlib
@@ -35,7 +37,7 @@ import numpy as np
 import peers
 import round_off
 import speed_cases
-from gpu_table import Row, print_row, save
+from gpu_table import Row, draw, print_row, save, turn
 from programs import Program, scan_steps, time_in_turns
 
 import svkc
@@ -186,28 +188,36 @@ def measure_group(name: str, what: str, lanes: int, options) -> list[Row]:
         for who in options.by
     }
     steps = options.steps if what == "steps" else min(options.steps, GRADIENT_STEPS)
-    programs = {}
+    programs, results, seconds = {}, {}, {}
     for who, row in rows.items():
-        try:
+        with failure_in(row):
             model = LIBRARIES[who](name, lanes)
-            program = Program(KINDS[what](model, steps), model.states)
-            row.compiled(program)
+            programs[who] = Program(KINDS[what](model, steps), model.states)
+            row.compiled(programs[who])
+    with turn(options.out):
+        for who, program in programs.items():
             # memory that lacks shows in the first call
-            result = first_lanes(program.program(program.states))
-            programs[who] = program
-            if who == "svkc" or name == "open":
-                compare(row, result, steps)
-        except Exception as error:  # a failure is a result: it is in the table
-            row.note = describe(error)
-    try:
-        seconds = time_in_turns(programs, options.rounds)
-    except Exception as error:
-        seconds = {}
-        for who in programs:
-            rows[who].note = describe(error)
+            with failure_in(rows[who]):
+                results[who] = jax.device_get(first_lanes(program.program(program.states)))
+        with failure_in(*(rows[who] for who in results)):
+            seconds = time_in_turns({who: programs[who] for who in results}, options.rounds)
     for who, times in seconds.items():
         rows[who].timed(steps * lanes / times / 1e6)
+    for who, result in results.items():
+        if who == "svkc" or name == "open":
+            with failure_in(rows[who]):
+                compare(rows[who], result, steps)
     return list(rows.values())
+
+
+@contextlib.contextmanager
+def failure_in(*rows: Row):
+    """Write an error into the note of rows: a failure is a result, and belongs into the table."""
+    try:
+        yield
+    except Exception as error:
+        for row in rows:
+            row.note = describe(error)
 
 
 def compare(row: Row, result, steps: int):
@@ -235,6 +245,7 @@ def main(options) -> int:
                     save(options.out, group)
                     rows += group
                     jax.clear_caches()
+    draw(options.out)
     notes = collections.Counter(row.note for row in rows if row.by == "svkc" and row.note)
     print("svkc:", dict(notes) or "all rows within the bound of round-off")
     return notes.total()

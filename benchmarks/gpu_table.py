@@ -1,5 +1,6 @@
 """The table and the picture of gpu.py."""
 
+import contextlib
 import csv
 import dataclasses
 import pathlib
@@ -64,25 +65,45 @@ def print_row(row: Row):
     print("| " + " | ".join(row.cells()) + " |", flush=True)
 
 
-def save(folder: pathlib.Path, group: list[Row]):
-    """Replace the rows of a group in gpu.csv and redraw gpu.png.
+@contextlib.contextmanager
+def turn(folder: pathlib.Path):
+    """Hold the lock of a folder, which is created.
 
-    folder: of both files; is created.
+    Processes that save to one folder compile side by side, and use the device and the table one at
+    a time.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    try:
+        import fcntl
+    except ImportError:  # Windows: one process at a time is up to the user
+        yield
+        return
+    with (folder / "gpu.lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def save(folder: pathlib.Path, group: list[Row]):
+    """Replace the rows of a group in gpu.csv."""
     here = machine() | {"device": jax.devices()[0].device_kind}
     rows = [dict(zip(HEAD, row.cells(), strict=True)) | here for row in group]
-    path = folder / "gpu.csv"
     key = lambda row: tuple(str(row[name]) for name in KEY)
-    if path.exists():
-        with path.open(newline="") as file:
-            rows += [row for row in csv.DictReader(file) if key(row) != key(rows[0])]
-    rows.sort(key=_order)
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, [*HEAD, *here], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-    draw(rows, folder / "gpu.png")
+    with turn(folder):
+        rows += [row for row in saved(folder) if key(row) != key(rows[0])]
+        rows.sort(key=_order)
+        with (folder / "gpu.csv").open("w", newline="") as file:
+            writer = csv.DictWriter(file, [*HEAD, *here], lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
+
+
+def saved(folder: pathlib.Path) -> list[dict]:
+    """Return the rows of gpu.csv; none if there is no such file."""
+    path = folder / "gpu.csv"
+    if not path.exists():
+        return []
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
 
 
 def _order(row: dict) -> tuple:
@@ -91,8 +112,9 @@ def _order(row: dict) -> tuple:
     return case, row["dtype"], row["what"] != "steps", int(row["lanes"]), row["by"] != "svkc"
 
 
-def draw(rows: list[dict], path: pathlib.Path):
-    """Draw rates against lanes: a column of panels for each case; steps above, gradients below.
+def draw(folder: pathlib.Path):
+    """Draw gpu.png from gpu.csv: rates against lanes, a column of panels for each case, steps above
+    and gradients below.
 
     Left out if matplotlib is not installed.
     """
@@ -100,6 +122,8 @@ def draw(rows: list[dict], path: pathlib.Path):
         import matplotlib.pyplot as plt
     except ImportError:
         return
+    with turn(folder):
+        rows = saved(folder)
     cases = list(dict.fromkeys(row["case"] for row in rows))
     figure, axes = plt.subplots(
         2, len(cases), figsize=(3.5 * len(cases), 5.5), layout="constrained", squeeze=False
@@ -121,5 +145,5 @@ def draw(rows: list[dict], path: pathlib.Path):
             ax.grid(alpha=0.3)
         axes[i, 0].set_ylabel("million steps per s")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), fontsize=8, loc="outside right center")
-    figure.savefig(path, dpi=110)
+    figure.savefig(folder / "gpu.png", dpi=110)
     plt.close(figure)

@@ -2,6 +2,9 @@
 and all of it with a few lanes on the CPU."""
 
 import csv
+import subprocess
+import sys
+import time
 import types
 
 import gpu
@@ -57,12 +60,14 @@ def run_out_of_memory(x):
 
 
 @pytest.mark.parametrize("what", gpu.KINDS)
-def test_failures_and_differences_are_in_the_rows(what, monkeypatch):
+def test_failures_and_differences_are_in_the_rows(what, monkeypatch, tmp_path):
     libraries = {"svkc": lambda x: 0.9 * x, "A": run_out_of_memory, "B": lambda x: x + "text"}
     monkeypatch.setattr(gpu, "LIBRARIES", {who: library(f) for who, f in libraries.items()})
     expected = np.full((gpu.COMPARED_LANES, 8), 0.9**3)
     expected = np.where(np.arange(8) < 7, expected, 0) if what == "gradient" else [expected] * 2
-    options = types.SimpleNamespace(by=list(libraries), precision="float64", steps=3, rounds=2)
+    options = types.SimpleNamespace(
+        by=list(libraries), precision="float64", steps=3, rounds=2, out=tmp_path
+    )
     for factor, note in ((1.0, ""), (1.001, "differs from the CPU")):
         reference = jax.tree.map(lambda x, factor=factor: factor * x, expected)
         monkeypatch.setattr(gpu, "reference_on_cpu", lambda *_, r=reference: (r, 1e-4))
@@ -75,13 +80,27 @@ def test_failures_and_differences_are_in_the_rows(what, monkeypatch):
         assert not any(row.rates for row in others)
 
 
+def test_processes_take_turns(tmp_path):
+    """A second process waits for its turn until the first has ended its own."""
+    program = (
+        "import pathlib, sys, time; sys.path.insert(0, 'benchmarks'); import gpu_table\n"
+        f"with gpu_table.turn(pathlib.Path({str(tmp_path)!r})): print(time.time())"
+    )
+    with gpu_table.turn(tmp_path):
+        other = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE)
+        with pytest.raises(subprocess.TimeoutExpired):
+            other.wait(timeout=20)
+        ended = time.time()
+    assert float(other.communicate()[0]) >= ended
+
+
 def rows_of(folder) -> list[dict]:
     with (folder / "gpu.csv").open(newline="") as file:
         return list(csv.DictReader(file))
 
 
-def test_saved_groups_replace_equal_ones(tmp_path, monkeypatch):
-    monkeypatch.setattr(gpu_table, "draw", lambda rows, path: None)
+def test_saved_groups_replace_equal_ones(tmp_path):
+    (tmp_path / "new").mkdir()
     row = lambda lanes, by, note: gpu_table.Row(
         case="open", dtype="float32", lanes=lanes, what="steps", by=by, note=note
     )
