@@ -16,7 +16,7 @@ from jax import lax
 from jax.extend import core
 from jaxtyping import Array
 
-from svkc._jax.chunked_sum import sum_in_chunks
+from svkc._jax.chunked_sum import sum_in_chunks, sum_without_library
 from svkc._jax.primitive import custom_primitive
 
 # lanes evaluated together on a CPU: intermediate values of 32 lanes stay in the processor's cache
@@ -116,6 +116,11 @@ def _gather(x, index, lanes: int, *, dimension_numbers, slice_sizes, **rest):
     )
 
 
+def _sum(x: Array, axes: tuple[int, ...]) -> Array:
+    """Sum over axes. The result is not differentiated: derivatives are of the function itself."""
+    return sum_in_chunks(x, axes, sum_without_library)
+
+
 def _dot_general(*sides, dimension_numbers, preferred_element_type, **_):
     """Evaluate `dot_general` by products and sums, as XLA has no batch axis last for `dot`."""
     sides = [v.x if isinstance(v, Batched) else jnp.asarray(v)[..., None] for v in sides]
@@ -138,7 +143,7 @@ def _dot_general(*sides, dimension_numbers, preferred_element_type, **_):
     products = (
         products if preferred_element_type is None else products.astype(preferred_element_type)
     )
-    return sum_in_chunks(products, tuple(range(end, end + len(contracted[0]))))
+    return _sum(products, tuple(range(end, end + len(contracted[0]))))
 
 
 def _solve(inputs: list, lanes: int, *, const_lengths, jaxprs, **_):
@@ -176,7 +181,7 @@ def _apply_rule(primitive, inputs: list, params: dict, shape: tuple[int, ...], l
     name = primitive.name
     if name == "reduce_sum":
         # after a vmap within the function, axes are NumPy's integers
-        return sum_in_chunks(inputs[0].x, tuple(map(int, params["axes"])))
+        return _sum(inputs[0].x, tuple(map(int, params["axes"])))
     if name in UNBATCHED_AXES:
         return primitive.bind(inputs[0].x, **params)
     if name in CONCATENATIONS:
