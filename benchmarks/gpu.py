@@ -3,8 +3,9 @@
 `python benchmarks/gpu.py [case ...] [--by ..] [--dtype ..] [--lanes ..] [--gradient-lanes ..]`
 (extras `bench` and `viz`, and a jax for the accelerator) prints and writes gpu.csv and draws
 gpu.png, in results/ or in `--out FOLDER`. Each group of rows is saved when it is measured; a later
-call replaces equal rows and keeps the others. Several calls at once (with
-XLA_PYTHON_CLIENT_PREALLOCATE=false) compile side by side and use the device in turns. `--small`
+call replaces rows of the same measurement and keeps the others. Several calls at once that save to
+one folder (with XLA_PYTHON_CLIENT_PREALLOCATE=false) compile side by side, and measure in turns.
+Each keeps the device memory that it has used: if a row lacks memory, measure it alone. `--small`
 runs all of it with a few lanes on any machine, and writes to out/.
 
 Cases, models and initial states are those of speed_cases.py, dt is 2 ms. Both libraries take the
@@ -37,7 +38,7 @@ import numpy as np
 import peers
 import round_off
 import speed_cases
-from gpu_table import Row, draw, print_row, save, turn
+from gpu_table import Row, draw, folder_lock, print_row, save
 from programs import Program, scan_steps, time_in_turns
 
 import svkc
@@ -188,36 +189,45 @@ def measure_group(name: str, what: str, lanes: int, options) -> list[Row]:
         for who in options.by
     }
     steps = options.steps if what == "steps" else min(options.steps, GRADIENT_STEPS)
-    programs, results, seconds = {}, {}, {}
+    programs, results = {}, {}
     for who, row in rows.items():
-        with failure_in(row):
+        with note_failure(row):
             model = LIBRARIES[who](name, lanes)
             programs[who] = Program(KINDS[what](model, steps), model.states)
             row.compiled(programs[who])
-    with turn(options.out):
+    with folder_lock(options.out):
         for who, program in programs.items():
-            # memory that lacks shows in the first call
-            with failure_in(rows[who]):
+            # a lack of memory shows in the first call
+            with note_failure(rows[who]):
                 results[who] = jax.device_get(first_lanes(program.program(program.states)))
-        with failure_in(*(rows[who] for who in results)):
-            seconds = time_in_turns({who: programs[who] for who in results}, options.rounds)
+        timed = {who: leave_out_if_failed(programs[who], rows[who]) for who in results}
+        seconds = time_in_turns(timed, options.rounds)
     for who, times in seconds.items():
         rows[who].timed(steps * lanes / times / 1e6)
-    for who, result in results.items():
         if who == "svkc" or name == "open":
-            with failure_in(rows[who]):
-                compare(rows[who], result, steps)
+            with note_failure(rows[who]):
+                compare(rows[who], results[who], steps)
     return list(rows.values())
 
 
 @contextlib.contextmanager
-def failure_in(*rows: Row):
-    """Write an error into the note of rows: a failure is a result, and belongs into the table."""
+def note_failure(row: Row):
+    """Write an error into the note of a row: a failure is a result, and belongs in the table."""
     try:
         yield
     except Exception as error:
-        for row in rows:
-            row.note = describe(error)
+        row.note = describe(error)
+
+
+def leave_out_if_failed(program: Callable, row: Row) -> Callable:
+    """Return a program whose failure is noted, and ends its own timing alone (`time_in_turns`)."""
+
+    def run():
+        with note_failure(row):
+            return program()
+        raise TimeoutError(f"{row.by}: {row.note}")
+
+    return run
 
 
 def compare(row: Row, result, steps: int):
@@ -245,9 +255,11 @@ def main(options) -> int:
                     save(options.out, group)
                     rows += group
                     jax.clear_caches()
-    draw(options.out)
     notes = collections.Counter(row.note for row in rows if row.by == "svkc" and row.note)
-    print("svkc:", dict(notes) or "all rows within the bound of round-off")
+    if "svkc" in options.by:
+        print("svkc:", dict(notes) or "all rows within the bound of round-off")
+    with folder_lock(options.out):
+        draw(options.out)
     return notes.total()
 
 
@@ -264,6 +276,9 @@ def parse(arguments: list[str]):
     parser.add_argument("--gradient-lanes", nargs="*", type=int)
     parser.add_argument("--out", type=pathlib.Path, help="folder of the table and the picture")
     options = parser.parse_args(arguments)
+    for names, known in ((options.cases, speed_cases.CASES), (options.by, LIBRARIES)):
+        for name in set(names) - set(known):
+            parser.error(f"got {name!r}, expected one of {', '.join(known)}")
     lanes, gradient_lanes, options.steps, options.rounds = (
         SMALL if options.small else (LANES, GRADIENT_LANES, STEPS, ROUNDS)
     )

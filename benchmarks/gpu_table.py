@@ -14,8 +14,8 @@ HEAD = [
     "case", "dtype", "lanes", "what", "by", "M steps per s", "least", "most", "trace s", "lower s",
     "compile s", "memory MB", "difference", "bound", "note",
 ]  # fmt: skip
-# columns that a group of rows has in common, and by which the table is sorted
-KEY = ("case", "dtype", "lanes", "what")
+# columns that say what a row measures
+KEY = ("case", "dtype", "lanes", "what", "by")
 
 
 @dataclasses.dataclass
@@ -66,11 +66,10 @@ def print_row(row: Row):
 
 
 @contextlib.contextmanager
-def turn(folder: pathlib.Path):
-    """Hold the lock of a folder, which is created.
+def folder_lock(folder: pathlib.Path):
+    """Hold the lock of a folder; create the folder if it is missing.
 
-    Processes that save to one folder compile side by side, and use the device and the table one at
-    a time.
+    Processes that save to one folder use the device and the table one at a time.
     """
     folder.mkdir(parents=True, exist_ok=True)
     try:
@@ -84,12 +83,13 @@ def turn(folder: pathlib.Path):
 
 
 def save(folder: pathlib.Path, group: list[Row]):
-    """Replace the rows of a group in gpu.csv."""
+    """Replace rows of gpu.csv that measure the same."""
     here = machine() | {"device": jax.devices()[0].device_kind}
     rows = [dict(zip(HEAD, row.cells(), strict=True)) | here for row in group]
     key = lambda row: tuple(str(row[name]) for name in KEY)
-    with turn(folder):
-        rows += [row for row in saved(folder) if key(row) != key(rows[0])]
+    replaced = {key(row) for row in rows}
+    with folder_lock(folder):
+        rows += [row for row in saved(folder) if key(row) not in replaced]
         rows.sort(key=_order)
         with (folder / "gpu.csv").open("w", newline="") as file:
             writer = csv.DictWriter(file, [*HEAD, *here], lineterminator="\n")
@@ -116,14 +116,13 @@ def draw(folder: pathlib.Path):
     """Draw gpu.png from gpu.csv: rates against lanes, a column of panels for each case, steps above
     and gradients below.
 
-    Left out if matplotlib is not installed.
+    Left out if matplotlib is not installed. Call it under `folder_lock`.
     """
     try:
         import matplotlib.pyplot as plt
     except ImportError:
         return
-    with turn(folder):
-        rows = saved(folder)
+    rows = saved(folder)
     cases = list(dict.fromkeys(row["case"] for row in rows))
     figure, axes = plt.subplots(
         2, len(cases), figsize=(3.5 * len(cases), 5.5), layout="constrained", squeeze=False

@@ -12,7 +12,7 @@ from jaxtyping import Array
 # grips, with 22 terms a third of that of the high bar's 16-joint figure
 TERMS_PER_SUM = 8
 # From jax 0.11 on, XLA's CPU backend leaves sums over arrays of 4,096 numbers or more to a library,
-# which takes 20 to 200 times as long for such short sums (benchmarks/README.md).
+# which is slow for such short sums (benchmarks/README.md).
 HAS_SUM_LIBRARY = not jax.__version__.startswith("0.10.")
 
 
@@ -34,9 +34,10 @@ def sum_in_chunks(x: Array, axes: tuple[int, ...], sum_over: Callable = jnp.sum)
 
 
 def sum_without_library(x: Array, axis: int, dtype) -> Array:
-    """Sum over an axis by code of XLA, not by a library that it calls. Has no derivative.
+    """Sum over an axis by code of XLA, not by a library that it calls.
 
-    XLA recognizes a sum by its reducer a + b. The reducer here, a - (-b), rounds equally.
+    XLA recognizes a sum by its reducer a + b. The reducer here, a - (-b), rounds equally. Use it
+    where nothing is differentiated: JAX has no short derivative for such a reducer.
     """
     if not HAS_SUM_LIBRARY or jax.default_backend() != "cpu":
         return jnp.sum(x, axis, dtype)

@@ -4,7 +4,6 @@ and all of it with a few lanes on the CPU."""
 import csv
 import subprocess
 import sys
-import time
 import types
 
 import gpu
@@ -59,6 +58,46 @@ def run_out_of_memory(x):
     raise RuntimeError("RESOURCE_EXHAUSTED: Out of memory while trying to allocate 9 bytes")
 
 
+class FailsLater:
+    """A step that fails in a call after the first ones."""
+
+    def __init__(self, calls: int):
+        self.calls = calls
+
+    def __call__(self, x):
+        def count(x):
+            self.calls -= 1
+            if self.calls < 0:
+                raise RuntimeError("no more calls")
+            return x
+
+        return jax.pure_callback(count, x, x, vmap_method="expand_dims")
+
+
+def test_failures_of_calls_are_in_their_own_rows(monkeypatch, tmp_path):
+    """A library that fails in its first call, or when it is timed, leaves out no other one."""
+    steps, rounds = 3, 4
+    libraries = {"A": FailsLater(0), "svkc": lambda x: 0.9 * x, "B": FailsLater(2 * steps)}
+    monkeypatch.setattr(gpu, "LIBRARIES", {who: library(f) for who, f in libraries.items()})
+    expected = [np.full((gpu.COMPARED_LANES, 8), 0.9**steps)] * 2
+    monkeypatch.setattr(gpu, "reference_on_cpu", lambda *_: (expected, 1e-4))
+    options = types.SimpleNamespace(
+        by=list(libraries), precision="float64", steps=steps, rounds=rounds, out=tmp_path
+    )
+    first, ours, later = gpu.measure_group("open", "steps", 4, options)
+    assert not ours.note
+    assert ours.rates
+    for row in (first, later):
+        assert "callback" in row.note.lower()
+        assert not row.rates
+
+
+def test_misspelt_names():
+    for arguments in (["opne"], ["--by", "mjx"]):
+        with pytest.raises(SystemExit):
+            gpu.parse(arguments)
+
+
 @pytest.mark.parametrize("what", gpu.KINDS)
 def test_failures_and_differences_are_in_the_rows(what, monkeypatch, tmp_path):
     libraries = {"svkc": lambda x: 0.9 * x, "A": run_out_of_memory, "B": lambda x: x + "text"}
@@ -81,17 +120,20 @@ def test_failures_and_differences_are_in_the_rows(what, monkeypatch, tmp_path):
 
 
 def test_processes_take_turns(tmp_path):
-    """A second process waits for its turn until the first has ended its own."""
+    """A second process waits for the lock of a folder until the first has left it."""
+    pytest.importorskip("fcntl")
     program = (
-        "import pathlib, sys, time; sys.path.insert(0, 'benchmarks'); import gpu_table\n"
-        f"with gpu_table.turn(pathlib.Path({str(tmp_path)!r})): print(time.time())"
+        "import pathlib, sys; sys.path.insert(0, 'benchmarks'); import gpu_table; print('ready')\n"
+        "sys.stdout.flush()\n"
+        f"with gpu_table.folder_lock(pathlib.Path({str(tmp_path)!r})): print('in turn')"
     )
-    with gpu_table.turn(tmp_path):
-        other = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE)
+    command = [sys.executable, "-c", program]
+    with gpu_table.folder_lock(tmp_path):
+        other = subprocess.Popen(command, cwd=processes.ROOT, stdout=subprocess.PIPE, text=True)
+        assert other.stdout.readline() == "ready\n"
         with pytest.raises(subprocess.TimeoutExpired):
-            other.wait(timeout=20)
-        ended = time.time()
-    assert float(other.communicate()[0]) >= ended
+            other.wait(timeout=1)
+    assert other.communicate()[0] == "in turn\n"
 
 
 def rows_of(folder) -> list[dict]:
@@ -100,15 +142,20 @@ def rows_of(folder) -> list[dict]:
 
 
 def test_saved_groups_replace_equal_ones(tmp_path):
-    (tmp_path / "new").mkdir()
     row = lambda lanes, by, note: gpu_table.Row(
         case="open", dtype="float32", lanes=lanes, what="steps", by=by, note=note
     )
     gpu_table.save(tmp_path / "new", [row(64, "svkc", "old"), row(64, "MJX", "old")])
-    gpu_table.save(tmp_path / "new", [row(8, "svkc", "other")])
+    gpu_table.save(tmp_path / "new", [row(8, "svkc", "other"), row(8, "MJX", "kept")])
+    gpu_table.save(tmp_path / "new", [row(8, "svkc", "again")])
     gpu_table.save(tmp_path / "new", [row(64, "MJX", "again"), row(64, "svkc", "again")])
     saved = [(row["lanes"], row["by"], row["note"]) for row in rows_of(tmp_path / "new")]
-    assert saved == [("8", "svkc", "other"), ("64", "svkc", "again"), ("64", "MJX", "again")]
+    assert saved == [
+        ("8", "svkc", "again"),
+        ("8", "MJX", "kept"),
+        ("64", "svkc", "again"),
+        ("64", "MJX", "again"),
+    ]
 
 
 def test_kernels_are_counted_in_loops():
