@@ -3,7 +3,6 @@
 import functools
 from collections.abc import Callable
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
@@ -11,9 +10,6 @@ from jaxtyping import Array
 # terms of a sum in one loop: with 46 terms that loop took a quarter of the time of a step with two
 # grips, with 22 terms a third of that of the high bar's 16-joint figure
 TERMS_PER_SUM = 8
-# From jax 0.11 on, XLA's CPU backend leaves sums over arrays of 4,096 numbers or more to a library,
-# which is slow for such short sums (benchmarks/README.md).
-HAS_SUM_LIBRARY = not jax.__version__.startswith("0.10.")
 
 
 def sum_in_chunks(x: Array, axes: tuple[int, ...], sum_over: Callable = jnp.sum) -> Array:
@@ -21,7 +17,7 @@ def sum_in_chunks(x: Array, axes: tuple[int, ...], sum_over: Callable = jnp.sum)
 
     XLA unrolls a sum this short, and can then vectorise the loop over the last axis.
 
-    sum_over: `jnp.sum`, or `sum_without_library`.
+    sum_over: `jnp.sum`, or `sum_by_xla` of reductions.py.
     """
     for axis in sorted(axes, reverse=True):
         size = x.shape[axis]
@@ -31,14 +27,3 @@ def sum_in_chunks(x: Array, axes: tuple[int, ...], sum_over: Callable = jnp.sum)
         ]
         x = functools.reduce(jnp.add, parts)
     return x
-
-
-def sum_without_library(x: Array, axis: int, dtype) -> Array:
-    """Sum over an axis by code of XLA, not by a library that it calls.
-
-    XLA recognizes a sum by its reducer a + b. The reducer here, a - (-b), rounds equally. Use it
-    where nothing is differentiated: JAX has no short derivative for such a reducer.
-    """
-    if not HAS_SUM_LIBRARY or jax.default_backend() != "cpu":
-        return jnp.sum(x, axis, dtype)
-    return lax.reduce(x, jnp.zeros((), dtype), lambda a, b: a - (-b), (axis,))

@@ -16,8 +16,9 @@ from jax import lax
 from jax.extend import core
 from jaxtyping import Array
 
-from svkc._jax.chunked_sum import sum_in_chunks, sum_without_library
+from svkc._jax.chunked_sum import sum_in_chunks
 from svkc._jax.primitive import custom_primitive
+from svkc._jax.reductions import max_by_xla, min_by_xla, sum_by_xla
 
 # lanes evaluated together on a CPU: intermediate values of 32 lanes stay in the processor's cache
 # (benchmarks/README.md)
@@ -33,14 +34,13 @@ UNBATCHED_AXES = {
     "argmin",
     "cumsum",
     "reduce_and",
-    "reduce_max",
-    "reduce_min",
     "reduce_or",
     "reduce_prod",
     "rev",
     "split",
     "squeeze",
 }
+EXTREMES = {"reduce_max": max_by_xla, "reduce_min": min_by_xla}
 CONCATENATIONS = {"concatenate", "stack"}
 # the primitives of one_kernel.py, which batches drop
 ONE_KERNEL = {"one_kernel_input", "one_kernel_output", "one_kernel_batched_output"}
@@ -118,7 +118,7 @@ def _gather(x, index, lanes: int, *, dimension_numbers, slice_sizes, **rest):
 
 def _sum(x: Array, axes: tuple[int, ...]) -> Array:
     """Sum over axes. The result is not differentiated: derivatives are of the function itself."""
-    return sum_in_chunks(x, axes, sum_without_library)
+    return sum_in_chunks(x, axes, sum_by_xla)
 
 
 def _dot_general(*sides, dimension_numbers, preferred_element_type, **_):
@@ -182,6 +182,8 @@ def _apply_rule(primitive, inputs: list, params: dict, shape: tuple[int, ...], l
     if name == "reduce_sum":
         # after a vmap within the function, axes are NumPy's integers
         return _sum(inputs[0].x, tuple(map(int, params["axes"])))
+    if name in EXTREMES:
+        return EXTREMES[name](inputs[0].x, tuple(map(int, params["axes"])))
     if name in UNBATCHED_AXES:
         return primitive.bind(inputs[0].x, **params)
     if name in CONCATENATIONS:
