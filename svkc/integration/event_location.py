@@ -1,4 +1,4 @@
-"""Event location: guards, the bracket about a root, and the search for the root.
+"""Event location: guards and the search for their roots.
 
 The search is a state machine that consumes one evaluation of the guards per call. The stepping
 loop evaluates the guards, so that the compiled loop contains one step of the solver only.
@@ -10,72 +10,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.pytrees import tree_where
 from svkc._jax.select import where
+from svkc.integration.bracket import Bracket
 from svkc.integration.ode import FieldArgs, ODEState
 from svkc.integration.vector_field import VectorField
 from svkc.model.annotations import Scalar
 from svkc.model.chain import State
 from svkc.model.validation import as_array, description
 from svkc.transitions.plan import Plan
-
-MAX_ITERATIONS = 200  # of the root finder
-
-
-class Bracket(eqx.Module):
-    """An interval [a, b] with fa < 0 <= fb that shrinks about a root of a function.
-
-    The root finder is the Illinois method (Dowell and Jarratt, BIT 11 (1971), 168-174), with a
-    bisection at every third iteration.
-
-    fa, fb: values at a and b, halved by the Illinois rule. tol: length of a converged bracket.
-    last_side: the end that moved last, 1 for b, -1 for a, 0 for neither. count: iterations so far.
-    """
-
-    a: Float[Array, ""]
-    b: Float[Array, ""]
-    fa: Float[Array, ""]
-    fb: Float[Array, ""]
-    tol: Float[Array, ""]
-    last_side: Int[Array, ""]
-    count: Int[Array, ""]
-
-    @staticmethod
-    def around(
-        a: Float[Array, ""], b: Float[Array, ""], fa: Float[Array, ""], fb: Float[Array, ""]
-    ) -> "Bracket":
-        """Return the bracket [a, b] before the first iteration. Its tolerance is round-off."""
-        eps = jnp.finfo(fb.dtype).eps
-        tol = 2 * eps * jnp.maximum(jnp.abs(a), jnp.abs(b)) + eps * (b - a)
-        zero = jnp.zeros((), jnp.int32)
-        return Bracket(a=a, b=b, fa=fa, fb=fb, tol=tol, last_side=zero, count=zero)
-
-    def not_converged(self) -> Bool[Array, ""]:
-        """Return whether another iteration is needed."""
-        return (self.b - self.a > self.tol) & (self.count < MAX_ITERATIONS)
-
-    def next_point(self) -> Float[Array, ""]:
-        """Return the point of the next evaluation: the root of the secant, or the midpoint."""
-        weight = self.fb - self.fa
-        secant = self.b - self.fb * (self.b - self.a) / where(weight == 0, 1, weight)
-        bisect = (self.count % 3 == 2) | (weight == 0)
-        c = where(bisect, self.a + (self.b - self.a) / 2, secant)
-        return jnp.clip(c, self.a + self.tol / 4, self.b - self.tol / 4)
-
-    def update(self, c: Float[Array, ""], fc: Float[Array, ""]) -> "Bracket":
-        """Return the bracket shrunk by the value fc of the function at c."""
-        right = fc >= 0
-        # Illinois rule: halve the value at an end that has not moved twice in a row.
-        fa = where(right & (self.last_side == 1), self.fa / 2, self.fa)
-        fb = where(~right & (self.last_side == -1), self.fb / 2, self.fb)
-        return Bracket(
-            a=where(right, self.a, c),
-            b=where(right, c, self.b),
-            fa=where(right, fa, fc),
-            fb=where(right, fc, fb),
-            tol=self.tol,
-            last_side=where(right, 1, -1).astype(jnp.int32),
-            count=self.count + 1,
-        )
-
 
 # A guard only touches zero (grazes) if, at its rate there, it would change over a step by less than
 # this fraction of its magnitude. A guard jumps only if it exceeds this fraction after the root.

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from svkc._jax.control_flow import unvmap_any
 from svkc._jax.one_kernel import one_kernel
 from svkc._jax.primitive import custom_primitive
 from svkc._jax.select import where
@@ -38,6 +39,7 @@ from svkc.transitions.newton_state import (
     RANK_SEARCH,
     NewtonState,
     Schedule,
+    closed_tolerance,
     is_any_of,
 )
 from svkc.tree.configuration import integrate
@@ -139,11 +141,20 @@ def _iterate(
 
     @functools.partial(jax.checkpoint, prevent_cse=False)
     def scan_body(current: NewtonState, x) -> tuple[NewtonState, None]:
-        return iteration(current, *x), None
+        kind, rank_known, repeats = x
+        step = lambda: iteration(current, kind, rank_known)
+        if CLOSE_PERTURBED not in kinds:
+            return step(), None
+        # the last Newton step, from gaps this small, has closed the probe's loops to round-off
+        closed = repeats & (jnp.max(current.residual_gaps) < closed_tolerance(q.dtype))
+        return jax.lax.cond(unvmap_any(~closed), step, lambda: current), None
 
+    kind_numbers = np.array(kinds, np.int32)
+    again = (kind_numbers[1:] == CLOSE_PERTURBED) & (kind_numbers[:-1] == CLOSE_PERTURBED)
     xs = (
-        jnp.asarray(np.array(kinds, np.int32)),
+        jnp.asarray(kind_numbers),
         jnp.asarray(np.arange(len(kinds)) >= all_row_steps),
+        jnp.asarray(np.concatenate([[False], again])),
     )
     return jax.lax.scan(scan_body, NewtonState.init(chain, structure, q, v), xs)[0]
 

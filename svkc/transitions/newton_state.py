@@ -9,10 +9,12 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.select import where
 from svkc.loops.pivoting import count_rank
+from svkc.model.annotations import DType
 from svkc.model.chain import Chain, Structure
 from svkc.tree.configuration import normalize
 
@@ -31,6 +33,14 @@ CONNECTION = (CLOSE, CLOSE, IMPACT)
 def is_any_of(kind: Int[Array, ""], *kinds: int) -> Bool[Array, ""]:
     """Return whether a traced kind is one of these kinds."""
     return functools.reduce(jnp.logical_or, [kind == k for k in kinds])
+
+
+def closed_tolerance(dtype: DType) -> float:
+    """Return the gap (rad, or in `chain.length`s) below which the loops of the probe are closed.
+
+    It is eps^(3/4): 1.8e-12 in float64, 6.4e-6 in float32.
+    """
+    return float(np.finfo(dtype).eps ** 0.75)
 
 
 class Schedule(eqx.Module):
@@ -110,11 +120,13 @@ class NewtonState(eqx.Module):
 
         The probe is left out if its loops are open.
         """
-        diag_R, eps = self.search_diag_R, jnp.finfo(self.search_diag_R.dtype)
-        closed = jnp.max(self.search_gaps[1]) < eps.eps**0.75
+        diag_R = self.search_diag_R
+        closed = jnp.max(self.search_gaps[1]) < closed_tolerance(diag_R.dtype)
         rank = where(
             closed, jnp.maximum(count_rank(diag_R[0]), count_rank(diag_R[1])), count_rank(diag_R[0])
         )
         last = jnp.arange(diag_R.shape[1], dtype=jnp.int32) == rank - 1
-        margin = jnp.sum(where(last, diag_R, 0), 1) / jnp.maximum(diag_R[:, 0], eps.tiny)
+        margin = jnp.sum(where(last, diag_R, 0), 1) / jnp.maximum(
+            diag_R[:, 0], jnp.finfo(diag_R.dtype).tiny
+        )
         return rank, where(closed, jnp.max(margin), margin[0])
