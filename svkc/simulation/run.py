@@ -130,18 +130,25 @@ def _next_stop(run: RunState, t1):
     return where((stop < run.t) | (run.result != RESULTS.successful), run.t, stop)
 
 
+def has_next_phase(run: RunState, t1) -> Bool[Array, ""]:
+    """Return whether the run has another phase: it is before its end, or a timed event is due."""
+    unfinished = (run.t < t1) | jnp.any(run.schedule.due(t1))
+    return unfinished & (run.result == RESULTS.successful)
+
+
 def run_phase(
     chain: Chain, run: RunState, index: Any, times: Any, *, plan: Plan, options: Options, args: Any
 ) -> RunState:  # fmt: skip
     """Integrate one phase, apply the events at its end, and write the records of both.
 
+    A run that has no next phase is unchanged.
+
     index: index of the phase.
     times: end of the run, and the save times.
     """
     t1, ts = times
+    active = has_next_phase(run, t1)
     run = _reevaluate_stale_guards(chain, run, plan, options, args)
-    active = (run.t < t1) | jnp.any(run.schedule.due(t1))
-    active = active & (run.result == RESULTS.successful)
     stop = _next_stop(run, t1)
     field_args = phase_field_args(chain, run.state.structure, args, options.field)
     outcome = solve_phase(run, stop, ts, plan, options, field_args)
