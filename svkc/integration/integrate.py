@@ -82,6 +82,7 @@ def integrate_phase(
         result=result.astype(jnp.int32),
         stats=end.stats,
         event=event,
+        step_size=end.step_size,
     )
 
 

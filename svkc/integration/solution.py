@@ -135,6 +135,7 @@ class PhaseSolution(eqx.Module):
     accepted, rejected: numbers of steps.
     result: result code, diffrax's or one of this module.
     event: the event at the end. None: there are no guards.
+    step_size: size that the controller proposes for the next step (s). None: not known.
     """
 
     t: Float[Array, ""]
@@ -149,6 +150,7 @@ class PhaseSolution(eqx.Module):
     stats: Stats
     event: EventInfo | None = None
     records: StepRecord | None = None
+    step_size: Float[Array, ""] | None = None
 
 
 class StepperState(eqx.Module):

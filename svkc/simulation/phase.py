@@ -43,6 +43,7 @@ class RunState(eqx.Module):
     guard_values: at the end of the last phase.
     stale: which guard values are re-evaluated at the start of the next phase.
     schedule: when the timed events happen, and which events have happened.
+    step_size: size of the first step of the next phase with the default controller (s).
     count: number of phases so far.
     saved, saved_work: states and work at the save times.
     derivative, invalid_from: why the run has no derivative, and the index of the first phase for
@@ -55,6 +56,7 @@ class RunState(eqx.Module):
     guard_values: Float[Array, " guards"] | None
     stale: Bool[Array, " guards"] | None
     schedule: EventSchedule
+    step_size: Float[Array, ""]
     events: Events
     records: PhaseRecords
     count: Int[Array, ""]
@@ -115,6 +117,7 @@ def solve_phase(
         PhaseProblem(field_args, options.field),
         armed,
         options,
+        _stepper_options(run, options, armed),
         options.field if guards is None else guards,
     )
     outcome = PhaseOutcome(
@@ -137,14 +140,17 @@ def solve_phase(
     )
 
 
-def _stepper_options(options: Options, armed: ArmedGuards | None) -> StepperOptions:
+def _stepper_options(run: RunState, options: Options, armed: ArmedGuards | None) -> StepperOptions:
     """Return the options of the stepping loop, which is never differentiated."""
     adjoint = options.adjoint
     replays = isinstance(adjoint, Replay)
     # guards alone need the dense output
     solver = options.solver if armed is not None else without_dense_output(options.solver)
-    solver, armed_guards, (controller, first_step) = stop_gradient_tree(
-        (with_scan_kind(solver, "lax"), armed, options.step_size_control())
+    controller, first_step = options.step_size_control()
+    if isinstance(controller, diffrax.PIDController):
+        first_step = run.step_size
+    solver, armed_guards, controller, first_step = stop_gradient_tree(
+        (with_scan_kind(solver, "lax"), armed, controller, first_step)
     )
     max_step = None
     if armed_guards is not None and armed_guards.evaluate.plan.max_steps is not None:
@@ -169,6 +175,7 @@ def _integrate(
     problem: PhaseProblem,
     armed: ArmedGuards | None,
     options: Options,
+    stepper_options: StepperOptions,
     guards: GuardValues | VectorField,
 ):
     """Return the solution of a phase, the event that ended it, and the time and ODE state at its
@@ -179,7 +186,7 @@ def _integrate(
     times: start and latest end of the phase, and the save times.
     guards: the guards, or the vector field where there are no guards.
     """
-    adjoint, stepper_options = options.adjoint, _stepper_options(options, armed)
+    adjoint = options.adjoint
     if isinstance(adjoint, Replay):
         solution, t, y = integrate_with_replay(y0, times, problem, stepper_options, guards)
         return solution, stop_gradient_tree(solution.event), t, y

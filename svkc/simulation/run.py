@@ -27,6 +27,9 @@ from svkc.simulation.traced_checks import initial_result
 from svkc.transitions.event_schedule import EventSchedule, armed_guards
 from svkc.transitions.plan import Plan, guard_round_off
 
+# The first step of a phase is this fraction of the size proposed at the end of the phase before.
+FIRST_STEP = 0.5
+
 
 def with_lock_mask(chain: Chain, state: State, plan: Plan) -> State:
     """Return the state with a mask of locked joints if an event locks or unlocks joints.
@@ -63,6 +66,7 @@ def initial_run_state(
         guard_values=jnp.asarray(initial, dtype) if plan.guards else None,
         stale=jnp.asarray(reevaluated_guards(plan)) if plan.guards else None,
         schedule=EventSchedule.at_start(plan),
+        step_size=options.first_step,
         events=empty_events(rows, links, dtype),
         records=empty_phase_records(rows + 1, state),
         count=jnp.asarray(0, jnp.int32),
@@ -170,6 +174,7 @@ def run_phase(
         )
     result = RESULTS.where(run.result == RESULTS.successful, result, run.result)
     guard_values, stale = _guard_values_after(chain, run, outcome, fired, plan)
+    step_size = outcome.solution.step_size
     return RunState(
         t=outcome.t,
         state=after,
@@ -177,6 +182,7 @@ def run_phase(
         guard_values=guard_values,
         stale=stale,
         schedule=run.schedule.advance(plan, outcome.t, fired, timed),
+        step_size=run.step_size if step_size is None else FIRST_STEP * step_size,
         events=events,
         records=records,
         count=run.count + active.astype(jnp.int32),

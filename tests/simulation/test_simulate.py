@@ -395,3 +395,19 @@ def test_step_size_below_the_lower_bound(pendulum):
     assert np.isfinite(traj.final.q).all()
     with pytest.raises(RuntimeError, match="lower bound"):
         simulate_pendulum(pendulum, stepsize_controller=controller, solver=diffrax.Tsit5())
+
+
+def test_steps_keep_their_size_across_events(pendulum):
+    """Each phase starts with half of the size proposed before it, so that phases shorter than the
+    steps take one step each. The first phase starts with a thousandth of the run."""
+    times = np.linspace(0, 2, 21)[1:-1]
+    events = [svkc.at(time, cut="hook") for time in times]  # not connected: nothing changes
+    state = pendulum.state({"arm": 0.3})
+    traj = svkc.simulate(pendulum, state, 2.0, events=events, rtol=1e-4)
+    accepted = np.asarray(traj.phases.accepted)
+    assert accepted.shape == (20,)
+    assert accepted[0] == 3  # of 2, 20 and 78 ms
+    assert accepted[2:].tolist() == [1] * 18
+    assert int(traj.phases.rejected.sum()) == 0
+    whole = svkc.simulate(pendulum, state, 2.0, rtol=1e-10)
+    np.testing.assert_allclose(traj.final.q, whole.final.q, atol=1e-4)
