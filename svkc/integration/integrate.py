@@ -40,7 +40,7 @@ def integrate_phase(
 
     times: start, scheduled end and save times.
     """
-    _, stop, save_ts = times
+    stop = times[1]
     problem = PhaseProblem(
         problem.field_args, dataclasses.replace(problem.field, differentiated=False)
     )
@@ -59,7 +59,12 @@ def integrate_phase(
         kind="lax",
     )
     options.progress_meter.close(end.progress_meter_state)
-    ys = end.ys
+    return _solution(end, times, options)
+
+
+def _solution(end: StepperState, times: Times, options: StepperOptions) -> PhaseSolution:
+    """Return the solution of a phase from the state of the stepping loop at its end."""
+    (_, stop, save_ts), ys = times, end.ys
     if save_ts.shape[0]:  # of equal save times, the loop writes the first row alone
         ys = jax.tree.map(lambda x: x[jnp.searchsorted(save_ts, save_ts)], ys)
     event, stopped = None, where(end.t < stop, MAX_STEPS, SUCCESSFUL)

@@ -117,8 +117,8 @@ def solve_phase(
         PhaseProblem(field_args, options.field),
         armed,
         options,
-        _stepper_options(run, options, armed),
-        options.field if guards is None else guards,
+        stepper_options=_stepper_options(run, options, armed),
+        guards=options.field if guards is None else guards,
     )
     outcome = PhaseOutcome(
         t=t,
@@ -175,6 +175,7 @@ def _integrate(
     problem: PhaseProblem,
     armed: ArmedGuards | None,
     options: Options,
+    *,
     stepper_options: StepperOptions,
     guards: GuardValues | VectorField,
 ):

@@ -27,9 +27,6 @@ from svkc.simulation.traced_checks import initial_result
 from svkc.transitions.event_schedule import EventSchedule, armed_guards
 from svkc.transitions.plan import Plan, guard_round_off
 
-# The first step of a phase is this fraction of the size proposed at the end of the phase before.
-FIRST_STEP = 0.5
-
 
 def with_lock_mask(chain: Chain, state: State, plan: Plan) -> State:
     """Return the state with a mask of locked joints if an event locks or unlocks joints.
@@ -123,6 +120,15 @@ def _guard_values_after(
     return where(stale & ~may_cross, 0, values), stale
 
 
+def _first_step_after(run: RunState, outcome: PhaseOutcome) -> Float[Array, ""]:
+    """Return the size of the first step after a phase (s).
+
+    It is half of the size proposed at the end of the phase, as the change may shorten the steps.
+    """
+    proposed = outcome.solution.step_size
+    return run.step_size if proposed is None else proposed / 2
+
+
 def _next_stop(run: RunState, t1):
     """Return the scheduled end of the next phase: the time of the next timed event, or t1.
 
@@ -174,7 +180,6 @@ def run_phase(
         )
     result = RESULTS.where(run.result == RESULTS.successful, result, run.result)
     guard_values, stale = _guard_values_after(chain, run, outcome, fired, plan)
-    step_size = outcome.solution.step_size
     return RunState(
         t=outcome.t,
         state=after,
@@ -182,7 +187,7 @@ def run_phase(
         guard_values=guard_values,
         stale=stale,
         schedule=run.schedule.advance(plan, outcome.t, fired, timed),
-        step_size=run.step_size if step_size is None else FIRST_STEP * step_size,
+        step_size=_first_step_after(run, outcome),
         events=events,
         records=records,
         count=run.count + active.astype(jnp.int32),

@@ -409,5 +409,5 @@ def test_steps_keep_their_size_across_events(pendulum):
     assert accepted[0] == 3  # of 2, 20 and 78 ms
     assert accepted[2:].tolist() == [1] * 18
     assert int(traj.phases.rejected.sum()) == 0
-    whole = svkc.simulate(pendulum, state, 2.0, rtol=1e-10)
-    np.testing.assert_allclose(traj.final.q, whole.final.q, atol=1e-4)
+    reference = svkc.simulate(pendulum, state, 2.0, rtol=1e-10)
+    np.testing.assert_allclose(traj.final.q, reference.final.q, atol=1e-4)
