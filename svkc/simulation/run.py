@@ -141,7 +141,10 @@ def _next_stop(run: RunState, t1):
 
 
 def has_next_phase(run: RunState, t1) -> Bool[Array, ""]:
-    """Return whether the run has another phase: it is before its end, or a timed event is due."""
+    """Return whether the run has another phase: it is before its end, or a timed event is due.
+
+    `run_phase` leaves a run without another phase unchanged.
+    """
     unfinished = (run.t < t1) | jnp.any(run.schedule.due(t1))
     return unfinished & (run.result == RESULTS.successful)
 
@@ -150,8 +153,6 @@ def run_phase(
     chain: Chain, run: RunState, index: Any, times: Any, *, plan: Plan, options: Options, args: Any
 ) -> RunState:  # fmt: skip
     """Integrate one phase, apply the events at its end, and write the records of both.
-
-    A run that has no next phase is unchanged.
 
     index: index of the phase.
     times: end of the run, and the save times.
