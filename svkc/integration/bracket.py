@@ -6,6 +6,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.select import where
 
+# Bisection alone takes 52 iterations in float64, and no function of the tests takes more than 80.
 MAX_ITERATIONS = 200
 
 
@@ -16,7 +17,7 @@ class Bracket(eqx.Module):
     inverse quadratic interpolation where it is safe, bisection elsewhere. It starts with a secant.
 
     fa, fb: values at a and b.
-    replaced, f_replaced: the end that the last iteration replaced, and the value there.
+    old_end, f_old_end: the end that the last iteration replaced, and the value there.
     moved_b: whether the last iteration replaced b.
     tol: length of a converged bracket.
     count: iterations so far.
@@ -26,8 +27,8 @@ class Bracket(eqx.Module):
     b: Float[Array, ""]
     fa: Float[Array, ""]
     fb: Float[Array, ""]
-    replaced: Float[Array, ""]
-    f_replaced: Float[Array, ""]
+    old_end: Float[Array, ""]
+    f_old_end: Float[Array, ""]
     moved_b: Bool[Array, ""]
     tol: Float[Array, ""]
     count: Int[Array, ""]
@@ -44,8 +45,8 @@ class Bracket(eqx.Module):
             b=b,
             fa=fa,
             fb=fb,
-            replaced=b,
-            f_replaced=fb,
+            old_end=b,
+            f_old_end=fb,
             moved_b=jnp.ones((), bool),
             tol=tol,
             count=jnp.zeros((), jnp.int32),
@@ -58,13 +59,13 @@ class Bracket(eqx.Module):
     def next_point(self) -> Float[Array, ""]:
         """Return the point of the next evaluation: the root of an interpolation, or the midpoint.
 
-        It is at least half of the tolerance away from both ends. So once an end is within round-off
-        of the root, the next point is on the other side, and the bracket has converged.
+        It is at least half of the tolerance away from both ends. So where interpolation shows a
+        root within round-off of an end, the next point is on the other side of the root.
         """
         # x1 is the last point, x2 the other end of the bracket, x3 the end that x1 replaced
         x1, f1 = where(self.moved_b, self.b, self.a), where(self.moved_b, self.fb, self.fa)
         x2, f2 = where(self.moved_b, self.a, self.b), where(self.moved_b, self.fa, self.fb)
-        x3, f3 = self.replaced, self.f_replaced
+        x3, f3 = self.old_end, self.f_old_end
         xi, phi = _ratio(x1 - x2, x3 - x2), _ratio(f1 - f2, f3 - f2)
         is_safe = (phi**2 < xi) & ((1 - phi) ** 2 < 1 - xi)
         secant = _ratio(f1, f1 - f2)
@@ -72,6 +73,7 @@ class Bracket(eqx.Module):
             _ratio(x3 - x1, x2 - x1) * _ratio(f1, f3 - f1) * _ratio(f2, f3 - f2)
         )
         fraction = where(self.count == 0, secant, where(is_safe, quadratic, 0.5))
+        fraction = where(jnp.isfinite(fraction), fraction, 0.5)  # of infinite values
         c = x1 + fraction * (x2 - x1)
         return jnp.clip(c, self.a + self.tol / 2, self.b - self.tol / 2)
 
@@ -83,8 +85,8 @@ class Bracket(eqx.Module):
             b=where(right, c, self.b),
             fa=where(right, self.fa, fc),
             fb=where(right, fc, self.fb),
-            replaced=where(right, self.b, self.a),
-            f_replaced=where(right, self.fb, self.fa),
+            old_end=where(right, self.b, self.a),
+            f_old_end=where(right, self.fb, self.fa),
             moved_b=right,
             tol=self.tol,
             count=self.count + 1,

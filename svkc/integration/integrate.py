@@ -87,7 +87,7 @@ def _solution(end: StepperState, times: Times, options: StepperOptions) -> Phase
         result=result.astype(jnp.int32),
         stats=end.stats,
         event=event,
-        step_size=end.step_size,
+        proposed_step=end.step_size,
     )
 
 

@@ -135,7 +135,8 @@ class PhaseSolution(eqx.Module):
     accepted, rejected: numbers of steps.
     result: result code, diffrax's or one of this module.
     event: the event at the end. None: there are no guards.
-    step_size: size that the controller proposes for the next step (s). None: not known.
+    proposed_step: size that the controller proposes for the next step (s). After an event it is the
+        size of the interrupted step; without a step, that of the first one. None: not known.
     """
 
     t: Float[Array, ""]
@@ -150,7 +151,7 @@ class PhaseSolution(eqx.Module):
     stats: Stats
     event: EventInfo | None = None
     records: StepRecord | None = None
-    step_size: Float[Array, ""] | None = None
+    proposed_step: Float[Array, ""] | None = None
 
 
 class StepperState(eqx.Module):

@@ -50,8 +50,8 @@ class StateCheck(eqx.Module):
     margin: Float[Array, "*states"]
 
     @classmethod
-    def none(cls, dtype: DType) -> "StateCheck":
-        """Return the check in place of that of a state that is not checked."""
+    def unchecked(cls, dtype: DType) -> "StateCheck":
+        """Return zeros, with a margin of one, for a state that is not checked."""
         zero, zeros = jnp.zeros((), dtype), lambda n: jnp.zeros(n, dtype)
         return cls(zeros(2), zeros(2), zero, zero, zeros(3), zeros(3), margin=jnp.ones((), dtype))
 
@@ -111,7 +111,7 @@ def _check_states(
         return jax.lax.cond(
             unvmap_any(is_needed),
             lambda: _check_state(chain, state, is_phase_end),
-            lambda: StateCheck.none(dtype),
+            lambda: StateCheck.unchecked(dtype),
         )
 
     checks = jax.lax.map(check, (states, jnp.asarray(is_phase_end), needed))

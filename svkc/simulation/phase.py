@@ -43,7 +43,8 @@ class RunState(eqx.Module):
     guard_values: at the end of the last phase.
     stale: which guard values are re-evaluated at the start of the next phase.
     schedule: when the timed events happen, and which events have happened.
-    step_size: size of the first step of the next phase with the default controller (s).
+    first_step: size of the first step of the next phase with a PID controller and `Replay` (s).
+    unsaved: whether an event has changed the state since states were saved.
     count: number of phases so far.
     saved, saved_work: states and work at the save times.
     derivative, invalid_from: why the run has no derivative, and the index of the first phase for
@@ -56,7 +57,8 @@ class RunState(eqx.Module):
     guard_values: Float[Array, " guards"] | None
     stale: Bool[Array, " guards"] | None
     schedule: EventSchedule
-    step_size: Float[Array, ""]
+    first_step: Float[Array, ""]
+    unsaved: Bool[Array, ""]
     events: Events
     records: PhaseRecords
     count: Int[Array, ""]
@@ -148,7 +150,7 @@ def _stepper_options(run: RunState, options: Options, armed: ArmedGuards | None)
     solver = options.solver if armed is not None else without_dense_output(options.solver)
     controller, first_step = options.step_size_control()
     if isinstance(controller, diffrax.PIDController):
-        first_step = run.step_size
+        first_step = run.first_step
     solver, armed_guards, controller, first_step = stop_gradient_tree(
         (with_scan_kind(solver, "lax"), armed, controller, first_step)
     )

@@ -63,7 +63,8 @@ def initial_run_state(
         guard_values=jnp.asarray(initial, dtype) if plan.guards else None,
         stale=jnp.asarray(reevaluated_guards(plan)) if plan.guards else None,
         schedule=EventSchedule.at_start(plan),
-        step_size=options.first_step,
+        first_step=options.first_step,
+        unsaved=jnp.zeros((), bool),
         events=empty_events(rows, links, dtype),
         records=empty_phase_records(rows + 1, state),
         count=jnp.asarray(0, jnp.int32),
@@ -123,10 +124,13 @@ def _guard_values_after(
 def _first_step_after(run: RunState, outcome: PhaseOutcome) -> Float[Array, ""]:
     """Return the size of the first step after a phase (s).
 
-    It is half of the size proposed at the end of the phase, as the change may shorten the steps.
+    It is half of the size proposed at the end of the phase, as the change may shorten the steps. A
+    phase without a step changes nothing.
     """
-    proposed = outcome.solution.step_size
-    return run.step_size if proposed is None else proposed / 2
+    proposed = outcome.solution.proposed_step
+    if proposed is None:
+        return run.first_step
+    return where(outcome.solution.accepted > 0, proposed / 2, run.first_step)
 
 
 def _next_stop(run: RunState, t1):
@@ -141,12 +145,17 @@ def _next_stop(run: RunState, t1):
 
 
 def has_next_phase(run: RunState, t1) -> Bool[Array, ""]:
-    """Return whether the run has another phase: it is before its end, or a timed event is due.
-
-    `run_phase` leaves a run without another phase unchanged.
-    """
+    """Return whether the run has another phase: it is before its end, or a timed event is due."""
     unfinished = (run.t < t1) | jnp.any(run.schedule.due(t1))
     return unfinished & (run.result == RESULTS.successful)
+
+
+def needs_phase(run: RunState, t1) -> Bool[Array, ""]:
+    """Return whether `run_phase` changes the records or the saved states of a run.
+
+    After an event at the end of a run, a phase of zero length saves the state after the event.
+    """
+    return has_next_phase(run, t1) | run.unsaved
 
 
 def run_phase(
@@ -188,7 +197,8 @@ def run_phase(
         guard_values=guard_values,
         stale=stale,
         schedule=run.schedule.advance(plan, outcome.t, fired, timed),
-        step_size=_first_step_after(run, outcome),
+        first_step=_first_step_after(run, outcome),
+        unsaved=jnp.any(fired),
         events=events,
         records=records,
         count=run.count + active.astype(jnp.int32),

@@ -36,7 +36,7 @@ from svkc.simulation.option_checks import (
 )
 from svkc.simulation.options import Options, prepare_options
 from svkc.simulation.phase import RunState
-from svkc.simulation.run import has_next_phase, initial_run_state, run_phase, with_lock_mask
+from svkc.simulation.run import initial_run_state, needs_phase, run_phase, with_lock_mask
 from svkc.simulation.trajectory import Trajectory
 from svkc.transitions.plan import Plan
 
@@ -130,7 +130,7 @@ def _run(chain: Chain, state: State, times, plan: Plan, options: Options, args) 
 
     def scan_body(run: RunState, index):
         # most runs have fewer events than the capacity
-        needed = unvmap_any(has_next_phase(run, t1))
+        needed = unvmap_any(needs_phase(run, t1))
         return jax.lax.cond(needed, lambda: phase(run, index), lambda: run), None
 
     if options.max_events == 0:

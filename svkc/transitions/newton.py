@@ -39,10 +39,12 @@ from svkc.transitions.newton_state import (
     RANK_SEARCH,
     NewtonState,
     Schedule,
-    closed_tolerance,
     is_any_of,
 )
 from svkc.tree.configuration import integrate
+
+# The probe is closed once a Newton step is smaller than this fraction of the rank tolerance.
+PROBE_TOLERANCE = 1e-2
 
 _loop_kinematics = one_kernel(loop_kinematics)
 
@@ -83,14 +85,18 @@ class _Iteration(eqx.Module):
                 lambda: (v, spatial_impulse, energy_lost),
             )
         q, probe = self._updated_configuration(q_eval, kind, step), current.probe
+        probe_step = current.probe_step
         if DECIDE_RANK in self.kinds:
             in_rank_search = is_any_of(kind, *RANK_SEARCH)
             q, probe = where(in_rank_search, current.q, q), where(in_rank_search, q, probe)
+            largest = jnp.max(jnp.abs(step) / jacobian_scales(chain)[1])
+            probe_step = where(kind == CLOSE_PERTURBED, largest, jnp.inf)
         return dataclasses.replace(
             current,
             q=q,
             v=v,
             probe=probe,
+            probe_step=probe_step,
             spatial_impulse=spatial_impulse,
             energy_lost=energy_lost,
             residual_gaps=residual_gaps,
@@ -141,20 +147,19 @@ def _iterate(
 
     @functools.partial(jax.checkpoint, prevent_cse=False)
     def scan_body(current: NewtonState, x) -> tuple[NewtonState, None]:
-        kind, rank_known, repeats = x
+        kind, rank_known = x
         step = lambda: iteration(current, kind, rank_known)
         if CLOSE_PERTURBED not in kinds:
             return step(), None
-        # the last Newton step, from gaps this small, has closed the probe's loops to round-off
-        closed = repeats & (jnp.max(current.residual_gaps) < closed_tolerance(q.dtype))
-        return jax.lax.cond(unvmap_any(~closed), step, lambda: current), None
+        # A pivot at the probe is wrong by about its distance from a closed configuration. At a
+        # singular one Newton's steps halve this distance; elsewhere it is the square of the step.
+        closed = current.probe_step < PROBE_TOLERANCE * rank_tolerance(q.dtype)
+        needed = unvmap_any((kind != CLOSE_PERTURBED) | ~closed)
+        return jax.lax.cond(needed, step, lambda: current), None
 
-    kind_numbers = np.array(kinds, np.int32)
-    again = (kind_numbers[1:] == CLOSE_PERTURBED) & (kind_numbers[:-1] == CLOSE_PERTURBED)
     xs = (
-        jnp.asarray(kind_numbers),
+        jnp.asarray(np.array(kinds, np.int32)),
         jnp.asarray(np.arange(len(kinds)) >= all_row_steps),
-        jnp.asarray(np.concatenate([[False], again])),
     )
     return jax.lax.scan(scan_body, NewtonState.init(chain, structure, q, v), xs)[0]
 

@@ -9,12 +9,10 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.select import where
 from svkc.loops.pivoting import count_rank
-from svkc.model.annotations import DType
 from svkc.model.chain import Chain, Structure
 from svkc.tree.configuration import normalize
 
@@ -35,14 +33,6 @@ def is_any_of(kind: Int[Array, ""], *kinds: int) -> Bool[Array, ""]:
     return functools.reduce(jnp.logical_or, [kind == k for k in kinds])
 
 
-def closed_tolerance(dtype: DType) -> float:
-    """Return the gap (rad, or in `chain.length`s) below which the loops of the probe are closed.
-
-    It is eps^(3/4): 1.8e-12 in float64, 6.4e-6 in float32.
-    """
-    return float(np.finfo(dtype).eps ** 0.75)
-
-
 class Schedule(eqx.Module):
     """The kinds of iterations to take, in order."""
 
@@ -59,6 +49,8 @@ class NewtonState(eqx.Module):
 
     rank, margin: rank m of the loop Jacobian, and |R_mm| / |R_11|.
     probe: the perturbed copy of q in the search for the rank.
+    probe_step: largest scaled change of the probe in the last iteration if that was a Newton step
+        on the probe, else inf.
     search_diag_R: |R_kk| of the loop Jacobian at q and at the probe when the search ends.
     search_gaps: largest gap of each loop at these two (rad, or in `chain.length`s).
     residual_gaps: largest gap of each loop at the last evaluation of the loops.
@@ -72,6 +64,7 @@ class NewtonState(eqx.Module):
     rank: Int[Array, ""]
     margin: Float[Array, ""]
     probe: Float[Array, " q"]
+    probe_step: Float[Array, ""]
     search_diag_R: Float[Array, "2 steps"]
     search_gaps: Float[Array, "2 links"]
     residual_gaps: Float[Array, " links"]
@@ -92,6 +85,7 @@ class NewtonState(eqx.Module):
             rank=structure.rank,
             margin=structure.margin,
             probe=q,
+            probe_step=jnp.full((), jnp.inf, dtype),
             search_diag_R=diag_R,
             search_gaps=gaps,
             residual_gaps=gaps[0],
@@ -120,13 +114,11 @@ class NewtonState(eqx.Module):
 
         The probe is left out if its loops are open.
         """
-        diag_R = self.search_diag_R
-        closed = jnp.max(self.search_gaps[1]) < closed_tolerance(diag_R.dtype)
+        diag_R, eps = self.search_diag_R, jnp.finfo(self.search_diag_R.dtype)
+        closed = jnp.max(self.search_gaps[1]) < eps.eps**0.75
         rank = where(
             closed, jnp.maximum(count_rank(diag_R[0]), count_rank(diag_R[1])), count_rank(diag_R[0])
         )
         last = jnp.arange(diag_R.shape[1], dtype=jnp.int32) == rank - 1
-        margin = jnp.sum(where(last, diag_R, 0), 1) / jnp.maximum(
-            diag_R[:, 0], jnp.finfo(diag_R.dtype).tiny
-        )
+        margin = jnp.sum(where(last, diag_R, 0), 1) / jnp.maximum(diag_R[:, 0], eps.tiny)
         return rank, where(closed, jnp.max(margin), margin[0])

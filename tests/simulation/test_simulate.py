@@ -397,6 +397,35 @@ def test_step_size_below_the_lower_bound(pendulum):
         simulate_pendulum(pendulum, stepsize_controller=controller, solver=diffrax.Tsit5())
 
 
+def test_states_after_the_last_event_are_saved(pendulum):
+    """At and after the time of an event at the end of a run, or of one that ends it, the saved
+    state is the one after the event: alone, in a batch beside a longer run, and in derivatives by
+    the time of the event."""
+    ts, start = jnp.array([0.0, 0.2, 0.3, 0.5]), pendulum.state({"arm": 0.5}, {"arm": 1.0})
+
+    def run(stop_time, last=0.5):
+        events = [
+            svkc.at(stop_time, connect="hook", here=True, stop=True),
+            svkc.at(last, connect="hook", here=True),
+        ]
+        return svkc.simulate(pendulum, start, 0.5, ts=ts, events=events, rtol=1e-9)
+
+    stopped, ended = run(0.3), run(9.0)
+    for traj, first in ((stopped, 2), (ended, 3)):
+        np.testing.assert_array_equal(traj.states.v[first:], 0)
+        np.testing.assert_array_equal(
+            traj.states.q[first:], traj.final.q[None].repeat(4 - first, 0)
+        )
+        assert traj.connected[:, 0].tolist() == [False] * first + [True] * (4 - first)
+    lanes = jax.vmap(run)(jnp.array([0.3, 9.0]))
+    for traj, lane in ((stopped, 0), (ended, 1)):
+        np.testing.assert_allclose(lanes.states.q[lane], traj.states.q, atol=ROUND_OFF)
+        np.testing.assert_allclose(lanes.states.v[lane], traj.states.v, atol=ROUND_OFF)
+    saved, final = jax.jacrev(lambda time: (run(time).states.q[-1], run(time).final.q))(0.3)
+    np.testing.assert_allclose(saved, final, rtol=1e-9)
+    assert abs(float(final[0])) > 0.1
+
+
 def test_steps_keep_their_size_across_events(pendulum):
     """Each phase starts with half of the size proposed before it, so that phases shorter than the
     steps take one step each. The first phase starts with a thousandth of the run."""

@@ -1,5 +1,5 @@
-"""Root finding: number of evaluations and accuracy for functions as guards are, and as they should
-not be."""
+"""Root finding: number of evaluations and accuracy for smooth functions, and for functions with
+jumps, kinks and flat roots."""
 
 import math
 
@@ -10,7 +10,7 @@ import pytest
 
 from svkc.integration.bracket import MAX_ITERATIONS, Bracket
 
-# function, interval, root, bound of the evaluations
+# function, interval, root, largest number of evaluations (bisection takes 52 in float64)
 SMOOTH = {
     "line": (lambda t: t - 0.1234, (0.0, 0.3), 0.1234, 4),
     "parabola": (lambda t: (t + 0.5) ** 2 - 0.36, (0.0, 0.3), 0.1, 9),
@@ -27,6 +27,13 @@ HARD = {
         0.1234,
         60,
     ),
+    "jump to infinity": (
+        lambda t: jnp.where(t > 0.1234, jnp.inf, -1.0).astype(t.dtype),
+        (0.0, 0.3),
+        0.1234,
+        60,
+    ),
+    "zero at the end": (lambda t: jnp.minimum(t - 0.3, 0.0) ** 3, (0.0, 0.3), 0.3, 60),
     "kink": (lambda t: (t - 0.1) * jnp.where(t > 0.1, 1.0, 1e3), (0.0, 0.3), 0.1, 80),
     "triple root": (lambda t: (t - 0.13) ** 3, (0.0, 0.3), 0.13, 80),
     "root of infinite rate": (lambda t: jnp.cbrt(t - 0.1), (0.0, 0.3), 0.1, 80),
@@ -50,7 +57,7 @@ def find_root(f, interval, dtype) -> Bracket:
 @pytest.mark.parametrize("name", [*SMOOTH, *HARD])
 def test_a_root_is_located_to_round_off(name, dtype):
     """The bracket ends within its tolerance, a few units of round-off of the time, and holds the
-    root. Smooth functions take few evaluations, others a few more than bisection's 52."""
+    root. In float32 bisection takes 24 evaluations."""
     f, interval, root, most = (SMOOTH | HARD)[name]
     end = find_root(f, interval, dtype)
     eps = float(np.finfo(dtype).eps)
@@ -58,7 +65,7 @@ def test_a_root_is_located_to_round_off(name, dtype):
     assert float(end.fa) < 0 <= float(end.fb)
     assert b - a <= 3 * eps * max(interval[1], 1e-3)
     assert abs(b - root) <= 8 * eps * interval[1]
-    assert int(end.count) <= most < MAX_ITERATIONS
+    assert int(end.count) <= min(most, 30 if dtype == np.float32 else MAX_ITERATIONS / 2)
 
 
 def test_round_off_of_a_guard_costs_few_evaluations():
