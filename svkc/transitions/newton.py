@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 from svkc._jax.control_flow import unvmap_any
 from svkc._jax.one_kernel import one_kernel
 from svkc._jax.primitive import custom_primitive
+from svkc._jax.pytrees import tree_where
 from svkc._jax.select import where
 from svkc.loops.constraint import jacobian_scales, loop_kinematics
 from svkc.loops.pivoting import (
@@ -154,8 +155,10 @@ def _iterate(
         # A pivot at the probe is wrong by about its distance from a closed configuration. At a
         # singular one Newton's steps halve this distance; elsewhere it is the square of the step.
         closed = current.probe_step < PROBE_TOLERANCE * rank_tolerance(q.dtype)
-        needed = unvmap_any((kind != CLOSE_PERTURBED) | ~closed)
-        return jax.lax.cond(needed, step, lambda: current), None
+        needed = (kind != CLOSE_PERTURBED) | ~closed
+        stepped = jax.lax.cond(unvmap_any(needed), step, lambda: current)
+        # a lane that is closed stays as it is while others iterate
+        return tree_where(needed, stepped, current), None
 
     xs = (
         jnp.asarray(np.array(kinds, np.int32)),
