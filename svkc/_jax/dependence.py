@@ -101,6 +101,8 @@ class _Walk:
             jaxpr, consts = getattr(inner, "jaxpr", inner), getattr(inner, "consts", ())
             if len(jaxpr.invars) == len(inputs) and len(jaxpr.constvars) == len(consts):
                 return self.outputs(jaxpr, consts, inputs)
+        if name == "batch_together":
+            return inputs
         if name == "split":
             ends = np.cumsum(eqn.params["sizes"])
             return np.split(inputs[0], ends[:-1], eqn.params["axis"])

@@ -222,6 +222,8 @@ def evaluate_jaxpr(closed: core.ClosedJaxpr, inputs: list, lanes: int) -> list:
             out = _solve(values, lanes, **params)
         elif name == "cond" and batched and not isinstance(values[0], Batched):
             out = [Batched(x) for x in _cond(values, lanes, **params)]
+        elif name == "batch_together":
+            out = values
         elif name == "unvmap_any" and batched:
             out = [jnp.any(values[0].x)]
         else:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from svkc._jax.batch_together import batch_together
 from svkc._jax.pytrees import only_leaves
 from svkc._jax.select import where
 from svkc._jax.static_gather import static_take
@@ -122,7 +123,7 @@ def kinematics(chain: Chain, q: Float[Array, " q"]) -> Kinematics:
 
 @eqx.filter_custom_jvp
 def _kinematics_with_jvp(chain: Chain, q: Float[Array, " q"]) -> Kinematics:
-    return _kinematics(chain, q)
+    return batch_together(_kinematics(chain, q), (chain, q))
 
 
 @_kinematics_with_jvp.def_jvp

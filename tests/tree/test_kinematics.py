@@ -89,3 +89,27 @@ def test_parameters_that_are_not_of_the_geometry_have_no_derivative(chain_and_q)
     chain, q = chain_and_q
     by_mass = lambda mass: as_vector(kinematics(eqx.tree_at(lambda c: c.mass, chain, mass), q))
     np.testing.assert_array_equal(jax.jit(jax.jacfwd(by_mass))(chain.mass), 0)
+
+
+SLIDES = """<mujoco><worldbody><body><joint type="slide" axis="1 0 0"/><geom size="0.1"/>
+  <body pos="1 0 0" euler="0 30 0"><joint type="slide" axis="0 1 0"/><geom size="0.1"/></body>
+</body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("model", [SLIDES, TREE])
+@pytest.mark.parametrize("batched", ["q", "pos"])
+def test_derivatives_of_compiled_batches(model, batched):
+    """Not all results depend on what `vmap` batches: rotations not on slides, nor on `pos`."""
+    chain = svkc.load(model)
+    lane = lambda q, pos: as_vector(kinematics(eqx.tree_at(lambda c: c.pos, chain, pos), q))
+    at = {"q": chain.state().q + 0.3, "pos": chain.pos}
+    axes = {name: 0 if name == batched else None for name in at}
+    at[batched] = jnp.stack([at[batched], 1.5 * at[batched], 0.5 * at[batched]])
+    compiled = jax.jit(jax.vmap(lane, tuple(axes.values())))
+    for i, derivative in ((0, jax.jacfwd), (1, jax.jacfwd), (0, jax.jacrev), (1, jax.jacrev)):
+        jacobian = derivative(compiled, i)(*at.values())
+        if i == list(at).index(batched):  # no lane depends on another
+            jacobian = jnp.moveaxis(jnp.diagonal(jacobian, 0, 0, 2), -1, 0)
+        for k, own in enumerate(jacobian):
+            of_lane = [x[k] if name == batched else x for name, x in at.items()]
+            np.testing.assert_allclose(own, jax.jacfwd(lane, i)(*of_lane), atol=1e-14)
