@@ -13,12 +13,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from svkc._jax.control_flow import unvmap_any
 from svkc._jax.one_kernel import one_kernel
 from svkc._jax.pytrees import stop_gradient_tree
 from svkc._jax.select import where
 from svkc.loops.constraint import assemble_loop_jacobian, jacobian_scales, largest_norms
 from svkc.loops.frames import frame_gaps, loop_frames
 from svkc.loops.pivoting import pivot_ratio, pivoted_qr, rank_tolerance
+from svkc.model.annotations import DType
 from svkc.model.chain import Chain, State, Structure, active_dofs
 from svkc.model.topology import FREE
 from svkc.simulation.records import PhaseRecords, Phases
@@ -47,6 +49,12 @@ class StateCheck(eqx.Module):
     angular: Float[Array, "*states 3"]
     margin: Float[Array, "*states"]
 
+    @classmethod
+    def unchecked(cls, dtype: DType) -> "StateCheck":
+        """Return zeros, with a margin of one, for a state that is not checked."""
+        zero, zeros = jnp.zeros((), dtype), lambda n: jnp.zeros(n, dtype)
+        return cls(zeros(2), zeros(2), zero, zero, zeros(3), zeros(3), margin=jnp.ones((), dtype))
+
 
 def certificate(
     chain: Chain,
@@ -66,8 +74,8 @@ def certificate(
     """
     rows = records.start.shape[0]
     ts, saved_states = saved
-    first, last, saved_checks = _check_states(chain, records, saved_states)
     written = jnp.arange(rows, dtype=jnp.int32) < count
+    first, last, saved_checks = _check_states(chain, records, written, saved_states)
     margin = stop_gradient_tree(jnp.minimum(first.margin, last.margin))
     lost = written & (margin < rank_tolerance(margin.dtype))
     lost_at = where(jnp.any(lost), jnp.argmax(lost).astype(jnp.int32), rows)
@@ -81,11 +89,12 @@ def certificate(
 
 
 def _check_states(
-    chain: Chain, records: PhaseRecords, saved: State
+    chain: Chain, records: PhaseRecords, written: Bool[Array, " phases"], saved: State
 ) -> tuple[StateCheck, StateCheck, StateCheck]:
     """Return the checks of the states at starts of phases, at ends of phases, and at save times.
 
-    One loop checks all states, so that kinematics and energy are compiled once.
+    One loop checks all states, so that kinematics and energy are compiled once. Checks of phases
+    that are not written are zero, with a margin of one.
     """
     r, rows, join = records, records.start.shape[0], lambda *x: jnp.concatenate(x)
     states = State(
@@ -94,7 +103,18 @@ def _check_states(
         jax.tree.map(join, r.structure, r.structure, saved.structure),
     )
     is_phase_end = np.arange(states.q.shape[0]) < 2 * rows
-    checks = jax.lax.map(lambda x: _check_state(chain, *x), (states, jnp.asarray(is_phase_end)))
+    needed = join(written, written, jnp.ones(saved.q.shape[0], bool))
+    dtype = states.q.dtype
+
+    def check(x):
+        state, is_phase_end, is_needed = x
+        return jax.lax.cond(
+            unvmap_any(is_needed),
+            lambda: _check_state(chain, state, is_phase_end),
+            lambda: StateCheck.unchecked(dtype),
+        )
+
+    checks = jax.lax.map(check, (states, jnp.asarray(is_phase_end), needed))
     parts = slice(rows), slice(rows, 2 * rows), slice(2 * rows, None)
     return tuple(jax.tree.map(lambda x, part=part: x[part], checks) for part in parts)
 

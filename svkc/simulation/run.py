@@ -64,6 +64,7 @@ def initial_run_state(
         stale=jnp.asarray(reevaluated_guards(plan)) if plan.guards else None,
         schedule=EventSchedule.at_start(plan),
         first_step=options.first_step,
+        unsaved=jnp.ones((), bool),
         events=empty_events(rows, links, dtype),
         records=empty_phase_records(rows + 1, state),
         count=jnp.asarray(0, jnp.int32),
@@ -143,6 +144,21 @@ def _next_stop(run: RunState, t1):
     return where((stop < run.t) | (run.result != RESULTS.successful), run.t, stop)
 
 
+def has_next_phase(run: RunState, t1) -> Bool[Array, ""]:
+    """Return whether the run has another phase: it is before its end, or a timed event is due."""
+    unfinished = (run.t < t1) | jnp.any(run.schedule.due(t1))
+    return unfinished & (run.result == RESULTS.successful)
+
+
+def needs_phase(run: RunState, t1) -> Bool[Array, ""]:
+    """Return whether `run_phase` changes the records or the saved states of a run.
+
+    In a run of no length, and after an event at the end of a run, a phase of zero length saves the
+    state.
+    """
+    return has_next_phase(run, t1) | run.unsaved
+
+
 def run_phase(
     chain: Chain, run: RunState, index: Any, times: Any, *, plan: Plan, options: Options, args: Any
 ) -> RunState:  # fmt: skip
@@ -152,9 +168,8 @@ def run_phase(
     times: end of the run, and the save times.
     """
     t1, ts = times
+    active = has_next_phase(run, t1)
     run = _reevaluate_stale_guards(chain, run, plan, options, args)
-    active = (run.t < t1) | jnp.any(run.schedule.due(t1))
-    active = active & (run.result == RESULTS.successful)
     stop = _next_stop(run, t1)
     field_args = phase_field_args(chain, run.state.structure, args, options.field)
     outcome = solve_phase(run, stop, ts, plan, options, field_args)
@@ -184,6 +199,7 @@ def run_phase(
         stale=stale,
         schedule=run.schedule.advance(plan, outcome.t, fired, timed),
         first_step=_first_step_after(run, outcome),
+        unsaved=jnp.any(fired),
         events=events,
         records=records,
         count=run.count + active.astype(jnp.int32),

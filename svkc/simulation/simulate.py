@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from svkc._jax.control_flow import unvmap_any
 from svkc._jax.eager import eager_jit
 from svkc._jax.functions import call_with_comparable
 from svkc._jax.primitive import ClosureConverted
@@ -35,7 +36,7 @@ from svkc.simulation.option_checks import (
 )
 from svkc.simulation.options import Options, prepare_options
 from svkc.simulation.phase import RunState
-from svkc.simulation.run import initial_run_state, run_phase, with_lock_mask
+from svkc.simulation.run import initial_run_state, needs_phase, run_phase, with_lock_mask
 from svkc.simulation.trajectory import Trajectory
 from svkc.transitions.plan import Plan
 
@@ -125,13 +126,16 @@ def _run(chain: Chain, state: State, times, plan: Plan, options: Options, args) 
     run = initial_run_state(chain, state, times, plan, options)
 
     def phase(run: RunState, index):
-        return run_phase(chain, run, index, (t1, ts), plan=plan, options=options, args=args), None
+        return run_phase(chain, run, index, (t1, ts), plan=plan, options=options, args=args)
+
+    def scan_body(run: RunState, index):
+        # most runs have fewer events than the capacity
+        needed = unvmap_any(needs_phase(run, t1))
+        return jax.lax.cond(needed, lambda: phase(run, index), lambda: run), None
 
     if options.max_events == 0:
-        run, _ = phase(run, jnp.asarray(0))
-    else:
-        run, _ = jax.lax.scan(phase, run, jnp.arange(options.max_events + 1))
-    return run
+        return phase(run, jnp.asarray(0))
+    return jax.lax.scan(scan_body, run, jnp.arange(options.max_events + 1))[0]
 
 
 def _with_certificate(

@@ -426,6 +426,18 @@ def test_states_after_the_last_event_are_saved(pendulum):
     assert abs(float(final[0])) > 0.1
 
 
+@pytest.mark.parametrize("guarded", [True, False])
+def test_a_run_of_no_length_saves_its_start(pendulum, guarded):
+    """Phases of no length are skipped, but not the first one."""
+    state = pendulum.state([0.4], v=[0.3])
+    events = [svkc.when(lambda t, state, args: state.q[0] - 1, stop=True)] if guarded else []
+    traj = svkc.simulate(pendulum, state, 1.5, t0=1.5, ts=[1.5, 1.5], events=events)
+    assert traj.events.count == 0 and traj.t_final == 1.5
+    for states in (traj.states.q, traj.final.q):
+        np.testing.assert_array_equal(states.ravel(), np.full(states.size, 0.4))
+    np.testing.assert_array_equal(traj.states.v, [[0.3], [0.3]])
+
+
 def test_steps_keep_their_size_across_events(pendulum):
     """Each phase starts with half of the size proposed before it, so that phases shorter than the
     steps take one step each. The first phase starts with a thousandth of the run."""
