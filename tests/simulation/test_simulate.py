@@ -432,7 +432,8 @@ def test_a_run_of_no_length_saves_its_start(pendulum, guarded):
     state = pendulum.state([0.4], v=[0.3])
     events = [svkc.when(lambda t, state, args: state.q[0] - 1, stop=True)] if guarded else []
     traj = svkc.simulate(pendulum, state, 1.5, t0=1.5, ts=[1.5, 1.5], events=events)
-    assert traj.events.count == 0 and traj.t_final == 1.5
+    assert traj.events.count == 0
+    assert traj.t_final == 1.5
     for states in (traj.states.q, traj.final.q):
         np.testing.assert_array_equal(states.ravel(), np.full(states.size, 0.4))
     np.testing.assert_array_equal(traj.states.v, [[0.3], [0.3]])
