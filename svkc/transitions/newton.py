@@ -133,46 +133,65 @@ def rank_search_perturbation(chain: Chain, structure: Structure) -> Float[Array,
     return where(active_dofs(chain, structure), change, 0).astype(chain.q_load.dtype)
 
 
-def _iterate(
-    chain: Chain, structure: Structure, q, v, schedule: Schedule, *, all_row_steps: int
-) -> NewtonState:
-    """Run the iterations of a schedule.
-
-    all_row_steps: the number of first iterations that use all rows, whatever the rank.
-    """
-    kinds, unlocked = schedule.kinds, dataclasses.replace(structure, locked=None)
+def _start(
+    chain: Chain, structure: Structure, q, v, kinds: tuple[int, ...]
+) -> tuple[_Iteration, NewtonState]:
+    """Return the body of the loop over `kinds`, and the state before it."""
+    unlocked = dataclasses.replace(structure, locked=None)
     # locked joints have a velocity before the impact that stops them
     v = where(active_dofs(chain, unlocked), v, 0)
     perturbation = rank_search_perturbation(chain, structure)
     iteration = _Iteration(chain, structure, perturbation=perturbation, kinds=kinds)
+    return iteration, NewtonState.init(chain, structure, q, v)
+
+
+def _iterate(
+    chain: Chain, structure: Structure, q, v, kinds: tuple[int, ...], *, all_row_steps: int
+) -> NewtonState:
+    """Run all iterations of the kinds, in order.
+
+    all_row_steps: the number of first iterations that use all rows, whatever the rank.
+    """
+    iteration, start = _start(chain, structure, q, v, kinds)
 
     @functools.partial(jax.checkpoint, prevent_cse=False)
     def scan_body(current: NewtonState, x) -> tuple[NewtonState, None]:
-        kind, rank_known = x
-        step = lambda: iteration(current, kind, rank_known)
-        if CLOSE_PERTURBED not in kinds:
-            return step(), None
-        # A pivot at the probe is wrong by about its distance from a closed configuration. At a
-        # singular one Newton's steps halve this distance; elsewhere it is the square of the step.
-        closed = current.probe_step < PROBE_TOLERANCE * rank_tolerance(q.dtype)
-        needed = (kind != CLOSE_PERTURBED) | ~closed
-        stepped = jax.lax.cond(unvmap_any(needed), step, lambda: current)
-        # a lane that is closed stays as it is while others iterate
-        return tree_where(needed, stepped, current), None
+        return iteration(current, *x), None
 
     xs = (
         jnp.asarray(np.array(kinds, np.int32)),
         jnp.asarray(np.arange(len(kinds)) >= all_row_steps),
     )
-    return jax.lax.scan(scan_body, NewtonState.init(chain, structure, q, v), xs)[0]
+    return jax.lax.scan(scan_body, start, xs)[0]
 
 
 def _solve(chain: Chain, structure: Structure, q, v, schedule: Schedule) -> NewtonState:
-    """Run a schedule. All rows are used until the search for the rank has ended."""
-    all_row_steps = (
-        schedule.all_row_steps + len(RANK_SEARCH) if DECIDE_RANK in schedule.kinds else 0
-    )
-    return _iterate(chain, structure, q, v, schedule, all_row_steps=all_row_steps)
+    """Run a schedule. All rows are used until the search for the rank has ended.
+
+    The search goes on to its last iteration as soon as the probe is closed. Reverse mode cannot
+    differentiate this loop, and need not: `_solve_jvp` leaves the search out.
+    """
+    kinds = schedule.kinds
+    if DECIDE_RANK not in kinds:
+        return _iterate(chain, structure, q, v, kinds, all_row_steps=0)
+    iteration, start = _start(chain, structure, q, v, kinds)
+    decide, order = kinds.index(DECIDE_RANK), jnp.asarray(np.array(kinds, np.int32))
+
+    def is_closed(current: NewtonState):
+        # A pivot at the probe is wrong by about its distance from a closed configuration. At a
+        # singular one Newton's steps halve this distance; elsewhere it is the square of the step.
+        return current.probe_step < PROBE_TOLERANCE * rank_tolerance(q.dtype)
+
+    def body(carry):
+        i, current = carry
+        closes_probe = order[i] == CLOSE_PERTURBED
+        after = iteration(current, order[i], i > decide)
+        # a lane of a batch that is closed stays as it is while others iterate
+        after = tree_where(closes_probe & is_closed(current), current, after)
+        all_closed = ~unvmap_any(~is_closed(after))
+        return where(closes_probe & all_closed, decide, i + 1), after
+
+    return jax.lax.while_loop(lambda carry: carry[0] < len(kinds), body, (np.int32(0), start))[1]
 
 
 def _solve_jvp(primals, tangents):
@@ -188,9 +207,7 @@ def _solve_jvp(primals, tangents):
         structure,
         (solution.rank, jax.lax.stop_gradient(solution.margin)),
     )
-    without_rank_search = Schedule(
-        tuple(kind for kind in schedule.kinds if kind not in RANK_SEARCH)
-    )
+    without_rank_search = tuple(kind for kind in schedule.kinds if kind not in RANK_SEARCH)
 
     @eqx.filter_checkpoint
     def iterate(chain, structure, q, v):
