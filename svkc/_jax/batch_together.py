@@ -1,10 +1,9 @@
 """Arrays that `vmap` batches all together or not at all.
 
-JAX stages a function with `jax.custom_jvp` under `vmap` with the batch axes of its values. Its
-derivative rule may return more batch axes: the rotations of a chain of slides do not depend on q,
-but the rule computes their zero rates from q. Without a program around the `vmap`, JAX makes the
-values fit. If the `vmap` is within `jit`, `scan` or `cond`, differentiation then fails, or the
-shapes are wrong.
+When `vmap` meets a `jax.custom_jvp` function within `jit`, `scan`, `cond` or `checkpoint`, JAX
+notes the batch axes of its outputs from the function alone. The derivative rule may batch more
+outputs: the rotations of a chain of slides do not depend on q, but the rule computes their zero
+rates from q. Differentiation then fails. Outside of these, JAX broadcasts the values.
 """
 
 from typing import Any
@@ -18,7 +17,10 @@ from jax.interpreters import ad, batching, mlir
 def batch_together(values: Any, inputs: Any) -> Any:
     """Return the values. If `vmap` batches a value or an input, it batches all values.
 
-    values, inputs: pytrees of arrays.
+    It is the last operation of a `jax.custom_jvp` function.
+
+    values: the function's outputs, a pytree of arrays.
+    inputs: all that its derivative rule reads.
     """
     leaves, tree = jax.tree.flatten(values)
     out = batch_together_p.bind(*leaves, *jax.tree.leaves(inputs))

@@ -6,6 +6,7 @@ from typing import Any
 import diffrax
 import jax
 
+from svkc._jax.select import where
 from svkc.integration.ode import ODEState
 from svkc.model.annotations import Scalar
 
@@ -24,7 +25,8 @@ class ProjectedInterpolation(diffrax.AbstractLocalInterpolation):
 
     def evaluate(self, t0: Scalar, t1: Scalar | None = None, left: bool = True) -> ODEState:
         def at(t):
-            fraction = (t - self.t0) / (self.t1 - self.t0)
+            duration = self.t1 - self.t0  # zero in a lane that has ended before others
+            fraction = (t - self.t0) / where(duration == 0, 1, duration)
             return jax.tree.map(
                 lambda y, s: y + fraction * s, self.inner.evaluate(t, left=left), self.shift
             )

@@ -44,7 +44,7 @@ class RunState(eqx.Module):
     stale: which guard values are re-evaluated at the start of the next phase.
     schedule: when the timed events happen, and which events have happened.
     first_step: size of the first step of the next phase with a PID controller and `Replay` (s).
-    unsaved: whether the state is that of the start, or after an event, and not saved yet.
+    unsaved: whether a phase still has to save the state: at the start, and after an event.
     count: number of phases so far.
     saved, saved_work: states and work at the save times.
     derivative, invalid_from: why the run has no derivative, and the index of the first phase for

@@ -151,10 +151,10 @@ def has_next_phase(run: RunState, t1) -> Bool[Array, ""]:
 
 
 def needs_phase(run: RunState, t1) -> Bool[Array, ""]:
-    """Return whether `run_phase` changes the records or the saved states of a run.
+    """Return whether `run_phase` changes the records, the saved states or their derivatives.
 
-    In a run of no length, and after an event at the end of a run, a phase of zero length saves the
-    state.
+    In a run of no length a phase of zero length gives the saved states their derivatives by t1 and
+    the save times. After an event at the end of a run, such a phase saves the state.
     """
     return has_next_phase(run, t1) | run.unsaved
 

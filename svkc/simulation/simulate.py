@@ -129,7 +129,12 @@ def _run(chain: Chain, state: State, times, plan: Plan, options: Options, args) 
         return run_phase(chain, run, index, (t1, ts), plan=plan, options=options, args=args)
 
     def scan_body(run: RunState, index):
-        # most runs have fewer events than the capacity
+        if not isinstance(options.adjoint, Replay):
+            # JAX refuses progress meters and other effects in a conditional under `vmap`; `Replay`
+            # hides them in its primitive
+            return phase(run, index), None
+        # Most runs have fewer events than the capacity. The phases left over are skipped, in a
+        # batch once all lanes have ended.
         needed = unvmap_any(needs_phase(run, t1))
         return jax.lax.cond(needed, lambda: phase(run, index), lambda: run), None
 

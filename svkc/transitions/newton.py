@@ -168,8 +168,8 @@ def _iterate(
 def _solve(chain: Chain, structure: Structure, q, v, schedule: Schedule) -> NewtonState:
     """Run a schedule. All rows are used until the search for the rank has ended.
 
-    The search goes on to its last iteration as soon as the probe is closed. Reverse mode cannot
-    differentiate this loop, and need not: `_solve_jvp` leaves the search out.
+    The search skips to its last iteration once the probes of all lanes are closed. Reverse mode
+    cannot differentiate this loop, and need not: `_solve_jvp` leaves the search out.
     """
     kinds = schedule.kinds
     if DECIDE_RANK not in kinds:
@@ -186,7 +186,7 @@ def _solve(chain: Chain, structure: Structure, q, v, schedule: Schedule) -> Newt
         i, current = carry
         closes_probe = order[i] == CLOSE_PERTURBED
         after = iteration(current, order[i], i > decide)
-        # a lane of a batch that is closed stays as it is while others iterate
+        # a lane whose probe is closed stays as it is while others iterate
         after = tree_where(closes_probe & is_closed(current), current, after)
         all_closed = ~unvmap_any(~is_closed(after))
         return where(closes_probe & all_closed, decide, i + 1), after

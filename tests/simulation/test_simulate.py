@@ -426,17 +426,44 @@ def test_states_after_the_last_event_are_saved(pendulum):
     assert abs(float(final[0])) > 0.1
 
 
-@pytest.mark.parametrize("guarded", [True, False])
-def test_a_run_of_no_length_saves_its_start(pendulum, guarded):
-    """Phases of no length are skipped, but not the first one."""
-    state = pendulum.state([0.4], v=[0.3])
-    events = [svkc.when(lambda t, state, args: state.q[0] - 1, stop=True)] if guarded else []
-    traj = svkc.simulate(pendulum, state, 1.5, t0=1.5, ts=[1.5, 1.5], events=events)
-    assert traj.events.count == 0
-    assert traj.t_final == 1.5
-    for states in (traj.states.q, traj.final.q):
-        np.testing.assert_array_equal(states.ravel(), np.full(states.size, 0.4))
-    np.testing.assert_array_equal(traj.states.v, [[0.3], [0.3]])
+def test_a_run_of_no_length_has_derivatives_by_its_end(pendulum):
+    """Phases after the end of a run are skipped, but not the first one."""
+    start = pendulum.state({"arm": 0.4}, {"arm": 0.3})
+
+    def saved(t1):
+        events = svkc.at(5.0, stop=True)
+        traj = svkc.simulate(pendulum, start, t1, dt=0.1, max_steps=16, events=events, max_events=3)
+        return traj.states.q[-1, 0]
+
+    q, rate = jax.value_and_grad(saved)(0.0)
+    np.testing.assert_allclose([q, rate], [0.4, 0.3], rtol=1e-12)
+
+
+def test_progress_meters_in_a_batch_with_events(pendulum):
+    """JAX refuses effects in a conditional under `vmap`: phases are skipped with `Replay` only."""
+
+    def end(angle):
+        return svkc.simulate(
+            pendulum, pendulum.state({"arm": angle}), 0.2, dt=0.1, max_steps=8,
+            events=svkc.at(0.1, lock="arm"), adjoint=diffrax.RecursiveCheckpointAdjoint(),
+            progress_meter=diffrax.TextProgressMeter(),
+        ).final.q[0]  # fmt: skip
+
+    ends = jax.vmap(end)(jnp.array([0.1, 0.2]))
+    np.testing.assert_allclose(ends, [end(0.1), end(0.2)], atol=ROUND_OFF)
+
+
+def test_gradients_of_lanes_of_different_length_by_diffrax(pendulum):
+    def saved(angle, t1):
+        return svkc.simulate(
+            pendulum, pendulum.state({"arm": angle}), t1, dt=0.1, max_steps=16,
+            adjoint=diffrax.RecursiveCheckpointAdjoint(),
+        ).states.q[-1, 0]  # fmt: skip
+
+    ends = jnp.array([0.35, 1.0])
+    gradients = jax.vmap(jax.grad(saved), (None, 0))(0.4, ends)
+    alone = [jax.grad(saved)(0.4, t1) for t1 in ends]
+    np.testing.assert_allclose(gradients, alone, atol=ROUND_OFF)
 
 
 def test_steps_keep_their_size_across_events(pendulum):
