@@ -51,7 +51,7 @@ class StateCheck(eqx.Module):
 
     @classmethod
     def unchecked(cls, dtype: DType) -> "StateCheck":
-        """Return zeros, with a margin of one, for a state that is not checked."""
+        """Return the values for a state that is not checked: zeros, and a margin of one."""
         zero, zeros = jnp.zeros((), dtype), lambda n: jnp.zeros(n, dtype)
         return cls(zeros(2), zeros(2), zero, zero, zeros(3), zeros(3), margin=jnp.ones((), dtype))
 
@@ -93,8 +93,8 @@ def _check_states(
 ) -> tuple[StateCheck, StateCheck, StateCheck]:
     """Return the checks of the states at starts of phases, at ends of phases, and at save times.
 
-    One loop checks all states, so that kinematics and energy are compiled once. Checks of phases
-    that are not written are zero, with a margin of one.
+    One loop checks all states, so that kinematics and energy are compiled once. It skips rows of
+    phases that no lane has written.
     """
     r, rows, join = records, records.start.shape[0], lambda *x: jnp.concatenate(x)
     states = State(

@@ -145,7 +145,10 @@ def _next_stop(run: RunState, t1):
 
 
 def has_next_phase(run: RunState, t1) -> Bool[Array, ""]:
-    """Return whether the run has another phase: it is before its end, or a timed event is due."""
+    """Return whether the run has another phase.
+
+    The run has neither failed nor stopped, and it is before its end or a timed event is due.
+    """
     unfinished = (run.t < t1) | jnp.any(run.schedule.due(t1))
     return unfinished & (run.result == RESULTS.successful)
 

@@ -3,7 +3,7 @@
 A phase has one structure and one smooth vector field. A phase ends at the next scheduled time, or
 at the first zero crossing of a guard. A crossing is located by re-taking the step in which the
 guard changed sign, so that its time and state have the order of the solver and not the order of an
-interpolation. Finished elements of a batch run zero-length phases until all elements are done.
+interpolation. In a batch, lanes that have ended run phases of zero length until all have ended.
 """
 
 from dataclasses import replace

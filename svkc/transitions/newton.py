@@ -1,7 +1,7 @@
 """Newton's method for a change of structure: closes the loops, decides their rank, and projects the
 velocity, with or without an impact (paper, section V-C).
 
-One scan with one body runs every kind of iteration of a `Schedule` (`newton_state.py`), so that
+One loop with one body runs every kind of iteration of a `Schedule` (`newton_state.py`), so that
 kinematics, loop Jacobian and pivoting are compiled once.
 """
 
@@ -51,7 +51,7 @@ _loop_kinematics = one_kernel(loop_kinematics)
 
 
 class _Iteration(eqx.Module):
-    """The body of the scan: one iteration of one of `kinds`.
+    """The body of the loop: one iteration of one of `kinds`.
 
     kinds: kinds of iterations in the schedule. Parts that none of them needs are not compiled.
     perturbation: the change of q by which the search for the rank starts.
@@ -148,7 +148,7 @@ def _start(
 def _iterate(
     chain: Chain, structure: Structure, q, v, kinds: tuple[int, ...], *, all_row_steps: int
 ) -> NewtonState:
-    """Run all iterations of the kinds, in order.
+    """Run one iteration of each kind, in order.
 
     all_row_steps: the number of first iterations that use all rows, whatever the rank.
     """
@@ -169,13 +169,14 @@ def _solve(chain: Chain, structure: Structure, q, v, schedule: Schedule) -> Newt
     """Run a schedule. All rows are used until the search for the rank has ended.
 
     The search skips to its last iteration once the probes of all lanes are closed. Reverse mode
-    cannot differentiate this loop, and need not: `_solve_jvp` leaves the search out.
+    cannot differentiate this loop. It need not: `_solve_jvp` leaves the search out, and
+    `decide_rank` has no derivative.
     """
     kinds = schedule.kinds
     if DECIDE_RANK not in kinds:
         return _iterate(chain, structure, q, v, kinds, all_row_steps=0)
     iteration, start = _start(chain, structure, q, v, kinds)
-    decide, order = kinds.index(DECIDE_RANK), jnp.asarray(np.array(kinds, np.int32))
+    last_of_search, kind_at = kinds.index(DECIDE_RANK), jnp.asarray(np.array(kinds, np.int32))
 
     def is_closed(current: NewtonState):
         # A pivot at the probe is wrong by about its distance from a closed configuration. At a
@@ -184,12 +185,12 @@ def _solve(chain: Chain, structure: Structure, q, v, schedule: Schedule) -> Newt
 
     def body(carry):
         i, current = carry
-        closes_probe = order[i] == CLOSE_PERTURBED
-        after = iteration(current, order[i], i > decide)
+        closes_probe = kind_at[i] == CLOSE_PERTURBED
+        after = iteration(current, kind_at[i], i > last_of_search)
         # a lane whose probe is closed stays as it is while others iterate
         after = tree_where(closes_probe & is_closed(current), current, after)
         all_closed = ~unvmap_any(~is_closed(after))
-        return where(closes_probe & all_closed, decide, i + 1), after
+        return where(closes_probe & all_closed, last_of_search, i + 1), after
 
     return jax.lax.while_loop(lambda carry: carry[0] < len(kinds), body, (np.int32(0), start))[1]
 

@@ -12,7 +12,7 @@ import svkc
 from svkc.transitions.newton import solve_structure
 from svkc.transitions.newton_state import RANK_SEARCH, Schedule
 
-# q of two bars of length 1 whose end is sqrt(2) away: two angles of the bars, that of the pin (rad)
+# angles of two bars of length 1, whose end is sqrt(2) away, and of the pin (rad)
 TRIANGLE = (-jnp.pi / 4, jnp.pi / 2, 0.0)
 
 

@@ -99,7 +99,7 @@ SLIDES = """<mujoco><worldbody><body><joint type="slide" axis="1 0 0"/><geom siz
 @pytest.mark.parametrize("model", [SLIDES, TREE])
 @pytest.mark.parametrize("batched", ["q", "pos"])
 def test_derivatives_of_compiled_batches(model, batched):
-    """Not all results depend on what `vmap` batches: rotations not on slides, nor on `pos`."""
+    """The rotations depend neither on slides nor on `pos`, and `vmap` batches one of these."""
     chain = svkc.load(model)
     lane = lambda q, pos: as_vector(kinematics(eqx.tree_at(lambda c: c.pos, chain, pos), q))
     at = {"q": chain.state().q + 0.3, "pos": chain.pos}
