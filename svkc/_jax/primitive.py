@@ -9,7 +9,7 @@ import equinox as eqx
 import equinox.internal as eqxi
 import jax
 from jax import core
-from jax.interpreters import ad, batching
+from jax.interpreters import ad
 
 # number of structures of arguments for which a primitive remembers the shapes of its results
 SHAPES_CACHE_SIZE = 32
@@ -21,7 +21,6 @@ def custom_primitive(
     jvp: Callable,
     transpose: Callable | None = None,
     like: Callable | None = None,
-    inlined_by_vmap: bool = False,
 ) -> Callable:
     """Return `function` as a JAX primitive with the given derivative rules.
 
@@ -33,9 +32,6 @@ def custom_primitive(
     linear, and transposing raises NotImplementedError.
     like: a function that is cheaper to trace and whose result has the same shapes and types; None:
         `function` itself.
-    inlined_by_vmap: whether `vmap` replaces the primitive by `jax.vmap(function)`. The transpose
-        rule of a batched primitive cannot sum over the lanes, and JAX's derivative of `function`
-        can.
     """
 
     def not_linear(*_, **__):
@@ -45,18 +41,16 @@ def custom_primitive(
     primitive = eqxi.create_vprim(
         name,
         implementation,
-        eqxi.filter_primitive_def(_abstract_evaluation(like or function)),
+        eqxi.filter_primitive_def(abstract_evaluation(like or function)),
         eqxi.filter_primitive_jvp(jvp),
         not_linear
         if transpose is None
         else eqxi.filter_primitive_transpose(transpose, materialise_zeros=True),
     )
-    if inlined_by_vmap:
-        batching.axis_primitive_batchers[primitive] = _inlining(implementation)
     return lambda *args: eqxi.filter_primitive_bind(primitive, *args)
 
 
-def _abstract_evaluation(function: Callable) -> Callable:
+def abstract_evaluation(function: Callable) -> Callable:
     """Return a function that computes the shapes and types of `function`'s results.
 
     JAX asks for them in every transformation. The latest are remembered.
@@ -80,21 +74,6 @@ def _abstract_evaluation(function: Callable) -> Callable:
         return jax.tree.map(to_aval, shapes(*key))
 
     return abstract_eval
-
-
-def _inlining(implementation: Callable) -> Callable:
-    """Return a batching rule that replaces a primitive by its batched implementation."""
-
-    def inline(axis_size, axis_name, _, inputs, batch_axes, **params):
-        batched = jax.vmap(
-            functools.partial(implementation, **params),
-            in_axes=batch_axes,
-            axis_name=axis_name,
-            axis_size=axis_size,
-        )(*inputs)
-        return batched, [0] * len(batched)
-
-    return inline
 
 
 def _is_hashable(x: Any) -> bool:

@@ -1,45 +1,46 @@
-"""Tangents of the steps of a phase, computed in blocks of steps.
+"""Tangents of the steps of a phase, computed in blocks of steps and groups of blocks.
 
 The tangents are those at fixed times of the steps. Where increments of the stages were stored in
-the run, the stages need not be computed again before they are differentiated.
+the run, the stages need not be computed again before they are differentiated. A phase has room for
+`max_steps` steps. Unused groups, blocks and steps are skipped in both directions, and reverse mode
+stores the arguments of each of them alone (`skippable`).
 """
 
 import dataclasses
 import math
-from collections.abc import Callable
 from typing import Any
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.control_flow import unvmap_any
-from svkc._jax.primitive import custom_primitive, undefined_primals
 from svkc._jax.pytrees import tree_where
 from svkc._jax.select import where
+from svkc._jax.skippable import skippable
 from svkc.integration.ode import FieldArgs, ODEState
-from svkc.integration.runge_kutta import increment_bytes, recorded_step, step_and_tangent
+from svkc.integration.runge_kutta import (
+    end_of_step,
+    increment_bytes,
+    recorded_step,
+    step_tangent,
+    zero_increments,
+)
 from svkc.integration.solution import PhaseProblem, PhaseSolution, StepperOptions, StepRecord
 from svkc.loops.constraint_rows import choose_rows
 
-# Unused blocks are skipped in groups of at most this size; unused groups are skipped in groups of
-# as many.
-GROUP_SIZE = 16
-# Number of steps at the start of a phase whose records are stored, and limit of the memory of their
-# increments for each element of a batch. The number is rounded up to whole groups of blocks.
-RECORDED_STEPS, RECORDS_BYTES = 512, 1 << 23
-
-
-def _group_size(options: StepperOptions) -> int:
-    """Return the number of blocks in a group."""
-    return min(GROUP_SIZE, -(-options.max_steps // options.checkpoint_interval))
+# Number of steps of a run whose records are stored, and limit of the memory of their increments for
+# each element of a batch. Each phase stores an equal part, that of its first steps.
+RECORDED_STEPS, RECORDS_BYTES = 1024, 1 << 23
 
 
 def record_capacity(start: ODEState, options: StepperOptions) -> int:
-    """Return the number of steps that are recorded, those of whole groups."""
-    steps = options.checkpoint_interval * _group_size(options)
-    groups = RECORDS_BYTES // max(1, steps * increment_bytes(options.solver, start))
-    return steps * min(groups, -(-min(RECORDED_STEPS, options.max_steps) // steps))
+    """Return the number of steps of a phase that are recorded, rounded up to whole blocks."""
+    steps, phases = options.checkpoint_interval, options.phases
+    blocks = RECORDS_BYTES // max(1, phases * steps * increment_bytes(options.solver, start))
+    return steps * min(blocks, -(-min(RECORDED_STEPS // phases, options.max_steps) // steps))
 
 
 def with_rows_at(q, field_args: FieldArgs, near: Any = None) -> FieldArgs:
@@ -55,40 +56,66 @@ def with_rows_at(q, field_args: FieldArgs, near: Any = None) -> FieldArgs:
     return dataclasses.replace(field_args, row_choice=rows)
 
 
-def _blocks(start: ODEState, step_grid, solution: PhaseSolution, options: StepperOptions):
-    """Return the blocks of `checkpoint_interval` steps, [groups of groups, groups, blocks].
+class _Steps(eqx.Module):
+    """The steps of a phase, and what their tangents depend on besides.
 
-    For each block: its index, whether any of its steps was taken, the state at its start, and the
-    starts and ends of its steps and which of them were taken with reduced rows.
+    save_index: index of the step that ends at each save time.
+    accepted: number of steps.
+    records: of the first steps. None: none are stored.
     """
-    interval, size = options.checkpoint_interval, _group_size(options)
-    count = solution.checkpoints.q.shape[0] + 1
-    groups = min(GROUP_SIZE, -(-count // size))
-    shape = (-(-count // (size * groups)), groups, size)
-    count = math.prod(shape)
-    padding = count - solution.checkpoints.q.shape[0] - 1
-    index = jnp.arange(count, dtype=jnp.int32)
-    used = index * interval < solution.accepted
-    states = jax.tree.map(
-        lambda s, c: jnp.concatenate([s[None], c, jnp.broadcast_to(s[None], (padding, *s.shape))]),
-        start,
-        solution.checkpoints,
-    )
+
+    problem: PhaseProblem
+    solver: diffrax.AbstractSolver[Any]
+    save_index: Int[Array, " times"]
+    accepted: Int[Array, ""]
+    records: StepRecord | None
+
+
+class _Blocks(eqx.Module):
+    """Blocks of consecutive steps.
+
+    first: index of the first one.
+    y: the state at its start.
+    starts, ends: times of the steps, equal in rows past the end of the phase.
+    near: which steps were taken with reduced rows of the loops. None: see `StepperState.near`.
+    """
+
+    first: Int[Array, "*blocks"]
+    y: ODEState
+    starts: Float[Array, "*blocks steps"]
+    ends: Float[Array, "*blocks steps"]
+    near: Bool[Array, "*blocks steps"] | None
+
+
+def _blocks(start: ODEState, step_grid, solution: PhaseSolution, interval: int) -> _Blocks:
+    """Return all blocks of `interval` steps, [groups, blocks of a group].
+
+    There are about as many groups as blocks in a group. Rows past the end of the phase hold no
+    step.
+    """
+    needed = solution.checkpoints.q.shape[0] + 1
+    size = math.isqrt(needed - 1) + 1
+    groups = -(-needed // size)
+    count = groups * size
+    first = interval * jnp.arange(count, dtype=jnp.int32)
+    used = first < solution.accepted
+    repeat = lambda x, n: jnp.broadcast_to(x[None], (n, *x.shape))
+    rows = lambda s, c: jnp.concatenate([s[None], c, repeat(s, count - needed)])
+    states = jax.tree.map(rows, start, solution.checkpoints)
     # Unused blocks get a finite state.
-    states = jax.tree.map(
-        lambda s, c: where(used.reshape(-1, *(1,) * s.ndim), c, s[None]), start, states
-    )
+    states = jax.tree.map(lambda s, y: where(_broadcast_mask(used, y), y, s[None]), start, states)
     rest = count * interval + 1 - step_grid.shape[0]
-    times = jnp.concatenate([step_grid, jnp.broadcast_to(step_grid[-1:], (rest,))])
-    rows = lambda x: x.reshape(-1, interval)
+    times = jnp.concatenate([step_grid, repeat(step_grid[-1], rest)])
     near = solution.step_near
     if near is not None:
-        near = rows(jnp.concatenate([near, jnp.zeros(rest, bool)]))
-    blocks = index, used, states, (rows(times[:-1]), rows(times[1:]), near)
-    return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), blocks)
+        near = jnp.concatenate([near, jnp.zeros(rest, bool)]).reshape(count, interval)
+    steps = lambda x: x.reshape(count, interval)
+    blocks = _Blocks(first, states, steps(times[:-1]), steps(times[1:]), near)
+    return jax.tree.map(lambda x: x.reshape(groups, size, *x.shape[1:]), blocks)
 
 
 @eqx.filter_jit
+@eqx.filter_checkpoint
 def replay_tangents(
     start, problem, step_grid, save_index, *, solution: PhaseSolution, options: StepperOptions,
     with_increments: bool,
@@ -101,135 +128,130 @@ def replay_tangents(
     step_grid: times of the start and of the ends of the steps. save_index: steps of the save times.
     with_increments: whether the tangents of the recorded increments are returned; if not, None.
     """
-    (start, d_start), interval = start, options.checkpoint_interval
-    count = solution.checkpoints.q.shape[0]
-
-    def block(carry, x):
-        d_y, d_ys, d_recorded = carry
-        (i, used, y, steps), records = x
-
-        def differentiate():
-            first = i * interval
-            d_after, (d_steps, d_increments) = _block_tangent(
-                (d_y, problem[1]), (y, steps, records), problem[0], options.solver
-            )
-            last = jnp.minimum(first + interval, solution.accepted)
-            in_block = used & (save_index > first) & (save_index <= last)
-            step_index = jnp.clip(save_index - first - 1, 0, interval - 1)
-            save = lambda old, new: where(_broadcast_mask(in_block, old), new[step_index], old)
-            d_written = None if d_recorded is None else _write(d_recorded, d_increments, first)
-            return tree_where(used, d_after, d_y), jax.tree.map(save, d_ys, d_steps), d_written
-
-        carry = jax.lax.cond(unvmap_any(used), differentiate, lambda: carry)
-        return carry, carry[0]
-
-    def group(carry, x):
-        return jax.lax.scan(block, carry, (x, _records_of_blocks(solution.records, x[0], interval)))
-
-    many_groups = lambda carry, x: jax.lax.scan(_skipped_if_unused(group), carry, x)
+    (start, d_start), (problem, d_problem), interval = start, problem, options.checkpoint_interval
+    steps = _Steps(problem, options.solver, save_index, solution.accepted, solution.records)
     at_start = lambda d: where(_broadcast_mask(save_index == 0, d[None]), d[None], 0)
     d_recorded = None
     if with_increments and solution.records is not None:
         d_recorded = jax.tree.map(jnp.zeros_like, solution.records.increments)
-    carry = d_start, jax.tree.map(at_start, d_start), d_recorded
+
+    def group(carry, blocks):
+        return _group_if_used(
+            (carry, d_problem), blocks.first[0] < solution.accepted, blocks, steps
+        )
+
     (d_end, d_ys, d_recorded), d_after = jax.lax.scan(
-        _skipped_if_unused(many_groups), carry, _blocks(start, step_grid, solution, options)
+        group,
+        (d_start, jax.tree.map(at_start, d_start), d_recorded),
+        _blocks(start, step_grid, solution, interval),
     )
+    count = solution.checkpoints.q.shape[0]
     written = jnp.arange(1, count + 1, dtype=jnp.int32) * interval <= solution.accepted
-    d_checkpoints = jax.tree.map(lambda d: d.reshape(-1, *d.shape[3:])[:count], d_after)
+    d_checkpoints = jax.tree.map(lambda d: d.reshape(-1, *d.shape[2:])[:count], d_after)
     mask = lambda d: where(_broadcast_mask(written, d), d, 0)
     return d_end, d_ys, jax.tree.map(mask, d_checkpoints), d_recorded
 
 
-def _skipped_if_unused(scan: Callable) -> Callable:
-    """Return `scan` of blocks, (carry, blocks) -> (carry, tangents after each block), or no change
-    and zeros if none of the blocks is used.
+def _tangents_of_group(tangents, blocks: _Blocks, steps: _Steps):
+    """Return the tangents after a group of blocks, and the tangents after each of its blocks.
 
-    Reverse mode stores the arguments and recomputes the rest. The outer checkpoint keeps constants
-    from being stored for each group, the inner one keeps what a branch computes from being stored.
+    tangents: those before it, as in `_tangents_of_block`.
     """
+    carry, d_problem = tangents
 
-    @jax.checkpoint
-    def scan_or_skip(carry, blocks):
-        used = blocks[1]
-        zeros = lambda d: jnp.zeros((*used.shape, *d.shape), d.dtype)
-        skip = lambda carry, _: (carry, jax.tree.map(zeros, carry[0]))
-        return jax.lax.cond(unvmap_any(jnp.any(used)), jax.checkpoint(scan), skip, carry, blocks)
+    def block(carry, block):
+        carry = _block_if_used((carry, d_problem), block.first < steps.accepted, block, steps)
+        return carry, carry[0]
 
-    return scan_or_skip
+    return jax.lax.scan(block, carry, blocks)
 
 
-def _records_of_blocks(records: StepRecord | None, index, interval: int):
-    """Return the records of a group of blocks, and for each block whether it has records.
+def _no_group(tangents, blocks: _Blocks, steps: _Steps):
+    """Return the tangents unchanged, and zeros for those after each block."""
+    carry, zeros = tangents[0], lambda d: jnp.zeros((*blocks.first.shape, *d.shape), d.dtype)
+    return carry, jax.tree.map(zeros, carry[0])
 
-    index: of the blocks.
+
+def _tangents_of_block(tangents, block: _Blocks, steps: _Steps):
+    """Return the tangents after a block: of the state, at the save times, and of the increments.
+
+    tangents: those before it, and that of the problem.
     """
-    if records is None:
-        return None
-    assert records.increments is not None
-    steps, capacity = index.shape[0] * interval, _row_count(records.increments)
-    first = index[0] * interval
-    rows = lambda x: jax.lax.dynamic_slice_in_dim(x, first, steps).reshape(
-        -1, interval, *x.shape[1:]
-    )
-    return jax.tree.map(rows, records), jnp.broadcast_to(first < capacity, index.shape)
-
-
-def _tangents_of_block(tangents, block, problem: PhaseProblem, solver):
-    """Return the tangents after a block of steps, after each of its steps, and of its increments.
-
-    tangents: of the state at its start and of the problem.
-    block: state at its start, starts and ends of its steps and which of them have reduced rows,
-    and as from `_records_of_blocks`.
-    """
-    (d_y, d_problem), (y, steps, stored) = tangents, block
-    records, is_stored = (None, False) if stored is None else stored
+    (d_y, d_ys, d_recorded), d_problem = tangents
+    first, interval, records = block.first, block.starts.shape[0], steps.records
+    is_stored = False
+    if records is not None:
+        assert records.increments is not None
+        is_stored = first < _row_count(records.increments)
+        rows = lambda x: jax.lax.dynamic_slice_in_dim(x, first, interval)
+        records = jax.tree.map(rows, records)
 
     def step(carry, x):
-        (start, stop, near), record = x
+        (y, d_y), (start, end, near, record) = carry, x
+        used = end > start
+        record = _recorded_or_taken_again(y, (start, end, near), record, is_stored, steps)
+        d_y, d_increments = _step_if_used((d_y, d_problem), used, (start, end), y, record, steps)
+        move = lambda: end_of_step(steps.solver, (start, end, record), steps.problem, y)
+        after = jax.lax.cond(unvmap_any(used), move, lambda: y)
+        return (tree_where(used, after, y), d_y), (d_y, d_increments)
 
-        def take_again(y):
-            field_args = with_rows_at(y.q, problem.field_args, near)
-            return recorded_step(solver, problem.field, (start, stop), y, field_args)
-
-        if record is None:
-            record = take_again(carry[0])
-        else:
-            stored = record
-            record = jax.lax.cond(is_stored, lambda y: stored, take_again, carry[0])
-        *end, d_increments = step_and_tangent(
-            solver, (start, stop, record), (problem, d_problem), carry
-        )
-        # rows past the end of the phase hold no step
-        end = tree_where(stop > start, tuple(end), carry)
-        return end, (end[1], d_increments)
-
-    (_, d_end), d_steps = jax.lax.scan(step, (y, d_y), (steps, records))
-    return d_end, d_steps
+    (_, d_after), (d_steps, d_increments) = jax.lax.scan(
+        step, (block.y, d_y), (block.starts, block.ends, block.near, records)
+    )
+    last = jnp.minimum(first + interval, steps.accepted)
+    in_block = (steps.save_index > first) & (steps.save_index <= last)
+    step_index = jnp.clip(steps.save_index - first - 1, 0, interval - 1)
+    save = lambda old, new: where(_broadcast_mask(in_block, old), new[step_index], old)
+    d_written = None if d_recorded is None else _write(d_recorded, d_increments, first)
+    used = first < steps.accepted
+    return tree_where(used, d_after, d_y), jax.tree.map(save, d_ys, d_steps), d_written
 
 
-def _block_tangent_jvp(primals, tangents):
-    # without the primitive, which would compute the value a second time
-    return eqx.filter_jvp(eqx.filter_checkpoint(_tangents_of_block), primals, tangents)
+def _recorded_or_taken_again(
+    y: ODEState, step, record: StepRecord | None, is_stored, steps: _Steps
+) -> StepRecord:
+    """Return the record of a step from y, which may be any record if the step has no length.
+
+    step: start, end, and whether it was taken with reduced rows.
+    record: as stored, None if no block has records. is_stored: whether this block has records.
+    """
+    (start, end, near), problem, solver = step, steps.problem, steps.solver
+
+    def take_again():
+        field_args = with_rows_at(y.q, problem.field_args, near)
+        return recorded_step(solver, problem.field, (start, end), y, field_args)
+
+    if record is None:
+        record = StepRecord(zero_increments(solver, y), problem.field_args.row_choice)
+    return jax.lax.cond(unvmap_any(end > start) & ~is_stored, take_again, lambda: record)
 
 
-def _block_tangent_transpose(inputs, cotangents):
-    tangents, *rest = inputs
-    shapes, known = undefined_primals(tangents)
-    linear = lambda unknown: _tangents_of_block(eqx.combine(unknown, known), *rest)
-    (cotangents,) = jax.linear_transpose(linear, shapes)(cotangents)
-    return cotangents, *jax.tree.map(lambda _: None, tuple(rest))
+def _no_block(tangents, block: _Blocks, steps: _Steps):
+    """Return the tangents unchanged."""
+    return tangents[0]
 
 
-# JAX traces the steps of a block once for a gradient. Without the primitive, JAX would transform
-# their equations again for every scan, condition and checkpoint around them.
-_block_tangent = custom_primitive(
-    "block_tangent",
-    eqx.filter_checkpoint(_tangents_of_block),
-    _block_tangent_jvp,
-    _block_tangent_transpose,
-    inlined_by_vmap=True,
-)
+def _tangent_of_step(tangents, times, y: ODEState, record: StepRecord, steps: _Steps):
+    """Return the tangents of the state after a step and of its increments.
+
+    tangents: of the state before it and of the problem.
+    times: start and end.
+    """
+    (d_y, d_problem), (start, end) = tangents, times
+    d_end, d_increments = step_tangent(
+        steps.solver, (start, end, record), (steps.problem, d_problem), (y, d_y)
+    )
+    return tree_where(end > start, d_end, d_y), d_increments
+
+
+def _no_step(tangents, times, y: ODEState, record: StepRecord, steps: _Steps):
+    """Return the tangent of the state unchanged, and zeros for that of the increments."""
+    return tangents[0], zero_increments(steps.solver, y)
+
+
+_step_if_used = skippable("step_tangent", _tangent_of_step, _no_step)
+_block_if_used = skippable("block_tangent", _tangents_of_block, _no_block)
+_group_if_used = skippable("group_tangent", _tangents_of_group, _no_group)
 
 
 def _broadcast_mask(mask, like):

@@ -39,20 +39,29 @@ class Replay(eqx.Module):
     are fixed in derivatives; the times of events, of the start, of the end and of saved states are
     not.
 
-    Of explicit Runge-Kutta solvers the stages of the first 512 steps of a phase are kept, or of
-    fewer where they take more than 8 MiB. Steps beyond are taken again in derivatives. The memory
-    for a phase is max_steps (1 + n / every) numbers, where n counts the entries of q and v, plus
-    the stages, plus the residuals of one block of `every` steps.
+    Of explicit Runge-Kutta solvers the stages of 1024 steps of a run are kept, or of fewer where
+    they take more than 8 MiB. Each phase has an equal part, for its first steps. Steps beyond are
+    taken again in derivatives. The memory for a phase is max_steps (1 + n / every) numbers, where n
+    counts the entries of q and v, plus the stages of its part, plus those of one block of `every`
+    steps.
 
-    every: number of steps between checkpoints.
+    every: number of steps between checkpoints. None: 16, or 64 if `max_steps` is at least 4096.
 
     Raises ValueError if `every` is not an integer of at least 1.
     """
 
-    every: int = eqx.field(static=True, default=16)
+    every: int | None = eqx.field(static=True, default=None)
 
     def __check_init__(self) -> None:
-        integer("every", self.every, 1)
+        if self.every is not None:
+            integer("every", self.every, 1)
+
+    def checkpoint_interval(self, max_steps: int) -> int:
+        """Return the number of steps between checkpoints in phases of at most `max_steps` steps."""
+        every = self.every
+        if every is None:
+            every = 64 if max_steps >= 4096 else 16
+        return min(every, max_steps)
 
 
 def _step_grid(t0, save_ts, solution: PhaseSolution):

@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Array
 
 from svkc._jax.one_kernel import one_kernel
-from svkc._jax.select import where
 from svkc.integration.ode import FieldArgs, ODEState
 from svkc.integration.solution import PhaseProblem, StepRecord
 from svkc.integration.vector_field import VectorField, project_state
@@ -88,16 +87,22 @@ def initial_records(
     solver: diffrax.AbstractSolver[Any], field_args: FieldArgs, start: ODEState, capacity: int
 ) -> StepRecord | None:
     """Return records without motion, None without capacity or for a solver without increments."""
-    tableau = _explicit_tableau(solver)
-    if not capacity or tableau is None:
+    increments = zero_increments(solver, start)
+    if not capacity or increments is None:
         return None
-    shape = lambda x: (capacity, _stage_count(tableau), *x.shape)
-    return StepRecord(
-        increments=jax.tree.map(lambda x: jnp.zeros(shape(x), x.dtype), start),
-        row_choice=jax.tree.map(
-            lambda x: jnp.broadcast_to(x[None], (capacity, *x.shape)), field_args.row_choice
-        ),
-    )
+    rows = lambda x: jnp.broadcast_to(x[None], (capacity, *x.shape))
+    return StepRecord(*jax.tree.map(rows, (increments, field_args.row_choice)))
+
+
+def zero_increments(solver: diffrax.AbstractSolver[Any], y: ODEState) -> ODEState | None:
+    """Return the increments of a step without motion, None for a solver without increments."""
+    tableau = _explicit_tableau(solver)
+    return None if tableau is None else _zero_increments(tableau, y)
+
+
+def _zero_increments(tableau: diffrax.ButcherTableau, y: ODEState) -> ODEState:
+    """Return the increments of a step of an explicit Runge-Kutta method without motion."""
+    return jax.tree.map(lambda y: jnp.zeros((_stage_count(tableau), *y.shape), y.dtype), y)
 
 
 def increment_bytes(solver: diffrax.AbstractSolver[Any], start: ODEState) -> int:
@@ -125,47 +130,87 @@ def recorded_step(
 
 
 @one_kernel
-def step_and_tangent(
+def end_of_step(
+    solver: diffrax.AbstractSolver[Any],
+    step: tuple[Array, Array, StepRecord],
+    problem: PhaseProblem,
+    y: ODEState,
+) -> ODEState:
+    """Return the end of a projected step from y.
+
+    step: start, end and record.
+    """
+    (t0, t1, record), field = step, problem.field
+    field_args = dataclasses.replace(problem.field_args, row_choice=record.row_choice)
+    tableau = _explicit_tableau(solver)
+    if tableau is None:
+        end = _step_of_any_solver(solver, field, (t0, t1), y, field_args)
+    else:
+        assert record.increments is not None
+        end = _add(y, _weights_of_end(tableau), record.increments)
+    return project_state(field, field_args, end)[0]
+
+
+def step_tangent(
     solver: diffrax.AbstractSolver[Any],
     step: tuple[Array, Array, StepRecord],
     problem: tuple[PhaseProblem, Any],
     start: tuple[ODEState, ODEState],
-) -> tuple[ODEState, ODEState, ODEState | None]:
-    """Return the end of a projected step, its tangent and the tangent of the increments.
+) -> tuple[ODEState, ODEState | None]:
+    """Return the tangents of the end of a projected step and of its increments.
 
     Reverse mode stores the arguments of the torques and of the rates in each evaluation of the
-    field, and those of each iteration of the projection, and recomputes these functions.
+    field, and those of the projection, and recomputes these functions.
 
     step: start, end and record.
     problem, start: pairs of primal and tangent.
     """
-    t0, t1, record = step
-    (y, d_y), (model, d_model) = start, problem
+    (_, t1, record), tableau = step, _explicit_tableau(solver)
+    if tableau is None or record.increments is None:
+        return _tangent_of_any_step(solver, step, problem, start), None
+    # outside the kernel: a kernel cannot hold products of matrices
+    A = jnp.asarray(_stage_weights(tableau), t1.dtype)
+    stages = jax.tree.map(lambda y, k: y + jnp.tensordot(A, k, 1), start[0], record.increments)
+    return _tangent_of_stages(solver, step, stages, problem, start)
+
+
+@one_kernel
+def _tangent_of_any_step(solver, step, problem, start) -> ODEState:
+    """Return the tangent of the end of a projected step of a solver without increments.
+
+    The arguments are those of `step_tangent`.
+    """
+    end = lambda y, p: end_of_step(solver, step, p, y)
+    return eqx.filter_jvp(end, *((y, p) for y, p in zip(start, problem, strict=True)))[1]
+
+
+@one_kernel
+def _tangent_of_stages(solver, step, stages: ODEState, problem, start) -> tuple[ODEState, ODEState]:
+    """Return `step_tangent` of an explicit Runge-Kutta step.
+
+    stages: states at the stages. The other arguments are those of `step_tangent`.
+    """
+    (t0, t1, record), (y, d_y), (model, d_model) = step, start, problem
     tableau = _explicit_tableau(solver)
+    assert tableau is not None
     with_rows = lambda p: dataclasses.replace(p.field_args, row_choice=record.row_choice)
+
+    def stage(t, weights, d_increments, y_stage):
+        rate = lambda y, p: p.field(t, y, with_rows(p))
+        tangents = _add(d_y, weights, d_increments), d_model
+        return eqx.filter_jvp(rate, (y_stage, model), tangents)[1]
+
+    d_increments = _scan_stages(tableau, stage, (t0, t1), stages)
+    b = _weights_of_end(tableau)
+    ends = (_add(y, b, record.increments), model), (_add(d_y, b, d_increments), d_model)
     project = lambda y, p: project_state(p.field, with_rows(p), y)[0]
-    if tableau is None:
-        step_and_project = lambda y, p: project(
-            _step_of_any_solver(solver, p.field, (t0, t1), y, with_rows(p)), p
-        )
-        y1, d_y1 = eqx.filter_jvp(step_and_project, (y, model), (d_y, d_model))
-        return y1, d_y1, None
-    increments = record.increments
-    assert increments is not None
+    projection_and_tangent = one_kernel(eqx.filter_checkpoint(eqx.filter_jvp))
+    return projection_and_tangent(project, *ends)[1], d_increments
 
-    def rate_tangent(t, primals, tangents):
-        return eqx.filter_jvp(lambda y, p: p.field(t, y, with_rows(p)), primals, tangents)[1]
 
-    def stage(t, weights, d_increments):
-        y_stage, d_stage = _add(y, weights, increments), _add(d_y, weights, d_increments)
-        return rate_tangent(t, (y_stage, model), (d_stage, d_model))
-
-    d_increments = _scan_stages(tableau, stage, (t0, t1), y)
-    b = tableau.b_sol[: _stage_count(tableau)]
-    ends = (_add(y, b, increments), model), (_add(d_y, b, d_increments), d_model)
-    projection_and_tangent = one_kernel(eqx.filter_jvp)
-    y1, d_y1 = projection_and_tangent(project, *ends)
-    return y1, d_y1, d_increments
+def _weights_of_end(tableau: diffrax.ButcherTableau):
+    """Return the weights of the increments in the end of a step."""
+    return tableau.b_sol[: _stage_count(tableau)]
 
 
 def _step_of_any_solver(solver, field, times, y: ODEState, field_args: FieldArgs) -> ODEState:
@@ -186,36 +231,40 @@ def _increments(
 
     rate: vector field. times: start and end.
     """
-    stage = lambda t, weights, increments: rate(t, _add(y, weights, increments), field_args)
-    return _scan_stages(tableau, stage, times, y)
+    stage = lambda t, weights, increments, _: rate(t, _add(y, weights, increments), field_args)
+    zeros = _zero_increments(tableau, y)
+    return _scan_stages(tableau, stage, times, zeros)
 
 
-def _scan_stages(tableau: diffrax.ButcherTableau, stage, times, y: ODEState) -> ODEState:
+def _scan_stages(tableau: diffrax.ButcherTableau, stage, times, xs: ODEState) -> ODEState:
     """Return h k_i of all stages i, by a scan, with h the size of the step.
 
-    stage: (time, weights of earlier stages, increments of earlier stages) -> rate.
-    times: start and end. y: example of a state.
+    stage: (time, weights of earlier stages, increments of earlier stages, x of the stage) -> rate.
+    times: start and end. xs: of all stages, in the shape of the increments.
     """
-    count, (t0, t1) = _stage_count(tableau), times
+    t0, t1 = times
+    count = _stage_count(tableau)
 
+    @eqx.filter_checkpoint
     def body(increments, x):
-        weights, fraction, is_row = x
-        k = stage(t0 + fraction * (t1 - t0), weights, increments)
-        write = lambda ks, k: where(is_row.reshape(-1, *(1,) * k.ndim), (t1 - t0) * k, ks)
+        weights, fraction, one_hot, x_stage = x
+        k = stage(t0 + fraction * (t1 - t0), weights, increments, x_stage)
+        # the transpose of a selection would read a mask of the shape of all increments
+        write = lambda ks, k: ks + jnp.expand_dims(one_hot, range(1, ks.ndim)) * ((t1 - t0) * k)
         return jax.tree.map(write, increments, k), None
 
-    zeros = jax.tree.map(lambda y: jnp.zeros((count, *y.shape), y.dtype), y)
-    stages = (*_stage_weights(tableau, t1.dtype), np.eye(count, dtype=bool))
-    return jax.lax.scan(body, zeros, stages)[0]
+    A, c, one_hot = _stage_weights(tableau), np.append(0.0, tableau.c)[:count], np.eye(count)
+    constants = jax.tree.map(lambda x: jnp.asarray(x, t1.dtype), (A, c, one_hot))
+    return jax.lax.scan(body, jax.tree.map(jnp.zeros_like, xs), (*constants, xs))[0]
 
 
-def _stage_weights(tableau: diffrax.ButcherTableau, dtype) -> tuple[Array, Array]:
-    """Return the weights of earlier stages, [stages, stages], and the times of the stages."""
+def _stage_weights(tableau: diffrax.ButcherTableau):
+    """Return the weights of earlier stages, [stages, stages]."""
     count = _stage_count(tableau)
     A = np.zeros((count, count))
     for i, row in enumerate(tableau.a_lower[: count - 1]):
         A[i + 1, : i + 1] = row
-    return jnp.asarray(A, dtype), jnp.asarray(np.append(0.0, tableau.c)[:count], dtype)
+    return A
 
 
 def _add(y: ODEState, weights, increments: ODEState) -> ODEState:

@@ -45,6 +45,7 @@ class StepperOptions(eqx.Module):
     gap_tolerance: steps that leave a larger loop gap are rejected (rad, units of `chain.length`).
     max_steps: the most steps of a phase, accepted and rejected; event location is not counted.
     checkpoint_interval: one state in so many steps is stored.
+    phases: number of phases of the run.
     record_capacity: records of so many first steps are stored.
     """
 
@@ -57,6 +58,7 @@ class StepperOptions(eqx.Module):
     gap_tolerance: float = eqx.field(static=True)
     max_steps: int = eqx.field(static=True)
     checkpoint_interval: int = eqx.field(static=True)
+    phases: int = eqx.field(static=True)
     record_capacity: int = eqx.field(static=True, default=0)
 
 

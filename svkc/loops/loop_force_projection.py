@@ -47,7 +47,6 @@ def project_by_loop_forces(
     if not differentiated:
         return _project_until_closed(chain, structure, (q, v, info), choice, iterations)
 
-    @functools.partial(jax.checkpoint, prevent_cse=False)
     def newton_step(i, carry):
         q, v, _ = carry
         is_last = i == iterations

@@ -167,7 +167,10 @@ def _stepper_options(run: RunState, options: Options, armed: ArmedGuards | None)
         progress_meter=options.progress_meter if replays else diffrax.NoProgressMeter(),
         gap_tolerance=options.gap_tolerance,
         max_steps=options.max_steps,
-        checkpoint_interval=min(adjoint.every, options.max_steps) if replays else options.max_steps,
+        checkpoint_interval=(
+            adjoint.checkpoint_interval(options.max_steps) if replays else options.max_steps
+        ),
+        phases=options.max_events + 1,
     )
 
 
