@@ -102,8 +102,8 @@ def _shapes(abstract_eval: Callable) -> Callable:
             return core.ShapedArray(tuple(shape), aval.dtype)
 
         outputs = abstract_eval(*(in_one_lane(i, x) for i, x in enumerate(avals)), **params)
-        sizes = tuple(lane.size for lane in reversed(lanes))
-        return [core.ShapedArray((*sizes, *x.shape), x.dtype) for x in outputs]
+        batch_shape = tuple(lane.size for lane in reversed(lanes))
+        return [core.ShapedArray((*batch_shape, *x.shape), x.dtype) for x in outputs]
 
     return shapes
 

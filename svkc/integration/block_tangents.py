@@ -110,7 +110,9 @@ def _blocks(start: ODEState, step_grid, solution: PhaseSolution, interval: int) 
     if near is not None:
         near = jnp.concatenate([near, jnp.zeros(rest, bool)]).reshape(count, interval)
     steps = lambda x: x.reshape(count, interval)
-    blocks = _Blocks(first, states, steps(times[:-1]), steps(times[1:]), near)
+    blocks = _Blocks(
+        first=first, y=states, starts=steps(times[:-1]), ends=steps(times[1:]), near=near
+    )
     return jax.tree.map(lambda x: x.reshape(groups, size, *x.shape[1:]), blocks)
 
 
@@ -129,7 +131,13 @@ def replay_tangents(
     with_increments: whether the tangents of the recorded increments are returned; if not, None.
     """
     (start, d_start), (problem, d_problem), interval = start, problem, options.checkpoint_interval
-    steps = _Steps(problem, options.solver, save_index, solution.accepted, solution.records)
+    steps = _Steps(
+        problem=problem,
+        solver=options.solver,
+        save_index=save_index,
+        accepted=solution.accepted,
+        records=solution.records,
+    )
     at_start = lambda d: where(_broadcast_mask(save_index == 0, d[None]), d[None], 0)
     d_recorded = None
     if with_increments and solution.records is not None:

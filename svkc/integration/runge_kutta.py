@@ -170,7 +170,9 @@ def step_tangent(
         return _tangent_of_any_step(solver, step, problem, start), None
     # outside the kernel: a kernel cannot hold products of matrices
     A = jnp.asarray(_stage_weights(tableau), t1.dtype)
-    stages = jax.tree.map(lambda y, k: y + jnp.tensordot(A, k, 1), start[0], record.increments)
+    stages = jax.tree.map(
+        lambda y, k: y[None] + jnp.tensordot(A, k, 1), start[0], record.increments
+    )
     return _tangent_of_stages(solver, step, stages, problem, start)
 
 
@@ -250,7 +252,9 @@ def _scan_stages(tableau: diffrax.ButcherTableau, stage, times, xs: ODEState) ->
         weights, fraction, one_hot, x_stage = x
         k = stage(t0 + fraction * (t1 - t0), weights, increments, x_stage)
         # the transpose of a selection would read a mask of the shape of all increments
-        write = lambda ks, k: ks + jnp.expand_dims(one_hot, range(1, ks.ndim)) * ((t1 - t0) * k)
+        write = lambda ks, k: (
+            ks + jnp.expand_dims(one_hot, range(1, ks.ndim)) * ((t1 - t0) * k)[None]
+        )
         return jax.tree.map(write, increments, k), None
 
     A, c, one_hot = _stage_weights(tableau), np.append(0.0, tableau.c)[:count], np.eye(count)
