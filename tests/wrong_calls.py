@@ -215,7 +215,12 @@ CASES = {
     "...[...]: got": lambda s: s.four.state({"crank": [1.0, 2.0]}),
     "actuated: expected": lambda s: s.actuation(actuated=np.ones(2, bool)),
     "adjoint: expected": lambda s: s.simulate(adjoint="replay"),
-    "adjoint: svkc.integrators.Replay": lambda s: s.simulate(
+    "adjoint: svkc.integrators.Replay cannot": lambda s: jax.grad(
+        lambda t1: jnp.sum(
+            s.simulate(t1=t1, solver=diffrax.ReversibleHeun(), dt=0.5, max_steps=2).final.q
+        )
+    )(1.0),
+    "adjoint: svkc.integrators.Replay needs": lambda s: s.simulate(
         stepsize_controller=diffrax.StepTo(jnp.linspace(0, 1, 5)), adjoint=svkc.integrators.Replay()
     ),
     "at: got time": lambda s: s.simulate(events=[svkc.at(-1.0, cut="pin")]),

@@ -1,14 +1,13 @@
 """Linear functions that are skipped where a flag is false, as are their transposes.
 
-To transpose a `lax.cond`, JAX first evaluates what is known in its branches and stores these values
-for the transpose. A branch that is skipped stores zeros of the same size. In a scan, every
-iteration stores them. The functions of this module store their arguments alone.
+JAX transposes a `lax.cond` in two passes. The first pass stores residuals for both branches. Those
+of the branch that is not taken are zeros of full size, and in a scan each iteration stores them. A
+function made by `skippable` stores only its arguments and computes the rest again.
 """
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
@@ -17,92 +16,77 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from svkc._jax.control_flow import unvmap_any
-from svkc._jax.primitive import abstract_evaluation, undefined_primals
+from svkc._jax.primitive import abstract_evaluation
 
 
-class Lanes(NamedTuple):
-    """A `vmap` of a primitive.
+class _Vmap(NamedTuple):
+    """One `vmap` that was applied to a primitive.
 
-    axes: batch axis of each argument, None if the lanes share it. That of a tangent is 0.
+    axes: batch axis of each argument. None: it is not batched.
     """
 
     size: int
-    name: Any
+    axis_name: Any
     axes: tuple[int | None, ...]
 
 
 def skippable(name: str, function: Callable, skipped: Callable) -> Callable:
     """Return f(tangents, used, *rest): `function` if `used` holds, else `skipped`.
 
-    Under `vmap`, `function` is evaluated if `used` holds for any lane.
+    Under `vmap`, `function` is evaluated for all lanes if `used` holds for any. It must return the
+    values of `skipped` in lanes that are not used, and its derivatives must be finite there.
 
     function, skipped: (tangents, *rest) -> outputs of equal shapes and types, both linear in the
-        tangents. The tangents are a pytree of floating-point arrays.
+        tangents. The tangents are a pytree of floating-point arrays, `used` is an array.
     """
 
     def value(tangents, used, *rest):
         pick = lambda branch: lambda: branch(tangents, *rest)
         return jax.lax.cond(unvmap_any(used), pick(function), pick(skipped))
 
-    def transpose(inputs, cotangents):
-        tangents, used, *rest = inputs
-        shapes, known = undefined_primals(tangents)
-
-        def pull_back(branch):
-            linear = lambda unknown: branch(eqx.combine(unknown, known), *rest)
-            return lambda: jax.linear_transpose(linear, shapes)(cotangents)[0]
-
-        result = jax.lax.cond(unvmap_any(used), pull_back(function), pull_back(skipped))
-        return result, None, *jax.tree.map(lambda _: None, tuple(rest))
-
-    like = lambda tangents, used, *rest: skipped(tangents, *rest)
+    without_flag = lambda branch: lambda tangents, used, *rest: branch(tangents, *rest)
+    of_leaves = eqxi.filter_primitive_def
     primitive = Primitive(name)
     primitive.multiple_results = True
-    value_of_leaves = eqxi.filter_primitive_def(value)
-    implementation = lambda *inputs, lanes=(), **params: _over_lanes(
-        lambda *inputs: value_of_leaves(*inputs, **params), lanes, lambda lane: lane.axes
-    )(*inputs)
+    implementation = _over_lanes(of_leaves(value))
     primitive.def_impl(implementation)
     mlir.register_lowering(primitive, mlir.lower_fun(implementation, multiple_results=True))
-    primitive.def_abstract_eval(_shapes(eqxi.filter_primitive_def(abstract_evaluation(like))))
+    primitive.def_abstract_eval(_shapes(of_leaves(abstract_evaluation(without_flag(skipped)))))
     ad.primitive_jvps[primitive] = _jvp(implementation)
     ad.primitive_transposes[primitive] = _transpose(
-        eqxi.filter_primitive_transpose(transpose, materialise_zeros=True)
+        *(_over_lanes(of_leaves(without_flag(branch))) for branch in (function, skipped))
     )
     batching.axis_primitive_batchers[primitive] = _batch(primitive)
-
-    def bind(tangents, used, *rest):
-        assert all(map(eqx.is_array, jax.tree.leaves(tangents)))
-        return eqxi.filter_primitive_bind(primitive, tangents, used, *rest)
-
-    return bind
+    return lambda *args: eqxi.filter_primitive_bind(primitive, *args)
 
 
-def _over_lanes(function: Callable, lanes: tuple[Lanes, ...], in_axes: Callable) -> Callable:
-    """Return the function under each `vmap`, with outputs batched along their first axes.
+def _over_lanes(function: Callable) -> Callable:
+    """Return a function of leaves under each `vmap` that was applied to the primitive."""
 
-    in_axes: the function's batch axes in a `vmap`.
-    """
-    for lane in lanes:
-        function = jax.vmap(
-            function, in_axes=in_axes(lane), axis_size=lane.size, axis_name=lane.name
-        )
-    return function
+    def over_lanes(*inputs, vmaps: tuple[_Vmap, ...] = (), **params):
+        batched = lambda *inputs: function(*inputs, **params)
+        for one in vmaps:
+            batched = jax.vmap(
+                batched, in_axes=one.axes, axis_size=one.size, axis_name=one.axis_name
+            )
+        return batched(*inputs)
+
+    return over_lanes
 
 
 def _shapes(abstract_eval: Callable) -> Callable:
     """Return the rule of shapes under `vmap`, given that of a single lane."""
 
-    def shapes(*avals, lanes: tuple[Lanes, ...] = (), **params):
+    def shapes(*avals, vmaps: tuple[_Vmap, ...] = (), **params):
         def in_one_lane(i, aval):
             shape = list(aval.shape)
-            for lane in reversed(lanes):
-                if lane.axes[i] is not None:
-                    del shape[lane.axes[i]]
+            for one in reversed(vmaps):
+                if one.axes[i] is not None:
+                    del shape[one.axes[i]]
             return core.ShapedArray(tuple(shape), aval.dtype)
 
         outputs = abstract_eval(*(in_one_lane(i, x) for i, x in enumerate(avals)), **params)
-        batch_shape = tuple(lane.size for lane in reversed(lanes))
+        batch_shape = tuple(one.size for one in reversed(vmaps))
         return [core.ShapedArray((*batch_shape, *x.shape), x.dtype) for x in outputs]
 
     return shapes
@@ -113,67 +97,50 @@ def _jvp(implementation: Callable) -> Callable:
 
     def jvp(primals, tangents, **params):
         changing = [i for i, t in enumerate(tangents) if type(t) is not ad.Zero]
-
-        @jax.checkpoint
-        def of_changing(*changed):
-            inputs = list(primals)
-            for i, x in zip(changing, changed, strict=True):
-                inputs[i] = x
-            return implementation(*inputs, **params)
-
+        of_changing = lambda *xs: implementation(*_merged(primals, changing, xs), **params)
         pick = lambda xs: tuple(xs[i] for i in changing)
-        return jax.jvp(of_changing, pick(primals), pick(tangents))
+        return jax.jvp(jax.checkpoint(of_changing), pick(primals), pick(tangents))
 
     return jvp
 
 
-def _transpose(transpose: Callable) -> Callable:
-    """Return the transpose rule under `vmap`, given that of a single lane."""
+def _transpose(function: Callable, skipped: Callable) -> Callable:
+    """Return the transpose rule, given functions of leaves under each `vmap`.
 
-    def transpose_lanes(cotangents, *inputs, lanes: tuple[Lanes, ...] = (), **params):
-        unknown = [ad.is_undefined_primal(x) for x in inputs]
-        pick = lambda xs, mask: [x for x, m in zip(xs, mask, strict=True) if m]
-        known = [not x for x in unknown]
+    JAX transposes the batched functions, so that it sums over lanes that share a tangent.
+    """
 
-        def in_one_lane(cotangents, known_inputs):
-            rest = iter(known_inputs)
-            one_lane = lambda x: ad.UndefinedPrimal(
-                core.ShapedArray(x.aval.shape[len(lanes) :], x.aval.dtype)
-            )
-            lane_inputs = [
-                one_lane(x) if m else next(rest) for x, m in zip(inputs, unknown, strict=True)
-            ]
-            out = transpose(cotangents, *lane_inputs, **params)
-            return [ad.instantiate_zeros(x) for x in pick(out, unknown)]
+    def transpose(cotangents, *inputs, treedef, **params):
+        unknown = [i for i, x in enumerate(inputs) if ad.is_undefined_primal(x)]
+        shapes = [
+            jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype)
+            for x in map(inputs.__getitem__, unknown)
+        ]
+        cotangents = [ad.instantiate_zeros(x) for x in cotangents]
 
-        in_axes = lambda lane: (0, pick(lane.axes, known))
-        results = iter(
-            _over_lanes(in_one_lane, lanes, in_axes)(
-                [ad.instantiate_zeros(x) for x in cotangents], pick(inputs, known)
-            )
-        )
-        return [next(results) if m else None for m in unknown]
+        def pull_back(branch):
+            linear = lambda *xs: branch(*_merged(inputs, unknown, xs), treedef=treedef, **params)
+            return lambda: jax.linear_transpose(linear, *shapes)(cotangents)
 
-    return transpose_lanes
+        used = inputs[treedef.children()[0].num_leaves]
+        results = jax.lax.cond(unvmap_any(jnp.any(used)), pull_back(function), pull_back(skipped))
+        return _merged([None] * len(inputs), unknown, results)
+
+    return transpose
+
+
+def _merged(inputs, indices: list[int], xs) -> list[Any]:
+    """Return the inputs with those at the indices replaced by xs."""
+    replaced = dict(zip(indices, xs, strict=True))
+    return [replaced.get(i, x) for i, x in enumerate(inputs)]
 
 
 def _batch(primitive: Primitive) -> Callable:
-    """Return the rule of `vmap`. It batches all tangents, so that JAX sums the cotangents of those
-    that the lanes share."""
+    """Return the rule of `vmap`, which keeps the primitive."""
 
-    def batch(axis_size, axis_name, _, inputs, axes, *, treedef, lanes=(), **params):
-        count = treedef.children()[0].num_leaves
-
-        def to_front(x, axis):
-            if axis is None:
-                return jnp.broadcast_to(x, (axis_size, *jnp.shape(x)))
-            return jnp.moveaxis(x, axis, 0)
-
-        front = map(to_front, inputs[:count], axes[:count])
-        lane = Lanes(axis_size, axis_name, (0,) * count + tuple(axes[count:]))
-        out = primitive.bind(
-            *front, *inputs[count:], treedef=treedef, lanes=(*lanes, lane), **params
-        )
+    def batch(axis_size, axis_name, _, inputs, axes, *, vmaps=(), **params):
+        vmaps = (*vmaps, _Vmap(axis_size, axis_name, tuple(axes)))
+        out = primitive.bind(*inputs, vmaps=vmaps, **params)
         return out, [0] * len(out)
 
     return batch

@@ -187,7 +187,7 @@ def _tangents_of_block(tangents, block: _Blocks, steps: _Steps):
     """
     (d_y, d_ys, d_recorded), d_problem = tangents
     first, interval, records = block.first, block.starts.shape[0], steps.records
-    is_stored = False
+    is_stored = jnp.zeros((), bool)
     if records is not None:
         assert records.increments is not None
         is_stored = first < _row_count(records.increments)

@@ -12,6 +12,7 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -96,6 +97,7 @@ def _integrate_jvp(primals, tangents, *, with_records: bool):
     with_records: whether the solution and its tangents have the records.
     """
     start, times, problem, options, guards = primals
+    _check_solver(options.solver)
     d_start, d_times, d_problem, _, d_guards = tangents
     options = dataclasses.replace(options, record_capacity=record_capacity(start, options))
     solution, t, y = _integrate_with_records(start, times, problem, options, guards)
@@ -134,6 +136,19 @@ def _integrate_jvp(primals, tangents, *, with_records: bool):
         rate_end,
     )
     return (solution, t, y), (d_solution, *d_end)
+
+
+def _check_solver(solver: diffrax.AbstractSolver[Any]) -> None:
+    """Raise ValueError for a solver whose steps depend on values that it keeps from step to step.
+
+    A step is differentiated by the state at its start alone.
+    """
+    if isinstance(solver, diffrax.LeapfrogMidpoint | diffrax.ReversibleHeun):
+        raise ValueError(
+            f"adjoint: svkc.integrators.Replay cannot differentiate {type(solver).__name__}, whose"
+            " steps depend on earlier ones; give a diffrax adjoint, such as"
+            " diffrax.RecursiveCheckpointAdjoint()"
+        )
 
 
 def _solution_tangent(solution: PhaseSolution, d_states, d_increments) -> PhaseSolution:

@@ -29,7 +29,6 @@ def reference(tangents, used, x):
 
 
 def in_lanes(f):
-    """Lanes that share `used`, and the second tangent, as they share the masses of a chain."""
     return lambda tangents, used, x: jax.vmap(f, ((0, None), None, 0))(tangents, used, x)
 
 
@@ -57,6 +56,7 @@ DERIVATIVES = {
 @pytest.mark.parametrize("used", [True, False])
 @pytest.mark.parametrize("compiled", [True, False])
 def test_derivatives(derivative, used, compiled):
+    """The lanes share the second tangent, as they may share the masses of a chain."""
     batch = (X, jnp.asarray(0.7)), jnp.asarray(used), X + 1
     alone = jax.tree.map(lambda x: x[0] if x.ndim == 2 else x, batch)
     nested = (jnp.stack([X, X + 2]), jnp.asarray(0.3)), jnp.asarray(used), jnp.stack([X, X])
@@ -78,14 +78,36 @@ def test_derivatives(derivative, used, compiled):
         )
 
 
-def test_lanes_with_other_flags_are_evaluated_together():
-    # `function` takes care of the lanes that are not used, as its docstring says
-    f = lambda used, x: ours((x, jnp.ones(())), used, x)
-    result = jax.vmap(f)(USED, X)
-    expected = jax.vmap(lambda x: scaled((x, jnp.ones(())), x))(X)
-    jax.tree.map(np.testing.assert_array_equal, result, expected)
-    result = jax.vmap(f)(jnp.zeros(LANES, bool), X)
-    np.testing.assert_array_equal(result[0], X)
+@pytest.mark.parametrize("derivative", list(DERIVATIVES))
+def test_derivatives_of_lanes_with_other_flags(derivative):
+    masked = lambda tangents, used, x: reference(tangents, used, x)
+    f = skippable("test_masked", masked, lambda tangents, used, x: unchanged(tangents, x))
+
+    def of(f):
+        lanes = jax.vmap(f, ((0, None), 0, 0))
+        return DERIVATIVES[derivative](lambda p: loss(lanes)((p[0], p[1]), USED, p[2]))
+
+    ours = of(lambda tangents, used, x: f(tangents, used, used, x))((X, jnp.asarray(0.7), X + 1))
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12),
+        ours,
+        of(reference)((X, jnp.asarray(0.7), X + 1)),
+    )
+
+
+def test_cotangents_of_a_shared_tangent_are_summed_at_once():
+    f = skippable("test_product", lambda W, x: W @ x, lambda W, x: W[0] * 0)
+    lanes, W = 64, jnp.ones((128, 128))
+
+    def value(W, xs):
+        step = lambda total, x: (
+            total + jnp.sum(jax.vmap(f, (None, None, 0))(W, x[0, 0] > 0, x)),
+            None,
+        )
+        return jax.lax.scan(step, 0.0, xs)[0]
+
+    gradient = jax.jit(jax.grad(value)).lower(W, jnp.ones((3, lanes, 128))).compile()
+    assert gradient.memory_analysis().temp_size_in_bytes < 4 * W.nbytes  # with a copy a lane: 64
 
 
 @pytest.mark.parametrize("used", [True, False])
@@ -97,6 +119,7 @@ def test_the_transpose_is_skipped(used):
         return scaled(tangents, x)
 
     f = skippable("test_counted", counted, unchanged)
+    used = jnp.asarray(used)
     gradient = jax.jit(jax.grad(lambda x: jnp.sum(f((x, jnp.ones(())), used, X[0])[0])))
     gradient(X[1])
     jax.effects_barrier()

@@ -453,12 +453,14 @@ def test_progress_meters_in_a_batch_with_events(pendulum):
     np.testing.assert_allclose(ends, [end(0.1), end(0.2)], atol=ROUND_OFF)
 
 
-def test_gradients_of_lanes_of_different_length_by_diffrax(pendulum):
+@pytest.mark.parametrize(
+    "adjoint", [diffrax.RecursiveCheckpointAdjoint(), svkc.integrators.Replay(every=3)]
+)
+def test_gradients_of_lanes_of_different_length(pendulum, adjoint):
     def saved(angle, t1):
         return svkc.simulate(
-            pendulum, pendulum.state({"arm": angle}), t1, dt=0.1, max_steps=16,
-            adjoint=diffrax.RecursiveCheckpointAdjoint(),
-        ).states.q[-1, 0]  # fmt: skip
+            pendulum, pendulum.state({"arm": angle}), t1, dt=0.1, max_steps=16, adjoint=adjoint
+        ).states.q[-1, 0]
 
     ends = jnp.array([0.35, 1.0])
     gradients = jax.vmap(jax.grad(saved), (None, 0))(0.4, ends)
