@@ -31,13 +31,13 @@ from svkc.integration.runge_kutta import (
 from svkc.integration.solution import PhaseProblem, PhaseSolution, StepperOptions, StepRecord
 from svkc.loops.constraint_rows import choose_rows
 
-# Number of steps of a run whose records are stored, and limit of the memory of their increments for
-# each element of a batch. Each phase stores an equal part, that of its first steps.
+# At most this many steps of a run have records, and their increments take at most this many bytes
+# for each element of a batch. The phases share both equally. Each phase records its first steps.
 RECORDED_STEPS, RECORDS_BYTES = 1024, 1 << 23
 
 
 def record_capacity(start: ODEState, options: StepperOptions) -> int:
-    """Return the number of steps of a phase that are recorded, rounded up to whole blocks."""
+    """Return the number of steps of a phase that are recorded, those of whole blocks."""
     steps, phases = options.checkpoint_interval, options.phases
     blocks = RECORDS_BYTES // max(1, phases * steps * increment_bytes(options.solver, start))
     return steps * min(blocks, -(-min(RECORDED_STEPS // phases, options.max_steps) // steps))
@@ -56,12 +56,12 @@ def with_rows_at(q, field_args: FieldArgs, near: Any = None) -> FieldArgs:
     return dataclasses.replace(field_args, row_choice=rows)
 
 
-class _Steps(eqx.Module):
-    """The steps of a phase, and what their tangents depend on besides.
+class _PhaseData(eqx.Module):
+    """Data that all steps of a phase share.
 
     save_index: index of the step that ends at each save time.
     accepted: number of steps.
-    records: of the first steps. None: none are stored.
+    records: of the first steps. None: there are none.
     """
 
     problem: PhaseProblem
@@ -76,7 +76,7 @@ class _Blocks(eqx.Module):
 
     first: index of the first one.
     y: the state at its start.
-    starts, ends: times of the steps, equal in rows past the end of the phase.
+    starts, ends: times of the steps. In unused rows both are the end of the phase.
     near: which steps were taken with reduced rows of the loops. None: see `StepperState.near`.
     """
 
@@ -90,8 +90,7 @@ class _Blocks(eqx.Module):
 def _blocks(start: ODEState, step_grid, solution: PhaseSolution, interval: int) -> _Blocks:
     """Return all blocks of `interval` steps, [groups, blocks of a group].
 
-    There are about as many groups as blocks in a group. Rows past the end of the phase hold no
-    step.
+    There are about as many groups as blocks in a group.
     """
     needed = solution.checkpoints.q.shape[0] + 1
     size = math.isqrt(needed - 1) + 1
@@ -102,7 +101,7 @@ def _blocks(start: ODEState, step_grid, solution: PhaseSolution, interval: int) 
     repeat = lambda x, n: jnp.broadcast_to(x[None], (n, *x.shape))
     rows = lambda s, c: jnp.concatenate([s[None], c, repeat(s, count - needed)])
     states = jax.tree.map(rows, start, solution.checkpoints)
-    # Unused blocks get a finite state.
+    # Unused blocks start from the start of the phase, as their checkpoints are not written.
     states = jax.tree.map(lambda s, y: where(_broadcast_mask(used, y), y, s[None]), start, states)
     rest = count * interval + 1 - step_grid.shape[0]
     times = jnp.concatenate([step_grid, repeat(step_grid[-1], rest)])
@@ -131,7 +130,7 @@ def replay_tangents(
     with_increments: whether the tangents of the recorded increments are returned; if not, None.
     """
     (start, d_start), (problem, d_problem), interval = start, problem, options.checkpoint_interval
-    steps = _Steps(
+    phase = _PhaseData(
         problem=problem,
         solver=options.solver,
         save_index=save_index,
@@ -145,7 +144,7 @@ def replay_tangents(
 
     def group(carry, blocks):
         return _group_if_used(
-            (carry, d_problem), blocks.first[0] < solution.accepted, blocks, steps
+            (carry, d_problem), blocks.first[0] < solution.accepted, blocks, phase
         )
 
     (d_end, d_ys, d_recorded), d_after = jax.lax.scan(
@@ -160,7 +159,7 @@ def replay_tangents(
     return d_end, d_ys, jax.tree.map(mask, d_checkpoints), d_recorded
 
 
-def _tangents_of_group(tangents, blocks: _Blocks, steps: _Steps):
+def _tangents_of_group(tangents, blocks: _Blocks, phase: _PhaseData):
     """Return the tangents after a group of blocks, and the tangents after each of its blocks.
 
     tangents: those before it, as in `_tangents_of_block`.
@@ -168,25 +167,25 @@ def _tangents_of_group(tangents, blocks: _Blocks, steps: _Steps):
     carry, d_problem = tangents
 
     def block(carry, block):
-        carry = _block_if_used((carry, d_problem), block.first < steps.accepted, block, steps)
+        carry = _block_if_used((carry, d_problem), block.first < phase.accepted, block, phase)
         return carry, carry[0]
 
     return jax.lax.scan(block, carry, blocks)
 
 
-def _no_group(tangents, blocks: _Blocks, steps: _Steps):
+def _no_group(tangents, blocks: _Blocks, phase: _PhaseData):
     """Return the tangents unchanged, and zeros for those after each block."""
     carry, zeros = tangents[0], lambda d: jnp.zeros((*blocks.first.shape, *d.shape), d.dtype)
     return carry, jax.tree.map(zeros, carry[0])
 
 
-def _tangents_of_block(tangents, block: _Blocks, steps: _Steps):
+def _tangents_of_block(tangents, block: _Blocks, phase: _PhaseData):
     """Return the tangents after a block: of the state, at the save times, and of the increments.
 
     tangents: those before it, and that of the problem.
     """
     (d_y, d_ys, d_recorded), d_problem = tangents
-    first, interval, records = block.first, block.starts.shape[0], steps.records
+    first, interval, records = block.first, block.starts.shape[0], phase.records
     is_stored = jnp.zeros((), bool)
     if records is not None:
         assert records.increments is not None
@@ -197,33 +196,32 @@ def _tangents_of_block(tangents, block: _Blocks, steps: _Steps):
     def step(carry, x):
         (y, d_y), (start, end, near, record) = carry, x
         used = end > start
-        record = _recorded_or_taken_again(y, (start, end, near), record, is_stored, steps)
-        d_y, d_increments = _step_if_used((d_y, d_problem), used, (start, end), y, record, steps)
-        move = lambda: end_of_step(steps.solver, (start, end, record), steps.problem, y)
+        record = _record_of_step(y, (start, end, near), record, is_stored, phase)
+        d_y, d_increments = _step_if_used((d_y, d_problem), used, (start, end), y, record, phase)
+        move = lambda: end_of_step(phase.solver, (start, end, record), phase.problem, y)
         after = jax.lax.cond(unvmap_any(used), move, lambda: y)
         return (tree_where(used, after, y), d_y), (d_y, d_increments)
 
     (_, d_after), (d_steps, d_increments) = jax.lax.scan(
         step, (block.y, d_y), (block.starts, block.ends, block.near, records)
     )
-    last = jnp.minimum(first + interval, steps.accepted)
-    in_block = (steps.save_index > first) & (steps.save_index <= last)
-    step_index = jnp.clip(steps.save_index - first - 1, 0, interval - 1)
+    last = jnp.minimum(first + interval, phase.accepted)
+    in_block = (phase.save_index > first) & (phase.save_index <= last)
+    step_index = jnp.clip(phase.save_index - first - 1, 0, interval - 1)
     save = lambda old, new: where(_broadcast_mask(in_block, old), new[step_index], old)
     d_written = None if d_recorded is None else _write(d_recorded, d_increments, first)
-    used = first < steps.accepted
-    return tree_where(used, d_after, d_y), jax.tree.map(save, d_ys, d_steps), d_written
+    return d_after, jax.tree.map(save, d_ys, d_steps), d_written
 
 
-def _recorded_or_taken_again(
-    y: ODEState, step, record: StepRecord | None, is_stored, steps: _Steps
+def _record_of_step(
+    y: ODEState, step, record: StepRecord | None, is_stored, phase: _PhaseData
 ) -> StepRecord:
-    """Return the record of a step from y, which may be any record if the step has no length.
+    """Return the record of a step from y. That of an unused step is arbitrary but finite.
 
     step: start, end, and whether it was taken with reduced rows.
-    record: as stored, None if no block has records. is_stored: whether this block has records.
+    record: None if the phase has no records. is_stored: whether `record` was stored in the run.
     """
-    (start, end, near), problem, solver = step, steps.problem, steps.solver
+    (start, end, near), problem, solver = step, phase.problem, phase.solver
 
     def take_again():
         field_args = with_rows_at(y.q, problem.field_args, near)
@@ -234,12 +232,12 @@ def _recorded_or_taken_again(
     return jax.lax.cond(unvmap_any(end > start) & ~is_stored, take_again, lambda: record)
 
 
-def _no_block(tangents, block: _Blocks, steps: _Steps):
+def _no_block(tangents, block: _Blocks, phase: _PhaseData):
     """Return the tangents unchanged."""
     return tangents[0]
 
 
-def _tangent_of_step(tangents, times, y: ODEState, record: StepRecord, steps: _Steps):
+def _tangent_of_step(tangents, times, y: ODEState, record: StepRecord, phase: _PhaseData):
     """Return the tangents of the state after a step and of its increments.
 
     tangents: of the state before it and of the problem.
@@ -247,14 +245,14 @@ def _tangent_of_step(tangents, times, y: ODEState, record: StepRecord, steps: _S
     """
     (d_y, d_problem), (start, end) = tangents, times
     d_end, d_increments = step_tangent(
-        steps.solver, (start, end, record), (steps.problem, d_problem), (y, d_y)
+        phase.solver, (start, end, record), (phase.problem, d_problem), (y, d_y)
     )
     return tree_where(end > start, d_end, d_y), d_increments
 
 
-def _no_step(tangents, times, y: ODEState, record: StepRecord, steps: _Steps):
+def _no_step(tangents, times, y: ODEState, record: StepRecord, phase: _PhaseData):
     """Return the tangent of the state unchanged, and zeros for that of the increments."""
-    return tangents[0], zero_increments(steps.solver, y)
+    return tangents[0], zero_increments(phase.solver, y)
 
 
 _step_if_used = skippable("step_tangent", _tangent_of_step, _no_step)

@@ -40,11 +40,11 @@ class Replay(eqx.Module):
     are fixed in derivatives; the times of events, of the start, of the end and of saved states are
     not.
 
-    Of explicit Runge-Kutta solvers the stages of 1024 steps of a run are kept, or of fewer where
-    they take more than 8 MiB. Each phase has an equal part, for its first steps. Steps beyond are
-    taken again in derivatives. The memory for a phase is max_steps (1 + n / every) numbers, where n
-    counts the entries of q and v, plus the stages of its part, plus those of one block of `every`
-    steps.
+    Of explicit Runge-Kutta solvers the stages of up to 1024 steps of a run are kept, in at most
+    8 MiB. The phases share this equally, and each keeps the stages of its first steps. Stages of
+    later steps are computed again in derivatives. The memory for a phase is max_steps (1 + n /
+    every) numbers, where n counts the entries of q and v, plus its stages, plus those of one block
+    of `every` steps.
 
     every: number of steps between checkpoints. None: 16, or 64 if `max_steps` is at least 4096.
 

@@ -86,7 +86,7 @@ def increments_of_stages(solver: diffrax.AbstractSolver[Any], dense_info: Any) -
 def initial_records(
     solver: diffrax.AbstractSolver[Any], field_args: FieldArgs, start: ODEState, capacity: int
 ) -> StepRecord | None:
-    """Return records without motion, None without capacity or for a solver without increments."""
+    """Return zero records, None without capacity or for a solver without increments."""
     increments = zero_increments(solver, start)
     if not capacity or increments is None:
         return None
@@ -166,8 +166,9 @@ def step_tangent(
     problem, start: pairs of primal and tangent.
     """
     (_, t1, record), tableau = step, _explicit_tableau(solver)
-    if tableau is None or record.increments is None:
+    if tableau is None:
         return _tangent_of_any_step(solver, step, problem, start), None
+    assert record.increments is not None
     # outside the kernel: a kernel cannot hold products of matrices
     A = jnp.asarray(_stage_weights(tableau), t1.dtype)
     stages = jax.tree.map(
@@ -251,7 +252,7 @@ def _scan_stages(tableau: diffrax.ButcherTableau, stage, times, xs: ODEState) ->
     def body(increments, x):
         weights, fraction, one_hot, x_stage = x
         k = stage(t0 + fraction * (t1 - t0), weights, increments, x_stage)
-        # the transpose of a selection would read a mask of the shape of all increments
+        # a `where` here would store a mask of the shape of all increments in reverse mode
         write = lambda ks, k: (
             ks + jnp.expand_dims(one_hot, range(1, ks.ndim)) * ((t1 - t0) * k)[None]
         )
