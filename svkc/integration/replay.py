@@ -143,6 +143,8 @@ def _check_solver(solver: diffrax.AbstractSolver[Any]) -> None:
 
     A step is differentiated by the state at its start alone.
     """
+    while isinstance(solver, diffrax.AbstractWrappedSolver):
+        solver = solver.solver
     if isinstance(solver, diffrax.LeapfrogMidpoint | diffrax.ReversibleHeun):
         raise ValueError(
             f"adjoint: svkc.integrators.Replay cannot differentiate {type(solver).__name__}, whose"
