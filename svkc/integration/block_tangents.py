@@ -59,6 +59,7 @@ def with_rows_at(q, field_args: FieldArgs, near: Any = None) -> FieldArgs:
 class _PhaseData(eqx.Module):
     """Data that all steps of a phase share.
 
+    start, start_time: of the phase.
     save_index: index of the step that ends at each save time.
     accepted: number of steps.
     records: of the first steps. None: there are none.
@@ -66,6 +67,8 @@ class _PhaseData(eqx.Module):
 
     problem: PhaseProblem
     solver: diffrax.AbstractSolver[Any]
+    start: ODEState
+    start_time: Float[Array, ""]
     save_index: Int[Array, " times"]
     accepted: Int[Array, ""]
     records: StepRecord | None
@@ -130,9 +133,16 @@ def replay_tangents(
     with_increments: whether the tangents of the recorded increments are returned; if not, None.
     """
     (start, d_start), (problem, d_problem), interval = start, problem, options.checkpoint_interval
+    # In a batch, a phase after the end of one run is computed beside those of other runs. Its
+    # cotangents may be NaN: they are not passed on.
+    has_steps, d_before = solution.accepted > 0, d_start
+    zeros = jax.tree.map(jnp.zeros_like, (d_start, d_problem))
+    d_start, d_problem = tree_where(has_steps, (d_start, d_problem), zeros)
     phase = _PhaseData(
         problem=problem,
         solver=options.solver,
+        start=start,
+        start_time=step_grid[0],
         save_index=save_index,
         accepted=solution.accepted,
         records=solution.records,
@@ -149,13 +159,14 @@ def replay_tangents(
 
     (d_end, d_ys, d_recorded), d_after = jax.lax.scan(
         group,
-        (d_start, jax.tree.map(at_start, d_start), d_recorded),
+        (d_start, jax.tree.map(at_start, d_before), d_recorded),
         _blocks(start, step_grid, solution, interval),
     )
     count = solution.checkpoints.q.shape[0]
     written = jnp.arange(1, count + 1, dtype=jnp.int32) * interval <= solution.accepted
     d_checkpoints = jax.tree.map(lambda d: d.reshape(-1, *d.shape[2:])[:count], d_after)
     mask = lambda d: where(_broadcast_mask(written, d), d, 0)
+    d_end = tree_where(has_steps, d_end, d_before)
     return d_end, d_ys, jax.tree.map(mask, d_checkpoints), d_recorded
 
 
@@ -197,7 +208,10 @@ def _tangents_of_block(tangents, block: _Blocks, phase: _PhaseData):
         (y, d_y), (start, end, near, record) = carry, x
         used = end > start
         record = _record_of_step(y, (start, end, near), record, is_stored, phase)
-        d_y, d_increments = _step_if_used((d_y, d_problem), used, (start, end), y, record, phase)
+        # In a batch, unused steps are computed beside used ones. Their derivatives are multiplied
+        # by zero, but need not be finite at the end of a phase: they are those at its start.
+        at = tree_where(used, (y, start, end), (phase.start, phase.start_time, phase.start_time))
+        d_y, d_increments = _step_if_used((d_y, d_problem), used, at[1:], at[0], record, phase)
         move = lambda: end_of_step(phase.solver, (start, end, record), phase.problem, y)
         after = jax.lax.cond(unvmap_any(used), move, lambda: y)
         return (tree_where(used, after, y), d_y), (d_y, d_increments)

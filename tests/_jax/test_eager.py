@@ -60,6 +60,7 @@ def eagerly(linkage):
     return jax.tree.map(lambda *x: np.stack(x), *[all_results(*linkage, x) for x in XS])
 
 
+@pytest.mark.slow
 def test_results_under_jit_and_scan_equal_eager_ones(linkage, eagerly):
     assert_close(
         jax.jit(lambda xs: jax.lax.map(lambda x: all_results(*linkage, x), xs))(XS), eagerly

@@ -93,6 +93,7 @@ def test_derivatives_of_reduced_rows(four_bar):
     np.testing.assert_allclose(reverse, forward, rtol=ROUND_OFF)
 
 
+@pytest.mark.slow
 def test_second_derivative_of_reduced_rows(four_bar):
     """At rates that fit the loops it agrees with the central difference of the first one."""
     chain = four_bar[0]

@@ -80,6 +80,7 @@ def slider_crank():
     return chain, chain.state({"crank": -0.6}, {"crank": 3.0})
 
 
+@pytest.mark.slow
 def test_accelerations_of_a_massless_slider(slider_crank):
     """They are those by pivots, for a tiny mass and for none, and those without the slider."""
     chain, state = slider_crank

@@ -84,6 +84,7 @@ def test_torques_by_name_are_those_of_the_array():
     np.testing.assert_allclose(by_name["arm"], by_array[chain.v_index("arm")][0], rtol=1e-14)
 
 
+@pytest.mark.slow
 def test_control_and_loop_forces_take_torques_by_name():
     chain = models.four_bar()
     state = chain.state({"crank": 0.3})

@@ -44,11 +44,11 @@ def linked_trees(joint: str, parent: str, real: str) -> svkc.Chain:
 LINKS = pytest.mark.parametrize(
     ("joint", "parent", "real"),
     [
-        ("weld", "b5", "last"),
-        ("hinge", "last", "b4"),
-        ("universal", "b5", "last"),
         ("ball", "world", "b5"),
-        ("slide", "b3", "last"),
+        pytest.param("weld", "b5", "last", marks=pytest.mark.slow),
+        pytest.param("hinge", "last", "b4", marks=pytest.mark.slow),
+        pytest.param("universal", "b5", "last", marks=pytest.mark.slow),
+        pytest.param("slide", "b3", "last", marks=pytest.mark.slow),
     ],
 )
 

@@ -93,6 +93,7 @@ def test_closed_chains_are_those_of_forward_dynamics_and_loop_forces(name):
             assert np.abs(ours - theirs).max() < KERNEL * scale * (1 + np.abs(f).max())
 
 
+@pytest.mark.slow
 def test_rows_are_those_of_the_loop_gaps():
     """The rank of the rows is that of J_C without the joints' freedoms, and rates are derivatives
     of gaps."""
@@ -112,7 +113,16 @@ def test_rows_are_those_of_the_loop_gaps():
     np.testing.assert_allclose(rates_at(chain, q, v, table), derivative, atol=1e-12)
 
 
-@pytest.mark.parametrize("joint", ["weld", "hinge", "universal", "ball", "slide", "planar"])
+@pytest.mark.parametrize(
+    "joint",
+    [
+        "ball",
+        *(
+            pytest.param(joint, marks=pytest.mark.slow)
+            for joint in ("weld", "hinge", "universal", "slide", "planar")
+        ),
+    ],
+)
 def test_an_impact_is_that_of_connect(joint):
     """The velocity after `connect` satisfies the rows of a connection, with some impulse."""
     chain = models.two_boxes(joint)

@@ -65,6 +65,7 @@ BALL = (
 )
 
 
+@pytest.mark.slow
 def test_errors_of_a_turning_ball_turn_back_in_its_axes():
     """Its plan turns by 1.5 rad about z in 1 s; an error of its pose stays where it is in space.
 

@@ -98,6 +98,7 @@ def test_integer_codes_of_schema_4_are_read_by_their_meaning(field, name, value,
     assert getattr(traj, field) == getattr(enumeration, name)
 
 
+@pytest.mark.slow
 def test_files_hold_the_names_of_codes(run, tmp_path):
     """Of a batch as well; an unknown name is an error that says so, and leaves the chain."""
     chain, traj = run

@@ -45,6 +45,7 @@ def message(chain, state=None, args=(), **kw):
     return source
 
 
+@pytest.mark.slow
 def test_the_control_is_named_with_its_joint_and_the_array_of_args(arm):
     expected = "the control: nan for 'lower' (args['gain'] is not finite), at t = {} s"
     assert message(arm, args={"until": 0.011}) == expected.format(0.0125)

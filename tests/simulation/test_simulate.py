@@ -397,6 +397,7 @@ def test_step_size_below_the_lower_bound(pendulum):
         simulate_pendulum(pendulum, stepsize_controller=controller, solver=diffrax.Tsit5())
 
 
+@pytest.mark.slow
 def test_states_after_the_last_event_are_saved(pendulum):
     """At and after the time of an event at the end of a run, or of one that ends it, the saved
     state is the one after the event: alone, in a batch beside a longer run, and in derivatives by
@@ -426,6 +427,7 @@ def test_states_after_the_last_event_are_saved(pendulum):
     assert abs(float(final[0])) > 0.1
 
 
+@pytest.mark.slow
 def test_a_run_of_no_length_has_derivatives_by_its_end(pendulum):
     """Phases after the end of a run are skipped, but not the first one."""
     start = pendulum.state({"arm": 0.4}, {"arm": 0.3})
@@ -439,6 +441,7 @@ def test_a_run_of_no_length_has_derivatives_by_its_end(pendulum):
     np.testing.assert_allclose([q, rate], [0.4, 0.3], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_progress_meters_in_a_batch_with_events(pendulum):
     """JAX refuses effects in a conditional under `vmap`: phases are skipped with `Replay` only."""
 
@@ -453,6 +456,7 @@ def test_progress_meters_in_a_batch_with_events(pendulum):
     np.testing.assert_allclose(ends, [end(0.1), end(0.2)], atol=ROUND_OFF)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "adjoint", [diffrax.RecursiveCheckpointAdjoint(), svkc.integrators.Replay(every=3)]
 )
@@ -468,6 +472,32 @@ def test_gradients_of_lanes_of_different_length(pendulum, adjoint):
     np.testing.assert_allclose(gradients, alone, atol=ROUND_OFF)
 
 
+@pytest.mark.slow
+def test_lanes_that_end_where_the_field_has_no_derivative():
+    """Steps after the end of a lane are computed beside those of other lanes, and change nothing.
+
+    The force grows with the square root of the distance from x = 0, where one lane ends.
+    """
+    body = f'<body name="a"><joint name="a" type="slide" axis="1 0 0"/>{models.BOX}</body>'
+    text = models.MJCF.format(body.format("0.1 0.1 0.1")).replace("0.3 -0.2 -9.81", "0 0 0")
+    hook = svkc.VirtualLink("hook", "world", "a", "weld")
+    chain = svkc.load(text, virtual_links=[hook])
+
+    def end(x, stop_time):
+        events = [svkc.at(stop_time, stop=True), svkc.at(1.5, cut="hook")]
+        force = lambda t, state, args: 1e-40 * jnp.sqrt(jnp.abs(state.q[:1]))
+        start = chain.state({"a": x}, {"a": -1.0})
+        return svkc.simulate(
+            chain, start, 3.0, dt=0.5, solver=diffrax.Euler(), control=force, events=events
+        ).final.q[0]  # fmt: skip
+
+    x, times = jnp.array([1.0, 4.0]), jnp.array([1.0, 3.0])
+    ends, gradients = jax.vmap(jax.value_and_grad(end))(x, times)
+    np.testing.assert_array_equal(ends, [0, 1])
+    np.testing.assert_array_equal(gradients, 1)
+
+
+@pytest.mark.slow
 def test_steps_keep_their_size_across_events(pendulum):
     """Each phase starts with half of the size proposed before it, so that phases shorter than the
     steps take one step each. The first phase starts with a thousandth of the run."""

@@ -57,6 +57,7 @@ def fall_time(height, speed, size):
     return (speed + np.sqrt(speed**2 + 2 * GRAVITY * (height - size))) / GRAVITY
 
 
+@pytest.mark.slow
 def test_a_ball_is_caught_by_hands_smaller_than_a_step(ball):
     """Lanes of one program: sizes of the hand, velocities of the throw, tolerances. A ball that
     starts within the hand and never leaves it is not caught."""
@@ -136,6 +137,7 @@ def test_each_crossing_fires_in_its_direction(ball, options):
             np.testing.assert_allclose(located, expected, atol=1e-9, err_msg=name)
 
 
+@pytest.mark.slow
 def test_the_earliest_of_two_guards_fires(ball):
     """Both guards cross zero twice in one step; the second in the list crosses first."""
     first = svkc.when(lambda t, s, a: jnp.abs(t - a[0]) - 0.01, stop=True)

@@ -105,6 +105,7 @@ def test_a_grip_replaces_the_one_that_its_event_ends(sliders):
         assert float(traj.events.energy_lost.sum()) > 0
 
 
+@pytest.mark.slow
 def test_a_grip_in_a_slot_that_stays_connected_ends_with_no_slot(sliders):
     chain, state = sliders
     held = svkc.connect(

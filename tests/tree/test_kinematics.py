@@ -96,7 +96,7 @@ SLIDES = """<mujoco><worldbody><body><joint type="slide" axis="1 0 0"/><geom siz
 </body></worldbody></mujoco>"""
 
 
-@pytest.mark.parametrize("model", [SLIDES, TREE])
+@pytest.mark.parametrize("model", [SLIDES, pytest.param(TREE, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("batched", ["q", "pos"])
 def test_derivatives_of_compiled_batches(model, batched):
     """The rotations depend neither on slides nor on `pos`, and `vmap` batches one of these."""
