@@ -46,6 +46,7 @@ def test_batches_are_their_single_solves(lanes, size):
         np.testing.assert_allclose(solve(A, x), expected, rtol=REFERENCE, atol=ROUND_OFF)
 
 
+@pytest.mark.slow
 def test_derivatives():
     rng = np.random.default_rng(0)
     A, x = jnp.asarray(rng.normal(size=(4, 4))), jnp.asarray(rng.normal(size=(4, 2)))

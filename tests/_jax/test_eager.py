@@ -150,6 +150,7 @@ def test_the_derivative_of_a_state_closed_from_afar(make):
         )
 
 
+@pytest.mark.slow
 def test_a_state_that_cannot_be_closed_is_an_error_under_a_derivative():
     chain = models.four_bar()
     with pytest.raises(Exception, match="cannot be closed"):

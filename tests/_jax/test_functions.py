@@ -281,6 +281,7 @@ def test_globals_of_libraries_are_static():
     assert same(many["f59"], many["f59"])
 
 
+@pytest.mark.slow
 def test_a_loop_compiles_once(arm, expected, programs):
     """Arrays may be in any container; each run uses the arrays of its own function."""
     module = lambda pair: lambda t, state, args: pair.torque(t, state, args)

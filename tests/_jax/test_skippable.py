@@ -78,7 +78,10 @@ def test_derivatives(derivative, used, compiled):
         )
 
 
-@pytest.mark.parametrize("derivative", list(DERIVATIVES))
+@pytest.mark.parametrize(
+    "derivative",
+    [pytest.param(n, marks=pytest.mark.slow) if "over" in n else n for n in DERIVATIVES],
+)
 def test_derivatives_of_lanes_with_other_flags(derivative):
     f = skippable("test_masked", reference, lambda tangents, used, x: unchanged(tangents, x))
 

@@ -41,6 +41,7 @@ def acceleration_error(chain, state, vdot, result):
     )
 
 
+@pytest.mark.slow
 def test_as_many_motors_as_freedoms(five_bar):
     """Two motors for two freedoms reach the acceleration, without redundancy (paper (22))."""
     chain, state, vdot, co = five_bar

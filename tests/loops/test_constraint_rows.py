@@ -78,6 +78,7 @@ def along_a_line(chain, state, v, rng):
     return both
 
 
+@pytest.mark.slow
 def test_derivatives_of_reduced_rows(four_bar):
     """Both modes agree with central differences, also where the rates do not fit the loops."""
     chain = four_bar[0]

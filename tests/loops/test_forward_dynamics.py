@@ -204,6 +204,7 @@ def gripped():
     return chain, open_, svkc.connect(chain, bound, "spare_0", here=True), declared, a
 
 
+@pytest.mark.slow
 def test_bind_a_spare_slot(gripped):
     """A grip bound at run time moves as a declared link; unbinding empties its slot."""
     chain, _, gripped, declared, a = gripped

@@ -113,6 +113,7 @@ def test_derivatives_of_a_stage(joint, parent, real):
     assert not np.any(H[-n:, -n:])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("function", CLOSED_FORMS)
 @LINKS
 def test_derivatives_of_a_node(function, joint, parent, real):

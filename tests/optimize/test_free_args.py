@@ -48,7 +48,10 @@ def solved():
     return problem, guess, problem.solve(guess)
 
 
-@pytest.mark.parametrize("solver", [optimize.Ipopt(), optimize.InteriorPoint()])
+@pytest.mark.parametrize(
+    "solver",
+    [pytest.param(optimize.Ipopt(), marks=pytest.mark.slow), optimize.InteriorPoint()],
+)
 def test_a_mass_with_a_known_optimum(solved, solver):
     problem, guess, _ = solved
     solution = problem.solve(guess, solver=solver)
@@ -99,6 +102,7 @@ def test_saved_solutions_have_their_args(solved, tmp_path):
         optimize.load_solution(tmp_path / "move.npz", other)
 
 
+@pytest.mark.slow
 def test_the_optimal_cost_by_an_arg(solved):
     """The derivative by the price is 1 / mass, and zero by the free arg."""
     _, _, solution = solved
@@ -172,6 +176,7 @@ def test_a_solution_with_fixed_args_is_a_guess(solved):
     assert problem.solve(plain.solve(plain.guess([{"x": 0.0}, {"x": 1.0}]))).args["mass"] > 1
 
 
+@pytest.mark.slow
 def test_free_args_that_are_zero():
     """Derivatives by other unknowns are complete although they are zero at the guess."""
     gain = lambda p: p.args["gain"] * jnp.sum(p.u**2)

@@ -102,6 +102,7 @@ def test_the_gradient_of_the_lagrangian_is_zero(solved):
     assert (start.upper > 0.1).sum() == (start.lower > 0.1).sum() == 2
 
 
+@pytest.mark.slow
 def test_warm_starts(solved):
     """From multipliers, and on another mesh without them."""
     problem, guess, solution = solved

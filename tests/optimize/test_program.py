@@ -96,6 +96,7 @@ def test_derivatives_of_functions_that_are_constant_at_most_points():
     assert active[-1]
 
 
+@pytest.mark.slow
 def test_derivatives_of_joint_limits():
     """At the guess and near it the cart is far inside its range."""
     rail = models.MJCF.format(

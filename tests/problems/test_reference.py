@@ -87,15 +87,9 @@ def test_heavy_top(case):
 ERROR_AT = {1e-9: 1e-5, 1e-12: 1e-8}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("windows", "tolerances"),
-    [
-        (1, [1e-9]),
-        *(
-            pytest.param(*case, marks=pytest.mark.slow)
-            for case in ((1, [1e-12]), (2, [1e-9, 1e-12]), (5, [1e-9]))
-        ),
-    ],
+    ("windows", "tolerances"), [(1, [1e-9, 1e-12]), (2, [1e-9, 1e-12]), (5, [1e-9])]
 )
 def test_n_four_bar_through_its_singular_configurations(windows, tolerances):
     """Angle, energy and loops of 10 s (two windows: 20 s) with some forty drops of the rank.

@@ -119,6 +119,7 @@ def test_failures_and_differences_are_in_the_rows(what, monkeypatch, tmp_path):
         assert not any(row.rates for row in others)
 
 
+@pytest.mark.slow
 def test_processes_take_turns(tmp_path):
     """A second process waits for the lock of a folder until the first has left it."""
     pytest.importorskip("fcntl")

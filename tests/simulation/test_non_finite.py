@@ -54,6 +54,7 @@ def test_the_control_is_named_with_its_joint_and_the_array_of_args(arm):
     assert message(arm, args={"until": -1.0}) == expected.format(0)
 
 
+@pytest.mark.slow
 def test_the_guard_is_named_by_its_place_in_the_events(arm):
     source = message(arm, args={"seen_until": 0.011, "gain": 0.0})
     assert source == "the guard of events[1], at t = 0.0125 s"

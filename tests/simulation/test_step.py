@@ -81,6 +81,7 @@ def damped_four_bar():
     return chain, chain.state(v={"crank": 4.0})
 
 
+@pytest.mark.slow
 def test_damping_of_a_closed_loop_enters_with_its_constraints(damped_four_bar):
     """The velocity's change is that of the loop with dt D on the diagonal of the mass matrix."""
     chain, state = damped_four_bar

@@ -93,12 +93,9 @@ def test_symplectic_euler_bounds_the_energy_error_of_a_pendulum():
     assert explicit[-1] > 20 * symplectic.max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "stabilization",
-    [
-        svkc.stabilization.Projection(),
-        pytest.param(svkc.stabilization.CoordinatePartitioning(), marks=pytest.mark.slow),
-    ],
+    "stabilization", [svkc.stabilization.Projection(), svkc.stabilization.CoordinatePartitioning()]
 )
 def test_each_stabilization_closes_the_loops(stabilization):
     """Short steps close the loops to round-off; one step that is too long reduces the gap."""
@@ -164,6 +161,7 @@ def test_former_names_of_dynamics():
         assert type(Dynamics().resolved(chain)) is usual
 
 
+@pytest.mark.slow
 def test_every_line_of_the_report():
     """Each number of the report equals an independent computation, for a driven four-bar."""
     chain = models.four_bar()

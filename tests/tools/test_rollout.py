@@ -194,6 +194,7 @@ def scaled(gain):
     return lambda t, state, args: gain * args * state.v
 
 
+@pytest.mark.slow
 def test_a_folder_continues_the_same_rollout_only(tmp_path):
     """Another value in `control` or `lane`, another body of either, and other options are refused
     by name; equal functions that are new objects are not."""

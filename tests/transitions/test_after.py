@@ -48,6 +48,7 @@ def place_at_the_end(h, delay):
     return -G / 2 * (1.2 - jnp.sqrt(2 * h / G) - delay) ** 2
 
 
+@pytest.mark.slow
 def test_a_release_after_a_catch(falling, caught_and_released):
     h, delay = jnp.asarray(1.0), jnp.asarray(0.4)
     traj = caught_and_released(h, delay)

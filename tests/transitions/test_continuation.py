@@ -192,7 +192,7 @@ def state_of_geometry(name):
 
 
 # planar topologies, one in space and a platform; the slow tier has all geometries of all topologies
-IN_FAST_TIER = ("five-bar", "six-bar", "crank and rocker in space", "platform")
+IN_FAST_TIER = ("five-bar",)
 
 
 @pytest.mark.parametrize(

@@ -104,13 +104,8 @@ def test_a_caught_ball_hangs_in_the_hand(ball):
     np.testing.assert_allclose(traj.final.v[0], 0, atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        pytest.param({}, id="adaptive"),
-        pytest.param({"dt": 0.9}, id="fixed", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [{}, {"dt": 0.9}], ids=["adaptive", "fixed"])
 def test_each_crossing_fires_in_its_direction(ball, options):
     """Three guards without action record rising, falling and all crossings, in lanes that differ
     in the number of crossings within a step."""

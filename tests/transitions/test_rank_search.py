@@ -38,7 +38,13 @@ def search(chain: svkc.Chain, state: svkc.State, q):
 
 
 @pytest.mark.parametrize("x64", [True, False])
-@pytest.mark.parametrize(("a", "b"), [(1.0, 0.5), (1.0, 0.99), (1.0, 1.0), (0.3, 1.2)])
+@pytest.mark.parametrize(
+    ("a", "b"),
+    [
+        (1.0, 0.5),
+        *(pytest.param(*x, marks=pytest.mark.slow) for x in ((1.0, 0.99), (1.0, 1.0), (0.3, 1.2))),
+    ],
+)
 def test_stretched_bars_have_the_rank_of_their_only_closed_configuration(a, b, x64):
     """Newton's steps halve the distance of the probe from this singular configuration. In float32
     the search must not stop as soon as the gap, its square, is small."""

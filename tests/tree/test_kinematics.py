@@ -63,6 +63,7 @@ def test_derivatives_are_those_of_automatic_differentiation(chain_and_q):
     np.testing.assert_allclose(as_vector(got), as_vector(expected), atol=1e-13)
 
 
+@pytest.mark.slow
 def test_second_derivatives_are_those_of_automatic_differentiation(chain_and_q):
     chain, q = chain_and_q
     weights = jnp.cos(jnp.arange(as_vector(kinematics(chain, q)).size))
@@ -96,7 +97,8 @@ SLIDES = """<mujoco><worldbody><body><joint type="slide" axis="1 0 0"/><geom siz
 </body></worldbody></mujoco>"""
 
 
-@pytest.mark.parametrize("model", [SLIDES, pytest.param(TREE, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("model", [SLIDES, TREE])
 @pytest.mark.parametrize("batched", ["q", "pos"])
 def test_derivatives_of_compiled_batches(model, batched):
     """The rotations depend neither on slides nor on `pos`, and `vmap` batches one of these."""
