@@ -99,13 +99,8 @@ CHANGES = {
 }
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "catch",
-        *(pytest.param(name, marks=pytest.mark.slow) for name in CHANGES if name != "catch"),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(CHANGES))
 def test_momentum_across_changes_of_structure(name):
     """Momentum changes by external impulses, to round-off.
 

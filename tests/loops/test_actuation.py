@@ -56,6 +56,7 @@ def test_as_many_motors_as_freedoms(five_bar):
     np.testing.assert_allclose(short.tau, result.tau, rtol=ROUND_OFF)
 
 
+@pytest.mark.slow
 def test_more_motors_than_freedoms(five_bar):
     """Three motors give torques of least norm, compared with numpy's pseudo-inverse.
 

@@ -105,6 +105,7 @@ def test_second_derivative_of_reduced_rows(four_bar):
     np.testing.assert_allclose(second, (first(h) - first(-h)) / (2 * h), rtol=DIFFERENCE)
 
 
+@pytest.mark.slow
 def test_redundant_loops_keep_as_many_rows_as_their_rank():
     """Of two loops, one of which is wholly redundant, as many rows stay as there are constraints.
 

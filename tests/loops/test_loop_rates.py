@@ -42,6 +42,7 @@ def chain_and_q():
     )
 
 
+@pytest.mark.slow
 def test_rates_are_those_of_the_loop_jacobian(chain_and_q):
     chain, structure, q = chain_and_q
     v = jax.random.normal(jax.random.key(2), (chain.dofs,))

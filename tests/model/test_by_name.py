@@ -64,6 +64,7 @@ def test_a_virtual_link_has_the_coordinates_of_its_joint():
     assert welded.joint(welded.state(), "w").q.shape == (0,)
 
 
+@pytest.mark.slow
 def test_torques_by_name_are_those_of_the_array():
     chain = cases.CASES["pivot"].build()
     state = chain.state({"arm": 0.7})

@@ -28,6 +28,15 @@ ELSEWHERE = {
     "module ... has no": ("project/test_public_api.py", "has no attribute"),
 }
 
+# messages whose calls compile for seconds; they are raised in the slow tier
+LONGEST = (
+    "inverse_dynamics_along: at t = ... s the joints",
+    "inverse_dynamics_along: at t = ... s:",
+    "target: ... cannot",
+    "... depends on fixed",
+    "pictures need",
+)
+
 
 @pytest.fixture(scope="module")
 def setting(tmp_path_factory):
@@ -57,7 +66,10 @@ def test_the_page_has_every_message():
         assert error_page.codes(enumeration.__name__) == list(enumeration._name_to_item)
 
 
-@pytest.mark.parametrize("opening", wrong_calls.CASES)
+@pytest.mark.parametrize(
+    "opening",
+    [pytest.param(o, marks=pytest.mark.slow) if o in LONGEST else o for o in wrong_calls.CASES],
+)
 def test_each_message(setting, opening):
     with (
         error_page.as_users_see(),

@@ -109,6 +109,7 @@ def cuttable_case():
     return chain, chain.state({"a": 0.4, "b": 0.5}, {"a": 1.0, "b": 20.0}), tau, order
 
 
+@pytest.mark.slow
 def test_damping_of_a_cuttable_joint_is_implicit():
     """A joint named in `cuttable=` moves as it does in the tree."""
     chain, state, tau, order = cuttable_case()

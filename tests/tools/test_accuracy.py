@@ -115,6 +115,7 @@ def test_each_stabilization_closes_the_loops(stabilization):
     assert np.abs(svkc.loop_gaps(chain, after)).max() < 1e-3 * gap
 
 
+@pytest.mark.slow
 def test_partitioning_moves_only_dependent_coordinates():
     """Coordinate partitioning closes the loops and leaves the independent coordinates unchanged."""
     chain = models.four_bar()

@@ -86,7 +86,6 @@ def test_connect_at_current_pose():
     assert float(jnp.abs(svkc.loop_gaps(chain, after)).max()) < 1e-14
 
 
-@pytest.mark.slow
 def test_lock_and_unlock(high_bar):
     """A locked knee has zero velocity and acceleration; an unlocked knee accelerates again."""
     chain, state = high_bar

@@ -113,6 +113,7 @@ def with_sites(text):
     return re.sub("<geom", site, text)
 
 
+@pytest.mark.slow
 def test_sites_against_mujoco():
     chain = svkc.load(with_sites(models.random_tree(7, seed=7)))
     state, model, data = random_motion(chain)
