@@ -53,7 +53,7 @@ DERIVATIVES = {
 
 
 @pytest.mark.parametrize("derivative", list(DERIVATIVES))
-@pytest.mark.parametrize("used", [True, False])
+@pytest.mark.parametrize("used", [True, pytest.param(False, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("compiled", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_derivatives(derivative, used, compiled):
     """The lanes share the second tangent, as they may share the masses of a chain."""

@@ -44,11 +44,11 @@ def linked_trees(joint: str, parent: str, real: str) -> svkc.Chain:
 LINKS = pytest.mark.parametrize(
     ("joint", "parent", "real"),
     [
+        ("weld", "b5", "last"),
+        ("hinge", "last", "b4"),
+        ("universal", "b5", "last"),
         ("ball", "world", "b5"),
-        pytest.param("weld", "b5", "last", marks=pytest.mark.slow),
-        pytest.param("hinge", "last", "b4", marks=pytest.mark.slow),
-        pytest.param("universal", "b5", "last", marks=pytest.mark.slow),
-        pytest.param("slide", "b3", "last", marks=pytest.mark.slow),
+        ("slide", "b3", "last"),
     ],
 )
 
@@ -79,6 +79,7 @@ def close(x, y, scale=None):
     np.testing.assert_allclose(x, y, rtol=0, atol=ROUND_OFF * scale)
 
 
+@pytest.mark.slow
 @LINKS
 def test_derivatives_of_a_stage(joint, parent, real):
     """First derivatives and those of a sum of all rows, in every variable of the stage."""

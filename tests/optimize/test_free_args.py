@@ -48,10 +48,8 @@ def solved():
     return problem, guess, problem.solve(guess)
 
 
-@pytest.mark.parametrize(
-    "solver",
-    [pytest.param(optimize.Ipopt(), marks=pytest.mark.slow), optimize.InteriorPoint()],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", [optimize.Ipopt(), optimize.InteriorPoint()])
 def test_a_mass_with_a_known_optimum(solved, solver):
     problem, guess, _ = solved
     solution = problem.solve(guess, solver=solver)

@@ -99,6 +99,7 @@ def check(name, count):
     assert results > len(mechanisms.seeds(count)) / 3
 
 
+@pytest.mark.slow
 def test_states_of_a_planar_loop():
     check("four-bar", 40)
 

@@ -362,7 +362,7 @@ def test_step_equals_a_step_of_simulate():
     ("dtype", "rtol", "atol"),
     [
         ("float64", 1e-11, 1e-13),
-        ("float64", 1e-4, 1e-6),
+        pytest.param("float64", 1e-4, 1e-6, marks=pytest.mark.slow),
         pytest.param("float32", 1e-5, 8 * 2.0**-23, marks=pytest.mark.slow),
     ],
 )

@@ -13,6 +13,7 @@ from tolerances import ROUND_OFF
 import svkc
 
 
+@pytest.mark.slow
 def test_impact_equals_impulse_equation_for_figure():
     chain, state = cases.flight()
     for name in ("left_hand_grip", "right_hand_grip"):

@@ -62,6 +62,7 @@ LEG = """<body name="leg{0}" pos="{1} {2} 0"><joint name="foot{0}" type="ball"/>
  <geom size="0.02" contype="0"/></body></body>"""
 
 
+@pytest.mark.slow
 def test_a_plate_on_legs_keeps_its_pose():
     """All six coordinates of a free joint, which the legs allow."""
     places = ((0.3, 0), (-0.2, 0.3), (-0.2, -0.3))

@@ -80,12 +80,14 @@ def test_a_guard_at_zero_at_the_start_fires_when_it_crosses_zero_later(events_of
         np.testing.assert_allclose(time, [0.5, 0.5, 1, 1], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_guard_that_an_event_puts_at_zero_has_not_crossed(events_of):
     """The event at 0.3 moves the guard from 5 to zero, from where it rises or falls."""
     for index in (MOVED_UP, MOVED_DOWN):
         assert events_of(index, hold=0.3)[0] == [HOLD]
 
 
+@pytest.mark.slow
 def test_a_guard_that_has_just_fired_does_not_fire_at_once(events_of):
     """The weld holds the box when the guard falls to zero, and the guard turns around. The guard
     that cuts the weld when it rises fires at the next rise through zero."""
@@ -94,6 +96,7 @@ def test_a_guard_that_has_just_fired_does_not_fire_at_once(events_of):
     np.testing.assert_allclose(time, [0.3] * 3 + [0.5] * 2 + [0.7] * 3, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_crossing_at_the_time_of_another_event_is_not_lost(events_of):
     """The guard is within round-off of zero at the timed event, on its way through zero.
 
