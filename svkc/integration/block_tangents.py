@@ -59,7 +59,8 @@ def with_rows_at(q, field_args: FieldArgs, near: Any = None) -> FieldArgs:
 class _PhaseData(eqx.Module):
     """Data that all steps of a phase share.
 
-    start, start_time: of the phase.
+    start_time: of the phase.
+    idle_start: state at which unused steps are evaluated.
     save_index: index of the step that ends at each save time.
     accepted: number of steps.
     records: of the first steps. None: there are none.
@@ -67,8 +68,8 @@ class _PhaseData(eqx.Module):
 
     problem: PhaseProblem
     solver: diffrax.AbstractSolver[Any]
-    start: ODEState
     start_time: Float[Array, ""]
+    idle_start: ODEState
     save_index: Int[Array, " times"]
     accepted: Int[Array, ""]
     records: StepRecord | None
@@ -78,7 +79,7 @@ class _Blocks(eqx.Module):
     """Blocks of consecutive steps.
 
     first: index of the first one.
-    y: the state at its start.
+    y: the state at its start; arbitrary but finite for an unused block.
     starts, ends: times of the steps. In unused rows both are the end of the phase.
     near: which steps were taken with reduced rows of the loops. None: see `StepperState.near`.
     """
@@ -100,12 +101,9 @@ def _blocks(start: ODEState, step_grid, solution: PhaseSolution, interval: int) 
     groups = -(-needed // size)
     count = groups * size
     first = interval * jnp.arange(count, dtype=jnp.int32)
-    used = first < solution.accepted
     repeat = lambda x, n: jnp.broadcast_to(x[None], (n, *x.shape))
     rows = lambda s, c: jnp.concatenate([s[None], c, repeat(s, count - needed)])
     states = jax.tree.map(rows, start, solution.checkpoints)
-    # Unused blocks start from the start of the phase, as their checkpoints are not written.
-    states = jax.tree.map(lambda s, y: where(_broadcast_mask(used, y), y, s[None]), start, states)
     rest = count * interval + 1 - step_grid.shape[0]
     times = jnp.concatenate([step_grid, repeat(step_grid[-1], rest)])
     near = solution.step_near
@@ -133,15 +131,10 @@ def replay_tangents(
     with_increments: whether the tangents of the recorded increments are returned; if not, None.
     """
     (start, d_start), (problem, d_problem), interval = start, problem, options.checkpoint_interval
-    # In a batch, a phase after the end of one run is computed beside those of other runs. Its
-    # cotangents may be NaN: they are not passed on.
-    has_steps, d_before = solution.accepted > 0, d_start
-    zeros = jax.tree.map(jnp.zeros_like, (d_start, d_problem))
-    d_start, d_problem = tree_where(has_steps, (d_start, d_problem), zeros)
     phase = _PhaseData(
         problem=problem,
         solver=options.solver,
-        start=start,
+        idle_start=_start_of_unused_steps(start, solution),
         start_time=step_grid[0],
         save_index=save_index,
         accepted=solution.accepted,
@@ -159,15 +152,26 @@ def replay_tangents(
 
     (d_end, d_ys, d_recorded), d_after = jax.lax.scan(
         group,
-        (d_start, jax.tree.map(at_start, d_before), d_recorded),
+        (d_start, jax.tree.map(at_start, d_start), d_recorded),
         _blocks(start, step_grid, solution, interval),
     )
     count = solution.checkpoints.q.shape[0]
     written = jnp.arange(1, count + 1, dtype=jnp.int32) * interval <= solution.accepted
     d_checkpoints = jax.tree.map(lambda d: d.reshape(-1, *d.shape[2:])[:count], d_after)
     mask = lambda d: where(_broadcast_mask(written, d), d, 0)
-    d_end = tree_where(has_steps, d_end, d_before)
     return d_end, d_ys, jax.tree.map(mask, d_checkpoints), d_recorded
+
+
+def _start_of_unused_steps(start: ODEState, solution: PhaseSolution) -> ODEState:
+    """Return the state at which unused steps of a phase are evaluated.
+
+    In a batch, unused steps are computed beside used ones. Their cotangents are zero, but zero
+    times an infinite derivative is NaN, and the vector field may have no finite derivative at the
+    end of a phase. So unused steps are evaluated at the start of the phase, as is the first step. A
+    phase without steps starts at the end of the run: its steps are evaluated close to it.
+    """
+    close = lambda y: y + jnp.finfo(y.dtype).eps ** 0.5
+    return tree_where(solution.accepted > 0, start, jax.tree.map(close, start))
 
 
 def _tangents_of_group(tangents, blocks: _Blocks, phase: _PhaseData):
@@ -207,12 +211,15 @@ def _tangents_of_block(tangents, block: _Blocks, phase: _PhaseData):
     def step(carry, x):
         (y, d_y), (start, end, near, record) = carry, x
         used = end > start
-        record = _record_of_step(y, (start, end, near), record, is_stored, phase)
-        # In a batch, unused steps are computed beside used ones. Their derivatives are multiplied
-        # by zero, but need not be finite at the end of a phase: they are those at its start.
-        at = tree_where(used, (y, start, end), (phase.start, phase.start_time, phase.start_time))
-        d_y, d_increments = _step_if_used((d_y, d_problem), used, at[1:], at[0], record, phase)
-        move = lambda: end_of_step(phase.solver, (start, end, record), phase.problem, y)
+        at, times = tree_where(
+            used, (y, (start, end)), (phase.idle_start, (phase.start_time, phase.start_time))
+        )
+        choice = phase.problem.field_args.row_choice
+        if choice is not None:
+            near = where(used, near, choice.near)
+        record = _record_of_step(at, (*times, near), record, is_stored, phase)
+        d_y, d_increments = _step_if_used((d_y, d_problem), used, times, at, record, phase)
+        move = lambda: end_of_step(phase.solver, (*times, record), phase.problem, at)
         after = jax.lax.cond(unvmap_any(used), move, lambda: y)
         return (tree_where(used, after, y), d_y), (d_y, d_increments)
 

@@ -96,7 +96,7 @@ def test_accelerations_of_a_massless_slider(slider_crank):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("body", ["slider", pytest.param("hub", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("body", ["slider", "hub"])
 def test_accelerations_by_bodies_are_those_by_pivots(body, slider_crank):
     """Also with loops open, in a batch, and with a locked joint of the massless body."""
     chain, state = slider_crank

@@ -28,7 +28,7 @@ ELSEWHERE = {
     "module ... has no": ("project/test_public_api.py", "has no attribute"),
 }
 
-# messages whose calls compile for seconds; they are raised in the slow tier
+# The calls that raise these messages compile for seconds. They are in the slow tier.
 LONGEST = (
     "inverse_dynamics_along: at t = ... s the joints",
     "inverse_dynamics_along: at t = ... s:",
@@ -59,6 +59,7 @@ def _row(opening: str) -> str:
 
 def test_the_page_has_every_message():
     assert sorted(ROWS) == sorted(error_page.messages())
+    assert set(LONGEST) < set(wrong_calls.CASES)
     assert sorted(map(_row, [*wrong_calls.CASES, *ELSEWHERE])) == sorted(ROWS)
     for file, words in ELSEWHERE.values():
         assert words in (TESTS / file).read_text(), file

@@ -190,19 +190,20 @@ def test_objects_without_values_are_shown_by_their_structure(run, results):
     assert "ts=f64[4]" in texts[2]
 
 
-def test_lanes(batch):
-    """`traj[i]` is `tree_map`, for arrays of JAX and of numpy, over one axis of lanes or two."""
-    of_numpy = jax.tree.map(np.asarray, batch)
-    for traj in (batch, of_numpy):
-        assert bool(eqx.tree_equal(traj[3], jax.tree.map(lambda x: x[3], traj)))
-    assert float(of_numpy[-509].events.energy_lost[0]) == 100
-    failed = np.asarray(of_numpy.result == svkc.RESULTS.max_steps)
-    for some in (of_numpy[failed], of_numpy[[17, 40]], of_numpy[17:41:23]):
+@pytest.mark.parametrize("arrays", ["numpy", pytest.param("jax", marks=pytest.mark.slow)])
+def test_lanes(batch, arrays):
+    """`traj[i]` is `tree_map` over one axis of lanes or two."""
+    if arrays == "numpy":
+        batch = jax.tree.map(np.asarray, batch)
+    assert bool(eqx.tree_equal(batch[3], jax.tree.map(lambda x: x[3], batch)))
+    assert float(batch[-509].events.energy_lost[0]) == 100
+    failed = np.asarray(batch.result == svkc.RESULTS.max_steps)
+    for some in (batch[failed], batch[[17, 40]], batch[17:41:23]):
         assert str(some.result) == "max_steps: 2"
-    two_axes = jax.tree.map(lambda x: x.reshape(2, 256, *x.shape[1:]), of_numpy)
-    assert bool(eqx.tree_equal(two_axes[1, 5], of_numpy[261]))
+    two_axes = jax.tree.map(lambda x: x.reshape(2, 256, *x.shape[1:]), batch)
+    assert bool(eqx.tree_equal(two_axes[1, 5], batch[261]))
     assert two_axes[1].ts.shape == (256, 4)
-    assert len(list(of_numpy[:5])) == 5
+    assert len(list(batch[:5])) == 5
     traced = jax.jit(lambda traj, i: traj[i].events.energy_lost[0])(batch, 3)
     assert float(traced) == 100
     for index in (512, (0, 0), (slice(None), 1)):

@@ -192,14 +192,10 @@ def state_of_geometry(name):
     return state
 
 
-# planar topologies, one in space and a platform; the slow tier has all geometries of all topologies
-IN_FAST_TIER = ("five-bar",)
-
-
 @pytest.mark.parametrize(
     "name",
     [
-        n if n in IN_FAST_TIER else pytest.param(n, marks=pytest.mark.slow)
+        n if n == "five-bar" else pytest.param(n, marks=pytest.mark.slow)
         for n in linkages.TOPOLOGIES
     ],
 )
