@@ -59,8 +59,8 @@ def with_rows_at(q, field_args: FieldArgs, near: Any = None) -> FieldArgs:
 class _PhaseData(eqx.Module):
     """Data that all steps of a phase share.
 
-    start_time: of the phase.
-    idle_start: state at which unused steps are evaluated.
+    start_time: of the phase; the time at which unused steps are evaluated.
+    unused_y: the state at which they are evaluated.
     save_index: index of the step that ends at each save time.
     accepted: number of steps.
     records: of the first steps. None: there are none.
@@ -69,7 +69,7 @@ class _PhaseData(eqx.Module):
     problem: PhaseProblem
     solver: diffrax.AbstractSolver[Any]
     start_time: Float[Array, ""]
-    idle_start: ODEState
+    unused_y: ODEState
     save_index: Int[Array, " times"]
     accepted: Int[Array, ""]
     records: StepRecord | None
@@ -134,8 +134,8 @@ def replay_tangents(
     phase = _PhaseData(
         problem=problem,
         solver=options.solver,
-        idle_start=_start_of_unused_steps(start, solution),
         start_time=step_grid[0],
+        unused_y=_state_of_unused_steps(start, solution),
         save_index=save_index,
         accepted=solution.accepted,
         records=solution.records,
@@ -162,13 +162,13 @@ def replay_tangents(
     return d_end, d_ys, jax.tree.map(mask, d_checkpoints), d_recorded
 
 
-def _start_of_unused_steps(start: ODEState, solution: PhaseSolution) -> ODEState:
+def _state_of_unused_steps(start: ODEState, solution: PhaseSolution) -> ODEState:
     """Return the state at which unused steps of a phase are evaluated.
 
-    In a batch, unused steps are computed beside used ones. Their cotangents are zero, but zero
-    times an infinite derivative is NaN, and the vector field may have no finite derivative at the
-    end of a phase. So unused steps are evaluated at the start of the phase, as is the first step. A
-    phase without steps starts at the end of the run: its steps are evaluated close to it.
+    In a batch, unused steps are computed beside used ones, with cotangents of zero. Zero times an
+    infinite derivative is NaN, and the vector field may have an infinite derivative at the end of a
+    phase. So this is the state at the start of the phase, where the first step is evaluated. If the
+    phase has no steps, that may be the end of the run: then it is a state close to the start.
     """
     close = lambda y: y + jnp.finfo(y.dtype).eps ** 0.5
     return tree_where(solution.accepted > 0, start, jax.tree.map(close, start))
@@ -212,7 +212,7 @@ def _tangents_of_block(tangents, block: _Blocks, phase: _PhaseData):
         (y, d_y), (start, end, near, record) = carry, x
         used = end > start
         at, times = tree_where(
-            used, (y, (start, end)), (phase.idle_start, (phase.start_time, phase.start_time))
+            used, (y, (start, end)), (phase.unused_y, (phase.start_time, phase.start_time))
         )
         choice = phase.problem.field_args.row_choice
         if choice is not None:
