@@ -84,6 +84,28 @@ def read_number(page, name):
     return float(page.inner_text(f"#{name}").split()[0])
 
 
+# Change the width of the drawing. After the page has seen the new size, in the same frame, return
+# the number of its pixels that are not empty.
+PIXELS_AFTER_A_RESIZE = """() => new Promise(done => {
+  const view = document.querySelector("#view"), canvas = view.querySelector("canvas");
+  let calls = 0;
+  new ResizeObserver(() => {
+    if (++calls === 1) return view.style.width = "500px";  // the first call is that of observe
+    const { width, height } = canvas;
+    const context = new OffscreenCanvas(width, height).getContext("2d");
+    context.drawImage(canvas, 0, 0);
+    done(context.getImageData(0, 0, width, height).data.filter((x, i) => i % 4 === 3 && x).length);
+  }).observe(view);
+})"""
+
+
+@pytest.mark.slow
+def test_a_frame_is_drawn_when_the_size_changes(open_page, tmp_path):
+    page = open_page(svkc.render(*run_of_every_geom(), tmp_path / "run.html"))
+    screenshot(page)
+    assert page.evaluate(PIXELS_AFTER_A_RESIZE) > 1000
+
+
 @pytest.mark.slow
 def test_playing_seeking_and_keys(release, open_page, tmp_path):
     """At every time the page's numbers are the trajectory's."""

@@ -211,7 +211,7 @@ function resize() {
   camera.aspect = width / height;
   camera.updateProjectionMatrix();
   if (cameraFitted) fit();
-  draw();
+  renderer.render(scene, camera); // not in the next frame: setSize clears the canvas, and this frame would be empty
 }
 
 try {
