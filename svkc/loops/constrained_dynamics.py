@@ -97,7 +97,7 @@ class ArticulatedBodies(AbstractDynamics):
         self, chain: Chain, structure: Structure, loops: LoopKinematics, selection: Any = None
     ) -> Callable[..., Any]:
         column, active = jacobian_scales(chain)[1], active_dofs(chain, structure)
-        rows = constraint_rows(chain, structure, loops.J) if selection is None else selection
+        rows = constraint_rows(chain, structure, loops) if selection is None else selection
         J, chain_and_kin, locked = jax.lax.stop_gradient(
             (loops.J, (chain, loops.kin), structure.locked)
         )

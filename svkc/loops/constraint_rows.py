@@ -2,65 +2,24 @@
 
 Virtual joints have coordinates without inertia, along which a loop transmits no force. The rows of
 the loop Jacobian are therefore projected onto the complement of the virtual joints' motion
-subspaces. The three angular rows of a ball vanish there and are left out.
+subspaces. Of joints whose axes are known in advance the rows along these axes are left out.
 """
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from svkc._jax.control_flow import unvmap_any
 from svkc._jax.select import where
 from svkc._jax.static_gather import static_take
 from svkc.loops.constraint import LoopKinematics, jacobian_scales, loop_kinematics, loop_rates
+from svkc.loops.delassus_rows import DelassusRows, delassus_rows
 from svkc.loops.pivoting import has_redundant_rows, rank_tolerance, release_threshold
 from svkc.loops.virtual_joints import VirtualJoints, virtual_joints
 from svkc.model.chain import Chain, Structure
 from svkc.tree.spatial import matvec
-
-BALL_FREEDOMS = (True, True, True, False, False, False)
-
-
-class DelassusRows(NamedTuple):
-    """The rows of J in Delassus' matrix D: all six of `full_links`, the linear three of the others.
-
-    full_links: links with all six rows in D. The others are balls by their declaration, which
-        cannot be locked.
-    rows: index in J of each row of D.
-    position: index in D of each row of J; the size of D for rows that are not in D.
-    """
-
-    full_links: np.ndarray
-    rows: np.ndarray
-    position: np.ndarray
-
-    def expand(self, x: Float[Array, " delassus"]) -> Float[Array, " rows"]:
-        """Return x over all rows of J, zero for rows that are not in D."""
-        return static_take(x, self.position)
-
-
-def delassus_rows(chain: Chain, any_locked: bool) -> DelassusRows:
-    """Return the rows of J that are in D.
-
-    The angular rows of a declared ball are left out unless some joint may be locked. Those of a
-    spare slot are kept, as its joint is known at run time only.
-    """
-    top = chain.topology
-    is_free_ball = np.array(
-        [
-            tuple(f) == BALL_FREEDOMS and not spare and not any_locked
-            for f, spare in zip(top.link_freedoms, top.link_spare, strict=True)
-        ],
-        bool,
-    )
-    of_link = np.arange(6 * len(is_free_ball)).reshape(-1, 6)
-    rows = np.concatenate([of_link[~is_free_ball].ravel(), of_link[is_free_ball][:, 3:].ravel()])
-    position = np.full(of_link.size, len(rows))
-    position[rows] = np.arange(len(rows))
-    return DelassusRows(np.flatnonzero(~is_free_ball), rows, position)
 
 
 class RowChoice(NamedTuple):
@@ -83,19 +42,21 @@ class RowChoice(NamedTuple):
 
         near: whether the phase starts near a singular configuration.
         """
-        count = len(delassus_rows(chain, structure.locked is not None).rows)
+        count = delassus_rows(chain, structure.locked is not None).count
         return cls(near | has_redundant_rows(structure), jnp.ones(count, bool))
 
 
 class ConstraintRows(NamedTuple):
     """The loop constraints J x + bias = 0 without the rates of the virtual joints.
 
-    They are A x + T R bias = 0 over the tree's coordinates, with A = T R J_D. J_D are the rows of J
-    in D, and R rejects what the virtual joints can follow. T is the identity, or the row reduction
-    of R J_D near a singular configuration, or it selects the rows that are kept of redundant loops.
+    They are A x + T R N bias = 0 over the tree's coordinates, with A = T R N J. N selects the rows
+    of D, and R rejects what the virtual joints of coupled links can follow. T is the identity, or
+    the row reduction of R N J near a singular configuration, or it selects the rows that are kept
+    of redundant loops.
 
-    joints: the virtual joints. in_D: the rows of J in D.
-    scaled: R J_D with scaled columns. rank: the largest rank of A.
+    joints: the virtual joints. in_D: the rows of D.
+    bases: axes of the groups that N turns, as columns.
+    scaled: R N J with scaled columns. rank: the largest rank of A.
     T: None for the identity.
     pivots: one-hot rows: the pivot column of each row of A, zero where T is no row reduction. None
         if T is None.
@@ -104,6 +65,7 @@ class ConstraintRows(NamedTuple):
 
     joints: VirtualJoints
     in_D: DelassusRows
+    bases: Float[Array, "turned 3 3"]
     scaled: Float[Array, "delassus nv"]
     rank: Int[Array, ""]
     A: Float[Array, "delassus nv"]
@@ -113,11 +75,11 @@ class ConstraintRows(NamedTuple):
 
     def reject(self, x: Float[Array, "*n delassus"]) -> Float[Array, "*n delassus"]:
         """Return R x."""
-        n = 6 * len(self.in_D.full_links)
+        n = 6 * len(self.in_D.coupled)
         if not n:
-            return x  # the joint rates of free balls are in none of these rows
-        full_joints = self.joints.subset(self.in_D.full_links)
-        return jnp.concatenate([full_joints.reject(x[..., :n]), x[..., n:]], -1)
+            return x
+        of_coupled = self.joints.subset(self.in_D.coupled).reject(x[..., :n])
+        return jnp.concatenate([of_coupled, x[..., n:]], -1)
 
     def along_joints(self) -> Float[Array, "delassus delassus"]:
         """Return the projector onto known left null directions of A.
@@ -125,42 +87,42 @@ class ConstraintRows(NamedTuple):
         These are the dropped rows or, if no row is dropped, the motions of the virtual joints:
         I - R.
         """
-        eye = jnp.eye(len(self.in_D.rows), dtype=self.A.dtype)
+        eye = jnp.eye(self.in_D.count, dtype=self.A.dtype)
         projector = eye - self.reject(eye)
         if self.kept is None:
             return projector
         return where(jnp.all(self.kept), projector, where(self.kept[:, None], 0, eye))
 
     def reduce(self, bias: Float[Array, " rows"]) -> Float[Array, " delassus"]:
-        """Return T R bias."""
-        x = self.reject(static_take(bias, self.in_D.rows))
+        """Return T R N bias."""
+        x = self.reject(self.in_D.select(bias, self.bases))
         return x if self.T is None else matvec(self.T, x)
 
     def expand(self, force: Float[Array, " delassus"]) -> Float[Array, " rows"]:
         """Return the forces on all rows of J whose generalized force is A^T force."""
         x = force if self.T is None else matvec(self.T.T, force)
-        return static_take(self.reject(x), self.in_D.position)
+        return self.in_D.expand(self.reject(x), self.bases)
 
 
 def constraint_rows(
-    chain: Chain,
-    structure: Structure,
-    J: Float[Array, "rows dofs"],
-    choice: RowChoice | None = None,
+    chain: Chain, structure: Structure, loops: LoopKinematics, choice: RowChoice | None = None
 ) -> ConstraintRows:
     """Return the constraint rows of the scaled J_C, without derivatives.
 
     choice: which rows are used (None: all of them).
     """
-    J, column = jax.lax.stop_gradient((J, jacobian_scales(chain)[1]))
+    J, axes, column = jax.lax.stop_gradient((loops.J, loops.frames.axes, jacobian_scales(chain)[1]))
     in_D = delassus_rows(chain, structure.locked is not None)
     joints = virtual_joints(chain, J / column[None])
     joint_columns = jnp.sum(jnp.any(J[:, chain.nv :] != 0, 0), dtype=jnp.int32)
-    J_D = static_take(J[:, : chain.nv], in_D.rows)
+    # the axes of translation are those of the joint's frame in the parent
+    bases = jnp.swapaxes(static_take(axes[:, 3:], in_D.turned // 2), -1, -2)
+    selected_rows = in_D.select(J[:, : chain.nv], bases)
     rows = ConstraintRows(
-        joints=joints, in_D=in_D, scaled=J_D, rank=structure.rank - joint_columns, A=J_D
-    )
-    scaled, unscale = rows.reject(J_D.T).T, 1 / column[None, : chain.nv]
+        joints=joints, in_D=in_D, bases=bases, scaled=selected_rows,
+        rank=structure.rank - joint_columns, A=selected_rows,
+    )  # fmt: skip
+    scaled, unscale = rows.reject(selected_rows.T).T, 1 / column[None, : chain.nv]
     rows = rows._replace(scaled=scaled, A=scaled * unscale)
     if choice is None:
         return rows
@@ -200,8 +162,8 @@ def choose_rows(
     first = RowChoice.of_first_step(chain, structure, near)
 
     def independent() -> Bool[Array, " delassus"]:
-        J = loop_kinematics(chain, structure, q).J
-        kept = independent_rows(structure, constraint_rows(chain, structure, J))
+        loops = loop_kinematics(chain, structure, q)
+        kept = independent_rows(structure, constraint_rows(chain, structure, loops))
         return where(redundant, kept, first.kept)
 
     # under `vmap`, one lane with redundant loops makes all lanes choose rows

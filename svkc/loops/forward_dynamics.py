@@ -115,7 +115,7 @@ def _select_rows(
         assert selection is not None
         v = _projected_if_near_singular(chain, structure, selection, J, v)
     if not dynamics.uses_pivots:
-        selection = constraint_rows(chain, structure, J, choice)
+        selection = constraint_rows(chain, structure, loops, choice)
         if choice is not None:
             v = _with_consistent_velocities_if(choice.near, chain, structure, loops, v, selection)
     return selection, v

@@ -124,7 +124,7 @@ def _step_by_loop_forces(
         # under `vmap`, one open lane lets all lanes take a step on q
         on_velocity = is_last | ~unvmap_any(jnp.max(gap) > jnp.finfo(J.dtype).eps ** _ROUND_OFF)
     residual = where(on_velocity, loop_rates(chain, loops, where(active, v, 0)), loops.gap)
-    rows = constraint_rows(chain, structure, J, choice)
+    rows = constraint_rows(chain, structure, loops, choice)
     kept = rows.kept
     solve = ArticulatedBodies().prepare(chain, structure, loops, rows)
     change = solve(jnp.zeros(chain.dofs, q.dtype), residual)

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array, Float
 
+from svkc._jax.static_gather import static_take
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import checked_jit
 from svkc.tree.kinematics import kinematics, twists
@@ -51,7 +52,7 @@ def poses(chain: Chain, state: State) -> Poses:
     """
     rows = np.array(chain.topology.body_row)
     kin = kinematics(chain, state.q)
-    return Poses((kin.root_position + kin.r)[rows], kin.quat[rows])
+    return Poses(static_take(kin.root_position + kin.r, rows), static_take(kin.quat, rows))
 
 
 @checked_jit
@@ -63,4 +64,5 @@ def velocities(chain: Chain, state: State) -> Velocities:
     rows = np.array(chain.topology.body_row)
     kin = kinematics(chain, state.q)
     V = twists(chain, kin, state.v)
-    return Velocities((V[:, 3:] + cross(V[:, :3], kin.r))[rows], V[rows, :3])
+    linear = V[:, 3:] + cross(V[:, :3], kin.r)
+    return Velocities(static_take(linear, rows), static_take(V[:, :3], rows))
