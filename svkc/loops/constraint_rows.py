@@ -2,7 +2,7 @@
 
 Virtual joints have coordinates without inertia, along which a loop transmits no force. The rows of
 the loop Jacobian are therefore projected onto the complement of the virtual joints' motion
-subspaces. Of joints whose axes are known in advance the rows along these axes are left out.
+subspaces. Where a joint's axes are fixed in its parent, rows along them are left out instead.
 """
 
 from typing import NamedTuple
@@ -49,14 +49,14 @@ class RowChoice(NamedTuple):
 class ConstraintRows(NamedTuple):
     """The loop constraints J x + bias = 0 without the rates of the virtual joints.
 
-    They are A x + T R N bias = 0 over the tree's coordinates, with A = T R N J. N selects the rows
-    of D, and R rejects what the virtual joints of coupled links can follow. T is the identity, or
-    the row reduction of R N J near a singular configuration, or it selects the rows that are kept
-    of redundant loops.
+    They are A x + T R N bias = 0 over the tree's coordinates, with A = T R N J_tree. N rotates and
+    selects the rows of D (`DelassusRows.select`). R removes from the rows of links with all six
+    rows what their joints can follow. T is the identity, or the row reduction of R N J_tree near a
+    singular configuration, or it selects the rows that are kept of redundant loops.
 
-    joints: the virtual joints. in_D: the rows of D.
-    bases: axes of the groups that N turns, as columns.
-    scaled: R N J with scaled columns. rank: the largest rank of A.
+    joints: the virtual joints. in_D: which rows of J, rotated or not, are in D.
+    joint_axes: for each group that N rotates the axes of the joint's frame, as columns.
+    scaled: R N J_tree with scaled columns. rank: the largest rank of A.
     T: None for the identity.
     pivots: one-hot rows: the pivot column of each row of A, zero where T is no row reduction. None
         if T is None.
@@ -65,7 +65,7 @@ class ConstraintRows(NamedTuple):
 
     joints: VirtualJoints
     in_D: DelassusRows
-    bases: Float[Array, "turned 3 3"]
+    joint_axes: Float[Array, "rotated 3 3"]
     scaled: Float[Array, "delassus nv"]
     rank: Int[Array, ""]
     A: Float[Array, "delassus nv"]
@@ -75,17 +75,17 @@ class ConstraintRows(NamedTuple):
 
     def reject(self, x: Float[Array, "*n delassus"]) -> Float[Array, "*n delassus"]:
         """Return R x."""
-        n = 6 * len(self.in_D.coupled)
+        n = 6 * len(self.in_D.full_links)
         if not n:
             return x
-        of_coupled = self.joints.subset(self.in_D.coupled).reject(x[..., :n])
-        return jnp.concatenate([of_coupled, x[..., n:]], -1)
+        of_full_links = self.joints.subset(self.in_D.full_links).reject(x[..., :n])
+        return jnp.concatenate([of_full_links, x[..., n:]], -1)
 
     def along_joints(self) -> Float[Array, "delassus delassus"]:
         """Return the projector onto known left null directions of A.
 
-        These are the dropped rows or, if no row is dropped, the motions of the virtual joints:
-        I - R.
+        These are the dropped rows or, if no row is dropped, the motions of the joints of links with
+        all six rows: I - R.
         """
         eye = jnp.eye(self.in_D.count, dtype=self.A.dtype)
         projector = eye - self.reject(eye)
@@ -95,13 +95,13 @@ class ConstraintRows(NamedTuple):
 
     def reduce(self, bias: Float[Array, " rows"]) -> Float[Array, " delassus"]:
         """Return T R N bias."""
-        x = self.reject(self.in_D.select(bias, self.bases))
+        x = self.reject(self.in_D.select(bias, self.joint_axes))
         return x if self.T is None else matvec(self.T, x)
 
     def expand(self, force: Float[Array, " delassus"]) -> Float[Array, " rows"]:
         """Return the forces on all rows of J whose generalized force is A^T force."""
         x = force if self.T is None else matvec(self.T.T, force)
-        return self.in_D.expand(self.reject(x), self.bases)
+        return self.in_D.expand(self.reject(x), self.joint_axes)
 
 
 def constraint_rows(
@@ -115,11 +115,11 @@ def constraint_rows(
     in_D = delassus_rows(chain, structure.locked is not None)
     joints = virtual_joints(chain, J / column[None])
     joint_columns = jnp.sum(jnp.any(J[:, chain.nv :] != 0, 0), dtype=jnp.int32)
-    # the axes of translation are those of the joint's frame in the parent
-    bases = jnp.swapaxes(static_take(axes[:, 3:], in_D.turned // 2), -1, -2)
-    selected_rows = in_D.select(J[:, : chain.nv], bases)
+    # the axes of translation are those of the joint's frame; a single axis of rotation is, too
+    joint_axes = jnp.swapaxes(static_take(axes[:, 3:], in_D.rotated_groups // 2), -1, -2)
+    selected_rows = in_D.select(J[:, : chain.nv], joint_axes)
     rows = ConstraintRows(
-        joints=joints, in_D=in_D, bases=bases, scaled=selected_rows,
+        joints=joints, in_D=in_D, joint_axes=joint_axes, scaled=selected_rows,
         rank=structure.rank - joint_columns, A=selected_rows,
     )  # fmt: skip
     scaled, unscale = rows.reject(selected_rows.T).T, 1 / column[None, : chain.nv]

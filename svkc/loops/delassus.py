@@ -38,8 +38,10 @@ def _regularized_inverse(
 ) -> Callable:
     """Return x -> (D + regularization)^-1 x, regularized by a multiple of D's largest entry.
 
-    along_joints: projector onto directions in which D and x are zero. D is regular with its largest
-    entry there, whereas inverses of 3 x 3 blocks lose all digits where two pivots are tiny.
+    Redundant loops make several pivots of D tiny.
+
+    along_joints: projector onto directions in which D and x are zero. The largest entry of D is
+        added there.
     """
     largest = jnp.max(where(np.eye(D.shape[0], dtype=bool), D, 0))
     # the largest entry is zero if no loop is closed
@@ -48,7 +50,7 @@ def _regularized_inverse(
     regularized = D + regularization * jnp.eye(D.shape[0], dtype=D.dtype) + largest * along_joints
     if D.shape[0] >= LAPACK_MIN_ROWS:
         return cholesky_solver(regularized)
-    inverse = inverse_positive(regularized)
+    inverse = inverse_positive(regularized, by_adjugate=False)
     return lambda x: matvec(inverse, x)
 
 

@@ -12,85 +12,87 @@ from svkc.tree.spatial import matvec
 
 
 class DelassusRows(NamedTuple):
-    """The rows of D: those of J along which no virtual joint moves, as far as they are known.
+    """The rows of D: the rows of J, without those along which a virtual joint can move.
 
-    A link has two groups of rows in J, three angular and three linear ones. If the axes of its
-    joint span a part of a group, the group is turned into the axes of the joint's frame in the
-    parent, and its rows along the joint's axes are left out. A group that the joint spans is left
-    out, and other groups are unchanged.
+    A link has two groups of rows in J, three angular and three linear ones. If its joint moves
+    along one or two of a group's directions, the group is expressed in the joint's frame, which is
+    fixed in the parent, and the rows along the joint's axes are left out. If the joint moves along
+    all three, the group is left out; if it moves along none, the group stays as in J.
 
-    All six rows of coupled links are in D, unchanged. These are universal joints, whose axes depend
-    on their angles, joints of which a coordinate may be locked, and spare slots, whose joint is
-    known at run time only. They are also free joints, so that D has rows if a chain has loops.
+    Some links keep all six rows as in J. Their joints are universal joints, whose second axis
+    depends on the first angle, spare slots, which are known at run time only, and all joints that
+    move if coordinates may be locked. Free joints are among them, too, although they constrain
+    nothing: D would be empty for a chain with no other links.
 
-    coupled: links of the first rows of D.
-    turned: groups of the next rows: 2 i is the angular and 2 i + 1 the linear group of link i.
-    turned_rows: which rows of the turned groups are in D.
-    unchanged: index in J of the last rows of D.
+    full_links: links with all six rows, which are the first rows of D.
+    rotated_groups: groups that are expressed in a joint's frame. 2 i is the angular group of link
+        i, and 2 i + 1 is the linear one.
+    kept_of_rotated: of all rows of the rotated groups, those that are the next rows of D.
+    rows_as_in_J: rows of J that are the last rows of D.
     links: number of virtual links.
     """
 
-    coupled: np.ndarray
-    turned: np.ndarray
-    turned_rows: np.ndarray
-    unchanged: np.ndarray
+    full_links: np.ndarray
+    rotated_groups: np.ndarray
+    kept_of_rotated: np.ndarray
+    rows_as_in_J: np.ndarray
     links: int
 
     @property
     def count(self) -> int:
         """Number of rows of D."""
-        return 6 * len(self.coupled) + len(self.turned_rows) + len(self.unchanged)
+        return 6 * len(self.full_links) + len(self.kept_of_rotated) + len(self.rows_as_in_J)
 
     def select(
-        self, x: Float[Array, "rows *n"], bases: Float[Array, "turned 3 3"]
+        self, x: Float[Array, "rows *n"], joint_axes: Float[Array, "rotated 3 3"]
     ) -> Float[Array, "delassus *n"]:
-        """Return the rows of D from those of J.
+        """Return the rows of D from those of J: rotate the groups, and take the rows that are kept.
 
-        bases: for each turned group the axes of the joint's frame, as columns.
+        joint_axes: for each rotated group the axes of the joint's frame, as columns.
         """
         parts = []
-        if len(self.coupled):
-            parts.append(static_take(x, _rows_of(self.coupled, 6)))
-        if len(self.turned):
-            groups = static_take(x, _rows_of(self.turned, 3)).reshape(-1, 3, *x.shape[1:])
-            along = bases.reshape(-1, 3, 3, *(1,) * (x.ndim - 1))
-            turned = jnp.sum(along * groups[:, :, None], 1).reshape(-1, *x.shape[1:])
-            parts.append(static_take(turned, self.turned_rows))
-        if len(self.unchanged):
-            parts.append(static_take(x, self.unchanged))
+        if len(self.full_links):
+            parts.append(static_take(x, _rows_of(self.full_links, 6)))
+        if len(self.rotated_groups):
+            groups = static_take(x, _rows_of(self.rotated_groups, 3)).reshape(-1, 3, *x.shape[1:])
+            axes = joint_axes.reshape(-1, 3, 3, *(1,) * (x.ndim - 1))
+            rotated = jnp.sum(axes * groups[:, :, None], 1).reshape(-1, *x.shape[1:])
+            parts.append(static_take(rotated, self.kept_of_rotated))
+        if len(self.rows_as_in_J):
+            parts.append(static_take(x, self.rows_as_in_J))
         return jnp.concatenate(parts)
 
     def expand(
-        self, x: Float[Array, " delassus"], bases: Float[Array, "turned 3 3"]
+        self, x: Float[Array, " delassus"], joint_axes: Float[Array, "rotated 3 3"]
     ) -> Float[Array, " rows"]:
-        """Return x over all rows of J, the transpose of `select`."""
-        ends = np.cumsum([6 * len(self.coupled), len(self.turned_rows)]).tolist()
-        of_coupled, along, unchanged = jnp.split(x, ends)
-        source = _inverse(self.turned_rows, 3 * len(self.turned))
-        turned = matvec(bases, static_take(along, source).reshape(-1, 3)).ravel()
-        rows = _rows_of(self.coupled, 6), _rows_of(self.turned, 3), self.unchanged
-        position = _inverse(np.concatenate(rows), 6 * self.links)
-        return static_take(jnp.concatenate([of_coupled, turned, unchanged]), position)
+        """Return the transpose of `select` times x, over all rows of J."""
+        ends = np.cumsum([6 * len(self.full_links), len(self.kept_of_rotated)]).tolist()
+        of_full_links, of_rotated, as_in_J = jnp.split(x, ends)
+        source = _positions(self.kept_of_rotated, 3 * len(self.rotated_groups))
+        groups = matvec(joint_axes, static_take(of_rotated, source).reshape(-1, 3))
+        rows = _rows_of(self.full_links, 6), _rows_of(self.rotated_groups, 3), self.rows_as_in_J
+        source = _positions(np.concatenate(rows), 6 * self.links)
+        return static_take(jnp.concatenate([of_full_links, groups.ravel(), as_in_J]), source)
 
 
 def delassus_rows(chain: Chain, any_locked: bool) -> DelassusRows:
-    """Return the rows of J that are in D.
+    """Return which rows of J are in D.
 
-    any_locked: whether coordinates of the chain may be locked.
+    any_locked: whether the structure has a mask of locked coordinates.
     """
     top = chain.topology
     freedoms = np.array(top.link_freedoms, bool).reshape(-1, 2, 3)
     of_group = freedoms.sum(-1)
-    coupled = np.array(top.link_spare, bool) | (of_group[:, 0] == 2) | freedoms.all((1, 2))
+    is_full = np.array(top.link_spare, bool) | (of_group[:, 0] == 2) | freedoms.all((1, 2))
     if any_locked:
-        coupled = coupled | freedoms.any((1, 2))
-    partial = ~coupled[:, None] & (of_group > 0) & (of_group < 3)
-    unchanged = ~coupled[:, None] & (of_group == 0)
+        is_full = is_full | freedoms.any((1, 2))
+    is_rotated = ~is_full[:, None] & (of_group > 0) & (of_group < 3)
+    stays = ~is_full[:, None] & (of_group == 0)
     return DelassusRows(
-        coupled=np.flatnonzero(coupled),
-        turned=np.flatnonzero(partial.ravel()),
-        turned_rows=np.flatnonzero(~freedoms[partial].ravel()),
-        unchanged=_rows_of(np.flatnonzero(unchanged.ravel()), 3),
+        full_links=np.flatnonzero(is_full),
+        rotated_groups=np.flatnonzero(is_rotated.ravel()),
+        kept_of_rotated=np.flatnonzero(~freedoms[is_rotated].ravel()),
+        rows_as_in_J=_rows_of(np.flatnonzero(stays.ravel()), 3),
         links=len(freedoms),
     )
 
@@ -100,8 +102,8 @@ def _rows_of(blocks: np.ndarray, size: int) -> np.ndarray:
     return (size * blocks[:, None] + np.arange(size)).ravel()
 
 
-def _inverse(index: np.ndarray, size: int) -> np.ndarray:
-    """Return the position of 0, 1, ..., size - 1 in index; len(index) for absent ones."""
+def _positions(index: np.ndarray, size: int) -> np.ndarray:
+    """Return where each of 0, ..., size - 1 stands in index, or len(index) if it is absent."""
     position = np.full(size, len(index))
     position[index] = np.arange(len(index))
     return position

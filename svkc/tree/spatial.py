@@ -60,24 +60,27 @@ def skew(a: Float[Array, "*n 3"]) -> Float[Array, "*n 3 3"]:
     return _left_product_matrix(SKEW, a)
 
 
-def inverse_positive(D: Float[Array, "*n k k"]) -> Float[Array, "*n k k"]:
+def inverse_positive(D: Float[Array, "*n k k"], by_adjugate: bool = True) -> Float[Array, "*n k k"]:
     """Return the inverses of small symmetric positive definite matrices, without LAPACK.
 
-    Matrices of size 3 use the adjugate, larger ones block inversion by Schur complements.
+    Matrices are inverted by blocks, with Schur complements.
+
+    by_adjugate: whether blocks of size 3 are inverted by the adjugate, which is cheaper. It loses
+        all digits where two pivots of a block are tiny.
     """
     if D.shape[-1] == 1:
         return 1 / D
-    if D.shape[-1] == 3:
+    if D.shape[-1] == 3 and by_adjugate:
         a, b, c = D[..., 0, :], D[..., 1, :], D[..., 2, :]
         adjugate = cross(jnp.stack([b, c, a], -2), jnp.stack([c, a, b], -2))
         return adjugate / jnp.sum(a * adjugate[..., 0, :], -1)[..., None, None]
     matmul = lambda x, y: jnp.sum(x[..., None] * y[..., None, :, :], -2)
     n = D.shape[-1] // 2
     A, B, C = D[..., :n, :n], D[..., :n, n:], D[..., n:, n:]
-    C_inverse = inverse_positive(C)
+    C_inverse = inverse_positive(C, by_adjugate)
     BC_inverse = matmul(B, C_inverse)
     BC_inverse_T = jnp.swapaxes(BC_inverse, -1, -2)
-    upper = inverse_positive(A - matmul(BC_inverse, jnp.swapaxes(B, -1, -2)))
+    upper = inverse_positive(A - matmul(BC_inverse, jnp.swapaxes(B, -1, -2)), by_adjugate)
     right = -matmul(upper, BC_inverse)
     lower = C_inverse - matmul(BC_inverse_T, right)
     return jnp.concatenate(

@@ -71,7 +71,7 @@ def along_a_line(chain, state, v, rng):
     def both(x):
         out = velocity_and_acceleration(
             chain, state.structure, state.q + x * dq, v + x * dv, jnp.ones(4), dynamics=BODIES,
-            choice=RowChoice(jnp.asarray(True), jnp.ones(6, bool)),
+            choice=RowChoice.of_first_step(chain, state.structure, jnp.asarray(True)),
         )  # fmt: skip
         return jnp.concatenate(out) @ jnp.tile(weight, 2)
 
