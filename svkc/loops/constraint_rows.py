@@ -2,7 +2,7 @@
 
 Virtual joints have coordinates without inertia, along which a loop transmits no force. The rows of
 the loop Jacobian are therefore projected onto the complement of the virtual joints' motion
-subspaces. Where a joint's axes are fixed in its parent, rows along them are left out instead.
+subspaces. Most rows along a joint's axes are left out beforehand (`DelassusRows`).
 """
 
 from typing import NamedTuple
@@ -49,23 +49,24 @@ class RowChoice(NamedTuple):
 class ConstraintRows(NamedTuple):
     """The loop constraints J x + bias = 0 without the rates of the virtual joints.
 
-    They are A x + T R N bias = 0 over the tree's coordinates, with A = T R N J_tree. N rotates and
-    selects the rows of D (`DelassusRows.select`). R removes from the rows of links with all six
-    rows what their joints can follow. T is the identity, or the row reduction of R N J_tree near a
-    singular configuration, or it selects the rows that are kept of redundant loops.
+    They are A x + T R N bias = 0 over the tree's coordinates, with A = T R N J_tree. J_tree are the
+    columns of the tree in J, with scaled rows. N rotates and selects rows (`DelassusRows`). R
+    projects out the motions of the joints of `in_D.projected_links`. T is the identity without a
+    `RowChoice`. Near a singular configuration it is the row reduction of R N J_tree. Elsewhere it
+    sets the rows to zero that are not kept.
 
-    joints: the virtual joints. in_D: which rows of J, rotated or not, are in D.
-    joint_axes: for each group that N rotates the axes of the joint's frame, as columns.
+    joints: the virtual joints. in_D: N, without the axes of the frames.
+    frame_axes: for each group that N rotates the axes of the joint's frame, as columns.
     scaled: R N J_tree with scaled columns. rank: the largest rank of A.
-    T: None for the identity.
-    pivots: one-hot rows: the pivot column of each row of A, zero where T is no row reduction. None
-        if T is None.
+    T: None without a `RowChoice`.
+    pivots: row i is one at the pivot column of row i of A. It is zero if the row has no pivot, and
+        where T is no row reduction. None if T is None.
     kept: rows of A that are not dropped. None: all.
     """
 
     joints: VirtualJoints
     in_D: DelassusRows
-    joint_axes: Float[Array, "rotated 3 3"]
+    frame_axes: Float[Array, "rotated 3 3"]
     scaled: Float[Array, "delassus nv"]
     rank: Int[Array, ""]
     A: Float[Array, "delassus nv"]
@@ -75,17 +76,16 @@ class ConstraintRows(NamedTuple):
 
     def reject(self, x: Float[Array, "*n delassus"]) -> Float[Array, "*n delassus"]:
         """Return R x."""
-        n = 6 * len(self.in_D.full_links)
+        n = 6 * len(self.in_D.projected_links)
         if not n:
             return x
-        of_full_links = self.joints.subset(self.in_D.full_links).reject(x[..., :n])
-        return jnp.concatenate([of_full_links, x[..., n:]], -1)
+        of_projected = self.joints.subset(self.in_D.projected_links).reject(x[..., :n])
+        return jnp.concatenate([of_projected, x[..., n:]], -1)
 
-    def along_joints(self) -> Float[Array, "delassus delassus"]:
+    def null_projector(self) -> Float[Array, "delassus delassus"]:
         """Return the projector onto known left null directions of A.
 
-        These are the dropped rows or, if no row is dropped, the motions of the joints of links with
-        all six rows: I - R.
+        These are the dropped rows or, if no row is dropped, the motions that R projects out: I - R.
         """
         eye = jnp.eye(self.in_D.count, dtype=self.A.dtype)
         projector = eye - self.reject(eye)
@@ -95,13 +95,13 @@ class ConstraintRows(NamedTuple):
 
     def reduce(self, bias: Float[Array, " rows"]) -> Float[Array, " delassus"]:
         """Return T R N bias."""
-        x = self.reject(self.in_D.select(bias, self.joint_axes))
+        x = self.reject(self.in_D.select(bias, self.frame_axes))
         return x if self.T is None else matvec(self.T, x)
 
     def expand(self, force: Float[Array, " delassus"]) -> Float[Array, " rows"]:
         """Return the forces on all rows of J whose generalized force is A^T force."""
         x = force if self.T is None else matvec(self.T.T, force)
-        return self.in_D.expand(self.reject(x), self.joint_axes)
+        return self.in_D.expand(self.reject(x), self.frame_axes)
 
 
 def constraint_rows(
@@ -116,10 +116,10 @@ def constraint_rows(
     joints = virtual_joints(chain, J / column[None])
     joint_columns = jnp.sum(jnp.any(J[:, chain.nv :] != 0, 0), dtype=jnp.int32)
     # the axes of translation are those of the joint's frame; a single axis of rotation is, too
-    joint_axes = jnp.swapaxes(static_take(axes[:, 3:], in_D.rotated_groups // 2), -1, -2)
-    selected_rows = in_D.select(J[:, : chain.nv], joint_axes)
+    frame_axes = jnp.swapaxes(static_take(axes[:, 3:], in_D.rotated_groups // 2), -1, -2)
+    selected_rows = in_D.select(J[:, : chain.nv], frame_axes)
     rows = ConstraintRows(
-        joints=joints, in_D=in_D, joint_axes=joint_axes, scaled=selected_rows,
+        joints=joints, in_D=in_D, frame_axes=frame_axes, scaled=selected_rows,
         rank=structure.rank - joint_columns, A=selected_rows,
     )  # fmt: skip
     scaled, unscale = rows.reject(selected_rows.T).T, 1 / column[None, : chain.nv]

@@ -34,22 +34,21 @@ LAPACK_MIN_ROWS = 36
 
 
 def _regularized_inverse(
-    D: Float[Array, "delassus delassus"], along_joints: Float[Array, "delassus delassus"]
+    D: Float[Array, "delassus delassus"], null_projector: Float[Array, "delassus delassus"]
 ) -> Callable:
     """Return x -> (D + regularization)^-1 x, regularized by a multiple of D's largest entry.
 
-    Redundant loops make several pivots of D tiny.
-
-    along_joints: projector onto directions in which D and x are zero. The largest entry of D is
-        added there.
+    null_projector: projector onto known null directions of D, in which x is zero, too. The largest
+        entry of D is added there.
     """
     largest = jnp.max(where(np.eye(D.shape[0], dtype=bool), D, 0))
     # the largest entry is zero if no loop is closed
     largest = where(largest > 0, largest, 1)
     regularization = jnp.finfo(D.dtype).eps ** 0.625 * largest
-    regularized = D + regularization * jnp.eye(D.shape[0], dtype=D.dtype) + largest * along_joints
+    regularized = D + regularization * jnp.eye(D.shape[0], dtype=D.dtype) + largest * null_projector
     if D.shape[0] >= LAPACK_MIN_ROWS:
         return cholesky_solver(regularized)
+    # redundant loops make several pivots of D tiny, for which an adjugate loses all digits
     inverse = inverse_positive(regularized, by_adjugate=False)
     return lambda x: matvec(inverse, x)
 
@@ -110,7 +109,7 @@ def _solver_of_regular_mass_matrix(
     bodies = articulated_factors(chain, kin, free)
     passed = pass_inward(top, bodies, rows.A.T)
     D = inner_product(passed, passed)
-    solve_regularized = _regularized_inverse(D, rows.along_joints())
+    solve_regularized = _regularized_inverse(D, rows.null_projector())
 
     def solve(force, loop_bias):
         # a force on a virtual joint, which has no inertia, is transmitted by its loop

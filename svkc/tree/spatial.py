@@ -65,8 +65,8 @@ def inverse_positive(D: Float[Array, "*n k k"], by_adjugate: bool = True) -> Flo
 
     Matrices are inverted by blocks, with Schur complements.
 
-    by_adjugate: whether blocks of size 3 are inverted by the adjugate, which is cheaper. It loses
-        all digits where two pivots of a block are tiny.
+    by_adjugate: whether blocks of size 3 are inverted by the adjugate, with fewer operations. Where
+        two pivots of a block are tiny, its differences of products are round-off.
     """
     if D.shape[-1] == 1:
         return 1 / D
