@@ -65,6 +65,7 @@ def test_number_of_rows(every_joint):
     assert spare.count == 5 + 6
 
 
+@pytest.mark.slow
 def test_selected_rows_are_those_that_no_joint_can_follow(every_joint):
     """N is orthonormal, and N J is zero along joints, except those that are projected out."""
     chain, state = every_joint
@@ -87,7 +88,7 @@ def test_selected_rows_are_those_that_no_joint_can_follow(every_joint):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("locks", [False, True])
-def test_accelerations_agree_with_composite_bodies(every_joint, locks):
+def test_accelerations_are_those_of_composite_bodies(every_joint, locks):
     """Torques act on virtual joints, too. With a lock in the tree every link has six rows."""
     chain, state = every_joint
     if locks:
