@@ -53,7 +53,7 @@ class ConstraintRows(NamedTuple):
     columns of the tree in J, with scaled rows. N rotates and selects rows (`DelassusRows`). R
     projects out the motions of the joints of `in_D.projected_links`. T is the identity without a
     `RowChoice`. Near a singular configuration it is the row reduction of R N J_tree. Elsewhere it
-    sets the rows to zero that are not kept.
+    sets rows that are not kept to zero.
 
     joints: the virtual joints. in_D: N, without the axes of the frames.
     frame_axes: for each group that N rotates the axes of the joint's frame, as columns.

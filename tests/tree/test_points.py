@@ -237,3 +237,16 @@ def test_batches_and_bodies_at_rest():
     of_all = svkc.center_of_mass(chain, state)
     momentum = svkc.momentum(chain, state).linear
     np.testing.assert_allclose(of_all.mass * of_all.velocity, momentum, atol=ROUND_OFF)
+
+
+def test_derivatives_of_poses_and_velocities_hold_no_scatter():
+    """A scatter would keep an attempted step whose control differentiates poses from being one
+    kernel.
+    """
+    chain, state, _ = cases.CASES["two_hands"].random_motion()
+
+    def total(q):
+        moved = svkc.State(q, state.v, state.structure)
+        return sum(map(jnp.sum, (*svkc.poses(chain, moved), *svkc.velocities(chain, moved))))
+
+    assert "scatter" not in str(jax.make_jaxpr(jax.grad(total))(state.q))
