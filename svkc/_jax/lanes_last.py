@@ -29,12 +29,17 @@ ELEMENTWISE = set(
     " round rsqrt select_n sign sin sqrt square stop_gradient sub tan tanh xor".split()
 )
 # primitives whose parameters name axes counted from the front: lanes last changes nothing
-UNBATCHED_AXES = set(
-    "argmax argmin cumsum reduce_and reduce_or reduce_prod rev split squeeze".split()
-)
-# primitives after which a barrier keeps XLA's CPU backend from combining operations at a loss
-# (benchmarks/README.md)
-SUMS_AND_GATHERS = {"dot_general", "gather", "reduce_sum", "static_take"}
+UNBATCHED_AXES = {
+    "argmax",
+    "argmin",
+    "cumsum",
+    "reduce_and",
+    "reduce_or",
+    "reduce_prod",
+    "rev",
+    "split",
+    "squeeze",
+}
 EXTREMES = {"reduce_max": max_by_xla, "reduce_min": min_by_xla}
 CONCATENATIONS = {"concatenate", "stack"}
 # the primitives of one_kernel.py, which batches drop
@@ -228,8 +233,6 @@ def evaluate_jaxpr(closed: core.ClosedJaxpr, inputs: list, lanes: int) -> list:
                 else _apply_rule(eqn.primitive, values, params, eqn.outvars[0].aval.shape, lanes)
             )
             out = out if eqn.primitive.multiple_results else [out]
-            if batched and name in SUMS_AND_GATHERS and jax.default_backend() == "cpu":
-                out = lax.optimization_barrier(out)
             out = [Batched(x) for x in out] if batched else out
         env |= dict(zip(eqn.outvars, out, strict=True))
     return [read(v) for v in jaxpr.outvars]
