@@ -94,6 +94,7 @@ for _ in range(100):
 """
 
 
+@pytest.mark.slow
 def test_independent_calls_do_not_wait_for_each_other():
     subprocess.run([sys.executable, "-c", INDEPENDENT_CALLS], check=True, timeout=120)
 

@@ -298,6 +298,7 @@ def test_a_loop_compiles_once(arm, expected, programs):
     assert len(programs) == 5
 
 
+@pytest.mark.slow
 def test_a_global_that_changes(arm, expected, programs):
     """A changed number is another program, a changed array is not."""
     global GAIN

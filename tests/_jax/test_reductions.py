@@ -57,6 +57,7 @@ def test_lanes_last_calls_no_library():
         assert library_calls(jax.vmap(reduce_products), A, A) > 0
 
 
+@pytest.mark.slow
 def test_a_batch_of_steps_calls_no_library():
     chain, state = svkc.scenes.high_bar(ignore="limit")
     batch = jax.tree.map(lambda x: jnp.broadcast_to(x, (LANES, *x.shape)), state)

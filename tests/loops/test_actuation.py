@@ -102,6 +102,7 @@ def test_more_motors_than_freedoms(five_bar):
     assert float(jnp.abs(result.null_force).max()) > 1e-3
 
 
+@pytest.mark.slow
 def test_fewer_motors_than_freedoms(five_bar):
     """One motor for two freedoms leaves a residual and one undriven direction."""
     chain, state, vdot, _ = five_bar

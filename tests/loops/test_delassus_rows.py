@@ -55,6 +55,7 @@ def every_joint():
     return chain_of_joints(list(ROWS))
 
 
+@pytest.mark.slow
 def test_number_of_rows(every_joint):
     assert delassus_rows(every_joint[0], has_lock_mask=False).count == sum(ROWS.values())
     # if coordinates may be locked, a row along a joint's axis may become a constraint

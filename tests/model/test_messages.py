@@ -30,6 +30,11 @@ ELSEWHERE = {
 
 # The calls that raise these messages compile for seconds. They are in the slow tier.
 LONGEST = (
+    "... holds no model",
+    "simulate stopped",
+    "connect: the bodies",
+    "at the guess ... is",
+    "bind: ... is connected",
     "inverse_dynamics_along: at t = ... s the joints",
     "inverse_dynamics_along: at t = ... s:",
     "target: ... cannot",
@@ -124,6 +129,7 @@ def test_inside_compiled_programs(setting):
             call()
 
 
+@pytest.mark.slow
 def test_warnings_and_errors_of_other_libraries(setting, tmp_path):
     in_float64, again, another, deprecated, missing, unlike = error_page.OTHERS
     assert error_page.messages_of("warn", 0) == {in_float64, again, another, deprecated}

@@ -88,6 +88,7 @@ def test_free_args_in_other_processes(solved):
         assert abs(float(other.args["mass"]) - float(solution.args["mass"])) < 1e-5
 
 
+@pytest.mark.slow
 def test_saved_solutions_have_their_args(solved, tmp_path):
     problem, _, solution = solved
     solution.save(tmp_path / "move.npz")

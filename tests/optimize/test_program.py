@@ -63,6 +63,7 @@ def test_derivatives_are_those_of_differences(problem, seed):
     check_derivatives(*problem, seed)
 
 
+@pytest.mark.slow
 def test_derivatives_of_functions_that_are_constant_at_most_points():
     """Penalties and constraints that begin far from the guess are in the sparsity patterns."""
     over = lambda x, limit: jnp.maximum(x - limit, 0) ** 2

@@ -140,6 +140,7 @@ def caught(pendulum):
     )
 
 
+@pytest.mark.slow
 def test_simultaneous_guards_make_one_change(caught):
     """Guards that cross at one instant fire together, in one change of structure."""
     traj = caught

@@ -29,6 +29,7 @@ def test_impact_equals_impulse_equation_for_figure():
         state = after
 
 
+@pytest.mark.slow
 def test_order_of_connections_does_not_matter():
     """Inelastic impacts are projections, so their order does not matter."""
     chain, state = cases.flight()

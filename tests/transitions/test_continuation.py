@@ -113,6 +113,7 @@ def test_a_state_to_start_from(four_bar):
     np.testing.assert_allclose(near.q, four_bar.state({"crank": 7.1}).q, atol=ROUND_OFF)
 
 
+@pytest.mark.slow
 def test_lanes_that_fail_are_nan_alone(four_bar):
     q = jax.jit(jax.vmap(lambda x: four_bar.state({"rocker": x}, throw=False).q))(
         jnp.array([0.1, 3.0, -0.1])

@@ -15,6 +15,8 @@ from svkc.transitions.newton_state import RANK_SEARCH, Schedule
 # angles of two bars of length 1, whose end is sqrt(2) away, and of the pin (rad)
 TRIANGLE = (-jnp.pi / 4, jnp.pi / 2, 0.0)
 
+PRECISIONS = pytest.mark.parametrize("x64", [True, pytest.param(False, marks=pytest.mark.slow)])
+
 
 def two_bars(a: float, b: float, reach: float) -> tuple[svkc.Chain, svkc.State]:
     """Return two hinged bars of lengths a and b along x, whose end can be pinned to the ground at
@@ -37,7 +39,7 @@ def search(chain: svkc.Chain, state: svkc.State, q):
     return solve_structure(chain, structure, q, v, Schedule(RANK_SEARCH))
 
 
-@pytest.mark.parametrize("x64", [True, False])
+@PRECISIONS
 @pytest.mark.parametrize(
     ("a", "b"),
     [
@@ -54,7 +56,7 @@ def test_stretched_bars_have_the_rank_of_their_only_closed_configuration(a, b, x
     assert int(end.rank) == 2
 
 
-@pytest.mark.parametrize("x64", [True, False])
+@PRECISIONS
 def test_the_search_ends_where_the_probe_is_closed(x64):
     """A triangle of two bars and the ground: the loop of the probe is closed to round-off."""
     with jax.enable_x64(x64):
@@ -65,7 +67,7 @@ def test_the_search_ends_where_the_probe_is_closed(x64):
     assert float(end.margin) > 0.1
 
 
-@pytest.mark.parametrize("x64", [True, False])
+@PRECISIONS
 def test_the_search_of_a_lane_does_not_depend_on_other_lanes(x64):
     """Lanes whose probe is closed do not move while another lane iterates."""
     with jax.enable_x64(x64):
