@@ -9,7 +9,10 @@ import pytest
 from tolerances import ROUND_OFF
 
 import svkc
-from svkc._jax import lanes_last as rules
+from svkc._jax import lanes_last_rules
+from svkc._jax.lanes_last import TILE, with_lanes_last
+from svkc.loops.constraint_rows import RowChoice
+from svkc.loops.loop_force_projection import project_by_loop_forces
 
 KEY = jax.random.key(3)
 
@@ -62,11 +65,11 @@ def example(x, y, which):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [1, 5, rules.TILE, rules.TILE + 3])
+@pytest.mark.parametrize("count", [1, 5, TILE, TILE + 3])
 def test_every_rule(count):
     x, y = jax.random.normal(KEY, (2, count, 3, 3))
     which = jnp.arange(count) % 3
-    one = rules.with_lanes_last(example)
+    one = with_lanes_last(example)
     for axes in ((0, 0, 0), (0, None, None), (None, 0, 0), (0, 0, None)):
         args = [
             value if axis == 0 else value[0]
@@ -84,7 +87,7 @@ def test_every_rule(count):
 def test_zero_lanes_and_integers():
     """Integer sums and products keep their dtype; a batch of zero lanes gives empty arrays."""
     counted = lambda x: (jnp.sum(x, dtype=jnp.int32), x @ x, jnp.stack([x, x]))
-    one = rules.with_lanes_last(counted)
+    one = with_lanes_last(counted)
     for count in (0, 4):
         x = jnp.ones((count, 11), jnp.int32)
         for expected, got in zip(jax.vmap(counted)(x), jax.vmap(one)(x), strict=True):
@@ -92,21 +95,42 @@ def test_zero_lanes_and_integers():
             assert got.dtype == expected.dtype
 
 
-def test_every_primitive_of_a_step_has_a_rule(monkeypatch):
-    """Every primitive of `svkc.step` has a rule, so that none goes through `jax.vmap`."""
-    by_vmap = []
-    apply_vmap = rules._apply_vmap
+@pytest.fixture
+def by_vmap(monkeypatch):
+    """Return a list of the primitives without a rule, which go through `jax.vmap`."""
+    names = []
+    apply_vmap = lanes_last_rules._apply_vmap
     monkeypatch.setattr(
-        rules,
+        lanes_last_rules,
         "_apply_vmap",
-        lambda primitive, *rest: (by_vmap.append(primitive.name), apply_vmap(primitive, *rest))[1],
+        lambda primitive, *rest: (names.append(primitive.name), apply_vmap(primitive, *rest))[1],
     )
+    return names
+
+
+def test_every_primitive_of_a_step_has_a_rule(by_vmap):
     for chain in (models.four_bar(), svkc.load(models.random_tree(8, 1))):
         states = jax.tree.map(lambda x: jnp.stack([x, x]), chain.state())
-        jax.eval_shape(
-            jax.vmap(lambda s, chain=chain: svkc.step(chain, s, jnp.zeros(chain.nv), 1e-3)), states
-        )
+        step = lambda s, chain=chain: svkc.step(chain, s, jnp.zeros(chain.nv), 1e-3)
+        jax.jit(jax.vmap(step)).lower(states)
     assert not by_vmap
+
+
+def test_lanes_share_the_iterations_of_a_projection(by_vmap):
+    """All primitives have a rule, and the margin remains in a conditional, as lanes take the step
+    of the velocity together."""
+    chain = models.four_bar()
+    states = jax.tree.map(lambda x: jnp.stack([x, x]), chain.state())
+
+    def project(s):
+        choice = RowChoice.of_first_step(chain, s.structure, jnp.zeros((), bool))
+        return project_by_loop_forces(
+            chain, s.structure, s.q, s.v, choice, iterations=2, differentiated=False
+        )
+
+    program = jax.jit(jax.vmap(project)).lower(states).as_text()
+    assert not by_vmap
+    assert "stablehlo.case" in program
 
 
 @pytest.mark.slow

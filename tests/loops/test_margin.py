@@ -18,8 +18,8 @@ def test_margin_against_lapack(rows, rank, dofs):
     R = np.abs(np.diag(scipy.linalg.qr(J, pivoting=True, mode="r")[0]))
     margin = R[rank - 1] / R[0]
     by_qr = pivot_ratio(pivoted_qr(jnp.asarray(J), jnp.asarray(rank)))
-    by_squares = margin_of_rows(jnp.asarray(J), jnp.asarray(rank), None)
-    np.testing.assert_allclose([by_qr, by_squares], margin, rtol=ROUND_OFF)
+    by_columns = margin_of_rows(jnp.asarray(J), jnp.asarray(rank), None)
+    np.testing.assert_allclose([by_qr, by_columns], margin, rtol=ROUND_OFF)
 
 
 def test_independent_columns_are_pivots_last():
@@ -28,9 +28,9 @@ def test_independent_columns_are_pivots_last():
     J, rank = jnp.asarray(rng.normal(size=(6, 10))), jnp.asarray(6)
     independent = jnp.arange(10) < 3
     by_qr = pivot_ratio(pivoted_qr(J, rank, independent))
-    by_squares = margin_of_rows(J, rank, independent)
-    np.testing.assert_allclose(by_squares, by_qr, rtol=ROUND_OFF)
-    assert abs(float(by_squares) - float(margin_of_rows(J, rank, None))) > 1e-3
+    by_columns = margin_of_rows(J, rank, independent)
+    np.testing.assert_allclose(by_columns, by_qr, rtol=ROUND_OFF)
+    assert abs(float(by_columns) - float(margin_of_rows(J, rank, None))) > 1e-3
 
 
 def test_margin_without_loops():
