@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from svkc._jax.chunked_sum import sum_in_chunks
 from svkc._jax.control_flow import unvmap_any
 from svkc._jax.lanes_last import with_lanes_last
 from svkc._jax.one_kernel import one_kernel
@@ -177,9 +178,9 @@ def margin_of_rows(
         pivot = jnp.arange(dofs) == jnp.argmax(
             weighted >= (1 - rank_tolerance(J.dtype)) * jnp.max(weighted)
         )
-        column = jnp.sum(where(pivot, A, 0), 1)
+        column = sum_in_chunks(where(pivot, A, 0), (1,))
         squared = jnp.sum(column * column)
-        products = jnp.sum(column[:, None] * A, 0)
+        products = sum_in_chunks(column[:, None] * A, (0,))
         quotients = where(pivot, 0, products / where(squared > 0, squared, 1))
         A = where(pivot, 0, A - column[:, None] * quotients[None])
         norms = where(pivot, 0, norms - products * quotients)
