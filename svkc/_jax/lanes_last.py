@@ -49,10 +49,12 @@ def _cond(inputs: list, lanes: int, *, branches, **_) -> list:
     return lax.switch(inputs[0], [functools.partial(outputs, c) for c in branches], inputs[1:])
 
 
-def _scan(
-    inputs: list, lanes: int, *, jaxpr, num_consts, num_carry, length, reverse, unroll, **_
-) -> list:
+def _scan(inputs: list, lanes: int, *, jaxpr, length, reverse, unroll, **params) -> list:
     """Evaluate a `scan` with lanes last in its body; dependent outputs are `Batched`."""
+    if "ft_in" in params:  # since jax 0.12
+        num_consts, num_carry, _ = map(len, params["ft_in"].unpack())
+    else:
+        num_consts, num_carry = params["num_consts"], params["num_carry"]
     consts, xs = inputs[:num_consts], inputs[num_consts + num_carry :]
     carry = [
         v if isinstance(v, Batched) else jnp.asarray(v, aval.dtype)
