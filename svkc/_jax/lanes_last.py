@@ -50,7 +50,7 @@ def _cond(inputs: list, lanes: int, *, branches, **_) -> list:
 
 
 def _scan(inputs: list, lanes: int, *, jaxpr, length, reverse, unroll, **params) -> list:
-    """Evaluate a `scan` with lanes last in its body; dependent outputs are `Batched`."""
+    """Evaluate a `scan` with lanes last in its body; outputs that depend on lanes are `Batched`."""
     if "ft_in" in params:  # since jax 0.12
         num_consts, num_carry, _ = map(len, params["ft_in"].unpack())
     else:
@@ -60,19 +60,19 @@ def _scan(inputs: list, lanes: int, *, jaxpr, length, reverse, unroll, **params)
         v if isinstance(v, Batched) else jnp.asarray(v, aval.dtype)
         for v, aval in zip(inputs, jaxpr.in_avals, strict=True)
     ][num_consts : num_consts + num_carry]
-    like = lambda values, others: [
+    batched_as = lambda values, others: [
         Batched(broadcast_to_lanes(v, lanes)) if isinstance(other, Batched) else v
         for v, other in zip(values, others, strict=True)
     ]
 
     def body(carry, xs):
         outputs = evaluate_jaxpr(jaxpr, [*consts, *carry, *xs], lanes)
-        return like(outputs[:num_carry], carry), outputs[num_carry:]
+        return batched_as(outputs[:num_carry], carry), outputs[num_carry:]
 
-    first = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), xs)
+    x_shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), xs)
     while True:
         # a carry has lanes if the body makes it depend on a value with lanes
-        before, carry = carry, like(carry, jax.eval_shape(body, carry, first)[0])
+        before, carry = carry, batched_as(carry, jax.eval_shape(body, carry, x_shapes)[0])
         if jax.tree.structure(before) == jax.tree.structure(carry):
             break
     carry, ys = lax.scan(body, carry, xs, length, reverse=reverse, unroll=unroll)
@@ -98,7 +98,8 @@ def evaluate_jaxpr(closed: core.ClosedJaxpr, inputs: list, lanes: int) -> list:
         elif name == "batch_together":
             out = values
         elif name == "unvmap_any" and batched:
-            out = [jnp.any(values[0].x)]
+            # a `vmap` around this one reduces over its lanes, too
+            out = [eqn.primitive.bind(values[0].x)]
         else:
             out = (
                 eqn.primitive.bind(*values, **params)

@@ -78,7 +78,7 @@ def _project_until_closed(
         q = integrate(chain, q, where(on_velocity, 0, step.change))
         v = where(on_velocity, v + step.change, v)
         info = ProjectionInfo(gap=step.gap, margin=step.margin, kept=step.kept)
-        # one i for all lanes of a `vmap`, so that the margin stays in its conditional
+        # all lanes of a `vmap` share i, so that the margin is computed in the last step alone
         return where(unvmap_any(~on_velocity), i, iterations) + 1, (q, v, info)
 
     return jax.lax.while_loop(cond_fun, body_fun, (jnp.zeros((), jnp.int32), start))[1]
@@ -159,9 +159,7 @@ def margin_of_rows(
 ) -> Float[Array, ""]:
     """Return `pivot_ratio` of `pivoted_qr`, by modified Gram-Schmidt with column pivoting.
 
-    Norms of columns are updated, not computed again. They choose the pivots only: |R_kk| is the
-    norm of the pivot column itself. An iteration has fewer operations than one of the QR, as it
-    computes no Q.
+    An iteration has fewer operations than one of the QR, as it computes no Q.
 
     rank, independent: as in `pivoted_qr`.
     """
@@ -172,9 +170,9 @@ def margin_of_rows(
     J = jax.lax.stop_gradient(J)
 
     def step(k, carry):
-        # A: columns less their components along the pivot columns before
-        A, norms, least, largest = carry
-        weighted = norms * weight
+        # A: columns minus their projections onto earlier pivot columns
+        A, least, largest = carry
+        weighted = sum_in_chunks(A * A, (0,)) * weight
         pivot = jnp.arange(dofs) == jnp.argmax(
             weighted >= (1 - rank_tolerance(J.dtype)) * jnp.max(weighted)
         )
@@ -183,11 +181,10 @@ def margin_of_rows(
         products = sum_in_chunks(column[:, None] * A, (0,))
         quotients = where(pivot, 0, products / where(squared > 0, squared, 1))
         A = where(pivot, 0, A - column[:, None] * quotients[None])
-        norms = where(pivot, 0, norms - products * quotients)
         least = where(k < rank, jnp.minimum(least, squared), least)
-        return A, norms, least, jnp.maximum(largest, squared)
+        return A, least, jnp.maximum(largest, squared)
 
-    start = J, jnp.sum(J * J, 0), jnp.asarray(jnp.inf, J.dtype), jnp.zeros((), J.dtype)
-    _, _, least, largest = jax.lax.fori_loop(0, min(J.shape), step, start)
+    start = J, jnp.asarray(jnp.inf, J.dtype), jnp.zeros((), J.dtype)
+    _, least, largest = jax.lax.fori_loop(0, min(J.shape), step, start)
     ratio = jnp.sqrt(jnp.maximum(least, 0) / where(largest > 0, largest, 1))
     return where(rank > 0, ratio, 1)

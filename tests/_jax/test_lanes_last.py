@@ -116,9 +116,9 @@ def test_every_primitive_of_a_step_has_a_rule(by_vmap):
     assert not by_vmap
 
 
-def test_lanes_share_the_iterations_of_a_projection(by_vmap):
-    """All primitives have a rule, and the margin remains in a conditional, as lanes take the step
-    of the velocity together."""
+def test_every_primitive_of_a_projection_has_a_rule(by_vmap):
+    """A conditional whose predicate differs by lane has none: lanes share the number of iterations,
+    and the margin of the rank is computed in the last one alone."""
     chain = models.four_bar()
     states = jax.tree.map(lambda x: jnp.stack([x, x]), chain.state())
 
@@ -128,9 +128,8 @@ def test_lanes_share_the_iterations_of_a_projection(by_vmap):
             chain, s.structure, s.q, s.v, choice, iterations=2, differentiated=False
         )
 
-    program = jax.jit(jax.vmap(project)).lower(states).as_text()
+    jax.jit(jax.vmap(project)).lower(states)
     assert not by_vmap
-    assert "stablehlo.case" in program
 
 
 @pytest.mark.slow

@@ -33,6 +33,21 @@ def test_independent_columns_are_pivots_last():
     assert abs(float(by_columns) - float(margin_of_rows(J, rank, None))) > 1e-3
 
 
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_independent_columns_complete_the_rank(dtype):
+    """Where the other columns have a lower rank, columns that shall be independent are pivots, and
+    not the round-off that the others leave."""
+    rng = np.random.default_rng(2)
+    independent, eps = jnp.arange(10) < 3, np.finfo(dtype).eps
+    for _ in range(20):
+        others = rng.normal(size=(6, 4)) @ rng.normal(size=(4, 7))
+        J = np.concatenate([rng.normal(size=(6, 3)), others], 1).astype(dtype)
+        margin = float(margin_of_rows(jnp.asarray(J), jnp.asarray(6), independent))
+        expected = float(pivot_ratio(pivoted_qr(jnp.asarray(J), jnp.asarray(6), independent)))
+        assert expected > 1e3 * eps
+        np.testing.assert_allclose(margin, expected, rtol=1e4 * eps)
+
+
 def test_margin_without_loops():
     """Without rows of loops the margin is one."""
     zero = jnp.zeros((6, 4))
