@@ -51,7 +51,7 @@ def _cond(inputs: list, lanes: int, *, branches, **_) -> list:
 
 def _scan(inputs: list, lanes: int, *, jaxpr, length, reverse, unroll, **params) -> list:
     """Evaluate a `scan` with lanes last in its body; outputs that depend on lanes are `Batched`."""
-    if "ft_in" in params:  # since jax 0.12
+    if "ft_in" in params:  # since jax 0.11
         num_consts, num_carry, _ = map(len, params["ft_in"].unpack())
     else:
         num_consts, num_carry = params["num_consts"], params["num_carry"]
