@@ -113,6 +113,8 @@ def test_other_errors_are_raised():
 
 
 def test_options_are_passed_at_the_outermost_jit_only():
+    # the first eager call of a process drops the options that jaxlib does not know
+    eager.eager_jit(lambda x: x)(jnp.asarray(3.0))
     jit_options = []
 
     def jit(function, **options):
@@ -123,9 +125,7 @@ def test_options_are_passed_at_the_outermost_jit_only():
     assert float(jax.jit(double)(3.0)) == float(jax.jit(lambda: double(3.0))()) == 6
     assert jit_options == [{}]
     assert float(double(3.0)) == 6
-    # the first eager call of a process tries again without the options that jaxlib does not know
-    assert all("compiler_options" in options for options in jit_options[1:])
-    assert jit_options[-1] == {"compiler_options": eager._FAST_COMPILE_OPTIONS}
+    assert jit_options[1:] == [{"compiler_options": eager._FAST_COMPILE_OPTIONS}]
 
 
 @pytest.mark.slow

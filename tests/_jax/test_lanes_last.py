@@ -117,8 +117,8 @@ def test_every_primitive_of_a_step_has_a_rule(by_vmap):
 
 
 def test_every_primitive_of_a_projection_has_a_rule(by_vmap):
-    """A conditional whose predicate differs by lane has none: lanes share the number of iterations,
-    and the margin of the rank is computed in the last one alone."""
+    """Conditionals have a rule only if lanes share the predicate. So lanes share the number of
+    iterations, and the margin of the rank is computed in the last iteration only."""
     chain = models.four_bar()
     states = jax.tree.map(lambda x: jnp.stack([x, x]), chain.state())
 
