@@ -17,9 +17,11 @@ from jax.extend import core
 from svkc._jax.lanes_last_rules import Batched, apply_rule, broadcast_to_lanes
 from svkc._jax.primitive import custom_primitive
 
-# lanes evaluated together on a CPU: intermediate values of 32 lanes stay in the processor's cache
-# (benchmarks/README.md)
-TILE = 32
+# Bytes of one number in all lanes that are evaluated together on a CPU: 32 lanes in float64, 64 in
+# float32. Their intermediate values stay in the processor's cache (benchmarks/README.md).
+TILE_BYTES = 256
+# a tile that is not the only one has a multiple of so many lanes, for SIMD instructions
+SIMD_LANES = 8
 # primitives that call a jaxpr -> name of the parameter that holds the jaxpr
 CALL_JAXPR_PARAMETERS = {
     "closed_call": "call_jaxpr",
@@ -112,8 +114,26 @@ def evaluate_jaxpr(closed: core.ClosedJaxpr, inputs: list, lanes: int) -> list:
     return [read(v) for v in jaxpr.outvars]
 
 
+def tile_size(lanes: int, leaves: list) -> int:
+    """Return how many lanes are evaluated together: at most `TILE_BYTES` on a CPU.
+
+    Tiles of a batch are equal, so that few lanes are padding.
+
+    leaves: the arguments, whose widest floating-point type counts.
+    """
+    if jax.default_backend() != "cpu":
+        return max(1, lanes)
+    dtypes = [jnp.result_type(x) for x in leaves]
+    widths = [dtype.itemsize for dtype in dtypes if jnp.issubdtype(dtype, jnp.floating)]
+    most = TILE_BYTES // max(widths, default=8)
+    if lanes <= most:
+        return max(1, lanes)
+    equal = -(-lanes // -(-lanes // most))
+    return -(-equal // SIMD_LANES) * SIMD_LANES
+
+
 def _evaluate_batch(function: Callable, lanes: int, flags: list[bool], args):
-    """Evaluate a function for a batch, in tiles of `TILE` lanes on a CPU.
+    """Evaluate a function for a batch, in tiles of `tile_size` lanes.
 
     flags: for each leaf of `args`, whether its first axis is the batch.
     Inputs and outputs have the lanes first, as `custom_vmap` requires.
@@ -125,7 +145,7 @@ def _evaluate_batch(function: Callable, lanes: int, flags: list[bool], args):
     ]
     closed, out_shape = jax.make_jaxpr(function, return_shape=True)(*tree.unflatten(shapes))
     unflatten = jax.tree.structure(out_shape).unflatten
-    tile = max(1, min(lanes, TILE) if jax.default_backend() == "cpu" else lanes)
+    tile = tile_size(lanes, leaves)
     count = -(-lanes // tile)
 
     def evaluate_tile(batched_leaves):

@@ -1,8 +1,9 @@
 """Reductions by code of XLA's CPU backend, not by a library that it calls.
 
-From jax 0.11 on, XLA's CPU backend leaves sums, maxima and minima over arrays of 4,096 numbers or
-more to a library, which is slow for reductions over short axes, and does not compile a loop with
-such a call into a single kernel (benchmarks/README.md). XLA recognizes these reductions by their
+XLA's CPU backend leaves sums, maxima and minima over large arrays to a library. With jax 0.10 these
+are arrays of 32,768 numbers or more in float32, and from jax 0.11 on arrays of 4,096 numbers or
+more. The library is slow for reductions over short axes, and XLA does not compile a loop with such
+a call into a single kernel (benchmarks/README.md). XLA recognizes these reductions by their
 reducers a + b, max(a, b) and min(a, b). The reducers here have the same results in another form.
 
 Use these functions where nothing is differentiated: JAX has no short derivatives of such reducers.
@@ -14,8 +15,6 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
-
-HAS_LIBRARY = not jax.__version__.startswith("0.10.")
 
 
 def sum_by_xla(x: Array, axis: int, dtype) -> Array:
@@ -41,7 +40,7 @@ def min_by_xla(x: Array, axes: Sequence[int]) -> Array:
 
 def _calls_library(x: Array) -> bool:
     """Return whether XLA may leave a reduction to the library."""
-    return HAS_LIBRARY and jnp.issubdtype(x.dtype, jnp.floating) and jax.default_backend() == "cpu"
+    return jnp.issubdtype(x.dtype, jnp.floating) and jax.default_backend() == "cpu"
 
 
 def _reduce(x: Array, init: float, reducer: Callable, axes: Sequence[int]) -> Array:

@@ -10,7 +10,7 @@ from tolerances import ROUND_OFF
 
 import svkc
 from svkc._jax import lanes_last_rules
-from svkc._jax.lanes_last import TILE, with_lanes_last
+from svkc._jax.lanes_last import tile_size, with_lanes_last
 from svkc.loops.constraint_rows import RowChoice
 from svkc.loops.loop_force_projection import project_by_loop_forces
 
@@ -65,7 +65,7 @@ def example(x, y, which):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [1, 5, TILE, TILE + 3])
+@pytest.mark.parametrize("count", [1, 5, 32, 35])
 def test_every_rule(count):
     x, y = jax.random.normal(KEY, (2, count, 3, 3))
     which = jnp.arange(count) % 3
@@ -82,6 +82,19 @@ def test_every_rule(count):
         ):
             np.testing.assert_allclose(got, expected, rtol=1e-13, atol=1e-13)
             assert got.dtype == expected.dtype
+
+
+@pytest.mark.parametrize(
+    ("lanes", "dtype", "expected"),
+    [
+        (0, jnp.float64, 1), (5, jnp.float64, 5), (32, jnp.float64, 32), (33, jnp.float64, 24),
+        (1024, jnp.float64, 32), (33, jnp.float32, 33), (65, jnp.float32, 40),
+        (96, jnp.float32, 48), (1024, jnp.float32, 64), (64, jnp.int32, 32),
+    ],
+)  # fmt: skip
+def test_tile_size(lanes, dtype, expected):
+    """Tiles of a batch are equal, of 32 lanes at most in float64 and of 64 in float32."""
+    assert tile_size(lanes, [jnp.zeros(lanes, dtype), jnp.zeros(3, jnp.int32)]) == expected
 
 
 def test_zero_lanes_and_integers():
