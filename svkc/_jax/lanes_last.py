@@ -153,23 +153,26 @@ def _evaluate_batch(function: Callable, lanes: int, flags: list[bool], args):
         out = evaluate_jaxpr(
             closed,
             [
-                Batched(jnp.moveaxis(next(batched_leaves), 0, -1)) if flag else x
+                Batched(next(batched_leaves)) if flag else x
                 for x, flag in zip(leaves, flags, strict=True)
             ],
             tile,
         )
-        return [jnp.moveaxis(broadcast_to_lanes(x, tile), -1, 0) for x in out]
+        return [broadcast_to_lanes(x, tile) for x in out]
 
     batch = [x for x, flag in zip(leaves, flags, strict=True) if flag]
     if count == 1:
-        return unflatten(evaluate_tile(batch))
+        out = evaluate_tile([jnp.moveaxis(x, 0, -1) for x in batch])
+        return unflatten([jnp.moveaxis(x, -1, 0) for x in out])
     if count * tile != lanes:
         # pad the last tile by copies of the last lane
         batch = [
             jnp.concatenate([x, jnp.broadcast_to(x[-1:], (count * tile - lanes, *x.shape[1:]))])
             for x in batch
         ]
-    out = lax.map(evaluate_tile, [x.reshape(count, tile, *x.shape[1:]) for x in batch])
+    # lanes are moved outside of the loop, where XLA stores them as the last axis, once
+    tiles = [jnp.moveaxis(x.reshape(count, tile, *x.shape[1:]), 1, -1) for x in batch]
+    out = [jnp.moveaxis(x, -1, 1) for x in lax.map(evaluate_tile, tiles)]
     return unflatten([x.reshape(count * tile, *x.shape[2:])[:lanes] for x in out])
 
 

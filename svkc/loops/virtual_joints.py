@@ -12,7 +12,7 @@ from svkc.tree.spatial import inverse_positive, matvec
 
 
 class VirtualJoints(eqx.Module):
-    """Motion subspaces of the virtual joints, padded to the d freedoms of the freest.
+    """Motion subspaces of the virtual joints, padded to the d freedoms of the freest, at least two.
 
     S: motion subspace of each link. gram_inverse: (S^T S)^-1.
     dof: index of each freedom among the virtual joints' coordinates (padding: `count` or more).
@@ -64,7 +64,9 @@ def _align_batch_axes(
 def virtual_joints(chain: Chain, J: Float[Array, "rows dofs"]) -> VirtualJoints:
     """Return the virtual joints, with the motion subspaces in the columns of J."""
     dof, count = np.sort(chain.topology.links.dof - chain.nv, 1), chain.dofs - chain.nv
-    dof = dof[:, : max(1, np.max(np.sum(dof < count, 1)))]
+    # With two columns XLA stores the rows that `joint_rates` multiplies by S. With one it sums them
+    # in nested loops, which LLVM does not vectorize.
+    dof = dof[:, : max(2, np.max(np.sum(dof < count, 1)))]
     columns = jnp.concatenate([J[:, chain.nv :], jnp.zeros_like(J[:, :1])], 1)
     columns = columns.reshape(-1, 6, count + 1)
     S = jnp.swapaxes(columns[np.arange(len(dof))[:, None], :, np.minimum(dof, count)], -1, -2)
