@@ -11,7 +11,9 @@ import numpy as np
 
 import svkc
 
-SHORT = 0.1  # s
+# Calls that take less (s) are timed right after another call: threads of XLA that sleep take up to
+# half a millisecond to wake.
+WARMED_BELOW = 0.1
 
 
 class Program:
@@ -54,15 +56,12 @@ def compile_steps(step, states, steps: int) -> Program:
 def time_in_turns(runs: dict, rounds: int = 7) -> dict[str, np.ndarray]:
     """Return the seconds of each run of each function. Functions alternate; the first round is
     dropped.
-
-    A call shorter than `SHORT` is timed right after another one: threads of XLA's that sleep take
-    up to half a millisecond to start again.
     """
     seconds = {name: [] for name in runs}
     for _ in range(rounds + 1):
         for name, run in list(runs.items()):
             try:
-                if seconds[name] and seconds[name][-1] < SHORT:
+                if seconds[name] and seconds[name][0] < WARMED_BELOW:
                     run()
                 start = time.perf_counter()
                 run()

@@ -17,11 +17,11 @@ from jax.extend import core
 from svkc._jax.lanes_last_rules import Batched, apply_rule, broadcast_to_lanes
 from svkc._jax.primitive import custom_primitive
 
-# Bytes of one number in all lanes that are evaluated together on a CPU: 32 lanes in float64, 64 in
-# float32. Their intermediate values stay in the processor's cache (benchmarks/README.md).
+# Bytes that one scalar takes over all lanes of a tile on a CPU: 32 lanes in float64, 64 in float32
+# (benchmarks/README.md).
 TILE_BYTES = 256
-# a tile that is not the only one has a multiple of so many lanes, for SIMD instructions
-SIMD_LANES = 8
+# If there are several tiles, these bytes of a tile are a multiple of this: a SIMD register.
+SIMD_BYTES = 64
 # primitives that call a jaxpr -> name of the parameter that holds the jaxpr
 CALL_JAXPR_PARAMETERS = {
     "closed_call": "call_jaxpr",
@@ -115,21 +115,21 @@ def evaluate_jaxpr(closed: core.ClosedJaxpr, inputs: list, lanes: int) -> list:
 
 
 def tile_size(lanes: int, leaves: list) -> int:
-    """Return how many lanes are evaluated together: at most `TILE_BYTES` on a CPU.
+    """Return how many lanes are evaluated together: on a CPU as many as fit into `TILE_BYTES`.
 
-    Tiles of a batch are equal, so that few lanes are padding.
+    The tiles of a batch are of equal size, with as little padding as `SIMD_BYTES` allows for.
 
-    leaves: the arguments, whose widest floating-point type counts.
+    leaves: the arguments, of which the widest floating-point type counts.
     """
     if jax.default_backend() != "cpu":
         return max(1, lanes)
     dtypes = [jnp.result_type(x) for x in leaves]
-    widths = [dtype.itemsize for dtype in dtypes if jnp.issubdtype(dtype, jnp.floating)]
-    most = TILE_BYTES // max(widths, default=8)
-    if lanes <= most:
+    width = max((d.itemsize for d in dtypes if jnp.issubdtype(d, jnp.floating)), default=8)
+    if lanes * width <= TILE_BYTES:
         return max(1, lanes)
-    equal = -(-lanes // -(-lanes // most))
-    return -(-equal // SIMD_LANES) * SIMD_LANES
+    tiles = -(-lanes * width // TILE_BYTES)
+    tile_bytes = -(-lanes // tiles) * width
+    return -(-tile_bytes // SIMD_BYTES) * SIMD_BYTES // width
 
 
 def _evaluate_batch(function: Callable, lanes: int, flags: list[bool], args):
@@ -170,7 +170,7 @@ def _evaluate_batch(function: Callable, lanes: int, flags: list[bool], args):
             jnp.concatenate([x, jnp.broadcast_to(x[-1:], (count * tile - lanes, *x.shape[1:]))])
             for x in batch
         ]
-    # lanes are moved outside of the loop, where XLA stores them as the last axis, once
+    # transposed before and after the loop: XLA then transposes the batch once, not in every tile
     tiles = [jnp.moveaxis(x.reshape(count, tile, *x.shape[1:]), 1, -1) for x in batch]
     out = [jnp.moveaxis(x, -1, 1) for x in lax.map(evaluate_tile, tiles)]
     return unflatten([x.reshape(count * tile, *x.shape[2:])[:lanes] for x in out])

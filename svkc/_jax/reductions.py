@@ -1,10 +1,10 @@
 """Reductions by code of XLA's CPU backend, not by a library that it calls.
 
-XLA's CPU backend leaves sums, maxima and minima over large arrays to a library. With jax 0.10 these
-are arrays of 32,768 numbers or more in float32, and from jax 0.11 on arrays of 4,096 numbers or
-more. The library is slow for reductions over short axes, and XLA does not compile a loop with such
-a call into a single kernel (benchmarks/README.md). XLA recognizes these reductions by their
-reducers a + b, max(a, b) and min(a, b). The reducers here have the same results in another form.
+XLA's CPU backend leaves sums, maxima and minima over large arrays to a library: from jax 0.11 on
+those over 4,096 numbers or more, with jax 0.10 those over 32,768 or more in float32. The library is
+slow for reductions over short axes, and XLA does not compile a loop with such a call into a single
+kernel (benchmarks/README.md). XLA recognizes these reductions by their reducers a + b, max(a, b)
+and min(a, b). The reducers here have the same results in another form.
 
 Use these functions where nothing is differentiated: JAX has no short derivatives of such reducers.
 """

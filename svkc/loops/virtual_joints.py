@@ -12,7 +12,7 @@ from svkc.tree.spatial import inverse_positive, matvec
 
 
 class VirtualJoints(eqx.Module):
-    """Motion subspaces of the virtual joints, padded to the d freedoms of the freest, at least two.
+    """Motion subspaces of the virtual joints, padded to d columns: the freest joint's, at least 2.
 
     S: motion subspace of each link. gram_inverse: (S^T S)^-1.
     dof: index of each freedom among the virtual joints' coordinates (padding: `count` or more).
@@ -64,8 +64,8 @@ def _align_batch_axes(
 def virtual_joints(chain: Chain, J: Float[Array, "rows dofs"]) -> VirtualJoints:
     """Return the virtual joints, with the motion subspaces in the columns of J."""
     dof, count = np.sort(chain.topology.links.dof - chain.nv, 1), chain.dofs - chain.nv
-    # With two columns XLA stores the rows that `joint_rates` multiplies by S. With one it sums them
-    # in nested loops, which LLVM does not vectorize.
+    # With one column XLA computes the loop rows within the sum of `joint_rates`, in nested loops
+    # that LLVM does not vectorize over the lanes of a batch. With two it stores them first.
     dof = dof[:, : max(2, np.max(np.sum(dof < count, 1)))]
     columns = jnp.concatenate([J[:, chain.nv :], jnp.zeros_like(J[:, :1])], 1)
     columns = columns.reshape(-1, 6, count + 1)

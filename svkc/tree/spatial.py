@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from svkc._jax.evaluated_once import evaluated_once
 from svkc._jax.select import where
+from svkc._jax.stored import stored
 
 # Bilinear products as sums over a table, out_k = table[i, k, j] a_i b_j. These are a few operations
 # on arrays instead of dozens on entries; compiled programs of a four-bar's run and of its gradient
@@ -144,8 +144,8 @@ def quat_from_axis_angle(
 ) -> Float[Array, "*n 4"]:
     """Return the quaternion of a rotation by `angle` (rad) about a unit axis."""
     half = angle[..., None] / 2
-    s = evaluated_once(jnp.sin(half)) * axis
-    c = evaluated_once(jnp.cos(half))
+    s = stored(jnp.sin(half)) * axis
+    c = stored(jnp.cos(half))
     return jnp.concatenate([jnp.broadcast_to(c, (*s.shape[:-1], 1)), s], -1)
 
 
@@ -158,7 +158,8 @@ def quat_exp(u: Float[Array, "*n 3"]) -> Float[Array, "*n 4"]:
     small = square < 1e-8
     angle = jnp.sqrt(where(small, 1, square))
     # where `small`, the next terms of Taylor's series are below round-off
-    c = where(small, 1 - square / 8, evaluated_once(jnp.cos(angle / 2)))
+    c = where(small, 1 - square / 8, stored(jnp.cos(angle / 2)))
+    # XLA stores this quotient, too
     s = where(small, 0.5 - square / 48, jnp.sin(angle / 2) / angle)
     return jnp.concatenate([c, s * u], -1)
 

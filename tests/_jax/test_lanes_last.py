@@ -88,13 +88,27 @@ def test_every_rule(count):
     ("lanes", "dtype", "expected"),
     [
         (0, jnp.float64, 1), (5, jnp.float64, 5), (32, jnp.float64, 32), (33, jnp.float64, 24),
-        (1024, jnp.float64, 32), (33, jnp.float32, 33), (65, jnp.float32, 40),
+        (1024, jnp.float64, 32), (33, jnp.float32, 33), (65, jnp.float32, 48),
         (96, jnp.float32, 48), (1024, jnp.float32, 64), (64, jnp.int32, 32),
     ],
 )  # fmt: skip
 def test_tile_size(lanes, dtype, expected):
     """Tiles of a batch are equal, of 32 lanes at most in float64 and of 64 in float32."""
     assert tile_size(lanes, [jnp.zeros(lanes, dtype), jnp.zeros(3, jnp.int32)]) == expected
+    if dtype == jnp.float32:
+        with_float64 = [jnp.zeros(lanes, dtype), jnp.zeros(3)]
+        assert tile_size(lanes, with_float64) == tile_size(lanes, [jnp.zeros(3)])
+
+
+@pytest.mark.parametrize("count", [40, 64])
+def test_several_tiles(count):
+    """Lanes of several tiles, of which the last may be padded, are those of `jax.vmap`."""
+    function = lambda x, y: (x @ y.T, jnp.sum(x, 0), y)
+    x, y = jax.random.normal(KEY, (2, count, 3, 2))
+    assert tile_size(count, [x, y]) < count
+    expected = jax.vmap(function)(x, y)
+    for got, value in zip(jax.vmap(with_lanes_last(function))(x, y), expected, strict=True):
+        np.testing.assert_allclose(got, value, rtol=1e-13, atol=1e-13)
 
 
 def test_zero_lanes_and_integers():
