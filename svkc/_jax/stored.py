@@ -1,25 +1,26 @@
 """Values that XLA's CPU backend is made to store, instead of computing them again where used.
 
-XLA takes sines and cosines of real numbers for cheap operations. It fuses them into each kernel
-that uses them, which computes them again for every number that depends on them: up to 16 times in a
-product of quaternions.
+XLA considers sines and cosines of real numbers cheap. It fuses them into each kernel that uses
+them, which computes them again for every number that depends on them: up to 16 times in a product
+of quaternions.
 """
 
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Float
+
+from svkc._jax.select import where
 
 
 @jax.custom_jvp
 def stored(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """Return x. On a CPU it is stored, not computed again for each number that depends on it.
 
-    XLA stores quotients, because it takes a division for expensive. The divisor is one (x where x
-    is not a number), which XLA does not know. Derivatives of x are not stored.
+    XLA stores quotients, because it considers divisions expensive. The divisor is one (NaN where x
+    is NaN), which XLA does not know. Derivatives of x are not stored.
     """
     if jax.default_backend() != "cpu":
         return x
-    return x / jnp.where(x == x, jnp.ones((), x.dtype), x)
+    return x / where(x == x, 1, x)
 
 
 @stored.defjvp

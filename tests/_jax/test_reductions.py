@@ -55,10 +55,14 @@ def library_calls(function, *args) -> int:
     return jax.jit(function).lower(*args).compile().as_text().count("__ynn_fusion")
 
 
-def test_lanes_last_calls_no_library():
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_lanes_last_calls_no_library(dtype):
     """XLA leaves reductions of a plain `vmap` to a library, and none of those with lanes last."""
-    A = jnp.ones((LANES, MATRICES, 3, 3), jnp.float32)
+    A = jnp.ones((LANES, MATRICES, 3, 3), dtype)
     assert library_calls(jax.vmap(with_lanes_last(reduce_products)), A, A) == 0
+    only_float32 = jax.__version__.startswith("0.10.")
+    if only_float32 and dtype == jnp.float64:
+        return
     if "ynn_fusion_type" not in os.environ.get("XLA_FLAGS", ""):
         assert library_calls(jax.vmap(reduce_products), A, A) > 0
 
