@@ -1,4 +1,4 @@
-"""Sums in short loops, which XLA's CPU backend unrolls and vectorises."""
+"""Sums, maxima and minima in short loops, which XLA's CPU backend unrolls and vectorises."""
 
 import functools
 from collections.abc import Callable
@@ -19,11 +19,20 @@ def sum_in_chunks(x: Array, axes: tuple[int, ...], sum_over: Callable = jnp.sum)
 
     sum_over: `jnp.sum`, or `sum_by_xla` of reductions.py.
     """
+    return reduce_in_chunks(x, axes, lambda part, axes: sum_over(part, axes[0], x.dtype), jnp.add)
+
+
+def reduce_in_chunks(x: Array, axes: tuple[int, ...], reduce: Callable, join: Callable) -> Array:
+    """Reduce over one axis after the other, `TERMS_PER_SUM` terms at a time.
+
+    reduce: function of an array and a tuple of one axis that returns the reduced array.
+    join: reduces two arrays elementwise, such as `jnp.maximum`.
+    """
     for axis in sorted(axes, reverse=True):
         size = x.shape[axis]
         parts = [
-            sum_over(lax.slice_in_dim(x, i, min(i + TERMS_PER_SUM, size), axis=axis), axis, x.dtype)
+            reduce(lax.slice_in_dim(x, i, min(i + TERMS_PER_SUM, size), axis=axis), (axis,))
             for i in range(0, max(size, 1), TERMS_PER_SUM)
         ]
-        x = functools.reduce(jnp.add, parts)
+        x = functools.reduce(join, parts)
     return x

@@ -7,8 +7,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from svkc._jax.chunked_sum import sum_in_chunks
+from svkc._jax.chunked_sum import reduce_in_chunks, sum_in_chunks
 from svkc._jax.reductions import max_by_xla, min_by_xla, sum_by_xla
+from svkc._jax.stored import stored
 
 ELEMENTWISE = set(
     "abs add add_any and atan2 ceil clamp convert_element_type copy copy_p cos div eq exp exp2"
@@ -27,7 +28,7 @@ UNBATCHED_AXES = {
     "split",
     "squeeze",
 }
-EXTREMES = {"reduce_max": max_by_xla, "reduce_min": min_by_xla}
+EXTREMES = {"reduce_max": (max_by_xla, jnp.maximum), "reduce_min": (min_by_xla, jnp.minimum)}
 CONCATENATIONS = {"concatenate", "stack"}
 # the primitives of one_kernel.py, which batches drop
 ONE_KERNEL = {"one_kernel_input", "one_kernel_output", "one_kernel_batched_output"}
@@ -79,19 +80,15 @@ def _gather(x, index, lanes: int, *, dimension_numbers, slice_sizes, **rest):
         )
     # lax.gather reads an index vector from the last axis, so that lanes come before it
     index = jnp.swapaxes(index.x, -1, -2)
-    if not isinstance(x, Batched):
-        return lax.gather(x, index, d, slice_sizes, **rest)
-    of_x, of_index = (
-        (*d.operand_batching_dims, x.x.ndim - 1),
-        (*d.start_indices_batching_dims, index.ndim - 2),
-    )
-    return lax.gather(
-        x.x,
-        index,
-        d._replace(operand_batching_dims=of_x, start_indices_batching_dims=of_index),
-        (*slice_sizes, 1),
-        **rest,
-    )
+    if isinstance(x, Batched):
+        of_x = (*d.operand_batching_dims, x.x.ndim - 1)
+        of_index = (*d.start_indices_batching_dims, index.ndim - 2)
+        d = d._replace(operand_batching_dims=of_x, start_indices_batching_dims=of_index)
+        x, slice_sizes = x.x, (*slice_sizes, 1)
+    rows = lax.gather(x, index, d, slice_sizes, **rest)
+    # XLA gathers these rows with the lanes first, and would transpose them in each kernel that uses
+    # them
+    return stored(rows) if jnp.issubdtype(rows.dtype, jnp.floating) else rows
 
 
 def _sum(x: Array, axes: tuple[int, ...]) -> Array:
@@ -143,7 +140,8 @@ def apply_rule(primitive, inputs: list, params: dict, shape: tuple[int, ...], la
         # after a vmap within the function, axes are NumPy's integers
         return _sum(inputs[0].x, tuple(map(int, params["axes"])))
     if name in EXTREMES:
-        return EXTREMES[name](inputs[0].x, tuple(map(int, params["axes"])))
+        over, join = EXTREMES[name]
+        return reduce_in_chunks(inputs[0].x, tuple(map(int, params["axes"])), over, join)
     if name in UNBATCHED_AXES:
         return primitive.bind(inputs[0].x, **params)
     if name in CONCATENATIONS:

@@ -26,8 +26,8 @@ def static_take(
     """
     if not isinstance(index, np.ndarray):
         return jnp.concatenate([x, jnp.zeros_like(x[:1])])[index]
-    if index.ndim == 1 and np.array_equal(index, np.arange(x.shape[0])):
-        return x
+    if np.array_equal(index.ravel(), np.arange(x.shape[0])):
+        return x.reshape(*index.shape, *x.shape[1:])
     rows = static_take_p.bind(x, index=index.astype(np.int32).tobytes(), axis=0)
     return rows if index.ndim == 1 else rows.reshape(*index.shape, *x.shape[1:])
 

@@ -20,10 +20,7 @@ from svkc.model.checked_jit import checked_jit
 from svkc.model.topology import FREE, SLIDE
 from svkc.tree.bodies import Jacobian
 from svkc.tree.kinematics import Kinematics, bias_accelerations, kinematics
-from svkc.tree.spatial import (
-    motion_cross,
-    shift_motion,
-)
+from svkc.tree.spatial import angular_linear, cross, motion_cross, shift_motion
 
 
 def _virtual_motion_subspaces(
@@ -48,14 +45,21 @@ def assemble_loop_jacobian(
     Rows of links that are not connected, and columns of locked coordinates, are zero.
     """
     top = chain.topology
-    above = jnp.asarray(top.ancestor_mask[:, top.dof_row])
-    sign = above[structure.parent].astype(kin.r.dtype) - above[structure.real].astype(kin.r.dtype)
-    # the joint's position from the root of each coordinate's tree
-    of_parent = above[structure.parent][:, :, None]
-    position = where(
-        of_parent, frames.from_parent_root[:, None, :], frames.real_position[:, None, :]
+    active = structure.connected[:, None] & active_dofs(chain, structure)[None]
+    above = jnp.asarray(top.ancestor_mask[:, top.dof_row].astype(kin.r.dtype))
+    of_parent, of_real = (
+        where(active[:, : top.nv], above[link], 0) for link in (structure.parent, structure.real)
     )
-    tree = sign[:, :, None] * shift_motion(kin.S[None], position)
+    # coordinates above both links move neither relative to the other
+    moves_parent, moves_real = of_parent * (1 - of_real), of_real * (1 - of_parent)
+    sign = (moves_parent - moves_real)[:, :, None]
+    # the joint's position from the root of each coordinate's tree, times the sign
+    signed_position = (
+        moves_parent[:, :, None] * frames.from_parent_root[:, None]
+        - moves_real[:, :, None] * frames.real_position[:, None]
+    )
+    angular, linear = angular_linear(kin.S[None])
+    tree = jnp.concatenate([sign * angular, sign * linear + cross(angular, signed_position)], -1)
     S = _virtual_motion_subspaces(chain, structure, frames)
     count = len(top.link_names)
     # for each link and coordinate its row in the virtual joints' motion subspaces; rows past the
@@ -63,9 +67,7 @@ def assemble_loop_jacobian(
     source = np.full((count, top.dofs + 1), 6 * count)
     np.put_along_axis(source, top.links.dof, np.arange(6 * count).reshape(-1, 6), 1)
     virtual = static_take(S.reshape(-1, 6), source[:, top.nv : top.dofs])
-    J = jnp.concatenate([tree, virtual], 1)
-    active = structure.connected[:, None, None] & active_dofs(chain, structure)[None, :, None]
-    J = where(active, J, 0)
+    J = jnp.concatenate([tree, where(active[:, top.nv :, None], virtual, 0)], 1)
     return jnp.swapaxes(J, 1, 2).reshape(-1, top.dofs)
 
 

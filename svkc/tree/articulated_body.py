@@ -22,6 +22,7 @@ from svkc.tree.spatial import inverse_positive
 from svkc.tree.traversal import (
     initial_carry,
     level_tables,
+    rows_per_level,
     scan_levels,
     sum_children,
     with_level_data,
@@ -47,7 +48,7 @@ def articulated_factors(
 
     free: coordinates that are not locked (None: all).
     """
-    top, own = chain.topology, spatial_inertias(chain, kin)
+    top = chain.topology
     S = kin.S if free is None else where(free[:, None], kin.S, 0)
     armature = jnp.zeros(chain.nv, S.dtype) if chain.armature is None else chain.armature
     armature = armature if free is None else where(free, armature, 1)
@@ -55,8 +56,10 @@ def articulated_factors(
     armature = jnp.concatenate([armature, jnp.ones(1, S.dtype)])
 
     def step(from_children, level_data):
-        level, I_A, s, rotor = level_data
-        I_A = I_A if from_children is None else I_A + sum_children(level.children, from_children)
+        (level, s, rotor), own = level_data
+        I_A = own.matrices()
+        if from_children is not None:
+            I_A = I_A + sum_children(level.children, from_children)
         U = jnp.sum(s[:, :, :, None] * I_A[:, None], 2)
         D = (
             jnp.sum(U[:, :, None] * s[:, None], -1)
@@ -68,12 +71,13 @@ def articulated_factors(
         return to_parent, ArticulatedLevel(s, U, D_inverse)
 
     level_data = with_level_data(
-        top,
-        lambda x: static_take(own, x.rows),
-        lambda x: static_take(S, x.dofs),
-        lambda x: static_take(armature, x.dofs),
+        top, lambda x: static_take(S, x.dofs), lambda x: static_take(armature, x.dofs)
     )
-    return scan_levels(step, initial_carry(top, 6, 6, dtype=S.dtype), level_data, reverse=True)
+    # Matrices are assembled level by level, which copies each entry once.
+    own = rows_per_level(top, spatial_inertias(chain, kin))
+    return scan_levels(
+        step, initial_carry(top, 6, 6, dtype=S.dtype), zip_levels(level_data, own), reverse=True
+    )
 
 
 def _batched_matvec(A: Float[Array, "n i j"], x: Float[Array, "n j *k"]) -> Float[Array, "n i *k"]:

@@ -1,5 +1,7 @@
 """The mass matrix of the tree: by the composite-rigid-body algorithm, by unit vectors."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -70,14 +72,26 @@ def mass_matrix(chain: Chain, state: State) -> Float[Array, "nv nv"]:
     return mass_matrix_crba(chain, kinematics(chain, state.q))
 
 
-def spatial_inertias(chain: Chain, kin: Kinematics) -> Float[Array, "rows 6 6"]:
-    """Return each row's spatial inertia about its root's origin (Featherstone (2.63)).
+class SpatialInertias(NamedTuple):
+    """Spatial inertias about roots' origins, in world axes (Featherstone (2.63)), as their blocks.
 
-    Axes are the world's.
+    angular: rotational inertia (kg m^2). coupling: mass times the centre of mass, as the matrix of
+    a vector product (kg m). linear: mass times the identity (kg).
     """
+
+    angular: Float[Array, "*n 3 3"]
+    coupling: Float[Array, "*n 3 3"]
+    linear: Float[Array, "*n 3 3"]
+
+    def matrices(self) -> Float[Array, "*n 6 6"]:
+        """Return the inertias as matrices."""
+        upper = jnp.concatenate([self.angular, self.coupling], -1)
+        return jnp.concatenate([upper, jnp.concatenate([-self.coupling, self.linear], -1)], -2)
+
+
+def spatial_inertias(chain: Chain, kin: Kinematics) -> SpatialInertias:
+    """Return each row's spatial inertia about its root's origin."""
     (c, central), m = central_inertias(chain, kin), chain.mass[:, None, None]
-    cx, eye = skew(c), np.eye(3, dtype=c.dtype)[None]
+    eye = np.eye(3, dtype=c.dtype)[None]
     square = jnp.sum(c * c, -1)[:, None, None] * eye - c[:, :, None] * c[:, None, :]
-    upper = jnp.concatenate([central + m * square, m * cx], -1)
-    lower = jnp.concatenate([-m * cx, m * jnp.eye(3, dtype=c.dtype)[None]], -1)
-    return jnp.concatenate([upper, lower], -2)
+    return SpatialInertias(central + m * square, m * skew(c), m * eye)

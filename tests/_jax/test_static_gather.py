@@ -12,6 +12,7 @@ INDICES = {
     "some": np.array([0, 3, 3, 7, 1]),
     "a table": np.array([[0, 7, 6], [2, 2, 5]]),
     "all": np.arange(7),
+    "all as a table": np.arange(7)[:, None],
     "one of many": np.array([4]),
     "one row for all": np.zeros(90, int),
     "none": np.zeros(0, int),
