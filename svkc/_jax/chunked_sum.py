@@ -7,8 +7,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-# terms of a sum in one loop: with 46 terms that loop took a quarter of the time of a step with two
-# grips, with 22 terms a third of that of the high bar's 16-joint figure
+# terms of a reduction in one loop: sums of 46 terms took a quarter of the time of a step with two
+# grips, and sums of 22 terms a third of that of the high bar's 16-joint figure
 TERMS_PER_SUM = 8
 
 

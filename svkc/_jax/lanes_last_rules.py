@@ -86,8 +86,8 @@ def _gather(x, index, lanes: int, *, dimension_numbers, slice_sizes, **rest):
         d = d._replace(operand_batching_dims=of_x, start_indices_batching_dims=of_index)
         x, slice_sizes = x.x, (*slice_sizes, 1)
     rows = lax.gather(x, index, d, slice_sizes, **rest)
-    # XLA gathers these rows with the lanes first, and would transpose them in each kernel that uses
-    # them
+    # XLA gathers rows at indices of each lane with the lanes first. On a CPU it would transpose
+    # them in each kernel that uses them.
     return stored(rows) if jnp.issubdtype(rows.dtype, jnp.floating) else rows
 
 

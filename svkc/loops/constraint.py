@@ -45,15 +45,12 @@ def assemble_loop_jacobian(
     Rows of links that are not connected, and columns of locked coordinates, are zero.
     """
     top = chain.topology
-    active = structure.connected[:, None] & active_dofs(chain, structure)[None]
     above = jnp.asarray(top.ancestor_mask[:, top.dof_row].astype(kin.r.dtype))
-    of_parent, of_real = (
-        where(active[:, : top.nv], above[link], 0) for link in (structure.parent, structure.real)
-    )
-    # coordinates above both links move neither relative to the other
+    of_parent, of_real = above[structure.parent], above[structure.real]
+    # 0 or 1: a coordinate above both links moves them together, and its column is zero
     moves_parent, moves_real = of_parent * (1 - of_real), of_real * (1 - of_parent)
     sign = (moves_parent - moves_real)[:, :, None]
-    # the joint's position from the root of each coordinate's tree, times the sign
+    # the joint's position, of the parent's end or minus that of the real link's, each from its root
     signed_position = (
         moves_parent[:, :, None] * frames.from_parent_root[:, None]
         - moves_real[:, :, None] * frames.real_position[:, None]
@@ -67,7 +64,9 @@ def assemble_loop_jacobian(
     source = np.full((count, top.dofs + 1), 6 * count)
     np.put_along_axis(source, top.links.dof, np.arange(6 * count).reshape(-1, 6), 1)
     virtual = static_take(S.reshape(-1, 6), source[:, top.nv : top.dofs])
-    J = jnp.concatenate([tree, where(active[:, top.nv :, None], virtual, 0)], 1)
+    J = jnp.concatenate([tree, virtual], 1)
+    active = structure.connected[:, None, None] & active_dofs(chain, structure)[None, :, None]
+    J = where(active, J, 0)
     return jnp.swapaxes(J, 1, 2).reshape(-1, top.dofs)
 
 

@@ -73,7 +73,9 @@ def mass_matrix(chain: Chain, state: State) -> Float[Array, "nv nv"]:
 
 
 class SpatialInertias(NamedTuple):
-    """Spatial inertias about roots' origins, in world axes (Featherstone (2.63)), as their blocks.
+    """Blocks of spatial inertias about roots' origins, in world axes (Featherstone (2.63)).
+
+    The matrices are [[angular, coupling], [-coupling, linear]].
 
     angular: rotational inertia (kg m^2). coupling: mass times the centre of mass, as the matrix of
     a vector product (kg m). linear: mass times the identity (kg).

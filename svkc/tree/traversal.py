@@ -234,16 +234,19 @@ def with_level_data(top: Topology, *functions: Callable) -> Any:
 
 
 def rows_per_level(top: Topology, x: Any) -> Any:
-    """Return the rows of a pytree of arrays [rows *n] for each level, or for the stacked levels."""
+    """Return a pytree's arrays [rows *n] for each level below the world, or for stacked levels.
+
+    Rows of padding are zero.
+    """
     levels = level_tables(top)
     if not isinstance(levels, list):
         return jax.tree.map(lambda a: static_take(a, levels.rows), x)
     leaves, tree = jax.tree.flatten(x)
-    # slices, not gathers: XLA does not copy them
+    # the rows of a level are consecutive, so that no gather copies them
     parts = [_split_levels(top, a)[1:] for a in leaves]
     return [tree.unflatten(of_level) for of_level in zip(*parts, strict=True)]
 
 
 def zip_levels(a: Any, b: Any) -> Any:
-    """Return the pairs of two results of `scan_levels` or `with_level_data`, level by level."""
+    """Return the pairs of two values for each level, or of two values for stacked levels."""
     return list(zip(a, b, strict=True)) if isinstance(a, list) else (a, b)

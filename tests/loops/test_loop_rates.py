@@ -42,6 +42,15 @@ def chain_and_q():
     )
 
 
+def test_rows_of_links_not_connected_are_zero(chain_and_q):
+    """Also where the kinematics are not finite: a lost robot does not stop another."""
+    chain, structure, q = chain_and_q
+    rows = loop_kinematics(chain, structure, q * jnp.nan).J.reshape(-1, 6, chain.dofs)
+    unused = chain.link_names.index("unused")
+    np.testing.assert_array_equal(rows[unused], 0)
+    assert jnp.all(jnp.isnan(jnp.delete(rows, unused, 0)).any((1, 2)))
+
+
 @pytest.mark.slow
 def test_rates_are_those_of_the_loop_jacobian(chain_and_q):
     chain, structure, q = chain_and_q
