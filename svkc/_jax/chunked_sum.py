@@ -9,11 +9,11 @@ from jaxtyping import Array
 
 # terms of a reduction in one loop: sums of 46 terms took a quarter of the time of a step with two
 # grips, and sums of 22 terms a third of that of the high bar's 16-joint figure
-TERMS_PER_SUM = 8
+TERMS_PER_LOOP = 8
 
 
 def sum_in_chunks(x: Array, axes: tuple[int, ...], sum_over: Callable = jnp.sum) -> Array:
-    """Sum over axes, `TERMS_PER_SUM` terms at a time.
+    """Sum over axes, `TERMS_PER_LOOP` terms at a time.
 
     XLA unrolls a sum this short, and can then vectorise the loop over the last axis.
 
@@ -23,7 +23,7 @@ def sum_in_chunks(x: Array, axes: tuple[int, ...], sum_over: Callable = jnp.sum)
 
 
 def reduce_in_chunks(x: Array, axes: tuple[int, ...], reduce: Callable, join: Callable) -> Array:
-    """Reduce over one axis after the other, `TERMS_PER_SUM` terms at a time.
+    """Reduce over one axis after the other, `TERMS_PER_LOOP` terms at a time.
 
     reduce: function of an array and a tuple of one axis that returns the reduced array.
     join: reduces two arrays elementwise, such as `jnp.maximum`.
@@ -31,8 +31,8 @@ def reduce_in_chunks(x: Array, axes: tuple[int, ...], reduce: Callable, join: Ca
     for axis in sorted(axes, reverse=True):
         size = x.shape[axis]
         parts = [
-            reduce(lax.slice_in_dim(x, i, min(i + TERMS_PER_SUM, size), axis=axis), (axis,))
-            for i in range(0, max(size, 1), TERMS_PER_SUM)
+            reduce(lax.slice_in_dim(x, i, min(i + TERMS_PER_LOOP, size), axis=axis), (axis,))
+            for i in range(0, max(size, 1), TERMS_PER_LOOP)
         ]
         x = functools.reduce(join, parts)
     return x

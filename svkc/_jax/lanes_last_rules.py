@@ -140,8 +140,8 @@ def apply_rule(primitive, inputs: list, params: dict, shape: tuple[int, ...], la
         # after a vmap within the function, axes are NumPy's integers
         return _sum(inputs[0].x, tuple(map(int, params["axes"])))
     if name in EXTREMES:
-        over, join = EXTREMES[name]
-        return reduce_in_chunks(inputs[0].x, tuple(map(int, params["axes"])), over, join)
+        reduce, join = EXTREMES[name]
+        return reduce_in_chunks(inputs[0].x, tuple(map(int, params["axes"])), reduce, join)
     if name in UNBATCHED_AXES:
         return primitive.bind(inputs[0].x, **params)
     if name in CONCATENATIONS:

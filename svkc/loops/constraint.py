@@ -47,10 +47,11 @@ def assemble_loop_jacobian(
     top = chain.topology
     above = jnp.asarray(top.ancestor_mask[:, top.dof_row].astype(kin.r.dtype))
     of_parent, of_real = above[structure.parent], above[structure.real]
-    # 0 or 1: a coordinate above both links moves them together, and its column is zero
+    # One where a coordinate is above this link alone. A coordinate above both links moves them
+    # together, and its column is zero.
     moves_parent, moves_real = of_parent * (1 - of_real), of_real * (1 - of_parent)
     sign = (moves_parent - moves_real)[:, :, None]
-    # the joint's position, of the parent's end or minus that of the real link's, each from its root
+    # the parent's end, or minus the real link's end, each as its position from its root
     signed_position = (
         moves_parent[:, :, None] * frames.from_parent_root[:, None]
         - moves_real[:, :, None] * frames.real_position[:, None]

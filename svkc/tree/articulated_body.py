@@ -73,7 +73,7 @@ def articulated_factors(
     level_data = with_level_data(
         top, lambda x: static_take(S, x.dofs), lambda x: static_take(armature, x.dofs)
     )
-    # Blocks are selected before matrices are made: those of all levels would be copied once more.
+    # The matrices are made level by level: matrices of all levels would be copied once more.
     own = rows_per_level(top, spatial_inertias(chain, kin))
     return scan_levels(
         step, initial_carry(top, 6, 6, dtype=S.dtype), zip_levels(level_data, own), reverse=True

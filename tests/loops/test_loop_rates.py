@@ -43,7 +43,7 @@ def chain_and_q():
 
 
 def test_rows_of_links_not_connected_are_zero(chain_and_q):
-    """Also where the kinematics are not finite: a lost robot does not stop another."""
+    """These rows are zero also where the kinematics are NaN."""
     chain, structure, q = chain_and_q
     rows = loop_kinematics(chain, structure, q * jnp.nan).J.reshape(-1, 6, chain.dofs)
     unused = chain.link_names.index("unused")
