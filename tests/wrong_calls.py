@@ -19,6 +19,14 @@ from svkc.loops.constrained_dynamics import Dynamics
 
 TIMES = np.linspace(0, 1, 5)
 SITE = models.MJCF.format(models.bar("b", models.Y, "0 0 1", inside='<site name="s"/>'))
+RANGE = models.MJCF.format(
+    models.bar(
+        "stopped",
+        models.Y + ' range="-10 10"',
+        "0 0 1",
+        inside=models.bar("free", models.Y, "0 0 1"),
+    )
+)
 FREE = models.MJCF.format(models.bar("base", 'type="free"', "0 0 1"))
 
 
@@ -36,6 +44,7 @@ class Setting:
         )
         self.free = svkc.load(FREE)
         self.site = svkc.load(SITE)
+        self.rods = svkc.load(models.MJCF.format(models.TWO_RODS))
         self.data = mujoco.MjData(svkc.load(self.motor).model.model)
 
     def simulate(self, chain=None, **kw):
@@ -177,6 +186,7 @@ CASES = {
     "... holds no model": load_chain_without_model,
     "camera: no": lambda s: s.drawn(camera="nobody's"),
     "mp4 needs": render_without_ffmpeg,
+    "run: --ignore": lambda s: commands._load_scene("high_bar", ("tendon",)),
     "run: no scene": lambda s: commands._load_scene("nowhere", ()),
     "... is not linear": lambda s: jax.linear_transpose(
         custom_primitive("odd", jnp.sin, lambda p, t: (p[0], t[0])), jnp.ones(2)
@@ -215,6 +225,7 @@ CASES = {
     "...[...]: got": lambda s: s.four.state({"crank": [1.0, 2.0]}),
     "actuated: expected": lambda s: s.actuation(actuated=np.ones(2, bool)),
     "adjoint: expected": lambda s: s.simulate(adjoint="replay"),
+    "adjoint: diffrax.BacksolveAdjoint": lambda s: s.simulate(adjoint=diffrax.BacksolveAdjoint()),
     "adjoint: svkc.integrators.Replay cannot": lambda s: jax.grad(
         lambda t1: jnp.sum(
             s.simulate(t1=t1, solver=diffrax.ReversibleHeun(), dt=0.5, max_steps=2).final.q
@@ -224,6 +235,7 @@ CASES = {
         stepsize_controller=diffrax.StepTo(jnp.linspace(0, 1, 5)), adjoint=svkc.integrators.Replay()
     ),
     "at: got time": lambda s: s.simulate(events=[svkc.at(-1.0, cut="pin")]),
+    "at: got time ..., expected": lambda s: s.simulate(events=[svkc.at(np.nan, cut="pin")]),
     "at: time must": lambda s: s.simulate(events=[svkc.at(jnp.ones(2), cut="pin")]),
     "bind: ... is connected": lambda s: svkc.bind(
         s.spare, s.gripping(), "spare_0", "world", "crank"
@@ -300,6 +312,8 @@ CASES = {
         axis={"rocker": [0, 0, 1]}
     ),
     "...: got names": lambda s: s.four.replace(gravity={"crank": 1.0}),
+    "limit: ... has": lambda s: svkc.load(RANGE).replace(limit={"free": [0, 1]}),
+    "...: body": lambda s: s.free.replace(pos={"base": [0, 0, 1]}),
     "limit: the model": lambda s: s.four.replace(limit={"crank": [0, 1]}),
     "scale_inertia: body": lambda s: s.four.replace(mass={"world": 1.0}, scale_inertia=True),
     "scale_inertia: give": lambda s: s.four.replace(scale_inertia=True),
@@ -366,6 +380,7 @@ CASES = {
     "traj: expected": lambda s: svkc.render(s.four, 3, "x.gif"),
     "touch: axes": lambda s: svkc.touch(s.four, "pin", 0.1, axes="w"),
     "ts: expected at least": lambda s: s.along({"crank": TIMES}, ts=TIMES[::-1]),
+    "ts: expected one": lambda s: s.simulate(ts=0.5),
     "ts: expected non": lambda s: s.simulate(ts=jnp.array([0.5, 0.2])),
     "u: got": lambda s: s.load(s.motor).motors(jnp.zeros(3)),
     "unbind: expected": lambda s: svkc.at(0.5, unbind=3),
@@ -377,6 +392,9 @@ CASES = {
     "virtual link ...: ... must be a unit": lambda s: link(quat=(1, 1, 0, 0)),
     "virtual link ...: axis": lambda s: link(axis=(0, 0, 0)),
     "virtual_links: expected": lambda s: s.load(virtual_links=["pin"]),
+    "v: ... is locked": lambda s: s.rods.state(
+        v={"upper": 1.0}, near=svkc.lock(s.rods, s.rods.state(), "upper")
+    ),
     "virtual_links: names": lambda s: s.load(virtual_links=[link(), link()]),
     "weight: expected": lambda s: s.actuation(weight=-np.ones(4)),
     "when: direction": lambda s: svkc.when(lambda t, x, args: t, direction="up"),
@@ -388,6 +406,20 @@ ALSO = [
     ("libegl1 libgl1", render_without_opengl),
     # runs
     ("ts", lambda s: s.simulate(ts=[0.0, 2.0])),
+    ("ts: .* shape .0,.", lambda s: s.simulate(ts=[])),
+    (
+        "ts: .* shape .2, 2.",
+        lambda s: jax.jit(lambda t1: s.simulate(t1=t1, ts=np.zeros((2, 2))).ts)(1.0),
+    ),
+    (
+        "Replay needs .* without jump_ts",
+        lambda s: s.simulate(
+            stepsize_controller=diffrax.ClipStepSizeController(
+                diffrax.PIDController(1e-6, 1e-8), jump_ts=jnp.array([0.5])
+            ),
+            adjoint=svkc.integrators.Replay(),
+        ),
+    ),
     ("rtol", lambda s: s.simulate(rtol=0.0)),
     ("max_events", lambda s: s.simulate(max_events=-1)),
     ("max_steps", lambda s: s.simulate(max_steps=0)),

@@ -23,6 +23,12 @@ def cart(**options) -> svkc.Chain:
     return svkc.load(CART, virtual_links=[PIN], **options)
 
 
+@functools.cache
+def ball() -> svkc.Chain:
+    """Return a body on a ball joint."""
+    return svkc.load(CART.replace('name="x" type="slide" axis="1 0 0"', 'name="turn" type="ball"'))
+
+
 def phase(**changed):
     return optimize.Phase(**({"name": "move", "intervals": 1} | changed))
 
@@ -110,6 +116,10 @@ CASES = {
     "between: ... has": lambda s: optimize.between("x", 1, 0),
     "between: of=": lambda s: check(bounds=[optimize.between("x", 0, 1, of="torque")]),
     "chain_from: expected": lambda s: with_args(chain_from=lambda chain, args: s.four),
+    "chain: virtual link": lambda s: problem(
+        optimize.Torques(),
+        svkc.load(CART.replace('type="slide"', 'type="slide" stiffness="2"'), cuttable="x"),
+    ),
     "constraint ...: expected numbers": on_point(lambda p: None),
     "constraint ...: got the bounds": on_point((lambda p: p.state.q[0], 1, 0)),
     "constraint ...: its bounds": on_point(lambda p: (p.state.q[0], p.state.v[0], 1)),
@@ -130,6 +140,9 @@ CASES = {
     "of: got": lambda s: optimize.between("x", 0, 1, of="color"),
     "phase ...: ... is a spare slot": lambda s: check(chain=cart(spare=1), connected=("spare_0",)),
     "phase ...: ... must be a list": lambda s: phase(path=3),
+    "phase ...: between": lambda s: problem(
+        optimize.Torques(), ball(), bounds=[optimize.between("turn.ry", -1, 1)]
+    ).solve(problem(optimize.Torques(), ball()).guess([{}, {}])),
     "phase ...: bounds has": lambda s: phase(bounds=[lambda p: p.t]),
     "phase ...: got ... intervals": lambda s: phase(intervals=0),
     "phase ...: got the duration": lambda s: phase(duration=(2, 1)),

@@ -106,7 +106,7 @@ def view(path: pathlib.Path, show: bool) -> int:
         try:
             write(target)
             written.append(target)
-        except ImportError as error:
+        except (ImportError, RuntimeError) as error:
             failures.append(f"{target.name} not drawn: {error}")
     print("\n".join(failures) + "\n" * bool(failures) + "wrote " + ", ".join(map(str, written)))
     if show:

@@ -81,7 +81,7 @@ def _add_run_options(parser: argparse.ArgumentParser):
             metavar="NAME@TIME",
             help=f"{purpose} at a time, s; may be repeated; replaces the scene's own events",
         )
-    add("--ignore", nargs="*", action="extend", default=[], metavar="KINDS", help=IGNORE_HELP)
+    add("--ignore", action="append", default=[], metavar="KINDS", help=IGNORE_HELP)
     folder = pathlib.Path("out")
     add("--out", type=pathlib.Path, default=folder, help="folder for results (default: out)")
     add("--mp4", action="store_true", help="write an mp4 as well (needs the extra svkc[video])")

@@ -215,6 +215,8 @@ def _load_scene(name: str, ignore):
     import svkc
 
     if name in SCENES:
+        if ignore:
+            raise ValueError(f"run: --ignore is for model files, and {name!r} is a scene")
         build, end, _ = SCENES[name]
         return *build(), end
     if not pathlib.Path(name).is_file():

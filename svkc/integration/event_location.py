@@ -111,6 +111,7 @@ class EventSearch(eqx.Module):
     magnitudes: larger of the absolute values of each guard at the two ends of the step.
     bracket: interval that holds the first root of the guards that crossed.
     y, values: state and guards at `bracket.b`.
+    is_new: whether they are those of the last attempted step.
     values_after: guards just after `bracket.b`, valid once the search is done.
     active: whether a search is under way.
     narrowing: whether the bracket has yet to converge.
@@ -124,6 +125,7 @@ class EventSearch(eqx.Module):
     bracket: Bracket
     y: ODEState
     values: Float[Array, " guards"]
+    is_new: Bool[Array, ""]
     values_after: Float[Array, " guards"]
     active: Bool[Array, ""]
     narrowing: Bool[Array, ""]
@@ -143,6 +145,7 @@ class EventSearch(eqx.Module):
             bracket=Bracket.around(t0, t0, t0, t0),
             y=y,
             values=values,
+            is_new=no,
             values_after=values,
             active=no,
             narrowing=no,
@@ -205,6 +208,7 @@ def update_search(
         bracket=bracket,
         y=tree_where(at_right_end, y, old.y),
         values=where(at_right_end, values, old.values),
+        is_new=at_right_end,
         values_after=where(done, values, old.values_after),
         active=active,
         narrowing=active & bracket.not_converged(),

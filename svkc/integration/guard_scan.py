@@ -272,8 +272,9 @@ def locate_event(
     assert s.guard_values is not None
     assert options.armed_guards is not None
     scan = _scan_step(s, attempt, t1, problem, options)
-    is_nan = attempt.keep_step & jnp.any(jnp.isnan(scan.at_end))
-    several = options.armed_guards.armed & (scan.changes > 1)
+    armed = options.armed_guards.armed
+    is_nan = attempt.keep_step & jnp.any(jnp.isnan(scan.at_end) & armed)
+    several = armed & (scan.changes > 1)
     first = jnp.min(where(several, scan.first_change, jnp.inf))
     shorter = s.t + first * (t1 - s.t)
     # Crossings closer than simultaneous events are not separated.

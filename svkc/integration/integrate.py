@@ -154,14 +154,17 @@ def _body_fun(
     progress = (after.t - t0) / where(stop > t0, stop - t0, 1)
     # again, so that the kernel of the attempt need not return the rows
     row_choice = with_rows_of_projection(before, problem).field_args.row_choice
-    record = StepRecord(increments, row_choice)
+    record, is_last = StepRecord(increments, row_choice), kept
+    if after.search is not None:
+        # the step to the event is not the last attempted one, which goes past the event
+        is_last = (kept & ~after.search.done) | after.search.is_new
     return dataclasses.replace(
         after,
         progress_meter_state=options.progress_meter.step(s.progress_meter_state, progress),
         step_ts=write_row(s.step_ts, s.accepted, after.t, kept),
         step_near=write_row(s.step_near, s.accepted, s.near, kept),
         checkpoints=checkpoints,
-        records=write_record(s, record, kept, options.record_capacity),
+        records=write_record(s, record, is_last, options.record_capacity),
         ys=ys,
     )
 

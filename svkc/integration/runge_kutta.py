@@ -32,8 +32,13 @@ def with_scan_kind(
 ) -> diffrax.AbstractSolver[Any]:
     """Return a Runge-Kutta solver whose loop over stages is of this kind; others as they are.
 
+    Solvers that wrap one have it in the solver that they wrap.
+
     kind: "lax" for forward mode, "bounded" for both modes, None for diffrax's own choice.
     """
+    if isinstance(solver, diffrax.AbstractWrappedSolver):
+        inner = with_scan_kind(solver.solver, kind)
+        return eqx.tree_at(lambda s: s.solver, solver, inner)
     if not isinstance(solver, diffrax.AbstractRungeKutta):
         return solver
     return eqx.tree_at(lambda s: s.scan_kind, solver, kind, is_leaf=lambda x: x is None)
@@ -60,11 +65,10 @@ def without_dense_output(solver: diffrax.AbstractSolver[Any]) -> diffrax.Abstrac
 
 def _explicit_tableau(solver: diffrax.AbstractSolver[Any]) -> diffrax.ButcherTableau | None:
     """Return the tableau of an explicit Runge-Kutta solver, None for any other solver."""
-    if isinstance(solver, diffrax.AbstractERK) and isinstance(
-        solver.tableau, diffrax.ButcherTableau
-    ):
-        return solver.tableau
-    return None
+    # a solver that wraps one counts as explicit for diffrax, but has no tableau
+    tableau = getattr(solver, "tableau", None)
+    is_explicit = isinstance(solver, diffrax.AbstractERK)
+    return tableau if is_explicit and isinstance(tableau, diffrax.ButcherTableau) else None
 
 
 def _stage_count(tableau: diffrax.ButcherTableau) -> int:

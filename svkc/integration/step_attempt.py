@@ -50,7 +50,8 @@ def attempt_and_advance(
     guard_values, search, hold = None, None, jnp.zeros((), bool)
     if s.search is not None:
         attempt, guard_values, search, hold = locate_event(s, attempt, t1, problem, options)
-        search = tree_where(redo, s.search, search)
+        is_new = search.is_new & ~redo
+        search = dataclasses.replace(tree_where(redo, s.search, search), is_new=is_new)
     after = _state_after(s, attempt, hold | redo, times, options)
     rejected = (~attempt.keep_step & ~hold) | redo
     if search is not None:

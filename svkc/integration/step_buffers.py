@@ -27,11 +27,11 @@ def write_states(
     return ys, checkpoints
 
 
-def write_record(s: StepperState, record: StepRecord, kept, capacity: int) -> StepRecord | None:
-    """Write the record of a step that is kept, if there is room for it."""
+def write_record(s: StepperState, record: StepRecord, pred, capacity: int) -> StepRecord | None:
+    """Write the record of the next kept step where `pred` holds, if there is room for it."""
     if s.records is None:
         return None
-    return write_row(s.records, s.accepted, record, kept & (s.accepted < capacity))
+    return write_row(s.records, s.accepted, record, pred & (s.accepted < capacity))
 
 
 def write_row(rows, i, row, pred):

@@ -5,6 +5,7 @@ from collections.abc import Collection, Mapping
 
 import numpy as np
 
+from svkc.mjcf.flags import disabled_actuators, is_disabled
 from svkc.mjcf.unsupported import is_torque_motor
 from svkc.model.annotations import MuJoCo, Numbers
 from svkc.model.names import unknown_name
@@ -228,6 +229,7 @@ def springs_and_limits(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return stiffness [dofs], limit [2 dofs] and limit_spring [2 dofs]; see `Chain`."""
     n, model_v = topology.dofs, np.array(topology.model_v, int)
+    with_limits = "limit" not in ignored and not is_disabled(model, "limit", "constraint")
     stiffness, limit, spring = np.zeros(n), np.tile([[-np.inf], [np.inf]], (1, n)), np.zeros((2, n))
     for j in range(model.njnt):
         own = slice(
@@ -235,9 +237,9 @@ def springs_and_limits(
             int(model.jnt_dofadr[j]) + V_SIZE[JOINT_KINDS[int(model.jnt_type[j])]],
         )
         dofs = model_v[own]
-        if "spring" not in ignored:
+        if "spring" not in ignored and not is_disabled(model, "spring"):
             stiffness[dofs] = np.ravel(model.jnt_stiffness[j])[0]
-        if model.jnt_limited[j] and model.jnt_type[j] in (2, 3) and "limit" not in ignored:
+        if with_limits and model.jnt_limited[j] and model.jnt_type[j] in (2, 3):
             limit[:, dofs] = model.jnt_range[j][:, None]
             m = (
                 1 / model.dof_invweight0[own]
@@ -273,9 +275,9 @@ def actuator_arrays(model: MuJoCo, topology: Topology) -> tuple[np.ndarray, ...]
     """Return gear, control_range, force_range; see `Chain`.
 
     Actuators that svkc cannot simulate have no row. `left_out_elements` has checked that they are
-    ignored.
+    ignored. Rows of actuators that the model disables are zero.
     """
-    motors = np.flatnonzero(is_torque_motor(model))
+    motors, disabled = np.flatnonzero(is_torque_motor(model)), disabled_actuators(model)
     count, model_v = len(motors), np.array(topology.model_v, int)
     gear, control, force = (
         np.zeros((count, topology.dofs)),
@@ -285,11 +287,14 @@ def actuator_arrays(model: MuJoCo, topology: Topology) -> tuple[np.ndarray, ...]
     for i, motor in enumerate(motors):
         joint = int(model.actuator_trnid[motor, 0])
         size, start = V_SIZE[JOINT_KINDS[int(model.jnt_type[joint])]], int(model.jnt_dofadr[joint])
+        # an actuator may have several outputs and controls, but a motor has one of each
+        ratio = model.actuator_gear[model.actuator_outadr[motor], :size]
         gear[i, model_v[start : start + size]] = (
-            model.actuator_gear[motor, :size] * model.actuator_gainprm[motor, 0]
+            ratio * model.actuator_gainprm[motor, 0] * ~disabled[motor]
         )
-        if model.actuator_ctrllimited[motor]:
-            control[i] = model.actuator_ctrlrange[motor]
+        at = model.actuator_ctrladr[motor]
+        if model.actuator_ctrllimited[at] and not is_disabled(model, "clampctrl"):
+            control[i] = model.actuator_ctrlrange[at]
         if model.actuator_forcelimited[motor]:
             force[i] = np.sort(model.actuator_forcerange[motor] / model.actuator_gainprm[motor, 0])
     return gear, control, force

@@ -28,6 +28,7 @@ from svkc.mjcf.cuttable_joints import (
     cuttable_joints,
     with_cuttable_joints,
 )
+from svkc.mjcf.flags import is_disabled
 from svkc.mjcf.unsupported import left_out_elements
 from svkc.mjcf.virtual_links import declared_links, float_array, load_structure
 from svkc.model.annotations import Checked, Integer, MuJoCo, Names, Path
@@ -248,18 +249,14 @@ def _load_pose(model, topology: Topology) -> np.ndarray:
 
 def _gravity(model) -> np.ndarray:
     """Return gravity (m/s^2), zero if the model disables it."""
-    import mujoco
-
-    off = model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
-    return np.zeros(3) if off else model.opt.gravity
+    return np.zeros(3) if is_disabled(model, "gravity") else model.opt.gravity
 
 
 def _passive_forces(model, ignored: set[str], topology: Topology, q_load) -> dict[str, Any]:
     """Return the chain's fields on damping, springs and limits; None if the model has none."""
     stiffness, limit, spring = springs_and_limits(model, ignored, topology)
-    damping = scatter_to_dofs(
-        topology, 0 * model.dof_damping if "damping" in ignored else model.dof_damping
-    )
+    undamped = "damping" in ignored or is_disabled(model, "damper")
+    damping = scatter_to_dofs(topology, 0 * model.dof_damping if undamped else model.dof_damping)
     q_spring = np.array(q_load)
     q_spring[np.array(topology.model_q, int)] = model.qpos_spring
     sprung, limited = stiffness.any(), np.isfinite(limit).any()

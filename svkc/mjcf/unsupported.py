@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from svkc.mjcf.flags import is_disabled
 from svkc.model.annotations import MuJoCo
 
 
@@ -21,7 +22,9 @@ def is_torque_motor(model: MuJoCo) -> np.ndarray:
     )
     plain = joint | inparent
     plain &= model.actuator_dyntype == int(mujoco.mjtDyn.mjDYN_NONE)
-    plain &= model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_FIXED)
+    plain &= (model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_FIXED)) & (
+        model.actuator_delay == 0
+    )
     return plain & (model.actuator_biastype == int(mujoco.mjtBias.mjBIAS_NONE))
 
 
@@ -47,7 +50,7 @@ def _unsupported_in_actuators(model) -> dict[str, tuple]:
     tendon = [
         n
         for n in ("stiffness", "damping", "limited", "frictionloss", "armature")
-        if _any_nonzero(model, f"tendon_{n}")
+        if _any_nonzero(model, f"tendon_{n}", f"tendon_{n}poly")
     ]
     pulled = np.any(model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_TENDON))
     complex_motors = np.sum(~is_torque_motor(model))
@@ -161,7 +164,8 @@ def left_out_elements(model: MuJoCo, ignore: Sequence[str]) -> tuple[str, ...]:
             f" svkc.load(..., ignore=({names},))",
             [kind for kind, _ in elements],
         )
-    colliding = int(np.sum((model.geom_contype != 0) | (model.geom_conaffinity != 0)))
+    touching = not is_disabled(model, "contact", "constraint")
+    colliding = touching * int(np.sum((model.geom_contype != 0) | (model.geom_conaffinity != 0)))
     collisions = (
         (f"collision: {colliding} geoms of the model could touch; collisions are not simulated",)
         if colliding

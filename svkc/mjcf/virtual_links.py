@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array
 
 from svkc.mjcf.bodies import name_of
+from svkc.mjcf.flags import is_disabled
 from svkc.model.annotations import MuJoCo, Numbers
 from svkc.model.chain import Structure
 from svkc.model.topology import Topology
@@ -18,20 +19,24 @@ from svkc.model.virtual_link import VirtualLink, joint_freedoms
 def links_from_equalities(model: MuJoCo) -> list[VirtualLink]:
     """Return the model's <equality> elements as virtual links, children of the first body.
 
-    A connect becomes a ball, a weld a weld. Other elements are skipped.
+    A connect becomes a ball, as does a weld that is given no torque, and other welds a weld. Other
+    elements are skipped.
     """
     import mujoco
 
-    links = []
+    links, disabled = [], is_disabled(model, "equality", "constraint")
     for i in range(model.neq):
         kind, data = int(model.eq_type[i]), model.eq_data[i]
         if kind not in (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)):
             continue
-        weld = kind == int(mujoco.mjtEq.mjEQ_WELD)
+        is_weld = kind == int(mujoco.mjtEq.mjEQ_WELD)
+        weld = is_weld and data[10] != 0  # the element's torquescale
         ends = [int(model.eq_obj1id[i]), int(model.eq_obj2id[i])]
         if int(model.eq_objtype[i]) == int(mujoco.mjtObj.mjOBJ_SITE):
             places = [(model.site_pos[s], model.site_quat[s]) for s in ends]
             ends = [int(model.site_bodyid[s]) for s in ends]
+        elif is_weld and not weld:
+            places = [(data[3:6], (1, 0, 0, 0)), (data[:3], None)]
         elif weld:
             places = [(data[3:6], data[6:10]), (data[:3], (1, 0, 0, 0))]
         else:
@@ -47,7 +52,7 @@ def links_from_equalities(model: MuJoCo) -> list[VirtualLink]:
                 quat=_normalize(places[0][1]),
                 real_pos=tuple(places[1][0]),
                 real_quat=None if places[1][1] is None or not weld else _normalize(places[1][1]),
-                connected=bool(model.eq_active0[i]),
+                connected=bool(model.eq_active0[i]) and not disabled,
             )
         )
     return links

@@ -1,5 +1,6 @@
 """The bodies of a scene and the joints between them (`Chain`, for the life of the scene)."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -227,6 +228,11 @@ class Chain(Printed, NamedAccess):
         from svkc.mjcf.convert import to_mjcf
 
         return to_mjcf(self)
+
+
+def without_locks(structure: Structure) -> Structure:
+    """Return the structure with no joint locked."""
+    return dataclasses.replace(structure, locked=None)
 
 
 def active_dofs(chain: Chain, structure: Structure) -> Bool[Array, " dofs"]:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from svkc._jax.pytrees import is_concrete
 from svkc.model.names import body_index, q_slice, unknown_name, v_slice
-from svkc.model.topology import Topology
+from svkc.model.topology import FREE, Topology
 from svkc.model.validation import boolean, finite_array
 
 OF_BODIES = ("mass", "com", "inertia", "pos", "quat")
@@ -26,7 +26,8 @@ class BodyParameters(NamedTuple):
     mass: kg.
     com: centre of mass in the body's frame (m).
     inertia: rotational inertia about the centre of mass, in the body's axes (kg m^2).
-    pos, quat: placement of the body's frame in the parent's at the load pose (m, wxyz).
+    pos, quat: placement of the body's frame in the parent's at the load pose (m, wxyz). Those of a
+        body that is free or cuttable are not used: coordinates of its free joint place it.
     """
 
     mass: Float[Array, ""]
@@ -61,6 +62,8 @@ def with_parameters(
             new[field] = _with_entries(chain, field, array, value)
         else:
             new[field] = _as_shape(field, value, array)
+    if "limit" in new:
+        _check_limit_springs(chain, new)
     if "stiffness" in new and old["q_spring"] is None:
         new.setdefault("q_spring", new.get("q_load", old["q_load"]))
     if boolean("scale_inertia", scale_inertia):
@@ -80,12 +83,31 @@ def _default_array(chain: Any, field: str) -> Array:
     return jnp.zeros(chain.nv if field == "armature" else chain.dofs, chain.q_load.dtype)
 
 
+def _check_limit_springs(chain: Any, new: Mapping[str, Any]) -> None:
+    """Raise ValueError if a joint gets a range although the model gives it none, and no spring."""
+    limit, spring = new["limit"], new.get("limit_spring", chain.limit_spring)
+    if not is_concrete(limit, spring):
+        return
+    loose = np.isfinite(np.asarray(limit)).any(0) & (np.asarray(spring) == 0).all(0)
+    if np.any(loose):
+        name = chain.dof_names[int(np.argmax(loose))]
+        raise ValueError(
+            f"limit: {name!r} has no joint range in the model, and so no spring that would stop it"
+            " at the range's ends; load a model in which it has a range"
+        )
+
+
 def _with_entries(chain: Any, field: str, array: Array, values: Mapping[str, Any]) -> Array:
     """Return an array with the entries of the named bodies or joints set."""
     if field not in (*OF_BODIES, *OF_JOINTS):
         raise ValueError(f"{field}: got names, expected an array of shape {array.shape}")
     for name, value in values.items():
         at = _entries(chain.topology, field, name)
+        if field in ("pos", "quat") and chain.topology.kind[at] == FREE:
+            raise ValueError(
+                f"{field}: body {name!r} is placed by the coordinates of its free joint; give these"
+                " to chain.state, or change the structure's placement of a cuttable joint"
+            )
         entries = array[at]
         label = f"{field}[{name!r}]"
         value = finite_array(label, value, array.dtype)

@@ -5,6 +5,7 @@ Values of tracers cannot be checked; their shapes and dtypes are.
 """
 
 import inspect
+import warnings
 from typing import Any
 
 import jax
@@ -136,3 +137,19 @@ def names(name: str, value: Any) -> tuple[str, ...]:
     if not all(isinstance(x, str) for x in values):
         raise ValueError(f"{name}: expected names, got {value!r}")
     return values
+
+
+def warn_of_precision(dtype: DType, **values: Any) -> None:
+    """Warn about arrays in float64 that become float32.
+
+    dtype: of the chain. values: arguments of `state` by name.
+    """
+    float64_inputs = [
+        name for name, x in values.items() if isinstance(x, np.ndarray) and x.dtype == np.float64
+    ]
+    if float64_inputs and dtype == np.float32:
+        warnings.warn(
+            f"state: {' and '.join(float64_inputs)} in float64, kept in float32: jax_enable_x64 was"
+            " off when the chain was loaded",
+            stacklevel=4,
+        )

@@ -4,6 +4,8 @@ import dataclasses
 
 import numpy as np
 
+from svkc._jax.pytrees import is_concrete
+from svkc.model.chain import Chain
 from svkc.model.tables import Table, as_text
 from svkc.optimize.program import Program
 
@@ -48,6 +50,25 @@ class Check:
         )
         rows = [(name, f"{amount:.3g}") for name, amount in self.violated]
         return as_text([*words, Table(("violated most", "by"), rows)])
+
+
+def check_passive_links(chain: Chain) -> None:
+    """Raise ValueError if a virtual link has a spring, a damper or a joint range.
+
+    A motion over phases has no coordinates of virtual links, and so none of these forces.
+    """
+    for what in ("stiffness", "damping", "limit_spring"):
+        values = getattr(chain, what)
+        if values is None or not is_concrete(values):
+            continue
+        acts = np.any(np.atleast_2d(values)[:, chain.nv :], 0)
+        if np.any(acts):
+            name = chain.dof_names[chain.nv + int(np.argmax(acts))]
+            raise ValueError(
+                f"chain: virtual link {name!r} has a spring, a damper or a joint range, which"
+                " motions over phases leave out; load the model without them:"
+                ' ignore=("spring", "damping", "limit")'
+            )
 
 
 def check_finite(program: Program, x: np.ndarray) -> None:

@@ -12,6 +12,7 @@ from svkc._jax.static_gather import static_take
 from svkc.model.annotations import Checked, Function, Integer, Names, Numbers, Scalar
 from svkc.model.chain import Chain, State
 from svkc.model.checked_jit import torques_over_dofs
+from svkc.model.names import unknown_name
 from svkc.model.validation import boolean, names, real_array
 from svkc.optimize.schemes import Radau
 
@@ -83,16 +84,27 @@ class AbstractControls(abc.ABC):
         """Return the lower and upper bounds [2 count] of each block of a stage."""
 
 
-def _bounds(name: str, limit: Any, joints: list[str]) -> np.ndarray:
+def _bounds(
+    name: str, limit: Any, joints: list[str], groups: Mapping[str, list[str]] | None = None
+) -> np.ndarray:
     """Return lower and upper bounds [2 n] from a limit in one of the forms of `Torques.limit`.
 
     name: of the limit, for messages. joints: names of the n numbers that the limit is for.
+    groups: names of joints, each with the names of its numbers.
+
+    Raises ValueError, with the nearest names, if a limit is for an unknown name.
     """
     if limit is None:
         return np.full((2, len(joints)), [[-np.inf], [np.inf]])
     if isinstance(limit, Mapping):
-        pairs = [_bounds(f"{name}[{joint!r}]", limit.get(joint), [joint]) for joint in joints]
-        return np.concatenate(pairs, 1) if pairs else np.zeros((2, 0))
+        known = dict(groups or {}) | {joint: [joint] for joint in joints}
+        bounds = np.full((2, len(joints)), [[-np.inf], [np.inf]])
+        for key, value in limit.items():
+            if key not in known:
+                raise unknown_name("driven joint", key, tuple(known))
+            own = [joints.index(joint) for joint in known[key]]
+            bounds[:, own] = _bounds(f"{name}[{key!r}]", value, known[key])
+        return bounds
     if isinstance(limit, tuple) and len(limit) == 2:
         pair = [np.broadcast_to(real_array(name, x, float), len(joints)) for x in limit]
         return np.array(pair, float)
@@ -108,12 +120,13 @@ def _bounds(name: str, limit: Any, joints: list[str]) -> np.ndarray:
 def _driven_joints(chain: Chain, joints: Names | None, *limits: Any) -> list[str]:
     """Return the names of the driven joints.
 
-    They are the joints named. Without names: the keys of a limit. Without these: the actuated ones.
+    They are the joints named. Without names: the keys of all limits. Without these: the actuated
+    ones.
     """
     if joints is not None:
         driven_joints = list(names("joints", joints))
     elif named := [limit for limit in limits if isinstance(limit, Mapping)]:
-        driven_joints = list(named[0])
+        driven_joints = list(dict.fromkeys(joint for limit in named for joint in limit))
     else:
         driven = np.asarray(chain.actuated)
         driven_joints = [j for j in chain.joint_names if np.all(driven[chain.v_index(j)])]
@@ -137,6 +150,10 @@ class _JointTorques(AbstractControls):
 
     def _coordinates(self, chain: Chain) -> tuple[np.ndarray, list[str]]:
         return _columns(chain, self.joints)
+
+    def _bounds(self, chain: Chain, name: str, limit: Any) -> np.ndarray:
+        groups = {joint: _columns(chain, [joint])[1] for joint in self.joints}
+        return _bounds(name, limit, self.names(chain), groups)
 
     def driven(self, chain: Chain) -> np.ndarray:
         return np.isin(np.arange(chain.nv), self._coordinates(chain)[0])
@@ -185,7 +202,7 @@ class Torques(_JointTorques):
         return D0, np.zeros_like(D0)
 
     def limits(self, chain: Chain) -> list[np.ndarray]:
-        return [_bounds("limit", self.limit, self.names(chain))]
+        return [self._bounds(chain, "limit", self.limit)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -216,8 +233,8 @@ class TorqueRates(_JointTorques):
         return D0, D1
 
     def limits(self, chain: Chain) -> list[np.ndarray]:
-        over = self.names(chain)
-        return [_bounds("torque", self.torque, over), _bounds("limit", self.limit, over)]
+        limits = {"torque": self.torque, "limit": self.limit}
+        return [self._bounds(chain, name, limit) for name, limit in limits.items()]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,7 +13,7 @@ from svkc.model.annotations import Checked, Function, Integer
 from svkc.model.chain import Chain
 from svkc.model.checked_jit import check_chain
 from svkc.model.validation import boolean, check_function, integer
-from svkc.optimize.checks import Check, check, check_finite
+from svkc.optimize.checks import Check, check, check_finite, check_passive_links
 from svkc.optimize.compilation import compile_problem
 from svkc.optimize.controls import AbstractControls
 from svkc.optimize.encoding import encode
@@ -71,6 +71,7 @@ class Problem:
         project: bool = True,
     ):
         check_chain(chain)
+        check_passive_links(chain)
         phases = [phases] if isinstance(phases, Phase) else list(phases)
         bounds = tuple(as_constraint("bounds", i, entry) for i, entry in enumerate(bounds))
         self.controls: AbstractControls = controls.for_chain(chain)

@@ -6,9 +6,10 @@ from typing import NamedTuple
 import numpy as np
 
 from svkc.model.chain import Chain
+from svkc.optimize.charts import quaternion_starts
 from svkc.optimize.controls import AbstractControls
 from svkc.optimize.free_args import ArgsModel
-from svkc.optimize.phases import Phase, coordinates_of
+from svkc.optimize.phases import Between, Phase, coordinates_of
 from svkc.optimize.points import PhaseStructure
 from svkc.optimize.schemes import Radau
 from svkc.optimize.tables import PhaseIndices, Table
@@ -162,6 +163,7 @@ class UnknownsBuilder:
         places = (("bounds", slice(None)), ("start", 0), ("end", -1))
         for bound, where in [(b, at) for name, at in places for b in phase.bounds_at(name)]:
             at = coordinates_of(self.chain, bound, self.names.controls)
+            self._check_orientation(phase, bound, at)
             if bound.of == "torque" and not states:
                 raise ValueError('between: of="torque" needs TorqueRates; use of="control"')
             target = of_u if bound.of == "control" else nodes[:, where]
@@ -170,6 +172,27 @@ class UnknownsBuilder:
             target[1][..., columns] = np.minimum(target[1][..., columns], bound.upper)
         self._check_bounds(phase, nodes, of_u)
         return nodes[0], nodes[1], of_u
+
+    def _check_orientation(self, phase: Phase, bound: Between, at: np.ndarray) -> None:
+        """Raise ValueError if a bound is for the orientation of a ball or a free joint.
+
+        Its unknowns are rotation vectors from the guess, and their rates. Only the rate zero is
+        that of every guess.
+        """
+        if bound.of not in ("position", "velocity"):
+            return
+        low, high = (np.broadcast_to(x, at.shape) for x in (bound.lower, bound.upper))
+        bounded = np.isfinite(low) | np.isfinite(high)
+        if bound.of == "velocity":
+            bounded &= (low != 0) | (high != 0)
+        wrong = bounded & np.isin(at, quaternion_starts(self.chain)[1][:, None] + np.arange(3))
+        if np.any(wrong):
+            name = self.chain.dof_names[int(at[np.argmax(wrong)])]
+            raise ValueError(
+                f"phase {phase.name!r}: between bounds the {bound.of} of {name!r}, an orientation,"
+                " whose coordinates depend on the guess; give a function of p.state in `path`,"
+                " `start` or `end` instead"
+            )
 
     def _check_bounds(self, phase: Phase, nodes: np.ndarray, of_u: np.ndarray) -> None:
         """Raise ValueError if a lower bound is above its upper bound."""

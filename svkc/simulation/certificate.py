@@ -222,14 +222,18 @@ def _check_state(chain: Chain, state: State, is_phase_end: Bool[Array, ""]) -> S
 def _is_free(chain: Chain, s: Structure) -> Bool[Array, ""]:
     """Return whether the bodies are free of the ground.
 
-    They are if every tree has a free joint at its root, and no connected virtual link joins the
-    ground.
+    They are if every tree has a free joint at its root that is not locked, and no connected virtual
+    link joins the ground.
     """
     top = chain.topology
     roots = [i for i in range(1, len(top.parent)) if top.parent[i] == 0]
     if not roots or any(top.kind[i] != FREE for i in roots):
         return jnp.zeros((), bool)
-    return ~jnp.any(s.connected & ((s.parent == 0) | (s.real == 0)))
+    held = jnp.any(s.connected & ((s.parent == 0) | (s.real == 0)))
+    if s.locked is not None:
+        at_roots = np.concatenate([top.v_start[i] + np.arange(6) for i in roots])
+        held = held | jnp.any(s.locked[at_roots])
+    return ~held
 
 
 def _momentum_drift(
@@ -253,5 +257,7 @@ def evaluations_per_step(solver: diffrax.AbstractSolver[Any]) -> int:
 
     Newton iterations of implicit stages are not counted.
     """
+    if isinstance(solver, diffrax.HalfSolver):
+        return 3 * evaluations_per_step(solver.solver)
     tableau = getattr(solver, "tableau", None)
     return len(np.asarray(tableau.b_sol)) if isinstance(tableau, diffrax.ButcherTableau) else 1

@@ -68,30 +68,25 @@ def check_times(t0: Any, t1: Any, ts: Any, events: Any) -> None:
     for name, value in (("t0", t0), ("t1", t1)):
         scalar(name, value)
     times = None if ts is None else finite_array("ts", ts)
+    if times is not None and (times.ndim != 1 or not times.size):
+        raise ValueError(f"ts: expected one or more times, got an array of shape {times.shape}")
     if not is_concrete(t0, t1):
         return
     if not t1 >= t0 or not np.isfinite(t1) or not np.isfinite(t0):
         raise ValueError(f"t1: got {t1}, expected a time at or after t0 = {t0}")
     if ts is not None and is_concrete(ts):
         times = np.asarray(times)
-        if (
-            times.ndim != 1
-            or not times.size
-            or np.any(np.diff(times) < 0)
-            or np.any((times < t0) | (times > t1))
-        ):
+        if np.any(np.diff(times) < 0) or np.any((times < t0) | (times > t1)):
             raise ValueError(
                 f"ts: expected non-decreasing times from t0 = {t0} to t1 = {t1}, got {times}"
             )
     for event in events:
-        if (
-            isinstance(event, At)
-            and is_concrete(event.time)
-            and not np.all(
-                (np.asarray(event.time) >= (t0 if event.after is None else 0))
-                & np.isfinite(np.asarray(event.time))
-            )
-        ):
+        if not isinstance(event, At) or not is_concrete(event.time):
+            continue
+        if np.any(np.isnan(np.asarray(event.time))):
+            raise ValueError(f"at: got time {event.time}, expected a number")
+        # an event at an infinite time does not happen
+        if np.any(np.asarray(event.time) < (t0 if event.after is None else 0)):
             if event.after is not None:
                 raise ValueError(f"at: got time {event.time} after an event, expected 0 or more")
             raise ValueError(f"at: got time {event.time}, before the start of the run at {t0}")

@@ -239,13 +239,16 @@ def _inherits_tolerance(value) -> bool:
 def _resolve_adjoint(adjoint, controller) -> diffrax.AbstractAdjoint | Replay:
     """Return the adjoint, by default `Replay()`.
 
-    Replay needs steps that end at save times, as fixed and adaptive steps do. With other
-    controllers, for which saved states are interpolated, the default is diffrax's.
+    Replay needs steps that end at save times, as fixed and adaptive steps do, and that begin where
+    the step before ended, unlike those around a jump (`jump_ts`). With other controllers the
+    default is diffrax's adjoint.
 
-    Raises ValueError for another type, or for Replay with such a controller.
+    Raises ValueError for another type, for Replay with such a controller, and for
+    `BacksolveAdjoint`, which cannot save states.
     """
-    can_replay = controller is None or isinstance(
-        controller, diffrax.AbstractAdaptiveStepSizeController
+    is_adaptive = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
+    can_replay = controller is None or (
+        is_adaptive and getattr(controller, "jump_ts", None) is None
     )
     if adjoint is None:
         return Replay() if can_replay else diffrax.RecursiveCheckpointAdjoint()
@@ -253,10 +256,15 @@ def _resolve_adjoint(adjoint, controller) -> diffrax.AbstractAdjoint | Replay:
         raise ValueError(
             f"adjoint: expected svkc.integrators.Replay or a diffrax adjoint, got {adjoint!r}"
         )
+    if isinstance(adjoint, diffrax.BacksolveAdjoint):
+        raise ValueError(
+            "adjoint: diffrax.BacksolveAdjoint cannot save states; use svkc.integrators.Replay or"
+            " diffrax.RecursiveCheckpointAdjoint"
+        )
     if isinstance(adjoint, Replay) and not can_replay:
         raise ValueError(
-            "adjoint: svkc.integrators.Replay needs dt or an adaptive stepsize_controller; give a"
-            " diffrax adjoint with this controller"
+            "adjoint: svkc.integrators.Replay needs dt or an adaptive stepsize_controller without"
+            " jump_ts; give a diffrax adjoint with this controller"
         )
     return adjoint
 

@@ -197,13 +197,14 @@ def _integrate(
         solution, t, y = integrate_with_replay(y0, times, problem, stepper_options, guards)
         return solution, stop_gradient_tree(solution.event), t, y
     t0, stop, ts = times
-    event = None
+    event, located, failed = None, None, None
     if armed is not None:
         # the event is located first, without derivatives; the differentiated solve ends at its time
         constants = stop_gradient_tree((y0, times, problem))
         located = integrate_phase(constants[0], constants[1], constants[2], stepper_options)
         assert located.event is not None
-        stop = where(located.event.occurred, located.t, stop)
+        failed = (located.result != SUCCESSFUL) & (located.result != EVENT)
+        stop = where(located.event.occurred | failed, located.t, stop)
         ts, event = where(ts > stop, stop, ts), located.event
     controller, first_step = options.step_size_control(ts)
     stepper_options = dataclasses.replace(
@@ -214,6 +215,9 @@ def _integrate(
         progress_meter=options.progress_meter,
     )
     solution = integrate_with_diffrax(y0, (t0, stop, ts), problem, stepper_options, adjoint, event)
+    if located is not None:
+        result = where(failed, located.result, solution.result)
+        solution = dataclasses.replace(solution, result=result)
     # the adjoint differentiates by a scheduled end, so the end is not shifted again here
     stop_shift = jnp.zeros_like(solution.t)
     t, y = end_of_phase(solution.t, solution.y, stop_shift, problem.field_args, guards, event)

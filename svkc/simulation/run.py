@@ -176,7 +176,7 @@ def run_phase(
     stop = _next_stop(run, t1)
     field_args = phase_field_args(chain, run.state.structure, args, options.field)
     outcome = solve_phase(run, stop, ts, plan, options, field_args)
-    timed, fired = _fired_events(run, outcome, active, plan)
+    timed, fired = _fired_events(run, outcome, active, t1, plan)
     end_state = State(outcome.y.q, outcome.y.v, run.state.structure)
     saved, saved_work = _write_saved_states(run, end_state, outcome, ts)
     row = (jnp.arange(run.records.start.shape[0]) == index) & active
@@ -214,10 +214,15 @@ def run_phase(
     )
 
 
-def _fired_events(run: RunState, outcome: PhaseOutcome, active, plan: Plan):
-    """Return the mask of the timed events, and that of all events, that fired after a phase."""
+def _fired_events(run: RunState, outcome: PhaseOutcome, active, t1, plan: Plan):
+    """Return the mask of the timed events, and that of all events, that fired after a phase.
+
+    Events after t1 by more than round-off do not happen.
+    """
     reached = active & (outcome.result == RESULTS.successful)
-    timed = run.schedule.due(outcome.t + event_tolerance(outcome.t)) & reached
+    latest = t1 + 8 * jnp.finfo(t1.dtype).eps * jnp.maximum(1, jnp.abs(t1))
+    due_until = jnp.minimum(outcome.t + event_tolerance(outcome.t), latest)
+    timed = run.schedule.due(due_until) & reached
     indices = np.array(plan.timed + plan.guarded, int)
     fired = jnp.concatenate([timed, outcome.fired & reached])
     return timed, jnp.zeros(len(plan.actions), bool).at[indices].set(fired)

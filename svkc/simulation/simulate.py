@@ -157,9 +157,9 @@ def _with_certificate(
         chain, run.records, run.count, (ts, run.saved), stages
     )
     largest_gap = jnp.maximum(jnp.max(saved.gap), jnp.max(phases.gap))
-    result = RESULTS.where(
-        (result == RESULTS.successful) & (largest_gap > gap_tolerance), RESULTS.loop_open, result
-    )
+    ended = (result == RESULTS.successful) | (result == RESULTS.stopped)
+    is_open = ended & (largest_gap > gap_tolerance)
+    result = RESULTS.where(is_open, RESULTS.loop_open, result)
     derivative = DERIVATIVE.where(
         (rank_lost_at < phases.start.shape[0]) & (rank_lost_at <= run.invalid_from),
         DERIVATIVE.rank_lost,

@@ -18,7 +18,7 @@ from svkc._jax.select import where
 from svkc.loops.constraint import LoopKinematics, jacobian_scales, loop_kinematics
 from svkc.loops.frames import LoopFrames
 from svkc.loops.pivoting import PivotedQR, pivoted_qr
-from svkc.model.chain import Chain, Structure, active_dofs
+from svkc.model.chain import Chain, Structure, active_dofs, without_locks
 from svkc.transitions.newton_state import CLOSE_PERTURBED, NewtonState, is_any_of
 from svkc.transitions.stationarity import (
     Targets,
@@ -234,11 +234,12 @@ def linearize(
 ) -> LinearSolution:
     """Return the Newton step (corrector) and the tangent of the path (predictor) at q."""
     kind, column, weight = path.kind, jacobian_scales(chain)[1], weights(chain, structure)
-    kins, frames, Js, gaps, qs, size = _neighbourhood(chain, structure, q)
+    # a locked coordinate moves the loops on the way to its requested value
+    kins, frames, Js, gaps, qs, size = _neighbourhood(chain, without_locks(structure), q)
     kin, frames, J, gap = jax.tree.map(lambda x: x[0], (kins, frames, Js, gaps))
     on_leg, moved = is_any_of(kind, CLOSE_START, FOLLOW), path.held & (kind == FOLLOW)
     projects_held = (kind == PROJECT_VELOCITY_HELD) & targets.held_v
-    fixed = moved | projects_held | ~active_dofs(chain, structure)
+    fixed = moved | projects_held | ~(active := active_dofs(chain, structure))
     free_J = where(fixed, 0, J)
     rank = where(path.rank_known, path.newton.rank, min(J.shape))
     all_pivots = pivoted_qr(free_J, rank, targets.held_q & (kind == SELECT_HELD))
@@ -254,7 +255,7 @@ def linearize(
     # gaps and offsets shrink as 1 - s from their values where the leg begins
     residual = where(on_leg, gap - (1 - path.s) * initial_gap, gap)
     projects = is_any_of(kind, PROJECT_VELOCITY_HELD, PROJECT_VELOCITY)
-    residual = where(projects, J @ (path.newton.v / column), residual)
+    residual = where(projects, J @ where(active, path.newton.v / column, 0), residual)
     for_fixed = where(moved, offset - (1 - path.s) * initial_offset, 0)
     upper = where(fixed, for_fixed, where(on_leg, -gradient_of_change, 0))
     right_side = jnp.concatenate([upper, -selection.Q @ residual])

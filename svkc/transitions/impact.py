@@ -50,7 +50,8 @@ class StructureChange(eqx.Module):
         in world axes (N s, N m s).
     energy_lost: kinetic energy lost in the impact (J).
     initial_gap: largest loop gap before the new loops were closed (rad, or in `chain.length`s).
-    residual_gaps: largest gap of each loop after they were closed (rad, or in `chain.length`s).
+    residual_gaps: largest gap of each loop after they were closed (rad, or in `chain.length`s);
+        zero if nothing is new.
     """
 
     state: State

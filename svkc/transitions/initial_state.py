@@ -3,7 +3,6 @@ closed by continuation, the velocity projected, and errors that name what could 
 
 import functools
 import math
-import warnings
 from typing import Any, TypeAlias
 
 import equinox as eqx
@@ -20,7 +19,7 @@ from svkc.model.annotations import Checked, Names, Numbers, Scalar
 from svkc.model.chain import Chain, State, Structure
 from svkc.model.checked_jit import check_state
 from svkc.model.names import connection_mask, q_slice, v_slice
-from svkc.model.validation import boolean, finite_array, positive_scalar
+from svkc.model.validation import boolean, finite_array, positive_scalar, warn_of_precision
 from svkc.transitions.path_following import follow_path
 from svkc.transitions.spare_links import check_bound
 from svkc.transitions.stationarity import Targets
@@ -163,7 +162,7 @@ def assemble(
 ) -> State:  # fmt: skip
     """Return a consistent state; see `Chain.state`."""
     start, structure = starting_point(chain, near, connected)
-    _warn_of_precision(chain, q, v)
+    warn_of_precision(chain.q_load.dtype, q=q, v=v)
     requested, specified_q = full_vector(chain, "q", q, start)
     v_full, specified_v = full_vector(chain, "v", v, np.zeros(chain.dofs, chain.q_load.dtype))
     requested, v_full = jnp.asarray(requested), jnp.asarray(v_full)
@@ -171,7 +170,8 @@ def assemble(
     holds = [isinstance(x, dict) if hold is None else boolean("hold", hold) for x in (q, v)]
     throw, tolerance = boolean("throw", throw), _tolerance(chain, tolerance)
     if not len(chain.link_names):
-        return State(normalize(chain, requested), v_full, structure)
+        held_v = jnp.asarray(specified_v & holds[1])
+        return _state_without_links(chain, structure, requested, v_full, held_v, throw)
     held = HeldMasks(jnp.asarray(specified_q & holds[0]), jnp.asarray(specified_v & holds[1]))
     follows_names = isinstance(q, dict) and holds[0]
     # a full array gives the poses of the bodies of cuttable joints; names, and an array in the
@@ -188,6 +188,25 @@ def assemble(
         tolerance=tolerance,
     )
     state, deviations = _follow_and_compare(chain, structure, targets, held)
+    return _check_reached(chain, state, deviations, throw)
+
+
+def _state_without_links(
+    chain: Chain, structure: Structure, q: Array, v: Array, held_v: Array, throw: bool
+) -> State:
+    """Return the state of a chain without virtual links, whose locked joints are at rest."""
+    if structure.locked is None:
+        return State(normalize(chain, q), v, structure)
+    lost = where(held_v & structure.locked, jnp.abs(v), 0)
+    if throw and is_concrete(lost) and np.any(lost):
+        i = int(np.argmax(lost))
+        raise ValueError(
+            f"v: {chain.dof_names[i]} is locked, so that its velocity is 0, got {v[i]}"
+        )
+    state = State(normalize(chain, q), where(structure.locked, 0, v), structure)
+    deviations = Deviations(
+        q=jnp.zeros_like(lost), v=lost, is_open=jnp.zeros(0, bool), failed=jnp.any(lost > 0)
+    )
     return _check_reached(chain, state, deviations, throw)
 
 
@@ -214,21 +233,6 @@ def starting_point(
         start = state.q
         structure = eqx.tree_at(lambda s: s.connected, state.structure, jnp.asarray(mask))
     return start, structure
-
-
-def _warn_of_precision(chain: Chain, q, v):
-    """Warn about arrays in float64 that become float32."""
-    float64_inputs = [
-        name
-        for name, x in (("q", q), ("v", v))
-        if isinstance(x, np.ndarray) and x.dtype == np.float64
-    ]
-    if float64_inputs and chain.q_load.dtype == np.float32:
-        warnings.warn(
-            f"state: {' and '.join(float64_inputs)} in float64, kept in float32: jax_enable_x64 was"
-            " off when the chain was loaded",
-            stacklevel=4,
-        )
 
 
 def _check_reached(chain: Chain, state: State, deviations: Deviations, throw: bool) -> State:

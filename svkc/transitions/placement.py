@@ -1,6 +1,7 @@
 """Coordinates of virtual joints and placements of virtual links from the poses of their bodies."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -28,7 +29,8 @@ def joint_coordinates(
     """Return q with the coordinates of every virtual joint computed from the poses of its two
     bodies.
 
-    The part of the relative pose that the joint's freedoms cannot express is left out.
+    The part of the relative pose that the joint's freedoms cannot express is left out. Angles are
+    on the turn nearest to those of q.
     frames: `loop_frames` at q, if they are known.
     """
     top = chain.topology
@@ -57,8 +59,19 @@ def joint_coordinates(
     ):
         at = np.flatnonzero((index < top.nq_all).ravel())
         if len(at):
-            q = q.at[index.ravel()[at]].set(values.ravel()[at])
+            slots, new = index.ravel()[at], values.ravel()[at]
+            new = _on_turn_of(q[slots], new) if index is table.angle else new
+            q = q.at[slots].set(new)
     return q
+
+
+def _on_turn_of(old: Float[Array, " n"], angle: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Return the angles plus the full turns that bring them nearest to the old ones.
+
+    Springs and ranges of joints depend on the turn.
+    """
+    turn = 2 * np.pi
+    return angle + turn * jax.lax.stop_gradient(jnp.round((old - angle) / turn))
 
 
 def with_coordinates(

@@ -27,7 +27,7 @@ from svkc.loops.pivoting import (
     release_threshold,
     solve_positive,
 )
-from svkc.model.chain import Chain, Structure, active_dofs
+from svkc.model.chain import Chain, Structure, active_dofs, without_locks
 from svkc.model.topology import FREE, V_SIZE
 from svkc.tree.configuration import difference, integrate
 
@@ -155,7 +155,8 @@ def stationary_tangent(
     chain, _, start, _ = primals
     column, weight = jacobian_scales(chain)[1], weights(chain, structure)
     fixed = held | ~active_dofs(chain, structure)
-    J = loop_kinematics(chain, structure, q).J
+    # a locked coordinate moves the loops if its value at the start does
+    J = loop_kinematics(chain, without_locks(structure), q).J
     free_J = jax.lax.stop_gradient(where(fixed, 0, J))
     selection = independent_rows(structure, free_J, pivoted_qr(free_J, structure.rank))
     selection = jax.lax.stop_gradient(selection)

@@ -117,7 +117,7 @@ def _select_change(
         angular_impulse=impulse[:, :3],
         energy_lost=where(any_new, solution.energy_lost, 0),
         initial_gap=where(any_new, jnp.max(solution.search_gaps[0]), 0),
-        residual_gaps=where(any_new, solution.residual_gaps, solution.search_gaps[0]),
+        residual_gaps=where(any_new, solution.residual_gaps, 0),
     )
 
 

@@ -125,7 +125,9 @@ def limit_forces(
     lower, upper = chain.limit[:, scalar_v]
     x = static_take(q, scalar_q)
     outside = jnp.maximum(x - upper, 0) - jnp.maximum(lower - x, 0)
-    onset = where(outside != 0, jnp.exp(-0.02 / where(outside != 0, jnp.abs(outside), 1)), 0)
+    # nearer to the range than this the exponential is zero; its derivative would overflow
+    past = jnp.abs(outside) > 1e-6
+    onset = where(past, jnp.exp(-0.02 / where(past, jnp.abs(outside), 1)), 0)
     return replace_rows(
         tau, scalar_v, -(k[scalar_v] * outside + c[scalar_v] * static_take(v, scalar_v)) * onset
     )

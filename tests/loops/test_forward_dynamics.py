@@ -230,3 +230,12 @@ def test_bind_a_spare_slot_in_a_run(gripped):
         strict=True,
     ):
         np.testing.assert_allclose(ours, theirs, atol=ROUND_OFF)
+
+
+@pytest.mark.parametrize("outside", [1e-300, 1e-160, 1e-9])
+def test_derivatives_of_joint_ranges_are_finite_just_outside(outside):
+    rod = models.bar("rod", models.Y + ' range="0 30" limited="true"', "0 0 1")
+    chain = svkc.load(models.MJCF.format(rod))
+    force = lambda q: limit_forces(chain, q, jnp.ones(1))
+    value, slope = jax.jvp(force, (jnp.array([-outside]),), (jnp.ones(1),))
+    assert value.tolist() == slope.tolist() == [0.0]

@@ -201,3 +201,20 @@ def test_free_bodies_turn_through_quaternions():
     solution = problem.solve(problem.guess([start, svkc.State(end, start.v, start.structure)]))
     assert float(solution.cost) < KNOWN
     np.testing.assert_allclose(solution.motion[0].v[:, 5], 1.5, atol=1e-4)
+
+
+def test_limits_of_joints_with_several_coordinates():
+    """A joint's name stands for all of its coordinates; several limits name the driven joints."""
+    hinge = models.bar("hinge", models.Y, "0 0 1")
+    arm = models.MJCF.format(models.bar("ball", 'type="ball"', "0 0 1", inside=hinge))
+    chain = svkc.load(arm)
+    torques = optimize.Torques(limit={"ball": 5.0, "hinge": (-1.0, 2.0)}).for_chain(chain)
+    assert torques.names(chain) == ["ball.rx", "ball.ry", "ball.rz", "hinge"]
+    np.testing.assert_array_equal(torques.limits(chain)[0], [[-5, -5, -5, -1], [5, 5, 5, 2]])
+    rates = optimize.TorqueRates(torque={"hinge": 2.0}, limit={"ball": 4.0}).for_chain(chain)
+    assert rates.names(chain) == ["hinge", "ball.rx", "ball.ry", "ball.rz"]
+    np.testing.assert_array_equal(rates.limits(chain)[0][1], [2, np.inf, np.inf, np.inf])
+    np.testing.assert_array_equal(rates.limits(chain)[1][1], [np.inf, 4, 4, 4])
+    misspelt = optimize.Torques(joints=["hinge"], limit={"hing": 2.0}).for_chain(chain)
+    with pytest.raises(ValueError, match="no driven joint 'hing'; did you mean 'hinge'"):
+        misspelt.limits(chain)

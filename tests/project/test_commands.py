@@ -193,3 +193,13 @@ def test_info(tmp_path):
         assert line in told, (line, told)
     (tmp_path / "bad.xml").write_text("<mujoco")
     assert run("-m", "svkc", "info", tmp_path / "bad.xml").returncode == 1
+
+
+def test_ignore_takes_one_word(tmp_path, capsys):
+    """The word after it is the model. A scene has nothing to leave out."""
+    path = tmp_path / "missing.xml"
+    assert main(["run", "--ignore", "friction", str(path)]) == 1
+    assert f"no scene and no file '{path}'" in capsys.readouterr().out
+    assert main(["run", "--ignore", "friction", "high_bar", "--out", str(tmp_path)]) == 1
+    assert "--ignore is for model files" in capsys.readouterr().out
+    assert not list(tmp_path.iterdir())

@@ -138,3 +138,26 @@ def test_state_and_connect_under_jit_and_vmap(high_bar):
         consistent.v[1], chain.state(state.q[: chain.nq], v[1]).v, atol=ROUND_OFF
     )
     np.testing.assert_allclose(again.v, consistent.v, atol=ROUND_OFF)
+
+
+def test_a_joint_that_connects_again_keeps_its_turn():
+    """Springs and ranges depend on the turn: an angle above pi is not one below zero."""
+    rod = models.bar("rod", models.Y + ' range="0 270" limited="true"', "0 0 -0.4")
+    chain = svkc.load(models.MJCF.format(rod), cuttable="rod")
+    for angle in (3.5, 0.5):
+        state = chain.state({"rod": angle})
+        again = svkc.connect(chain, svkc.cut(chain, state, "rod"), "rod")
+        np.testing.assert_allclose(chain.joint(again, "rod").q, angle, atol=ROUND_OFF)
+
+
+def test_changes_that_connect_nothing_do_not_close_loops():
+    """Of a state with small gaps, as after many steps: q stays, and no error is raised."""
+    chain = models.parallelogram()
+    closed = chain.state({"leg0": 0.3}, {"leg0": 1.0})
+    q = closed.q + 3e-8 * np.sin(np.arange(closed.q.size))
+    state = svkc.State(q, closed.v, closed.structure)
+    assert 1e-8 < float(jnp.abs(svkc.loop_gaps(chain, state)).max()) < 1e-7
+    for after in (svkc.connect(chain, state, "pin1"), svkc.transition(chain, state, ["pin2"])):
+        np.testing.assert_array_equal(after.q, q)
+        np.testing.assert_array_equal(after.v, closed.v)
+    assert after.structure.connected.tolist() == [False, True]

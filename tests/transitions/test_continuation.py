@@ -256,3 +256,44 @@ def test_derivatives_of_both_modes_and_second_ones():
     second = jax.jit(jax.jacfwd(jax.grad(g)))(0.3)
     h = 1e-4
     np.testing.assert_allclose(second, (forward(0.3 + h) - forward(0.3 - h)) / (2 * h), rtol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def on_a_locked_base():
+    """Return a four-bar on a turntable, with the joint of the turntable locked, and the state."""
+    inside = models.FOUR_BAR.replace('"crank" pos="0 0 0"', '"crank" pos="0.3 0 0"')
+    text = models.MJCF.format(models.bar("base", models.Y, "0.3 0 0", inside=inside))
+    chain = svkc.load(text, virtual_links=[models.pin(pos=(1.5, 0, 0))])
+    return chain, svkc.lock(chain, chain.state(), "base")
+
+
+@pytest.mark.slow
+def test_locked_coordinates_move_to_their_requested_values(on_a_locked_base):
+    """The loops close around them. Only runs and changes of structure keep them."""
+    chain, locked = on_a_locked_base
+    for angle in (0.01, 0.5):
+        state = chain.state({"base": angle}, near=locked)
+        assert float(state.q[0]) == angle
+        assert float(jnp.abs(svkc.loop_gaps(chain, state)).max()) < ROUND_OFF
+    with pytest.raises(ValueError, match=r"v: .*base by 1 rad/s"):
+        chain.state(v={"base": 1.0}, near=locked)
+    np.testing.assert_allclose(chain.state(v=np.ones(4), near=locked).v[0], 0, atol=ROUND_OFF)
+
+
+@pytest.mark.slow
+def test_derivatives_by_a_locked_coordinate(on_a_locked_base):
+    chain, locked = on_a_locked_base
+    q = lambda x: chain.state(jnp.array([x, -0.1, 0.05, 0.0]), near=locked).q
+    check = svkc.check_grad(q, jnp.asarray(0.1))
+    assert check.error < 1e-8, check
+    assert float(jnp.abs(jax.jacfwd(q)(0.1)[1:]).min()) > 1e-3
+
+
+def test_locked_joints_of_open_chains_are_at_rest():
+    chain = svkc.load(models.MJCF.format(models.TWO_RODS))
+    locked = svkc.lock(chain, chain.state(), "upper")
+    assert chain.state({"upper": 0.3}, np.ones(2), near=locked).v.tolist() == [0, 1]
+    inside_jit = jax.jit(lambda v: chain.state(v=v, near=locked).v)
+    assert inside_jit(jnp.ones(2)).tolist() == [0, 1]
+    failed = chain.state(v={"upper": 5.0}, near=locked, throw=False)
+    assert np.isnan(failed.v).all()

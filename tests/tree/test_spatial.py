@@ -5,7 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from svkc.tree.spatial import cross, motion_cross, quat_matrix, quat_multiply, skew
+from svkc.tree.spatial import (
+    cross,
+    inverse_positive,
+    motion_cross,
+    quat_matrix,
+    quat_multiply,
+    skew,
+)
 
 
 def quaternion_product(a, b):
@@ -60,3 +67,14 @@ def test_products_broadcast_leading_axes():
     got, value = (jax.grad(loss(f), (0, 1))(a, b) for f in (quat_multiply, rows))
     for x, y in zip(got, value, strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-13, atol=1e-14)
+
+
+@pytest.mark.parametrize("size", [1e-15, 1e-9, 1.0, 1e9, 1e15])
+def test_inverses_of_small_and_large_inertias_in_float32(size):
+    """The cube of these numbers is zero or infinite in float32."""
+    rng = np.random.default_rng(0)
+    A = rng.normal(size=(4, 3, 3))
+    D = size * (A @ np.swapaxes(A, 1, 2) + np.eye(3))
+    inverse = inverse_positive(jnp.asarray(D, jnp.float32))
+    products = np.asarray(inverse, float) @ D
+    np.testing.assert_allclose(products, np.broadcast_to(np.eye(3), D.shape), atol=1e-5)
