@@ -248,7 +248,6 @@ def linearize(
     gradient_at = lambda q, J: gradient(chain, path.origin, q, J, path.multiplier, weight)
     gradients = jax.vmap(gradient_at)(qs, Js)
     hessian_on_leg = (gradients[1:] - gradients[:1]).T / size
-    diagonal = jnp.diag(where(kind == CLOSE_PERTURBED, 1, weight))
     gradient_of_change = gradients[0] - path.multiplier @ J
     offset = difference(chain, q, targets.requested) / column
     initial_offset, initial_gap = _initial_values(path, offset, gap)
@@ -260,7 +259,7 @@ def linearize(
     upper = where(fixed, for_fixed, where(on_leg, -gradient_of_change, 0))
     right_side = jnp.concatenate([upper, -selection.Q @ residual])
     along = jnp.concatenate([where(moved, initial_offset, 0), selection.Q @ -initial_gap])
-    hessian = where(on_leg, hessian_on_leg, diagonal)
+    hessian = where(on_leg, hessian_on_leg, jnp.diag(where(kind == CLOSE_PERTURBED, 1, weight)))
     matrix = optimality_matrix(hessian, selection.Q @ J, selection.active, fixed)
     # one call of LAPACK for both matrices
     orientation = _orientation_matrix(path.point, free_J)
