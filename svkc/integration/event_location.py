@@ -198,13 +198,12 @@ def update_search(
     bracket = tree_where(old.narrowing, old.bracket.update(t1, f1), old.bracket)
     bracket = tree_where(starts, Bracket.around(t0, t1, f0, f1), bracket)
     at_right_end = starts | (old.narrowing & (f1 >= 0))
-    magnitudes = jnp.maximum(jnp.abs(before), jnp.abs(values))
     done = old.active & ~old.narrowing
     active = starts | (old.active & ~done)
     search = EventSearch(
         step_size=where(starts, t1 - t0, old.step_size),
         sides=sides,
-        magnitudes=where(starts, magnitudes, old.magnitudes),
+        magnitudes=where(starts, jnp.maximum(abs(before), abs(values)), old.magnitudes),
         bracket=bracket,
         y=tree_where(at_right_end, y, old.y),
         values=where(at_right_end, values, old.values),

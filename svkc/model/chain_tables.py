@@ -29,10 +29,12 @@ def chain_summary(chain: Any) -> str:
 
 
 def chain_blocks(chain: Any) -> list[Block]:
-    """Return a summary, tables of the bodies and of the virtual links, and notes on the latter."""
+    """Return a summary, tables of the bodies and of the virtual links, notes on the latter, and
+    what the model has that is left out."""
     bodies = Table(("body", "parent", "joint", "kind", "freedoms", "mass (kg)"), _body_rows(chain))
+    left_out = [f"left out: {line}" for line in chain.left_out]
     if not chain.link_names:
-        return [chain_summary(chain), bodies]
+        return [chain_summary(chain), bodies, *left_out]
     distances = np.linalg.norm(np.asarray(chain.structure.real_pos), axis=-1)
     rows = _link_rows(chain, distances)
     place = "distance on real to\nits origin (m)"
@@ -45,7 +47,7 @@ def chain_blocks(chain: Any) -> list[Block]:
         )
         if as_loaded and is_connected == "no" and distance not in ("-", "0")
     ]
-    return [chain_summary(chain), bodies, Table(titles, rows), *notes]
+    return [chain_summary(chain), bodies, Table(titles, rows), *notes, *left_out]
 
 
 def _body_rows(chain: Any) -> list[tuple[str, ...]]:

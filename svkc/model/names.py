@@ -90,6 +90,11 @@ def _joint_slice(top: Topology, ranges: Any, joint: str, links: bool) -> slice:
     """Return the slice of a joint among the ranges (name, start, stop) of all."""
     cuttable = tuple(name for name, _, _ in top.cuttable_joints)
     known = dict.fromkeys(top.joint_names + cuttable + top.link_names * links)
+    if not _is_among(joint, known) and _is_among(joint, top.link_names):
+        raise ValueError(
+            f"no joint {joint!r}, but a virtual link, whose coordinates follow from those of the"
+            f" joints: {', '.join(known)}"
+        )
     if not _is_among(joint, known):
         raise unknown_name("joint", joint, tuple(known))
     return next(slice(start, stop) for name, start, stop in ranges if name == joint)

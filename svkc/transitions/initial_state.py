@@ -169,10 +169,9 @@ def assemble(
     check_quaternions(chain, requested)
     holds = [isinstance(x, dict) if hold is None else boolean("hold", hold) for x in (q, v)]
     throw, tolerance = boolean("throw", throw), _tolerance(chain, tolerance)
-    if not len(chain.link_names):
-        held_v = jnp.asarray(specified_v & holds[1])
-        return _state_without_links(chain, structure, requested, v_full, held_v, throw)
     held = HeldMasks(jnp.asarray(specified_q & holds[0]), jnp.asarray(specified_v & holds[1]))
+    if not len(chain.link_names):
+        return _state_without_links(chain, structure, requested, v_full, held.v, throw)
     follows_names = isinstance(q, dict) and holds[0]
     # a full array gives the poses of the bodies of cuttable joints; names, and an array in the
     # model's own order, give the coordinates of these joints
@@ -199,10 +198,8 @@ def _state_without_links(
         return State(normalize(chain, q), v, structure)
     lost = where(held_v & structure.locked, jnp.abs(v), 0)
     if throw and is_concrete(lost) and np.any(lost):
-        i = int(np.argmax(lost))
-        raise ValueError(
-            f"v: {chain.dof_names[i]} is locked, so that its velocity is 0, got {v[i]}"
-        )
+        name = chain.dof_names[int(np.argmax(lost))]
+        raise ValueError(f"v: {name} is locked, so that its velocity is zero")
     state = State(normalize(chain, q), where(structure.locked, 0, v), structure)
     deviations = Deviations(
         q=jnp.zeros_like(lost), v=lost, is_open=jnp.zeros(0, bool), failed=jnp.any(lost > 0)
