@@ -31,6 +31,26 @@ def test_against_differences(name):
     assert check.modes <= 1e-10, check
 
 
+def test_a_stop_against_differences():
+    """A rod is stopped by a guard: in reverse mode, by the velocity and by the guard's angle."""
+    chain = svkc.load(models.ARM)
+    state = chain.state({"arm": 1.2}, {"arm": 0.5})
+
+    def loss(x):
+        stop = svkc.when(lambda t, s, args: s.q[0] - args, stop=True)
+        start = svkc.State(state.q, x["speed"] * state.v, state.structure)
+        traj = svkc.simulate(
+            chain, start, 2.0, events=stop, args=x["angle"], max_events=1, **parameters.TIGHT
+        )
+        # infinite if the event does not occur
+        return traj.events.time[0] + jnp.sum(traj.final.v**2) / 10
+
+    x = {"speed": jnp.asarray(1.0), "angle": jnp.asarray(0.3)}
+    check = svkc.check_grad(loss, x, "reverse", directions=1)
+    assert check.error <= derivatives.RUN, check
+
+
+@pytest.mark.slow
 def test_a_release_against_differences():
     """A rod comes off its pivot at an angle and flies.
 

@@ -68,7 +68,10 @@ WELD = """<mujoco><worldbody><body name="a" pos="0 0 1"><freejoint/><geom size="
 
 @pytest.mark.parametrize(
     ("attributes", "freedoms"),
-    [('torquescale="0" anchor="0.1 0 0"', 4), ('anchor="0.1 0 0" torquescale="0.5"', 1)],
+    [
+        ('torquescale="0" anchor="0.1 0 0"', 4),
+        pytest.param('anchor="0.1 0 0" torquescale="0.5"', 1, marks=pytest.mark.slow),
+    ],
 )
 def test_a_weld_without_torque_is_a_ball(attributes, freedoms):
     chain = svkc.load(WELD.format(attributes))

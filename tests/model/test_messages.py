@@ -39,6 +39,7 @@ LONGEST = (
     "inverse_dynamics_along: at t = ... s:",
     "target: ... cannot",
     "... depends on fixed",
+    "camera: no",
     "pictures need",
 )
 

@@ -257,6 +257,7 @@ def test_wrong_free_args(case):
         move(**options)
 
 
+@pytest.mark.slow
 def test_wrong_guesses_of_free_args(solved):
     problem, _, _ = solved
     poses = [{"x": 0.0}, {"x": 1.0}]

@@ -235,6 +235,7 @@ def test_fixed_and_adaptive_steps_are_consistent(pendulum):
     assert 1e-5 < float(jnp.abs(euler.states.q - adaptive.states.q).max()) < 1e-1
 
 
+@pytest.mark.slow
 def test_control_and_work(pendulum, capsys):
     """The work of a control explains the change of energy. A control that is NaN from some time on
     ends the run with `non_finite`."""
@@ -362,7 +363,7 @@ def test_step_equals_a_step_of_simulate():
 @pytest.mark.parametrize(
     ("dtype", "rtol", "atol"),
     [
-        ("float64", 1e-11, 1e-13),
+        pytest.param("float64", 1e-11, 1e-13, marks=pytest.mark.slow),
         pytest.param("float64", 1e-4, 1e-6, marks=pytest.mark.slow),
         pytest.param("float32", 1e-5, 8 * 2.0**-23, marks=pytest.mark.slow),
     ],

@@ -120,6 +120,7 @@ def assert_equal_to_single_runs(traj, single_runs):
     assert traj.names.links == ("grip",)
 
 
+@pytest.mark.slow
 def test_lanes_equal_single_runs(case, single_runs, capsys):
     """Lanes equal single runs, for several chunks and an order by cost."""
     traj = run_rollout(*case, chunk=4, cost=-np.arange(LANES) % 3)

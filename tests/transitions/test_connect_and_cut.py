@@ -140,6 +140,7 @@ def test_state_and_connect_under_jit_and_vmap(high_bar):
     np.testing.assert_allclose(again.v, consistent.v, atol=ROUND_OFF)
 
 
+@pytest.mark.slow
 def test_a_joint_that_connects_again_keeps_its_turn():
     """Springs and ranges depend on the turn: an angle above pi is not one below zero."""
     rod = models.bar("rod", models.Y + ' range="0 270" limited="true"', "0 0 -0.4")
@@ -150,6 +151,7 @@ def test_a_joint_that_connects_again_keeps_its_turn():
         np.testing.assert_allclose(chain.joint(again, "rod").q, angle, atol=ROUND_OFF)
 
 
+@pytest.mark.slow
 def test_changes_that_connect_nothing_do_not_close_loops():
     """Of a state with small gaps, as after many steps: q stays, and no error is raised."""
     chain = models.parallelogram()
