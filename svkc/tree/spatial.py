@@ -72,14 +72,15 @@ def inverse_positive(D: Float[Array, "*n k k"], by_adjugate: bool = True) -> Flo
     if D.shape[-1] == 1:
         return 1 / D
     if D.shape[-1] == 3 and by_adjugate:
-        scale = jnp.ones((), D.dtype)
+        scale = None
         if D.dtype == jnp.float32:
             # the determinant of a matrix above 7e12 overflows, and below 2e-13 it is zero
             scale = (D[..., 0, 0] + D[..., 1, 1] + D[..., 2, 2])[..., None, None]
             D = D / scale
         a, b, c = D[..., 0, :], D[..., 1, :], D[..., 2, :]
         adjugate = cross(jnp.stack([b, c, a], -2), jnp.stack([c, a, b], -2))
-        return adjugate / (jnp.sum(a * adjugate[..., 0, :], -1)[..., None, None] * scale)
+        determinant = jnp.sum(a * adjugate[..., 0, :], -1)[..., None, None]
+        return adjugate / (determinant if scale is None else determinant * scale)
     matmul = lambda x, y: jnp.sum(x[..., None] * y[..., None, :, :], -2)
     n = D.shape[-1] // 2
     A, B, C = D[..., :n, :n], D[..., :n, n:], D[..., n:, n:]
