@@ -321,7 +321,7 @@ CASES = {
     "tau[...]: got": lambda s: s.four.torques({"crank": [1.0, 2.0]}),
     "no ... ...;": lambda s: s.four.state({"nobody": 1.0}),
     "source: no such file": lambda s: s.load("nowhere.xml"),
-    "no joint ..., but": lambda s: s.four.state({"pin": 0.1}),
+    "no joint ...; it": lambda s: s.four.state({"pin": 0.1}),
     "no virtual link ..., but": lambda s: svkc.cut(s.four, s.state, "crank"),
     "out: ... cannot": rollout_with_a_lock,
     "overload: give": lambda s: svkc.overload(s.four, "pin"),

@@ -111,7 +111,7 @@ class EventSearch(eqx.Module):
     magnitudes: larger of the absolute values of each guard at the two ends of the step.
     bracket: interval that holds the first root of the guards that crossed.
     y, values: state and guards at `bracket.b`.
-    is_new: whether they are those of the last attempted step.
+    is_new: whether `y` and `values` come from the last attempted step.
     values_after: guards just after `bracket.b`, valid once the search is done.
     active: whether a search is under way.
     narrowing: whether the bracket has yet to converge.

@@ -156,7 +156,7 @@ def _body_fun(
     row_choice = with_rows_of_projection(before, problem).field_args.row_choice
     record, is_last = StepRecord(increments, row_choice), kept
     if after.search is not None:
-        # the step to the event is not the last attempted one, which goes past the event
+        # the last attempt of a search goes past the event; that to the event came before it
         is_last = (kept & ~after.search.done) | after.search.is_new
     return dataclasses.replace(
         after,

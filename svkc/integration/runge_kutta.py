@@ -32,7 +32,7 @@ def with_scan_kind(
 ) -> diffrax.AbstractSolver[Any]:
     """Return a Runge-Kutta solver whose loop over stages is of this kind; others as they are.
 
-    Solvers that wrap one have it in the solver that they wrap.
+    For a solver that wraps another, the wrapped solver is changed.
 
     kind: "lax" for forward mode, "bounded" for both modes, None for diffrax's own choice.
     """

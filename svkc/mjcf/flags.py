@@ -17,7 +17,7 @@ def is_disabled(model: MuJoCo, *flags: str) -> bool:
 
 
 def disabled_actuators(model: MuJoCo) -> np.ndarray:
-    """Return the mask of the actuators that act with no force, by their group or all of them."""
+    """Return the mask of disabled actuators: those in a disabled group, or all of them."""
     # MuJoCo can disable the groups 0 to 30
     group = np.array(model.actuator_group, int)
     own = (

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from svkc.mjcf.flags import is_disabled
+from svkc.mjcf.flags import disabled_actuators, is_disabled
 from svkc.model.annotations import MuJoCo
 
 
@@ -52,8 +52,9 @@ def _unsupported_in_actuators(model) -> dict[str, tuple]:
         for n in ("stiffness", "damping", "limited", "frictionloss", "armature")
         if _any_nonzero(model, f"tendon_{n}", f"tendon_{n}poly")
     ]
-    pulled = np.any(model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_TENDON))
-    complex_motors = np.sum(~is_torque_motor(model))
+    acts = ~disabled_actuators(model)
+    pulled = np.any(acts & (model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_TENDON)))
+    complex_motors = np.sum(acts & ~is_torque_motor(model))
     return {
         "tendon": (
             tendon or pulled,
@@ -75,9 +76,11 @@ def _unsupported_in_joints(model) -> dict[str, tuple]:
     import mujoco
 
     ball = model.jnt_type == int(mujoco.mjtJoint.mjJNT_BALL)
-    balls = np.sum(ball & (model.jnt_limited != 0))
+    limited = not is_disabled(model, "limit", "constraint")
+    balls = limited * np.sum(ball & (model.jnt_limited != 0))
+    rubs = not is_disabled(model, "frictionloss", "constraint")
     return {
-        "friction": (_any_nonzero(model, "dof_frictionloss"), "joint friction loss"),
+        "friction": (rubs and _any_nonzero(model, "dof_frictionloss"), "joint friction loss"),
         "polynomial": (
             _any_nonzero(model, "jnt_stiffnesspoly", "dof_dampingpoly"),
             "polynomial stiffness or damping of joints",
@@ -101,16 +104,16 @@ def _unsupported_in_bodies(model) -> dict[str, tuple]:
     import mujoco
 
     supported = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
-    other = [
-        mujoco.mjtEq(int(t)).name[5:].lower() for t in model.eq_type if int(t) not in supported
-    ]
+    kinds = () if is_disabled(model, "equality", "constraint") else model.eq_type
+    other = [mujoco.mjtEq(int(t)).name[5:].lower() for t in kinds if int(t) not in supported]
+    pairs = 0 if is_disabled(model, "contact", "constraint") else model.npair
     density, viscosity, flexes = model.opt.density, model.opt.viscosity, getattr(model, "nflex", 0)
     return {
         "equality": (
             other,
             f"equality constraints: {', '.join(other)} (connect and weld are supported)",
         ),
-        "contact": (model.npair, f"{model.npair} explicit contact pairs"),
+        "contact": (pairs, f"{pairs} explicit contact pairs"),
         "gravcomp": (_any_nonzero(model, "body_gravcomp"), "gravity compensation"),
         "fluid": (
             density != 0 or viscosity != 0,

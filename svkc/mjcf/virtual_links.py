@@ -19,7 +19,7 @@ from svkc.model.virtual_link import VirtualLink, joint_freedoms
 def links_from_equalities(model: MuJoCo) -> list[VirtualLink]:
     """Return the model's <equality> elements as virtual links, children of the first body.
 
-    A connect becomes a ball, as does a weld that is given no torque, and other welds a weld. Other
+    A connect becomes a ball. A weld becomes a weld, or a ball if its torquescale is zero. Other
     elements are skipped.
     """
     import mujoco

@@ -92,8 +92,8 @@ def _joint_slice(top: Topology, ranges: Any, joint: str, links: bool) -> slice:
     known = dict.fromkeys(top.joint_names + cuttable + top.link_names * links)
     if not _is_among(joint, known) and _is_among(joint, top.link_names):
         raise ValueError(
-            f"no joint {joint!r}, but a virtual link, whose coordinates follow from those of the"
-            f" joints: {', '.join(known)}"
+            f"no joint {joint!r}; it is a virtual link, whose coordinates follow from those of the"
+            " joints"
         )
     if not _is_among(joint, known):
         raise unknown_name("joint", joint, tuple(known))

@@ -26,8 +26,8 @@ class BodyParameters(NamedTuple):
     mass: kg.
     com: centre of mass in the body's frame (m).
     inertia: rotational inertia about the centre of mass, in the body's axes (kg m^2).
-    pos, quat: placement of the body's frame in the parent's at the load pose (m, wxyz). Those of a
-        body that is free or cuttable are not used: coordinates of its free joint place it.
+    pos, quat: placement of the body's frame in the parent's at the load pose (m, wxyz). They
+        have no effect for a body with a free joint or a cuttable joint.
     """
 
     mass: Float[Array, ""]
@@ -84,7 +84,7 @@ def _default_array(chain: Any, field: str) -> Array:
 
 
 def _check_limit_springs(chain: Any, new: Mapping[str, Any]) -> None:
-    """Raise ValueError if a joint gets a range although the model gives it none, and no spring."""
+    """Raise ValueError if a joint gets a range but has no spring that would hold it there."""
     limit, spring = new["limit"], new.get("limit_spring", chain.limit_spring)
     if not is_concrete(limit, spring):
         return
@@ -106,7 +106,8 @@ def _with_entries(chain: Any, field: str, array: Array, values: Mapping[str, Any
         if field in ("pos", "quat") and chain.topology.kind[at] == FREE:
             raise ValueError(
                 f"{field}: body {name!r} is placed by the coordinates of its free joint; give these"
-                " to chain.state, or change the structure's placement of a cuttable joint"
+                " to chain.state; the placement of a cuttable joint is in structure.pos and"
+                " structure.quat"
             )
         entries = array[at]
         label = f"{field}[{name!r}]"

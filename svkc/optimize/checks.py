@@ -66,8 +66,8 @@ def check_passive_links(chain: Chain) -> None:
             name = chain.dof_names[chain.nv + int(np.argmax(acts))]
             raise ValueError(
                 f"chain: virtual link {name!r} has a spring, a damper or a joint range, which"
-                " motions over phases leave out; load the model without them:"
-                ' ignore=("spring", "damping", "limit")'
+                " motions over phases leave out; load the model without this cuttable joint, or"
+                " without these in its MJCF"
             )
 
 

@@ -99,7 +99,8 @@ def _bounds(
     if isinstance(limit, Mapping):
         known = dict(groups or {}) | {joint: [joint] for joint in joints}
         bounds = np.full((2, len(joints)), [[-np.inf], [np.inf]])
-        for key, value in limit.items():
+        # a limit of one coordinate takes precedence over that of its joint
+        for key, value in sorted(limit.items(), key=lambda item: item[0] in joints):
             if key not in known:
                 raise unknown_name("driven joint", key, tuple(known))
             own = [joints.index(joint) for joint in known[key]]

@@ -31,8 +31,8 @@ def between(joint: Names, lower: Scalar, upper: Scalar, *, of: str = "position")
     joint: one name or several, of joints or of coordinates (`Chain.dof_names`). For `of="control"`
         names of controls.
     lower, upper: smallest and largest value, in SI units and radians; -inf and inf: no bound.
-        Orientations of ball and free joints have no bounds on positions, and none on velocities but
-        zero: a function of a `Point` bounds them.
+        Orientations of ball and free joints cannot be bounded here, and their velocities can only
+        be fixed at zero. Bound them by a function of a `Point` in `path`, `start` or `end`.
     of: "position", "velocity", "torque", or "control". "torque" is for torques that are states, as
         with `TorqueRates`. The torques of `Torques` are controls.
 

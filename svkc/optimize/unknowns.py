@@ -176,8 +176,8 @@ class UnknownsBuilder:
     def _check_orientation(self, phase: Phase, bound: Between, at: np.ndarray) -> None:
         """Raise ValueError if a bound is for the orientation of a ball or a free joint.
 
-        Its unknowns are rotation vectors from the guess, and their rates. Only the rate zero is
-        that of every guess.
+        Its unknowns are a rotation vector relative to the guess, and its rate. A bound on them
+        depends on the guess, except that a rate of zero is an angular velocity of zero.
         """
         if bound.of not in ("position", "velocity"):
             return

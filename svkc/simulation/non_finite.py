@@ -34,6 +34,7 @@ class RunEnd:
 
     t, state: last time (s) and state.
     change_times: when timed events happen (s).
+    happened: indices of the events that have happened.
     probes: times after t at which the numbers are evaluated as well (s).
     """
 
@@ -43,6 +44,7 @@ class RunEnd:
     control: Any
     plan: Plan
     change_times: np.ndarray
+    happened: frozenset[int]
     args: Any
     probes: tuple[float, ...]
 
@@ -84,6 +86,7 @@ def run_end(traj: Any, options: dict[str, Any]) -> RunEnd:
         control=options.get("control"),
         plan=plan,
         change_times=_change_times(traj, plan),
+        happened=frozenset(np.asarray(traj.events.which)[: int(traj.events.count)].tolist()),
         args=options.get("args"),
         # Step-size controllers shorten steps with numbers that are not finite, except where only a
         # guard is not. Step sizes are not recorded, so that fractions of the run stand for them.
@@ -218,7 +221,11 @@ def _at_instant(end: RunEnd, t: float, state: State) -> str:
         return (
             f"the control: {tau[joint]} for {end.chain.dof_names[joint]!r}{_note_on_args(end.args)}"
         )
-    for guard, index in zip(end.plan.guards, end.plan.guarded, strict=True):
+    armed = np.asarray(end.plan.armed(end.chain, state.structure)) if end.plan.guards else []
+    for guard, index, may_fire in zip(end.plan.guards, end.plan.guarded, armed, strict=True):
+        first = end.plan.after[index]
+        if not may_fire or (first is not None and first not in end.happened):
+            continue
         value = guard.value(end.chain, time, state, end.args, jnp.asarray(tau, dtype))
         if np.isnan(np.asarray(jax.lax.stop_gradient(value))):
             return f"the guard of events[{index}]{_note_on_args(end.args)}"

@@ -38,6 +38,7 @@ from svkc.simulation.options import Options, prepare_options
 from svkc.simulation.phase import RunState
 from svkc.simulation.run import initial_run_state, needs_phase, run_phase, with_lock_mask
 from svkc.simulation.trajectory import Trajectory
+from svkc.transitions.events import stop_gradient_of_events
 from svkc.transitions.plan import Plan
 
 
@@ -104,12 +105,13 @@ def _raise_on_failure(chain: Chain, traj: Trajectory, arguments) -> Trajectory:
     if np.all(np.isin(np.asarray(result._value), [code._value for code in success])):
         return traj
     # inside of jvp and grad the primal values are concrete
-    chain, traj, arguments = stop_gradient_tree((chain, traj, arguments))
+    control, events, args, dt = arguments
+    chain, traj, control, args, dt = stop_gradient_tree((chain, traj, control, args, dt))
+    events = stop_gradient_of_events(events)
     phase, loop = int(traj.phases.count), int(traj.report().loop)
     where = f"phase {phase}" if loop < 0 else f"phase {phase}, loop {chain.link_names[loop]!r}"
     reason = RESULTS[result]
-    if result == RESULTS.non_finite and is_concrete(chain, traj, arguments):
-        control, events, args, dt = arguments
+    if result == RESULTS.non_finite and is_concrete(chain, traj, control, events, args, dt):
         source = traj.trace_non_finite(chain, control=control, events=events, args=args, dt=dt)
         reason += f" First: {source}"
     raise RuntimeError(f"simulate stopped at t = {float(traj.t_final):.9g} s, in {where}: {reason}")

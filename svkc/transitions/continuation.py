@@ -234,7 +234,7 @@ def linearize(
 ) -> LinearSolution:
     """Return the Newton step (corrector) and the tangent of the path (predictor) at q."""
     kind, column, weight = path.kind, jacobian_scales(chain)[1], weights(chain, structure)
-    # a locked coordinate moves the loops on the way to its requested value
+    # columns of locked coordinates are kept: their requested values change the loop gaps
     kins, frames, Js, gaps, qs, size = _neighbourhood(chain, without_locks(structure), q)
     kin, frames, J, gap = jax.tree.map(lambda x: x[0], (kins, frames, Js, gaps))
     on_leg, moved = is_any_of(kind, CLOSE_START, FOLLOW), path.held & (kind == FOLLOW)

@@ -4,12 +4,14 @@ An event says when something happens and what happens; `svkc.transitions.plan` c
 a chain and turns them into tables.
 """
 
+import dataclasses
 from collections.abc import Callable, Iterable
 from typing import Any, TypeAlias
 
 import equinox as eqx
 import numpy as np
 
+from svkc._jax.pytrees import stop_gradient_tree
 from svkc.model.annotations import Checked, Function, Names, Scalar
 from svkc.model.validation import (
     boolean,
@@ -181,6 +183,7 @@ def when(
 
     A guard is armed while its action would change the structure; one whose event stops the run, or
     has no action, is always armed. A guard with `after` is armed once that event has happened.
+    Before that it may be NaN, but in reverse mode its derivatives must be finite.
     A guard that starts the run within round-off of zero (eps^(3/4): 1.8e-12 in float64, 6.4e-6 in
     float32) has not crossed zero, whatever its sign and `direction`. It fires at its first crossing
     after it has left zero. The same holds after an event, for the guard that fired and for a guard
@@ -230,3 +233,20 @@ def as_events(events: Any) -> tuple[Any, ...]:
         if not isinstance(event, At | When):
             raise ValueError(f"events: expected svkc.at(...) and svkc.when(...), got {event!r}")
     return events
+
+
+def stop_gradient_of_events(events: Any) -> tuple[Any, ...]:
+    """Return one event or several, without derivatives. Each still names the same event as `after`,
+    which is recognized as an object."""
+    copies: dict[int, Any] = {}
+
+    def copied(event):
+        if event is None:
+            return None
+        if id(event) not in copies:
+            after = copied(event.after)
+            alone = stop_gradient_tree(dataclasses.replace(event, after=None))
+            copies[id(event)] = dataclasses.replace(alone, after=after)
+        return copies[id(event)]
+
+    return tuple(map(copied, as_events(events)))

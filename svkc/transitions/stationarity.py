@@ -155,7 +155,7 @@ def stationary_tangent(
     chain, _, start, _ = primals
     column, weight = jacobian_scales(chain)[1], weights(chain, structure)
     fixed = held | ~active_dofs(chain, structure)
-    # a locked coordinate moves the loops if its value at the start does
+    # columns of locked coordinates are kept: their given values change the loop gaps
     J = loop_kinematics(chain, without_locks(structure), q).J
     free_J = jax.lax.stop_gradient(where(fixed, 0, J))
     selection = independent_rows(structure, free_J, pivoted_qr(free_J, structure.rank))

@@ -125,7 +125,7 @@ def limit_forces(
     lower, upper = chain.limit[:, scalar_v]
     x = static_take(q, scalar_q)
     outside = jnp.maximum(x - upper, 0) - jnp.maximum(lower - x, 0)
-    # nearer to the range than this the exponential is zero; its derivative would overflow
+    # less than 1e-6 outside of the range the exponential is zero, but its derivative is 0 * inf
     past = jnp.abs(outside) > 1e-6
     onset = where(past, jnp.exp(-0.02 / where(past, jnp.abs(outside), 1)), 0)
     return replace_rows(

@@ -1,5 +1,7 @@
 """What a model's <option> disables, and elements whose numbers change what they are."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -43,6 +45,12 @@ def test_each_flag():
     assert not load('contact="disable"').left_out
     np.testing.assert_array_equal(load('clampctrl="disable"').motors([3.0, 3.0])[:2], [15, 3])
     assert not load('actuation="disable"').motors([1.0, 1.0]).any()
+    # what is disabled need not be ignored
+    rubbing = TWO_RODS.replace('name="b" axis', 'name="b" frictionloss="1" axis')
+    for flag in ("frictionloss", "constraint"):
+        svkc.load(rubbing.format(flags=f'{flag}="disable"', option="", rod=ROD))
+    with pytest.raises(ValueError, match="friction: joint friction loss"):
+        svkc.load(rubbing.format(flags="", option="", rod=ROD))
     without_group = load(option='actuatorgroupdisable="1"')
     np.testing.assert_array_equal(without_group.motors([1.0, 1.0])[:2], [0, 1])
 
@@ -58,6 +66,17 @@ def test_accelerations_with_flags_equal_those_of_mujoco():
         state = chain.state(v=np.array(data.qvel), connected=())
         vdot = svkc.forward_dynamics(chain, state, jnp.zeros(chain.dofs))
         np.testing.assert_allclose(vdot[:3], data.qacc, rtol=1e-9)
+
+
+def test_links_of_a_model_that_disables_equalities_survive_conversion():
+    chain = load('equality="disable"')
+    chain = chain.replace(gravity=[0, 0, -1.0])
+    connected = svkc.connect(chain, chain.state(), "pin").structure
+    again = svkc.load(
+        svkc.load(dataclasses.replace(chain, structure=connected).to_mjcf()).to_mjcf()
+    )
+    assert again.structure.connected.tolist() == [True]
+    assert load('equality="disable"').structure.connected.tolist() == [False]
 
 
 WELD = """<mujoco><worldbody><body name="a" pos="0 0 1"><freejoint/><geom size=".1"/></body>

@@ -269,7 +269,7 @@ def on_a_locked_base():
 
 @pytest.mark.slow
 def test_locked_coordinates_move_to_their_requested_values(on_a_locked_base):
-    """The loops close around them. Only runs and changes of structure keep them."""
+    """`chain.state` moves a locked joint and closes the loops. Runs never move it."""
     chain, locked = on_a_locked_base
     for angle in (0.01, 0.5):
         state = chain.state({"base": angle}, near=locked)

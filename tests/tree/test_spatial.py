@@ -71,10 +71,15 @@ def test_products_broadcast_leading_axes():
 
 @pytest.mark.parametrize("size", [1e-15, 1e-9, 1.0, 1e9, 1e15])
 def test_inverses_of_small_and_large_inertias_in_float32(size):
-    """The cube of these numbers is zero or infinite in float32."""
+    """The cubes of 1e-15 and 1e15 are zero and infinite in float32."""
     rng = np.random.default_rng(0)
     A = rng.normal(size=(4, 3, 3))
     D = size * (A @ np.swapaxes(A, 1, 2) + np.eye(3))
     inverse = inverse_positive(jnp.asarray(D, jnp.float32))
     products = np.asarray(inverse, float) @ D
     np.testing.assert_allclose(products, np.broadcast_to(np.eye(3), D.shape), atol=1e-5)
+    # d(D^-1) = -D^-1 dD D^-1
+    along = jnp.asarray(np.eye(3) * D, jnp.float32)
+    slope = jax.jvp(inverse_positive, (jnp.asarray(D, jnp.float32),), (along,))[1]
+    expected = -np.linalg.inv(D) @ (np.eye(3) * D) @ np.linalg.inv(D)
+    np.testing.assert_allclose(slope * size, expected * size, atol=1e-5)
