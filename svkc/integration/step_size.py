@@ -133,3 +133,12 @@ def unclipped_step_size(
         return proposed
     at_bound = keep_step & (proposed >= 0.99 * controller.factormax * taken)
     return where(at_bound, jnp.maximum(proposed, before), proposed)
+
+
+def has_jumps(controller: Any) -> bool:
+    """Return whether a controller, or one that it wraps, steps around the times of jumps."""
+    while controller is not None:
+        if getattr(controller, "jump_ts", None) is not None:
+            return True
+        controller = getattr(controller, "controller", None)
+    return False

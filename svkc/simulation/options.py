@@ -21,6 +21,7 @@ from svkc.integration.step_size import (
     SAFETY,
     FixedSteps,
     LimitedPIDController,
+    has_jumps,
 )
 from svkc.integration.vector_field import VectorField
 from svkc.loops.constrained_dynamics import (
@@ -247,7 +248,7 @@ def _resolve_adjoint(adjoint, controller) -> diffrax.AbstractAdjoint | Replay:
     `BacksolveAdjoint`, which cannot save states.
     """
     is_adaptive = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
-    can_replay = controller is None or (is_adaptive and not _has_jumps(controller))
+    can_replay = controller is None or (is_adaptive and not has_jumps(controller))
     if adjoint is None:
         return Replay() if can_replay else diffrax.RecursiveCheckpointAdjoint()
     if not isinstance(adjoint, Replay | diffrax.AbstractAdjoint):
@@ -265,15 +266,6 @@ def _resolve_adjoint(adjoint, controller) -> diffrax.AbstractAdjoint | Replay:
             " jump_ts; give a diffrax adjoint with this controller"
         )
     return adjoint
-
-
-def _has_jumps(controller) -> bool:
-    """Return whether a controller, or one that it wraps, steps around the times of jumps."""
-    while controller is not None:
-        if getattr(controller, "jump_ts", None) is not None:
-            return True
-        controller = getattr(controller, "controller", None)
-    return False
 
 
 def _resolve_max_events(max_events, plan: Plan) -> int:

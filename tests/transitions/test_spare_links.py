@@ -69,7 +69,6 @@ def test_an_event_that_connects_a_slot_that_is_not_bound_ends_the_run(sliders):
     np.testing.assert_allclose(traj.final.v[:, :2], [[1, 3], [2, 2]], atol=ROUND_OFF)
 
 
-@pytest.mark.slow
 def test_an_event_binds_and_connects_a_slot(sliders):
     chain, state = sliders
     grip = svkc.Grip("a", "b", slot="spare_0")
