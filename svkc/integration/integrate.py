@@ -154,17 +154,18 @@ def _body_fun(
     progress = (after.t - t0) / where(stop > t0, stop - t0, 1)
     # again, so that the kernel of the attempt need not return the rows
     row_choice = with_rows_of_projection(before, problem).field_args.row_choice
-    record, is_last = StepRecord(increments, row_choice), kept
+    record, to_record = StepRecord(increments, row_choice), kept
     if after.search is not None:
-        # the last attempt of a search goes past the event; that to the event came before it
-        is_last = (kept & ~after.search.done) | after.search.is_new
+        # The last attempt of a search ends after the event. The step to the event was attempted
+        # before it, and its record is kept.
+        to_record = (kept & ~after.search.done) | after.search.is_new
     return dataclasses.replace(
         after,
         progress_meter_state=options.progress_meter.step(s.progress_meter_state, progress),
         step_ts=write_row(s.step_ts, s.accepted, after.t, kept),
         step_near=write_row(s.step_near, s.accepted, s.near, kept),
         checkpoints=checkpoints,
-        records=write_record(s, record, is_last, options.record_capacity),
+        records=write_record(s, record, to_record, options.record_capacity),
         ys=ys,
     )
 

@@ -52,7 +52,7 @@ def to_mjcf(chain: Chain) -> str:
         elif not top.link_spare[link] and not (top.link_child and top.link_child[link] >= 0):
             notes += _add_equality(chain, spec, link, name)
     if np.any(np.asarray(chain.structure.connected)):
-        # the links would be without effect
+        # else MuJoCo would ignore the connected links
         spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_EQUALITY)
     slots = [name for name, spare in zip(chain.link_names, top.link_spare, strict=True) if spare]
     cuttable = [name for name, _, _ in top.cuttable_joints]

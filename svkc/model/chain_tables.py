@@ -29,8 +29,8 @@ def chain_summary(chain: Any) -> str:
 
 
 def chain_blocks(chain: Any) -> list[Block]:
-    """Return a summary, tables of the bodies and of the virtual links, notes on the latter, and
-    what the model has that is left out."""
+    """Return a summary, tables of the bodies and of the virtual links, notes on the links, and
+    the elements of the model that are left out."""
     bodies = Table(("body", "parent", "joint", "kind", "freedoms", "mass (kg)"), _body_rows(chain))
     left_out = [f"left out: {line}" for line in chain.left_out]
     if not chain.link_names:

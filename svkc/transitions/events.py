@@ -236,8 +236,10 @@ def as_events(events: Any) -> tuple[Any, ...]:
 
 
 def stop_gradient_of_events(events: Any) -> tuple[Any, ...]:
-    """Return one event or several, without derivatives. Each still names the same event as `after`,
-    which is recognized as an object."""
+    """Return one event or several, without derivatives.
+
+    `after` of each copy is the copy of that event, since events are recognized by identity.
+    """
     copies: dict[int, Any] = {}
 
     def copied(event):
