@@ -8,9 +8,9 @@ writes results/speed.csv and draws results/speed.png (extra `viz`). Libraries th
 One step is symplectic Euler of 2 ms. Rows hold microseconds per step and lane: median, least and
 most of rounds in which all compared libraries alternate. `times svkc` is relative to svkc on as
 many cores. XLA compiles each loop to one kernel (see README); with `--default-options` it does
-not, and the rows are written to results/speed_default_options.csv. svkc on one core is `vmap` of
-`svkc.step` in one program; on all cores each device has its own lanes. Grips are hard in svkc, soft
-in MuJoCo and MJX. Compile seconds: tracing, lowering, XLA.
+not, and the rows are written to results/speed_default_options.csv, by version of jax. svkc on one
+core is `vmap` of `svkc.step` in one program; on all cores each device has its own lanes. Grips are
+hard in svkc, soft in MuJoCo and MJX. Compile seconds: tracing, lowering, XLA.
 """
 
 import argparse
@@ -211,16 +211,28 @@ def main(cases, dtypes, batches):
 def save(key: tuple, rows):
     """Replace rows in results/ and redraw the picture.
 
+    The file of XLA's default options keeps the rows of other versions of jax.
+
     key: case, dtype and batch size of the rows.
     """
     path = RESULTS / ("speed_default_options.csv" if DEFAULT_OPTIONS else "speed.csv")
+    version = len(HEAD) + list(machine()).index("jax")
     rows_of_file = []
     if path.exists():
         with path.open() as file:
-            rows_of_file = [row for row in list(csv.reader(file))[1:] if tuple(row[:3]) != key]
+            rows_of_file = [
+                row
+                for row in list(csv.reader(file))[1:]
+                if tuple(row[:3]) != key or (DEFAULT_OPTIONS and row[version] != jax.__version__)
+            ]
     rows_of_file += [[*map(str, row), *map(str, machine().values())] for row in rows]
     rows_of_file.sort(
-        key=lambda row: (speed_cases.CASES.index(row[0]), row[1] != "float64", int(row[2]))
+        key=lambda row: (
+            row[version],
+            speed_cases.CASES.index(row[0]),
+            row[1] != "float64",
+            int(row[2]),
+        )
     )
     with path.open("w", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows([[*HEAD, *machine()], *rows_of_file])
