@@ -7,6 +7,7 @@ import linkages
 import models
 import numpy as np
 import pytest
+from optimized import optimized_jit
 from references import continuation
 from tolerances import ROUND_OFF
 
@@ -218,7 +219,7 @@ def compare_with_derivatives(name, count):
     # from one geometry to another, so that a planar one stays planar
     direction = tuple(np.roll(x, 1, 0) - x for x in numbers)
 
-    @jax.jit
+    @optimized_jit
     @jax.vmap
     def program(x, x_dot):
         shifted = lambda h: state(*(y + h * w for y, w in zip(x, x_dot, strict=True)))
