@@ -11,6 +11,7 @@ constant during a step, at its value in the middle. All three gradients are comp
 Times are medians; programs that are compared alternate.
 """
 
+import argparse
 import csv
 import os
 import pathlib
@@ -337,4 +338,5 @@ def main():
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser().parse_args()
     main()

@@ -5,6 +5,7 @@ hinges. `python benchmarks/joints.py` prints and writes results/joints.csv. The 
 alternate, so that other load slows both. The time of a batch is that of all its lanes together.
 """
 
+import argparse
 import csv
 import functools
 import itertools
@@ -163,6 +164,7 @@ def compare(dtype: str):
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser().parse_args()
     cpu = [
         line.split(":")[1].strip()
         for line in open("/proc/cpuinfo")
@@ -175,25 +177,22 @@ if __name__ == "__main__":
         "numpy": np.__version__,
     }
     machine |= {"backend": jax.default_backend(), "processor": cpu[0], "cores": os.cpu_count()}
+    head = [
+        "dtype",
+        "task",
+        "batch",
+        "unit",
+        *(f"{n} {x}" for n in ("balls", "hinges") for x in ("median", "min", "max")),
+        "ratio",
+        *machine,
+    ]
+    rows = []
+    line = "{} {} {:>2} {:12}: balls {:>6} ({} to {}), hinges {:>6} ({} to {}), ratio {}"
+    for dtype in ("float64", "float32"):
+        jax.config.update("jax_enable_x64", dtype == "float64")
+        for row in compare(dtype):
+            rows.append([*row, *machine.values()])
+            print(line.format(*row), flush=True)
     with RESULTS.open("w", newline="") as file:
-        table = csv.writer(file, lineterminator="\n")
-        table.writerow(
-            [
-                "dtype",
-                "task",
-                "batch",
-                "unit",
-                *(f"{n} {x}" for n in ("balls", "hinges") for x in ("median", "min", "max")),
-                "ratio",
-                *machine,
-            ]
-        )
-        for dtype in ("float64", "float32"):
-            jax.config.update("jax_enable_x64", dtype == "float64")
-            for row in compare(dtype):
-                table.writerow([*row, *machine.values()])
-                line = (
-                    "{} {} {:>2} {:12}: balls {:>6} ({} to {}), hinges {:>6} ({} to {}), ratio {}"
-                )
-                print(line.format(*row), flush=True)
+        csv.writer(file, lineterminator="\n").writerows([head, *rows])
     print(machine)

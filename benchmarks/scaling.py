@@ -7,8 +7,8 @@ tracing, lowering and compilation; megabytes of temporary memory. MuJoCo's `mj_s
 links.
 """
 
+import argparse
 import csv
-import sys
 
 import speed  # first: sets XLA_FLAGS, and the path to the tests
 
@@ -203,4 +203,6 @@ def main(names):
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:] or GROWTH)
+    parser = argparse.ArgumentParser()
+    parser.add_argument("names", nargs="*", metavar="name", help=f"of {', '.join(GROWTH)}")
+    main(parser.parse_args().names or GROWTH)
