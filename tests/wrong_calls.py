@@ -184,6 +184,9 @@ def batch_of(traj):
 CASES = {
     "pictures need": plot_without_matplotlib,
     "... holds no model": load_chain_without_model,
+    "stepsize_controller: its": lambda s: svkc.accuracy.estimate_error(
+        s.four, s.four.state(), 0.1, stepsize_controller=diffrax.ConstantStepSize()
+    ),
     "camera: no": lambda s: s.drawn(camera="nobody's"),
     "mp4 needs": render_without_ffmpeg,
     "run: --ignore": lambda s: commands._load_scene("high_bar", ("tendon",)),

@@ -3,6 +3,8 @@
 import pathlib
 import webbrowser
 
+import numpy as np
+
 from svkc.cli.printing import print_error, print_report
 
 
@@ -97,6 +99,10 @@ def view(path: pathlib.Path, show: bool) -> int:
     except (ValueError, OSError) as error:
         print(error)
         return 1
+    if np.ndim(traj.t_final):
+        print(traj)
+        print("a picture shows one run: draw one lane, such as svkc.render(chain, traj[0], path)")
+        return 0
     print_report(traj)
     written, failures = [], []
     for target, write in (
@@ -106,9 +112,9 @@ def view(path: pathlib.Path, show: bool) -> int:
         try:
             write(target)
             written.append(target)
-        except (ImportError, RuntimeError) as error:
+        except (ImportError, RuntimeError, ValueError) as error:
             failures.append(f"{target.name} not drawn: {error}")
-    print("\n".join(failures) + "\n" * bool(failures) + "wrote " + ", ".join(map(str, written)))
-    if show:
+    print("\n".join([*failures, "wrote " + (", ".join(map(str, written)) or "nothing")]))
+    if show and written:
         webbrowser.open(written[0].resolve().as_uri())
     return 0

@@ -29,9 +29,10 @@ from svkc.simulation.trajectory import Trajectory
 
 # Increase the schema whenever a stored array is added, renamed or changes its meaning: files of
 # schemas that are not readable are refused.
-SCHEMA = 6
-# Schema 5 lacks the names. Schema 4 stores result codes as integers, the indices of these names.
-READABLE = (4, 5, SCHEMA)
+SCHEMA = 7
+# Schema 6 numbers the arrays of the chain. Schema 5 lacks the names, too. Schema 4 stores result
+# codes as integers, the indices of these names.
+READABLE = (4, 5, 6, SCHEMA)
 _CODES_OF_SCHEMA_4 = (
     "successful", "stopped", "max_events", "max_steps", "step_too_small", "not_in_place",
     "loop_open", "non_finite", "grazing", "jump", "together", "rank_lost", "no_slot",
@@ -108,7 +109,8 @@ def save(
     arrays: dict[str, Any] = _flatten(traj)
     if chain is not None:
         meta |= {"model": chain.model.text, "arguments": _as_json(chain.model.arguments)}
-        arrays |= {f"chain.{i}": np.asarray(x) for i, x in enumerate(jax.tree.leaves(chain))}
+        stored = dict(_fields(chain)[0])
+        arrays |= {name: np.asarray(x) for name, x in stored.items() if x is not None}
     path = pathlib.Path(path)
     # in the same folder, so that os.replace is atomic; `tempfile` would deny other users access
     temporary = path.with_name(f"{path.name}.{os.getpid()}.{threading.get_ident()}.part")
@@ -153,6 +155,12 @@ def _as_json(value):
     return value.item() if isinstance(value, np.generic) else value
 
 
+def _fields(chain: Chain):
+    """Return (name, array or None) of each array of a chain, and the tree structure."""
+    fields, structure = jax.tree_util.tree_flatten_with_path(chain, is_leaf=lambda x: x is None)
+    return [("chain" + jax.tree_util.keystr(path), x) for path, x in fields], structure
+
+
 def load_chain(path: Path) -> Chain:
     """Return the chain that a trajectory was saved with.
 
@@ -172,9 +180,19 @@ def load_chain(path: Path) -> Chain:
         )
     arguments = meta["arguments"]
     arguments["virtual_links"] = [VirtualLink(**link) for link in arguments["virtual_links"]]
-    leaves, treedef = jax.tree.flatten(load(meta["model"], **arguments))
-    stored = [jnp.asarray(arrays[f"chain.{i}"]) for i in range(len(leaves))]
-    return jax.tree.unflatten(treedef, stored)
+    fields, structure = _fields(load(meta["model"], **arguments))
+    stored = {name: jnp.asarray(x) for name, x in arrays.items() if name.startswith("chain.")}
+    if meta["schema"] < 7:
+        # the arrays are numbered, in the order of the fields that are not None
+        names = [name for name, x in fields if x is not None]
+        numbered = [f"chain.{i}" for i in range(len(names))]
+        _check_complete(path, stored, set(numbered))
+        stored = {name: stored[number] for name, number in zip(names, numbered, strict=True)}
+    unknown = set(stored) - {name for name, _ in fields}
+    if unknown or not stored:
+        error = f"its chain has {', '.join(sorted(unknown)) or 'no arrays'}"
+        raise ValueError(f"{path} is not a complete trajectory file written by svkc: {error}")
+    return jax.tree.unflatten(structure, [stored.get(name) for name, _ in fields])
 
 
 def load_trajectory(path: Path) -> Trajectory:

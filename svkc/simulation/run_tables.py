@@ -25,7 +25,8 @@ def extent(traj: Any) -> str:
     most = lambda counts: int(np.max(np.asarray(counts), initial=0))
     end = float(np.max(traj.t_final))
     numbers = [
-        f"t = {np.min(traj.phases.start):.6g} to {end:.6g} s",
+        # a run of no length has no phases
+        f"t = {np.min(traj.phases.start, initial=end):.6g} to {end:.6g} s",
         count(np.shape(traj.ts)[-1], "save time"),
         count(most(traj.phases.count), "phase"),
         count(most(traj.events.count), "event"),
@@ -82,15 +83,15 @@ def joint_table(traj: Any) -> Table:
     Quaternions, and coordinates of virtual links that are not cuttable joints, are left out.
     """
     names, q, v = traj.names, np.asarray(traj.states.q), np.asarray(traj.states.v)
-    of_links = {
+    of_joints = {
         i
         for name, start, stop in names.q_ranges
-        if name in names.links and name not in names.cuttable
+        if name in names.joints or name in names.cuttable
         for i in range(start, stop)
     }
     rows = []
     for i, name in enumerate(names.q):
-        if i in of_links or name not in names.v:
+        if i not in of_joints or name not in names.v:
             continue
         k = names.v.index(name)
         ends = q[0, i], q[-1, i], q[:, i].min(), q[:, i].max(), np.abs(v[:, k]).max()

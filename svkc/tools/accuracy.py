@@ -154,18 +154,30 @@ def estimate_error(chain: Chain, state: State, t1: Scalar, **options: Any) -> fl
     is the `configuration_error` between the two runs (rad, m). The estimate is good if the finer
     run's own error is much smaller.
 
-    t1: end time (s).
-    options: keyword arguments of `simulate`.
+    It is infinite if one of the runs does not reach its end (`throw=False`).
 
-    Raises what `simulate` raises.
+    t1: end time (s).
+    options: keyword arguments of `simulate`. The finer run may take eight times `max_steps`.
+
+    Raises ValueError if a `stepsize_controller` is given, and what `simulate` raises.
     """
+    if options.get("stepsize_controller") is not None:
+        raise ValueError(
+            "stepsize_controller: its tolerances cannot be reduced; give rtol and atol, or dt"
+        )
     run = simulate(chain, state, t1, **options)
-    if "dt" in options:
+    if options.get("dt") is not None:
         finer: dict[str, Any] = {"dt": options["dt"] / 2}
     else:
         rtol, atol = resolve_tolerances(state.q.dtype, options.get("rtol"), options.get("atol"))
         finer = {"rtol": rtol / 32, "atol": atol / 32}
-    return configuration_error(chain, run, simulate(chain, state, t1, **(options | finer)))
+    if options.get("max_steps") is not None:
+        finer["max_steps"] = 8 * options["max_steps"]
+    reference = simulate(chain, state, t1, **(options | finer))
+    reached = (RESULTS.successful, RESULTS.stopped)
+    if not all(any(bool(x.result == code) for code in reached) for x in (run, reference)):
+        return np.inf
+    return configuration_error(chain, run, reference)
 
 
 def tune(

@@ -22,7 +22,7 @@ class GradientCheck(eqx.Module):
     The derivative is that of f(x + h direction) by h, where the direction is added to one leaf.
 
     error: |derivative - difference|, relative to the largest entry of either one over the output
-        leaf.
+        leaf; absolute if this is below 1e-9, where differences may be round-off.
     output: path of the output leaf (and entry), such as "f(x)['a'][3]"; of several entries
         "sum(w * f(x)['a'])" in "reverse", which has one derivative for all of them.
     input: path of the input leaf, such as "x.q".

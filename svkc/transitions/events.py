@@ -5,6 +5,7 @@ a chain and turns them into tables.
 """
 
 import dataclasses
+import re
 from collections.abc import Callable, Iterable
 from typing import Any, TypeAlias
 
@@ -93,7 +94,7 @@ def _make_action(*, connect, cut, lock, unlock, here, stop, bind, unbind) -> Act
     if (
         len(unbind) == 2
         and all(isinstance(u, str) for u in unbind)
-        and not all(u.startswith("spare_") for u in unbind)
+        and not all(re.fullmatch(r"spare_\d+", u) for u in unbind)
     ):
         unbind = (unbind,)
     if not all(isinstance(u, str) or (isinstance(u, tuple) and len(u) == 2) for u in unbind):

@@ -15,6 +15,7 @@ from svkc._jax.eager import eager_jit
 from svkc._jax.pytrees import is_concrete
 from svkc._jax.select import where
 from svkc.loops.constraint import gap_tolerance
+from svkc.loops.frames import loop_frames
 from svkc.model.annotations import Names, Numbers
 from svkc.model.chain import Chain, State, Structure
 from svkc.model.checked_jit import check_state
@@ -53,12 +54,14 @@ def _place_new_links(
 ) -> tuple[Structure, Float[Array, " q"]]:
     """Return the structure with the links in `at_current_pose` placed there, and q with the
     coordinates of the new joints computed from the poses of their bodies."""
-    kin = kinematics(chain, q)
+    kin, old = kinematics(chain, q), q
     if at_current_pose is not None:
         structure = place_at_current_pose(chain, structure, q, at_current_pose & new_links, kin)
-    return structure, with_coordinates(
-        chain, new_links, joint_coordinates(chain, structure, kin, q), q
-    )
+        # another joint than before, so that it does not keep the full turns of the old one
+        old = with_coordinates(chain, at_current_pose & new_links, jnp.zeros_like(q), q)
+    frames = loop_frames(chain, structure, kin, q)
+    new = joint_coordinates(chain, structure, kin, old, frames)
+    return structure, with_coordinates(chain, new_links, new, q)
 
 
 @functools.partial(eager_jit, jit=eqx.filter_jit)
@@ -172,7 +175,8 @@ def connect(chain: Chain, state: State, *names: str, here: bool = False) -> Stat
 
     names: virtual links to connect.
     here: False makes each joint at its placement (declared, or set by the last here=True), where
-        the bodies must already be; True makes it at the current poses of the bodies.
+        the bodies must already be; True makes it at the current poses of the bodies. This is
+        another joint: its coordinates start at zero, and springs and ranges count from there.
 
     Raises ValueError for unknown names; also, as a runtime error under jit, for a spare slot that
     is not bound, if bodies are too far from the placement, and if a loop cannot be closed.

@@ -11,7 +11,12 @@ from svkc.model.chain_names import ChainNames, chain_names
 from svkc.model.names import unknown_name
 from svkc.simulation.trajectory import Trajectory
 from svkc.tree.energy import kinetic_energy, potential_energy
-from svkc.viz.run_data import event_descriptions, saved_states, warn_of_another_chain
+from svkc.viz.run_data import (
+    event_descriptions,
+    plain_text,
+    saved_states,
+    warn_of_another_chain,
+)
 
 # curves in a panel, and curves of coordinates if no joints are named
 MOST_CURVES, MOST_SHOWN = 8, 48
@@ -53,19 +58,20 @@ def curves(
     for axes, group in zip(panels, groups, strict=False):
         axes.set_ylabel(group[0].unit)
         for curve in group:
-            axes.plot(ts, curve.values, linewidth=1, label=curve.label)
+            axes.plot(ts, curve.values, linewidth=1, label=plain_text(curve.label))
     *_, energies, gaps, mobility = panels
     _plot_energies(energies, traj, ts[: len(numbers)], numbers, chain)
     values = np.maximum(np.asarray(traj.gaps)[numbers], 1e-17)
     gaps.semilogy(ts[: len(numbers)], values, linewidth=1, label=["rad", "m"])
     gaps.set_ylabel("largest loop gap")
-    bounds = np.append(np.asarray(p.start)[:count], p.stop[count - 1])
-    mobility.stairs(np.asarray(p.freedoms)[:count], bounds, baseline=None, linewidth=1.5)
+    if count:
+        bounds = np.append(np.asarray(p.start)[:count], p.stop[count - 1])
+        mobility.stairs(np.asarray(p.freedoms)[:count], bounds, baseline=None, linewidth=1.5)
     mobility.set(ylabel="mobility", xlabel="t (s)")
     mobility.yaxis.get_major_locator().set_params(integer=True)
     for axes in panels[:-1]:
         axes.legend(loc="upper left", bbox_to_anchor=(1, 1), fontsize=8, frameon=False)
-    panels[0].set_title(note, fontsize=9, loc="left", pad=16)
+    panels[0].set_title(plain_text(note), fontsize=9, loc="left", pad=16)
     _mark_events(figure, panels, event_descriptions(traj, chain))
     return figure
 
@@ -164,7 +170,7 @@ def _plot_energies(axes, traj: Trajectory, ts, numbers, chain: Chain | None):
     for name, values in parts.items():
         if np.any(values):
             axes.plot(ts, values, linewidth=1, label=name)
-    drift = np.max(np.abs(total - total[0]), initial=0)
+    drift = np.max(np.abs(total - total[:1]), initial=0)
     axes.plot(ts, total, "k", linewidth=1.5, label=f"sum, drifts by {drift:.1e} J")
 
 
@@ -204,6 +210,8 @@ def _lost_in_events(traj: Trajectory, ts, energies) -> np.ndarray:
     energies: mechanical energy at the save times (J).
     """
     p, count = traj.phases, int(traj.phases.count)
+    if not count:
+        return np.zeros(np.shape(ts))
     starts, at_ends = np.asarray(p.start)[:count], np.asarray(p.energy)[:count]
     jumps = at_ends[:-1, 1] - at_ends[1:, 0]
     lost = np.sum(np.where(starts[1:] <= ts[:, None], jumps, 0), -1)
@@ -227,4 +235,4 @@ def _mark_events(figure, panels, events: list[tuple[float, str]]):
         )
     if events:
         names = (f"{number}: {t:.4f} s, {what}" for number, (t, what) in enumerate(events, 1))
-        figure.supxlabel("\n".join(names), fontsize=8)
+        figure.supxlabel(plain_text("\n".join(names)), fontsize=8)

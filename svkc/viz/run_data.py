@@ -27,6 +27,12 @@ def check_single_run(traj: Any) -> None:
         )
 
 
+def plain_text(text: str) -> str:
+    """Return text that matplotlib shows as it is: no TeX between dollar signs, and no label that is
+    left out of a legend because it starts with an underscore."""
+    return " " * text.startswith("_") + text.replace("$", r"\$")
+
+
 def color(i: int) -> str:
     """Return color i of a cyclic palette, as #rrggbb."""
     return COLORS[i % len(COLORS)]

@@ -11,6 +11,7 @@ from svkc.viz.outlines import Shape, ground_and_bodies, motion_box, outlines
 from svkc.viz.run_data import (
     color,
     connected_link_positions,
+    plain_text,
     positions_and_rotations,
     saved_states,
 )
@@ -128,7 +129,9 @@ def _add_legend(axes, chain: Chain, starts, structures, colors: dict):
         ]
         times = ", ".join(start_times[:6]) + ", ..." * (len(start_times) > 6)
         links = ", ".join(chain.link_names[k] for k in structure) or "nothing"
-        axes.plot([], [], color=structure_color, linewidth=5, label=f"{links} from {times} s")
+        axes.plot(
+            [], [], color=structure_color, linewidth=5, label=plain_text(f"{links} from {times} s")
+        )
     # below the picture: inside, the legend would hide limbs
     below = axes.transAxes + ScaledTranslation(0, -0.6, axes.figure.dpi_scale_trans)
     axes.legend(

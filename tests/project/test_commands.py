@@ -2,6 +2,8 @@
 
 import re
 
+import jax
+import jax.numpy as jnp
 import pytest
 from processes import looks_drawn, run
 
@@ -77,6 +79,20 @@ def test_run_and_view_of_a_model_file(tmp_path):
     assert view.returncode == 0, view.stdout + view.stderr
     assert "largest loop gap" in view.stdout
     assert "rod.html" in view.stdout
+
+
+@pytest.mark.slow
+def test_view_of_a_batch(tmp_path):
+    """It prints the table of the batch and draws nothing."""
+    chain = svkc.load(ROD)
+    states = jax.tree.map(lambda x: jnp.stack([x, x]), chain.state())
+    lanes = svkc.rollout(chain, states, 0.1, dt=0.05, progress=False)
+    lanes.save(tmp_path / "lanes.npz", chain)
+    view = command("view --no-open", tmp_path / "lanes.npz")
+    assert view.returncode == 0, view.stdout + view.stderr
+    assert view.stdout.startswith("Trajectories of 2 lanes: ")
+    assert "a picture shows one run" in view.stdout
+    assert [path.name for path in tmp_path.iterdir()] == ["lanes.npz"]
 
 
 @pytest.mark.slow

@@ -1,9 +1,10 @@
 """Trajectory files: stored files of the readable schemas, rejected schemas, and round trips.
 
-saved/schema_4.npz to saved/schema_6.npz were written by `traj.save(path, chain)` with these
+saved/schema_4.npz to saved/schema_7.npz were written by `traj.save(path, chain)` with these
 schemas.
 """
 
+import dataclasses
 import json
 import pathlib
 
@@ -17,7 +18,7 @@ from tolerances import REFERENCE, ROUND_OFF
 
 import svkc
 
-FILES = [pathlib.Path(__file__).parent / "saved" / f"schema_{i}.npz" for i in (4, 5, 6)]
+FILES = [pathlib.Path(__file__).parent / "saved" / f"schema_{i}.npz" for i in (4, 5, 6, 7)]
 FILE = FILES[-1]
 ROD = """<mujoco><worldbody>
   <body name="rod"><joint name="pivot" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -1"
@@ -48,7 +49,7 @@ def test_load_file_of_every_readable_schema(file):
     assert traj.connected[:, 0].tolist() == [False, False, False, True]
     assert traj.result == svkc.RESULTS.successful
     assert traj.derivative == svkc.types.DERIVATIVE.successful
-    assert (traj.names is None) == (file != FILE)
+    assert (traj.names is None) == (file in FILES[:2])
     assert svkc.load_chain(file).link_names == ("hook",)
 
 
@@ -118,12 +119,12 @@ def test_files_hold_the_names_of_codes(run, tmp_path):
     assert svkc.load_chain(newer).link_names == ("hook",)
 
 
-@pytest.mark.parametrize("schema", [1, 3, 7])
+@pytest.mark.parametrize("schema", [1, 3, 8])
 def test_other_schemas_are_rejected(schema, tmp_path):
     path = rewritten(FILE, tmp_path / "other.npz", schema=schema)
     for load in (svkc.load_trajectory, svkc.load_chain):
         with pytest.raises(
-            ValueError, match=f"has schema {schema}, .* reads schemas 4 to 6; load it"
+            ValueError, match=f"has schema {schema}, .* reads schemas 4 to 7; load it"
         ):
             load(path)
 
@@ -144,6 +145,33 @@ def test_save_and_load_round_trip(run, tmp_path):
         with pytest.raises(ValueError, match="not a complete trajectory"):
             svkc.load_trajectory(tmp_path / name)
     assert [p.name for p in tmp_path.glob("*.part")] == []
+
+
+def test_a_changed_chain_is_stored_by_the_names_of_its_fields(run, tmp_path):
+    """Fields that the model file lacks are kept, and so are fields that were removed."""
+    chain, traj = run
+    for changed in (
+        chain.replace(damping={"pivot": 0.3}),
+        dataclasses.replace(chain, anchor=None, stiffness=jnp.array([7.0])),
+    ):
+        traj.save(tmp_path / "run.npz", changed)
+        assert bool(eqx.tree_equal(svkc.load_chain(tmp_path / "run.npz"), changed))
+
+
+def test_a_file_with_another_chain_is_rejected(run, tmp_path):
+    """With an array of an unknown name, or with none."""
+    chain, traj = run
+    traj.save(tmp_path / "run.npz", chain)
+    with np.load(tmp_path / "run.npz") as file:
+        arrays = dict(file)
+    without = {name: x for name, x in arrays.items() if not name.startswith("chain.")}
+    for content, difference in (
+        (arrays | {"chain.size": 1.0}, "chain.size"),
+        (without, "no arrays"),
+    ):
+        np.savez(tmp_path / "other.npz", **content)
+        with pytest.raises(ValueError, match=f"its chain has {difference}"):
+            svkc.load_chain(tmp_path / "other.npz")
 
 
 def test_continue_a_saved_run(run, tmp_path):

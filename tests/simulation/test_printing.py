@@ -127,6 +127,17 @@ def test_a_run(run):
     assert repr(traj.result) == "RESULTS<successful>"
 
 
+@pytest.mark.slow
+def test_a_virtual_link_with_the_name_of_a_joint():
+    """The table of joints has the joint, not the link."""
+    link = svkc.VirtualLink("arm", "world", "arm", "ball", real_pos=(0, 0, -1))
+    chain = svkc.load(models.ARM, virtual_links=[link])
+    traj = svkc.simulate(chain, chain.state({"arm": 0.7}, connected=()), 0.1, dt=0.05)
+    rows = [line for line in str(traj).splitlines() if line.startswith("arm ")]
+    assert len(rows) == 1
+    assert rows[0].split()[:3] == ["arm", "rad", "0.7"]
+
+
 def test_a_batch(batch):
     assert str(batch) == BATCH
     assert str(batch.report()) == "\n".join(BATCH.splitlines()[6:])

@@ -377,6 +377,21 @@ def test_estimate_error_agrees_with_the_true_error(arm, exact):
         assert f"by a finer run {estimate:.2e}" in str(run.report(halved=estimate))
 
 
+def test_estimate_error_of_options_of_simulate(arm):
+    chain, state = arm
+    estimate = lambda **options: svkc.accuracy.estimate_error(
+        chain, state, 0.4, solver=diffrax.Heun(), **options
+    )
+    # enough for the run, not for half the step
+    assert estimate(dt=0.02, max_steps=25) == estimate(dt=0.02)
+    assert estimate(dt=None, rtol=1e-5, atol=1e-7) == estimate(rtol=1e-5, atol=1e-7)
+    # the ends of two runs that stopped early have no distance
+    assert estimate(dt=0.02, max_steps=3, throw=False) == np.inf
+    controller = diffrax.PIDController(rtol=1e-5, atol=1e-7)
+    with pytest.raises(ValueError, match=r"stepsize_controller.*give rtol and atol, or dt"):
+        estimate(stepsize_controller=controller)
+
+
 def test_default_options_can_be_the_best():
     """The best candidate's options may be empty, as those of the defaults are."""
     candidates = (svkc.accuracy.Candidate("default", {}, seconds=0.1, error=1e-9),)

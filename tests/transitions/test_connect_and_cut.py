@@ -149,6 +149,9 @@ def test_a_joint_that_connects_again_keeps_its_turn():
         state = chain.state({"rod": angle})
         again = svkc.connect(chain, svkc.cut(chain, state, "rod"), "rod")
         np.testing.assert_allclose(chain.joint(again, "rod").q, angle, atol=ROUND_OFF)
+        elsewhere = svkc.connect(chain, svkc.cut(chain, state, "rod"), "rod", here=True)
+        # another joint, which starts at zero on every turn
+        np.testing.assert_allclose(chain.joint(elsewhere, "rod").q, 0, atol=ROUND_OFF)
 
 
 @pytest.mark.slow

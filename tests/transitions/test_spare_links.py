@@ -31,6 +31,16 @@ def run(chain, state, *events, t1=0.2, **options):
     return svkc.simulate(chain, state, t1, events=events, dt=0.1, throw=False, **options)
 
 
+def test_a_pair_of_bodies_is_not_taken_for_two_slots():
+    """Bodies may have names that begin as those of spare slots."""
+    text = models.MJCF.format(_slider("spare_wheel", 0) + _slider("spare_tire", 1))
+    chain = svkc.load(text, spare=1)
+    pair = ("spare_wheel", "spare_tire")
+    change = [svkc.at(0.1, bind=svkc.Grip(*pair)), svkc.at(0.15, unbind=pair)]
+    traj = run(chain, chain.state(), *change)
+    assert traj.phases.connected[:3, 0].tolist() == [False, True, False]
+
+
 @pytest.mark.slow
 def test_connecting_a_slot_that_is_not_bound_is_an_error(sliders):
     chain, state = sliders

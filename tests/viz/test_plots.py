@@ -7,6 +7,7 @@ import matplotlib.image
 import models
 import numpy as np
 import pytest
+from processes import looks_drawn
 
 import svkc
 from svkc.model.chain_names import chain_names
@@ -39,6 +40,32 @@ def test_a_long_floor_does_not_shrink_the_figure(tmp_path):
         return matplotlib.image.imread(svkc.render(chain, traj, tmp_path / f"{half}.png"))
 
     np.testing.assert_array_equal(drawn(4.0), drawn(40.0))
+
+
+@pytest.mark.slow
+def test_runs_without_phases_or_save_times_are_drawn(tmp_path):
+    """A run of no length, and one that ends before its first save time."""
+    chain = svkc.load(models.ARM)
+    state = chain.state({"arm": 0.5})
+    at_rest = svkc.simulate(chain, state, 0.0, dt=0.05)
+    assert str(at_rest).startswith("Trajectory: t = 0 to 0 s, 2 save times, 0 phases")
+    stop = svkc.at(0.05, stop=True)
+    early = svkc.simulate(chain, state, 0.2, ts=jnp.array([0.1, 0.2]), dt=0.05, events=stop)
+    for traj in (at_rest, early):
+        traj.plot(chain).savefig(tmp_path / "run.png")
+        looks_drawn(tmp_path / "run.png")
+
+
+@pytest.mark.slow
+def test_names_are_shown_as_they_are(tmp_path):
+    """Legends leave out labels that start with an underscore, and dollar signs enclose TeX."""
+    for name in ("_arm", "arm$\\frac{$"):
+        chain = svkc.load(models.ARM.replace('name="arm"', f'name="{name}"'))
+        traj = svkc.simulate(chain, chain.state({name: 0.5}), 0.1, dt=0.05)
+        figure = traj.plot(chain)
+        figure.savefig(tmp_path / "run.png")
+        texts = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
+        assert [text.strip().replace("\\$", "$") for text in texts] == [name]
 
 
 def test_plot_draws_coordinates_and_events():
