@@ -228,7 +228,7 @@ CASES = {
     "...[...]: got": lambda s: s.four.state({"crank": [1.0, 2.0]}),
     "actuated: expected": lambda s: s.actuation(actuated=np.ones(2, bool)),
     "adjoint: expected": lambda s: s.simulate(adjoint="replay"),
-    "adjoint: diffrax.BacksolveAdjoint": lambda s: s.simulate(adjoint=diffrax.BacksolveAdjoint()),
+    "adjoint: diffrax": lambda s: s.simulate(adjoint=diffrax.BacksolveAdjoint()),
     "adjoint: svkc.integrators.Replay cannot": lambda s: jax.grad(
         lambda t1: jnp.sum(
             s.simulate(t1=t1, solver=diffrax.ReversibleHeun(), dt=0.5, max_steps=2).final.q
@@ -340,6 +340,7 @@ CASES = {
     ),
     "simulate stopped": lambda s: s.simulate(t1=1e-2, dt=1e-3, max_steps=2),
     "solver: ... has no error": lambda s: s.simulate(solver=diffrax.Euler()),
+    "solver: ... needs a split": lambda s: s.simulate(dt=0.01, solver=diffrax.SemiImplicitEuler()),
     "solver: expected": lambda s: s.simulate(solver="euler"),
     "source: expected": lambda s: svkc.load(3),
     "source: names of": lambda s: s.load(

@@ -114,6 +114,7 @@ CASES = {
     "at the guess the derivative": lambda s: check(last=0.0, of=fixed_problem()),
     "backend: got": lambda s: optimize.Ipopt(backend="snopt"),
     "between: ... has": lambda s: optimize.between("x", 1, 0),
+    "between: got bounds": lambda s: check(bounds=[optimize.between("x", [0, 1], [1, 2])]),
     "between: of=": lambda s: check(bounds=[optimize.between("x", 0, 1, of="torque")]),
     "chain_from: expected": lambda s: with_args(chain_from=lambda chain, args: s.four),
     "chain: virtual link": lambda s: problem(
@@ -130,11 +131,15 @@ CASES = {
         [{}, {}], free={"mass": np.ones(2)}
     ),
     "guess: expected problem.guess": lambda s: problem().solve(3),
-    "guess: got ... durations": lambda s: problem().guess([{}, {}], [1.0, 2.0]),
+    "guess: got durations": lambda s: problem().guess([{}, {}], [1.0, 2.0]),
+    "guess: got the durations": lambda s: problem().guess([{}, {}], [0.0]),
     "guess: got ... phases": lambda s: optimize.Problem(
         cart(), [phase(), phase(name="other")], controls=optimize.Torques()
     ).solve(problem().guess([{}, {}])),
     "guess: got ... poses": lambda s: problem().guess([{}]),
+    "guess: it is of": lambda s: problem(optimize.Torques()).solve(
+        problem(optimize.Torques(), ball()).guess([{}, {}])
+    ),
     "guess: the first": lambda s: problem().guess([None, {}]),
     "impulse: a point": on_point(lambda p: p.impulse("pin")[2]),
     "of: got": lambda s: optimize.between("x", 0, 1, of="color"),
@@ -143,6 +148,9 @@ CASES = {
     "phase ...: between": lambda s: problem(
         optimize.Torques(), ball(), bounds=[optimize.between("turn.ry", -1, 1)]
     ).solve(problem(optimize.Torques(), ball()).guess([{}, {}])),
+    "phase ...: ... has a between": lambda s: phase(
+        end=[optimize.between("x", 0, 1, of="control")]
+    ),
     "phase ...: bounds has": lambda s: phase(bounds=[lambda p: p.t]),
     "phase ...: got ... intervals": lambda s: phase(intervals=0),
     "phase ...: got the duration": lambda s: phase(duration=(2, 1)),

@@ -91,6 +91,9 @@ class LimitedPIDController(diffrax.PIDController):
         # the size proposed by the rejection, as a save time may have clipped the step since
         next_t1 = where(keep_step, jnp.minimum(next_t1, next_t0 + longest), next_t1)
         longest = where(keep_step, jnp.inf, next_t1 - next_t0)
+        # rounding of the time made the next step as long as the rejected one
+        too_small = ~keep_step & (next_t1 >= t1)
+        result = diffrax.RESULTS.where(too_small, diffrax.RESULTS.dt_min_reached, result)
         return keep_step, next_t0, next_t1, made_jump, (state, longest), result
 
 

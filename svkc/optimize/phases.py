@@ -34,7 +34,8 @@ def between(joint: Names, lower: Scalar, upper: Scalar, *, of: str = "position")
         Orientations of ball and free joints cannot be bounded here, and their velocities can only
         be fixed at zero. Bound them by a function of a `Point` in `path`, `start` or `end`.
     of: "position", "velocity", "torque", or "control". "torque" is for torques that are states, as
-        with `TorqueRates`. The torques of `Torques` are controls.
+        with `TorqueRates`. The torques of `Torques` are controls. Controls are bounded in whole
+        phases only.
 
     Raises ValueError if the lower bound is above the upper one, if a bound is not a number, or if
     `of` is unknown.
@@ -210,6 +211,12 @@ class Phase:
                     f"phase {self.name!r}: bounds has a function; it belongs in `path`, `start`"
                     " or `end`"
                 )
+            # the controls of an interval have no value at a node
+            if name in ("start", "end") and getattr(entry, "of", "") == "control":
+                raise ValueError(
+                    f'phase {self.name!r}: {name} has a between(..., of="control"), which bounds'
+                    " whole phases; put it in `bounds`, or give a function of p.u"
+                )
         return entries
 
     def constraints(self, which: str) -> list[Constraint]:
@@ -226,7 +233,7 @@ def coordinates_of(chain: Chain, bound: Between, controls: list[str]) -> np.ndar
 
     controls: names of a control block's numbers.
 
-    Raises ValueError, with the nearest names, for unknown names.
+    Raises ValueError, with the nearest names, for unknown names, and for another number of bounds.
     """
     if bound.of in ("torque", "control"):
         known = {name: [i] for i, name in enumerate(controls)}
@@ -237,4 +244,11 @@ def coordinates_of(chain: Chain, bound: Between, controls: list[str]) -> np.ndar
     for name in bound.joint:
         if name not in known:
             raise unknown_name(f"{bound.of} of a joint", name, tuple(known))
-    return np.array([i for name in bound.joint for i in known[name]], int)
+    at = np.array([i for name in bound.joint for i in known[name]], int)
+    for bounds in (bound.lower, bound.upper):
+        if bounds.shape not in ((), (1,), at.shape):
+            raise ValueError(
+                f"between: got bounds of shape {bounds.shape} for {at.size} coordinates of"
+                f" {', '.join(bound.joint)}"
+            )
+    return at

@@ -128,7 +128,12 @@ class Problem:
         middle = [sum(p.duration) / 2 for p in self.phases]
         durations = np.asarray(middle if durations is None else durations, float)
         if durations.shape != (count,):
-            raise ValueError(f"guess: got {durations.size} durations, expected {count}")
+            raise ValueError(
+                f"guess: got durations of shape {durations.shape}, expected one for each phase:"
+                f" ({count},)"
+            )
+        if not np.all((durations > 0) & np.isfinite(durations)):
+            raise ValueError(f"guess: got the durations {durations}, expected positive numbers")
         lines = PoseLine(chain, self.phases, poses).at(durations)
         motions = [
             motion_without_torques(chain, self.controls, self.scheme, phase, duration, line)

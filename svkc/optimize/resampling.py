@@ -18,7 +18,7 @@ def as_guess(guess: Any, problem: Any) -> Guess:
     """Return a guess on the mesh of a problem.
 
     guess: a `Guess` or a `Solution`, on any mesh.
-    Raises ValueError for other types, and for another number of phases.
+    Raises ValueError for other types, another number of phases, other controls or another chain.
     """
     if not isinstance(guess, Guess | Solution):
         raise ValueError(
@@ -27,6 +27,11 @@ def as_guess(guess: Any, problem: Any) -> Guess:
     motions = guess.phases if isinstance(guess, Guess) else guess.motion
     if len(motions) != len(problem.phases):
         raise ValueError(f"guess: got {len(motions)} phases, the problem has {len(problem.phases)}")
+    names = problem.controls.names(problem.chain)
+    state_count = len(names) * int(problem.controls.has_state)
+    shapes = {(m.v.shape[1], m.blocks.shape[2], m.states.shape[1]) for m in motions}
+    if shapes != {(problem.chain.nv, len(names), state_count)}:
+        raise ValueError("guess: it is of another chain, or of other controls, than the problem")
     blocks = problem.controls.blocks(problem.scheme)
     phases = []
     for phase, motion in zip(problem.phases, motions, strict=True):

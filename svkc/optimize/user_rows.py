@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from svkc._jax.dependence import NONLINEAR, dependence
 from svkc._jax.pytrees import is_concrete
@@ -38,7 +39,14 @@ def _evaluate(entry: Constraint, point: Point) -> Values:
         result, lower, upper = result
     if not is_real(as_array(result)):
         raise ValueError(f"constraint {entry.name!r}: expected numbers, got {description(result)}")
-    return Values(jnp.ravel(jnp.asarray(result)), lower, upper)
+    return Values(_as_float(result), lower, upper)
+
+
+def _as_float(value: Any) -> Array:
+    """Return real numbers as a vector of floats, which can be differentiated."""
+    value = jnp.ravel(jnp.asarray(value))
+    floats = jnp.issubdtype(value.dtype, jnp.floating)
+    return value if floats else value.astype(jnp.result_type(float))
 
 
 def _cost(function: Callable, name: str, point: Point) -> Any:
@@ -46,7 +54,7 @@ def _cost(function: Callable, name: str, point: Point) -> Any:
     value = function(point)
     if not is_real(as_array(value)) or jnp.shape(value) != ():
         raise ValueError(f"{name}: expected a cost of one number, got {description(value)}")
-    return value
+    return _as_float(value)
 
 
 class RowGroup(NamedTuple):
@@ -194,7 +202,7 @@ class UserRows:
             point = point_of_stage(transcription.model, params, data, y, group.active, **options)
             parts = [_evaluate(entry, point).numbers for entry in group.entries]
             scale = weight * point.duration if is_running else 1.0
-            return jnp.concatenate([*parts, *(scale * _cost(f, name, point)[None] for f in costs)])
+            return jnp.concatenate([*parts, *(scale * _cost(f, name, point) for f in costs)])
 
         lanes = lambda of_phase: np.concatenate([of_phase(i)[at] for i, at, _ in group.parts])
         places = [normalized_times(phase) for phase in transcription.phases]
@@ -258,8 +266,9 @@ class UserRows:
         for bound in (shape.lower, shape.upper):
             if not is_concrete(bound):
                 raise ValueError(
-                    f"constraint {entry.name!r}: its bounds depend on the point or on free args;"
-                    " put what depends on these into the function"
+                    f"constraint {entry.name!r}: its bounds depend on the point or on free args,"
+                    " or jnp made them inside the function; put what depends on these into the"
+                    " function's value, and make numbers by numpy"
                 )
             bounds.append(np.ravel(np.asarray(as_array(bound), float)))
         if not all(b.shape in ((1,), shape.numbers) for b in bounds) or not np.all(

@@ -35,7 +35,7 @@ class RESULTS(eqx.Enumeration, metaclass=FormerMeta):  # pyright: ignore
     max_steps = "More steps than max_steps in one phase. Raise max_steps, or loosen rtol and atol."
     step_too_small = (
         "The step size fell to its lower bound: the problem is too stiff, or singular, for this"
-        " solver and tolerance."
+        " solver and tolerance. Or a traced dt, rtol, atol or dtmax is not above zero."
     )
     not_in_place = (
         "An event connects a link at its declared placement, but the bodies were elsewhere. Use"

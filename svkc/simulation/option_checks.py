@@ -49,6 +49,18 @@ def check_instance(name: str, value: Any, kind: type) -> None:
         raise ValueError(f"{name}: expected a diffrax object for it, got {value!r}")
 
 
+def check_solver(solver: Any) -> None:
+    """Raise ValueError unless the solver is one of diffrax for ordinary differential equations."""
+    if not isinstance(solver, diffrax.AbstractSolver):
+        raise ValueError(f"solver: expected a diffrax solver, got {solver!r}")
+    if solver.term_structure not in (diffrax.AbstractTerm, diffrax.ODETerm):
+        raise ValueError(
+            f"solver: {type(solver).__name__} needs a split or a stochastic vector field; use a"
+            " solver of one ordinary differential equation, such as diffrax.Kvaerno5 or"
+            " svkc.integrators.SymplecticEuler"
+        )
+
+
 def check_initial_state(chain: Chain, state: State) -> None:
     """Raise ValueError if the state does not belong to the chain or is not finite."""
     check_state(chain, state)

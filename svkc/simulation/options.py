@@ -35,6 +35,7 @@ from svkc.simulation.default_dynamics import resolve_dynamics
 from svkc.simulation.option_checks import (
     check_initial_state,
     check_instance,
+    check_solver,
     check_step_options,
     check_times,
 )
@@ -50,8 +51,8 @@ class Options(eqx.Module):
     first_step: size of the first step with a controller (s).
     has_work: whether to integrate the work of control, joint limits and dampers.
     gap_tolerance: largest loop gap that does not fail a run (rad, m).
-    traced_times, traced_masses: whether a time, or a mass, inertia or armature of the chain, is
-        traced, so that the compiled run has to check it.
+    traced_times, traced_steps, traced_masses: whether a time, a step size or tolerance, or a mass,
+        inertia or armature of the chain is traced, so that the compiled run has to check it.
     """
 
     control: Callable | None
@@ -68,6 +69,7 @@ class Options(eqx.Module):
     has_work: bool = eqx.field(static=True)
     gap_tolerance: float = eqx.field(static=True)
     traced_times: bool = eqx.field(static=True)
+    traced_steps: bool = eqx.field(static=True)
     traced_masses: bool = eqx.field(static=True)
 
     @property
@@ -150,6 +152,7 @@ def prepare_options(
         has_work=control is not None or chain.limit is not None or chain.damping is not None,
         gap_tolerance=1e3 * gap_tolerance(dtype),
         traced_times=not is_concrete(t0, t1, ts, plan.times),
+        traced_steps=not is_concrete(dt, rtol, atol, dtmax),
         traced_masses=not is_concrete(chain.mass, chain.inertia, chain.armature),
     )
     save_at = host.stack([cast(t0), cast(t1)]) if ts is None else ts
@@ -200,8 +203,7 @@ def _resolve_solver(solver, controller, dtype) -> diffrax.AbstractSolver[Any]:
             if np.finfo(dtype).eps < 1e-10 and controller is not None
             else diffrax.Tsit5()
         )
-    if not isinstance(solver, diffrax.AbstractSolver):
-        raise ValueError(f"solver: expected a diffrax solver, got {solver!r}")
+    check_solver(solver)
     if isinstance(controller, diffrax.AbstractAdaptiveStepSizeController) and not isinstance(
         solver, diffrax.AbstractAdaptiveSolver
     ):
@@ -245,7 +247,7 @@ def _resolve_adjoint(adjoint, controller) -> diffrax.AbstractAdjoint | Replay:
     default is diffrax's adjoint.
 
     Raises ValueError for another type, for Replay with such a controller, and for
-    `BacksolveAdjoint`, which cannot save states.
+    `BacksolveAdjoint` and `ImplicitAdjoint`, which cannot save states.
     """
     is_adaptive = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
     can_replay = controller is None or (is_adaptive and not has_jumps(controller))
@@ -255,10 +257,10 @@ def _resolve_adjoint(adjoint, controller) -> diffrax.AbstractAdjoint | Replay:
         raise ValueError(
             f"adjoint: expected svkc.integrators.Replay or a diffrax adjoint, got {adjoint!r}"
         )
-    if isinstance(adjoint, diffrax.BacksolveAdjoint):
+    if isinstance(adjoint, diffrax.BacksolveAdjoint | diffrax.ImplicitAdjoint):
         raise ValueError(
-            "adjoint: diffrax.BacksolveAdjoint cannot save states; use svkc.integrators.Replay or"
-            " diffrax.RecursiveCheckpointAdjoint"
+            f"adjoint: diffrax.{type(adjoint).__name__} cannot save states; use"
+            " svkc.integrators.Replay or diffrax.RecursiveCheckpointAdjoint"
         )
     if isinstance(adjoint, Replay) and not can_replay:
         raise ValueError(

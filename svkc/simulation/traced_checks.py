@@ -5,6 +5,7 @@ Invalid concrete arguments raise ValueError in `option_checks`, and compile none
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool
 
 from svkc._jax.pytrees import stop_gradient_tree
 from svkc._jax.select import where
@@ -22,10 +23,21 @@ def initial_result(chain: Chain, times: Times, plan: Plan, options: Options) -> 
     times: start, end and save times (s).
     """
     result = _check_times(times, plan) if options.traced_times else RESULTS.successful
+    if options.traced_steps:
+        result = RESULTS.where(_has_step_size(options), result, RESULTS.step_too_small)
     if not options.traced_masses:
         return result
     invalid = has_invalid_inertial_parameters(chain)
     return RESULTS.where(invalid, RESULTS.not_positive_definite, result)
+
+
+def _has_step_size(options: Options) -> Bool[Array, ""]:
+    """Return whether the step, or the tolerances and the largest step, are positive numbers."""
+    controller, numbers = options.controller, (options.dt,)
+    if options.dt is None:
+        numbers = (controller.rtol, controller.atol, controller.dtmax)
+    positive = [jnp.asarray(x) > 0 for x in numbers if x is not None]
+    return jnp.all(jnp.stack(positive))
 
 
 def _check_times(times, plan: Plan) -> RESULTS:

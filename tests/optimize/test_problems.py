@@ -48,6 +48,37 @@ def test_minimum_time_of_a_double_integrator():
 
 
 @pytest.mark.slow
+def test_costs_that_are_python_numbers():
+    """The minimum time again, as the integral of 1, with a constraint that is an integer."""
+    ends = {"start": at(("x", 0, 0)), "end": [*at(("x", 1, 0)), (lambda p: 1, 0, 2)]}
+    phase = optimize.Phase("move", duration=(0.5, 5.0), intervals=4, **ends)
+    controls = optimize.Torques(1.0, constant=True)
+    options = {"running": lambda p: 1.0, "final": lambda p: 3}
+    problem = optimize.Problem(svkc.load(CART), [phase], controls=controls, **options)
+    solution = problem.solve(problem.guess([{"x": 0.0}, {"x": 1.0}]))
+    assert abs(float(solution.cost) - 5) < KNOWN
+
+
+@pytest.mark.slow
+def test_bounds_on_controls():
+    """Least squares of the force to x = 1 with v free: u = 3 (1 - t), which is zero at the end.
+
+    A bound that holds at the end anyway changes nothing there, but does in the whole phase.
+    """
+
+    def cost(**changed):
+        end = [*at(("x", 1)), *changed.pop("end", [])]
+        phase = optimize.Phase("a", duration=1.0, start=at(("x", 0, 0)), end=end, **changed)
+        options = {"controls": optimize.Torques(), "running": lambda p: jnp.sum(p.u**2)}
+        problem = optimize.Problem(svkc.load(CART), [phase], **options)
+        return float(problem.solve(problem.guess([{"x": 0.0}, {"x": 1.0}])).cost)
+
+    np.testing.assert_allclose(cost(), 3, rtol=KNOWN)
+    np.testing.assert_allclose(cost(end=[(lambda p: p.u, -1, 1)]), 3, rtol=KNOWN)
+    assert cost(bounds=[optimize.between("x", -2.5, 2.5, of="control")]) > 3.01
+
+
+@pytest.mark.slow
 def test_brachistochrone():
     """The fastest wire is a cycloid, on which the force by the speed is constant: 3.27 1/s.
 

@@ -67,3 +67,30 @@ def test_new_spellings_do_not_warn():
     with pytest.raises(AttributeError):
         RESULTS.nothing
     np.testing.assert_array_equal(np.asarray(traj.derivative._value), 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["dt", "rtol", "dtmax"])
+def test_traced_step_options_that_are_not_positive(name):
+    """Such lanes end before they start; a positive option runs as a concrete one does."""
+    chain = svkc.load(models.ARM)
+    state = chain.state({"arm": 0.5})
+    run = lambda x: svkc.simulate(chain, state, 0.2, throw=False, **{name: x})
+    lanes = jax.jit(jax.vmap(run))(jnp.array([0.01, 0.0, -0.01, np.nan]))
+    too_small = RESULTS.step_too_small
+    assert (lanes.result == RESULTS.successful).tolist() == [True, False, False, False]
+    assert (lanes.result == too_small).tolist() == [False, True, True, True]
+    assert lanes.t_final.tolist() == [0.2, 0, 0, 0]
+    np.testing.assert_array_equal(lanes.final.q[1:, 0], 0.5)
+    np.testing.assert_allclose(lanes.final.q[0], run(0.01).final.q, atol=1e-13)
+
+
+@pytest.mark.slow
+def test_steps_below_the_resolution_of_time():
+    """In float32, at t = 5e4 s, a stiff spring needs steps below the resolution of time."""
+    with jax.enable_x64(False):
+        arm = models.ARM.replace("<joint ", '<joint stiffness="1e4" ')
+        chain = svkc.load(arm)
+        traj = svkc.simulate(chain, chain.state({"arm": 0.2}), 50008.0, t0=5e4, throw=False)
+        assert traj.result == RESULTS.step_too_small
+        assert int(traj.report().rejected) < 10
