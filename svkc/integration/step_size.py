@@ -91,7 +91,7 @@ class LimitedPIDController(diffrax.PIDController):
         # the size proposed by the rejection, as a save time may have clipped the step since
         next_t1 = where(keep_step, jnp.minimum(next_t1, next_t0 + longest), next_t1)
         longest = where(keep_step, jnp.inf, next_t1 - next_t0)
-        # rounding of the time made the next step as long as the rejected one
+        # the time is rounded, so that the next step would end where the rejected one did
         too_small = ~keep_step & (next_t1 >= t1)
         result = diffrax.RESULTS.where(too_small, diffrax.RESULTS.dt_min_reached, result)
         return keep_step, next_t0, next_t1, made_jump, (state, longest), result

@@ -152,9 +152,7 @@ def estimate_error(chain: Chain, state: State, t1: Scalar, **options: Any) -> fl
 
     The finer run has half the step (`dt`), or tolerances (`rtol`, `atol`) divided by 32. The result
     is the `configuration_error` between the two runs (rad, m). The estimate is good if the finer
-    run's own error is much smaller.
-
-    It is infinite if one of the runs does not reach its end (`throw=False`).
+    run's own error is much smaller. It is infinite if one of the runs fails (`throw=False`).
 
     t1: end time (s).
     options: keyword arguments of `simulate`. The finer run may take eight times `max_steps`.
@@ -174,9 +172,9 @@ def estimate_error(chain: Chain, state: State, t1: Scalar, **options: Any) -> fl
     if options.get("max_steps") is not None:
         finer["max_steps"] = 8 * options["max_steps"]
     reference = simulate(chain, state, t1, **(options | finer))
-    reached = (RESULTS.successful, RESULTS.stopped)
-    if not all(any(bool(x.result == code) for code in reached) for x in (run, reference)):
-        return np.inf
+    for traj in (run, reference):
+        if traj.result != RESULTS.successful and traj.result != RESULTS.stopped:
+            return np.inf
     return configuration_error(chain, run, reference)
 
 

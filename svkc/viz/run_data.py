@@ -28,8 +28,11 @@ def check_single_run(traj: Any) -> None:
 
 
 def plain_text(text: str) -> str:
-    """Return text that matplotlib shows as it is: no TeX between dollar signs, and no label that is
-    left out of a legend because it starts with an underscore."""
+    """Return text that matplotlib shows as it is.
+
+    matplotlib reads TeX between dollar signs, and leaves labels that start with an underscore out
+    of legends.
+    """
     return " " * text.startswith("_") + text.replace("$", r"\$")
 
 
